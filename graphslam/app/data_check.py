@@ -10,11 +10,11 @@ from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameE
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.evaluate.log_checks import check_log
-from graphslam.evaluate.stream_checks import Noticed
+from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.io.catalog import load
 
 
-def check_source(source: str | Path, *, reader: str | None = None, **options: Any) -> list[Noticed]:
+def check_source(source: str | Path, *, reader: str | None = None, **options: Any) -> list[StreamFinding]:
     """What can be told to be wrong with a source: of its files, of what is in them, and of what it is good for.
 
     Parameters
@@ -25,7 +25,7 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
 
     Returns
     -------
-    list of Noticed
+    list of StreamFinding
         The first line says what was read. What cannot be read at all is a line of level ``bad``.
     """
     try:
@@ -33,18 +33,20 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     except UnknownNameError:
         raise
     except GraphSlamError as error:
-        return [Noticed("", Finding("bad", "unreadable", str(error)))]
+        return [StreamFinding("", Finding("bad", "unreadable", str(error)))]
     if not isinstance(log, SensorLog):
         text = f"{type(log).__name__}: no log of sensors, of which nothing is checked here."
-        return [Noticed("", Finding("", "read", text))]
-    said = [Noticed("", Finding("", "read", f"{reading_line(log) or log.name}."))]
-    said += [Noticed("", Finding("", "left-out", f"Left out by the reader: {n} {what}.")) for what, n in _lost(log)]
+        return [StreamFinding("", Finding("", "read", text))]
+    said = [StreamFinding("", Finding("", "read", f"{reading_line(log) or log.name}."))]
+    said += [
+        StreamFinding("", Finding("", "left-out", f"Left out by the reader: {n} {what}.")) for what, n in _lost(log)
+    ]
     said += check_log(log)
     try:
         choice = choose_front_end(log)
-        said.append(Noticed("", Finding("", "front-end", f"A run would use {choice.frontend}: {choice.why}.")))
+        said.append(StreamFinding("", Finding("", "front-end", f"A run would use {choice.frontend}: {choice.why}.")))
     except MissingDataError as error:
-        said.append(Noticed("", Finding("look", "no-front-end", str(error))))
+        said.append(StreamFinding("", Finding("look", "no-front-end", str(error))))
     return said
 
 
@@ -52,7 +54,7 @@ def _lost(log: SensorLog) -> list[tuple[str, int]]:
     return [(what, n) for what, n in log.dropped.items() if not what.endswith("(kept)")]
 
 
-def summary(found: list[Noticed]) -> str:
+def summary(found: list[StreamFinding]) -> str:
     """The last line: whether to run."""
     bad = sum(n.finding.level == "bad" for n in found)
     look = sum(n.finding.level == "look" for n in found)

@@ -13,7 +13,7 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Compass, Gps, LandmarkObservations
-from graphslam.evaluate.gps_floor import fix_segments
+from graphslam.evaluate.gps_repeatability import fix_segments
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import Solver

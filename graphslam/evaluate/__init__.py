@@ -6,9 +6,9 @@ _EXPORTS = {
     "consistency": "Consistency",
     "submap_consistency": "submap_nees submaps_consistency",
     "association": "match_observations",
-    "gps": "gps_residuals in_gps_frame",
-    "gps_floor": "fix_segments revisit_disagreement segment_table",
-    "reckoning": "dead_reckoning",
+    "gps": "gps_residuals move_to_gps_frame",
+    "gps_repeatability": "fix_segments revisit_disagreement segment_table",
+    "dead_reckoning_baseline": "dead_reckoned_path",
     "trajectory_error": "ate fit_alignment",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -19,8 +19,8 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.evaluate.gps_floor import fix_segments
-from graphslam.evaluate.without_truth import correlated_dof, two_sided
+from graphslam.evaluate.gps_repeatability import fix_segments
+from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bounds
 from graphslam.graph.factors.gps import GpsRecord, antenna_terms
 from graphslam.graph.factors.sensor_biases import sensor_biases_at
 from graphslam.graph.gps import FixErrors, arm_jacobian, datum_columns, lever_arm
@@ -109,7 +109,7 @@ class GpsInnovations:
         parts = (("each", self.normalised, correlated_dof(self.covariance, d)), ("joint", self.whitened, float(d * n)))
         for name, y, dof in parts:
             value = float(np.sum(y**2) / (d * n))
-            low, high, verdict = two_sided(value, dof, self.confidence)
+            low, high, verdict = two_sided_bounds(value, dof, self.confidence)
             pairs = y[1:][close] * y[:-1][close]
             rows.append(
                 {

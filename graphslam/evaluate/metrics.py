@@ -26,8 +26,8 @@ from graphslam.evaluate.consistency import joint_nees, vector_pose_error
 from graphslam.evaluate.gauge import aligned_nees, gauge_directions
 from graphslam.evaluate.gps import GpsResiduals, gps_residuals
 from graphslam.evaluate.map_error import landmark_error, match_ids
+from graphslam.evaluate.residual_consistency import class_consistency, two_sided_bounds
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.evaluate.without_truth import class_consistency, two_sided
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
 
@@ -360,7 +360,7 @@ def _contradiction(graph: PoseGraph) -> None:
     ways = class_consistency(graph).get("imu") if graph.imu.used else None
     if ways is None or not np.isfinite(ways.ratio):
         return
-    high = two_sided(ways.ratio, ways.dof, 0.999)[1]
+    high = two_sided_bounds(ways.ratio, ways.dof, 0.999)[1]
     if ways.ratio > high:
         graph.log_event("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
         logger.warning(

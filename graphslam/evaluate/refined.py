@@ -19,7 +19,7 @@ from graphslam.maps.refined import steps_at
 from graphslam.refine.refine import Refinement
 
 
-def upright_truth(truth: MapTruth, path: Trajectory | None, true_base: Array) -> tuple[MapTruth, Trajectory | None]:
+def level_truth(truth: MapTruth, path: Trajectory | None, true_base: Array) -> tuple[MapTruth, Trajectory | None]:
     """Truth in the gravity-aligned frame at the first base, which is the frame of a refined path.
 
     Parameters
@@ -57,7 +57,7 @@ def refined_truth_metrics(
     m : GlobalMap
         With the refined nodes.
     truth : MapTruth
-        Gravity-aligned (:func:`upright_truth`), as ``path``.
+        Gravity-aligned (:func:`level_truth`), as ``path``.
     path : Trajectory, optional
         True path at full rate.
     """

@@ -30,7 +30,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import Consistency
 from graphslam.evaluate.metrics import FigureTable
-from graphslam.evaluate.without_truth import ClassConsistency
+from graphslam.evaluate.residual_consistency import ClassConsistency
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.ledger import Ledger
 from graphslam.graph.pose_graph import PoseGraph

@@ -32,8 +32,8 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.association import pair_agreement
+from graphslam.evaluate.dead_reckoning_baseline import dead_reckoned_path
 from graphslam.evaluate.gps import gps_residuals
-from graphslam.evaluate.reckoning import dead_reckoning
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
@@ -161,7 +161,7 @@ def paper(log: SensorLog, *, seeds: int, figures: Path | None) -> None:
     few = log.slice(start, start + 60.0)
     _all_methods(few, judge_of(few, front), Results(), 0, progress=False)  # compiles
     results = Results()
-    reckoned = dead_reckoning(log, log["laser"].times)
+    reckoned = dead_reckoned_path(log, log["laser"].times)
     assert reckoned is not None
     results.add("dead reckoning", judge(reckoned))
     results.keep("dead reckoning", reckoned, np.zeros((0, 2)))

@@ -12,7 +12,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import GpsInnovations, _arm_covariance, gps_innovations
-from graphslam.evaluate.without_truth import class_consistency, correlated_dof, two_sided
+from graphslam.evaluate.residual_consistency import class_consistency, correlated_dof, two_sided_bounds
 from graphslam.graph.gps import GpsConfig, antenna_in_base
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
@@ -181,7 +181,7 @@ def test_correlated_squares_have_the_two_moments_that_the_bounds_use(rng):
     assert q.mean() == pytest.approx(12, rel=0.02)
     assert q.var() == pytest.approx(2 * 12**2 / dof, rel=0.05)
     assert correlated_dof(np.diag(np.arange(1.0, 13.0)), 3) == pytest.approx(12)
-    low, high, verdict = two_sided(1.0, dof, 0.95)
+    low, high, verdict = two_sided_bounds(1.0, dof, 0.95)
     assert (verdict, low < 1 < high) == ("consistent", True)
 
 
@@ -270,5 +270,5 @@ def test_what_cannot_be_predicted_is_refused_or_counted(rng):
 
 
 def test_bounds_are_those_of_chi_square():
-    low, high, _ = two_sided(1.0, 10.0, 0.95)
+    low, high, _ = two_sided_bounds(1.0, 10.0, 0.95)
     assert (10 * low, 10 * high) == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 10)))

@@ -9,7 +9,7 @@ its own. What is left there says two things that no figure of a solved graph say
   landmarks do. An honest robot has ``g ~ N(0, S)``; a wrong one gives the error itself, ``S⁻¹ g`` (one step of
   Gauss-Newton over path, landmarks and calibration), and its σ.
 
-Windows are independent, so both are sums (:mod:`graphslam.evaluate.systematic` reads them). Not seen, in principle: a
+Windows are independent, so both are sums (:mod:`graphslam.evaluate.bias_test` reads them). Not seen, in principle: a
 common scale of ranges and distances, and bearings and turns mirrored together. They give a map that is similar to the
 true one, and nothing in these two sensors says which is the world.
 """

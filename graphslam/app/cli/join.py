@@ -118,7 +118,7 @@ def compare(
     from graphslam.app.join_verdict import compare_verdict
     from graphslam.app.run.verdict import CONFIDENCE
     from graphslam.app.submap_sources import submap_source
-    from graphslam.evaluate.without_truth import two_sided
+    from graphslam.evaluate.residual_consistency import two_sided_bounds
 
     s = submap_source(source, submap_poses=submap_poses)
     options: dict[str, Any] = {"covariance_scale": s.covariance_scale if scale is None else scale}
@@ -145,6 +145,6 @@ def compare(
     if s.truth is None:
         text.append("No truth is known of these submaps: NEES and CI are not known, either.")
     elif n := found["nees_dof"].iloc[0]:
-        low, high, _ = two_sided(1.0, float(n), CONFIDENCE)
+        low, high, _ = two_sided_bounds(1.0, float(n), CONFIDENCE)
         text.append(f"An honest map has NEES/n between {low:.3g} and {high:.3g} in 95 % of the runs (n = {n}).")
     emit(value, "\n".join(text), as_json=as_json)

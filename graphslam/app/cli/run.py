@@ -169,13 +169,13 @@ CAUSES = frozenset(
 def join_note(result: Any) -> list[str]:
     """What to do about submaps that fit each other worse or better than they say, beyond what chance does."""
     from graphslam.app.run.verdict import CERTAIN
-    from graphslam.evaluate.without_truth import two_sided
+    from graphslam.evaluate.residual_consistency import two_sided_bounds
 
     m = result.metrics.set_index("key")["value"]
     chi2, dof = m.get("join_chi2_per_dof"), m.get("join_dof", 0.0)
     if chi2 is None or not dof > 0:
         return []
-    low, high, said = two_sided(chi2, dof, CERTAIN)
+    low, high, said = two_sided_bounds(chi2, dof, CERTAIN)
     if said == "consistent":
         return []
     text = f"note: join χ²/dof is {chi2:.3g}; for {dof:.4g} degrees of freedom 999 of 1000 honest runs lie between "

@@ -18,7 +18,7 @@ from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.path_consistency import path_consistency
-from graphslam.evaluate.without_truth import two_sided
+from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.io.submap_store import read_truth
 from graphslam.io.tum import read_tum
 from graphslam.maps.global_map import GlobalMap
@@ -133,7 +133,7 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     if len(made.rows) < 2:
         return []
     axis, ratio = _Axis.of(m.trajectory, made.rows), made.nees / made.dof
-    low, high, _ = two_sided(1.0, made.dof, CONFIDENCE)
+    low, high, _ = two_sided_bounds(1.0, made.dof, CONFIDENCE)
     inside = float(np.mean((ratio >= low) & (ratio <= high)))
     said = (
         f"Every pose of the path against the truth, first base fixed; {_BOUNDS} bounds of one pose with "
@@ -166,7 +166,7 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
     if found is not None:
         times, v, sigma, nis = found
         d, axis = v.shape[1], _Axis.at(path, times)
-        low, high, _ = two_sided(1.0, d, CONFIDENCE)
+        low, high, _ = two_sided_bounds(1.0, d, CONFIDENCE)
         inside = float(np.mean((nis / d >= low) & (nis / d <= high)))
         said = (
             f"Fixes that the graph was not given, against where it predicts them; {_BOUNDS} bounds of one fix, "

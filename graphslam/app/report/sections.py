@@ -27,7 +27,7 @@ from graphslam.core.markup import (
     value_text,
 )
 from graphslam.evaluate.metrics import is_time
-from graphslam.evaluate.without_truth import two_sided
+from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.ledger import EXCLUSIVE
 
 BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is honest"}
@@ -140,7 +140,7 @@ def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str
     for key in m:
         stem = key.removesuffix("_per_dof")
         if stem != key and stem.startswith("nees") and m.get(f"{stem}_dof", 0.0) > 0:
-            low, high, verdict = two_sided(m[key], m[f"{stem}_dof"], CONFIDENCE)
+            low, high, verdict = two_sided_bounds(m[key], m[f"{stem}_dof"], CONFIDENCE)
             out[key] = (f"{low:.3g} to {high:.3g}", verdict)
     return out, folded_in
 

@@ -23,7 +23,7 @@ from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, SteeringControls
-from graphslam.evaluate.without_truth import two_sided
+from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, SensorBiasConfig
@@ -212,7 +212,7 @@ def named_causes(
     name = log.of_type(LandmarkObservations)
     if config.given is not None or name is None or chi2_per_dof is None or not dof > 0:
         return []
-    if not chi2_per_dof > max(two_sided(chi2_per_dof, dof, CERTAIN)[1], DISAGREE):
+    if not chi2_per_dof > max(two_sided_bounds(chi2_per_dof, dof, CERTAIN)[1], DISAGREE):
         return []
     try:
         found = calibrate_sightings(SightingLog.of(log, name, log[name]), QUICK)

@@ -44,7 +44,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import FigureTable, is_time
-from graphslam.evaluate.without_truth import ClassConsistency
+from graphslam.evaluate.residual_consistency import ClassConsistency
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
@@ -374,7 +374,7 @@ def graph_facts(graph: PoseGraph, classes: Mapping[str, ClassConsistency]) -> di
     Parameters
     ----------
     classes : mapping of str to ClassConsistency
-        Of this graph (:func:`graphslam.evaluate.without_truth.class_consistency`).
+        Of this graph (:func:`graphslam.evaluate.residual_consistency.class_consistency`).
     """
     return {
         "dim": graph.dim,

@@ -54,6 +54,9 @@ from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.evaluate.bias_test import bias_test_findings
+from graphslam.evaluate.covariance_assessment import pooled_nonlinearity, tests_as_json
+from graphslam.evaluate.dead_reckoning_baseline import dead_reckoned_path
 from graphslam.evaluate.landmark_checks import sighting_findings
 from graphslam.evaluate.metrics import (
     Metrics,
@@ -70,18 +73,15 @@ from graphslam.evaluate.metrics import (
     truth_metrics_in_space,
     truth_path,
 )
-from graphslam.evaluate.reckoning import dead_reckoning
 from graphslam.evaluate.refined import (
     heading_error,
+    level_truth,
     refined_truth_metrics,
     refinement_facts,
     refinement_metrics,
-    upright_truth,
 )
-from graphslam.evaluate.stream_checks import Noticed, check_streams
-from graphslam.evaluate.systematic import systematic_findings
+from graphslam.evaluate.stream_checks import StreamFinding, check_streams
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.evaluate.trust import pooled_nonlinearity, rows_as_json
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
@@ -226,7 +226,7 @@ def _run(
     front = suited(front, log, applied.given, found, config)
     settings = replace(settings, calibrate=applied)
     seconds["calibrate"] = time.perf_counter() - clock
-    noticed = [*noticed, *(Noticed("", f) for f in said)]
+    noticed = [*noticed, *(StreamFinding("", f) for f in said)]
     effective = effective_config(log.name, name_of(frontend), solver, seed, front.config, settings)
     back = back_end(RecordSource(log), settings, solver, [ProgressBar(log, progress), *observers])
 
@@ -259,7 +259,7 @@ def finished(
     seconds: dict[str, float],
     begin: float,
     undo: Sequence[int | LoopDecision],
-    noticed: Sequence[Noticed],
+    noticed: Sequence[StreamFinding],
     *,
     progress: bool,
 ) -> Run:
@@ -561,7 +561,7 @@ def _judge(
     time_metrics(out, seconds, log.duration, scans, work.per_scan)
     out.add("path_length", global_map.trajectory.length(), "m")
     residuals = {}
-    reckoned = dead_reckoning(log, global_map.trajectory)
+    reckoned = dead_reckoned_path(log, global_map.trajectory)
     if gps is not None:
         withheld = ~used_fixes(gps, settings.gps)
         residuals = gps_metrics(out, global_map.trajectory, gps, withheld, global_map.T_gps_world)
@@ -577,7 +577,7 @@ def _judge(
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
         if refined is not None:
-            truth, true_path = upright_truth(truth, true_path, np.array(base))
+            truth, true_path = level_truth(truth, true_path, np.array(base))
             base = remove_roll_pitch(np.array(base)).tolist() if back.graph.dim == 3 else base
             refined_truth_metrics(out, global_map, refined.refinement, submaps, truth, path=true_path)
             if true_path is not None and len(true_path) >= 3:
@@ -612,7 +612,7 @@ def _judge(
         "objective": solution.objective,
         "converged": solution.converged,
         "graph": graph_facts(back.graph, checks.classes),
-        "evidence": rows_as_json(checks.evidence(submaps, refined=refined is not None)),
+        "evidence": tests_as_json(checks.evidence(submaps, refined=refined is not None)),
         "nonlinearity": pooled_nonlinearity([s.report for s in submaps]) if refined is None else 0.0,
     }
     if truth is not None:
@@ -642,7 +642,7 @@ def _judge(
     corrected = "noise" in effective.get("frontend", {})
     causes = named_causes(log, settings.calibrate, *join, ranges_corrected=corrected)
     causes = [*causes, *lasting_findings(lasting)]
-    seen = [*causes, *sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
+    seen = [*causes, *sighting_findings(log, reports, {**log.dropped, **drops.counts}), *bias_test_findings(reports)]
     lines = [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *refining, *verdict(figures)]
     report["verdict"] = verdict_json(summary(figures, lines), lines)
     return Run(

@@ -179,7 +179,8 @@ def headline(
     known : bool
         Is there anything that the result could be held against?
     word : str
-        On the covariances, by what the log itself holds (:func:`graphslam.evaluate.trust.trust`).
+        On the covariances, by what the log itself holds
+        (:func:`graphslam.evaluate.covariance_assessment.assess_covariances`).
     """
     found = list(findings)
     level = worst_level(found) or "good"

@@ -30,7 +30,7 @@ from graphslam.core.records import (
     VelocityControls,
     check_times,
 )
-from graphslam.evaluate.stream_checks import Noticed
+from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.io.log_store import INDEX_NAME, load_log, save_log
 from graphslam.refine.scans import Scans
 
@@ -69,7 +69,7 @@ class Taken:
         Its ``read`` counts every stream, its ``dropped`` what the reader and the front end dropped.
     identities : (q,) int64 or None
         Of the log's observations of landmarks, by a reference that the run never saw (−1 = none).
-    noticed : tuple of Noticed
+    noticed : tuple of StreamFinding
         What was seen in its streams before the run.
     scans : Scans or None
         What a refinement of the path reads; None where there is none.
@@ -77,7 +77,7 @@ class Taken:
 
     log: SensorLog
     identities: npt.NDArray[np.int64] | None = None
-    noticed: tuple[Noticed, ...] = ()
+    noticed: tuple[StreamFinding, ...] = ()
     scans: Scans | None = None
 
 
@@ -85,7 +85,7 @@ def take(
     log: SensorLog,
     dropped: Mapping[str, int],
     identities: npt.NDArray[np.int64] | None,
-    noticed: Sequence[Noticed] = (),
+    noticed: Sequence[StreamFinding] = (),
     scans: Scans | None = None,
 ) -> Taken:
     """What is kept of a log; ``dropped`` counts what its front end dropped."""
@@ -130,6 +130,6 @@ def read_taken(folder: Path) -> tuple[Taken, str | None]:
         rows = [(str(s), Finding.from_row(dict(zip(("level", "code", "text"), map(str, r))))) for s, *r in a["noticed"]]
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(f"stream or array {error} is missing", where=str(folder / "taken.npz")) from None
-    noticed = tuple(Noticed(stream, finding) for stream, finding in rows if finding is not None)
+    noticed = tuple(StreamFinding(stream, finding) for stream, finding in rows if finding is not None)
     scans = Scans.load(folder / SCANS, log.name) if (folder / SCANS).is_file() else None
     return Taken(replace(log, streams=streams), a.get("identities"), noticed, scans), generation_of(a)

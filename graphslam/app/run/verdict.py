@@ -16,10 +16,17 @@ from typing import Any
 from graphslam.app.run.stream_use import StreamUse
 from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
+from graphslam.evaluate.covariance_assessment import (
+    LEVEL,
+    MAX_NONLINEARITY,
+    ConsistencyTest,
+    CovarianceAssessment,
+    assess_covariances,
+    tests_of_json,
+)
 from graphslam.evaluate.intervals import by_chance, two_sided_width
-from graphslam.evaluate.stream_checks import Noticed
-from graphslam.evaluate.trust import BENT, LEVEL, Evidence, Trust, rows_of_json, trust
-from graphslam.evaluate.without_truth import LASTING, two_sided
+from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
+from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.maps.contradictions import LOOK
 
 TWO_MAPS_DO = "see which of both is right there, or give GPS there and run again"
@@ -125,7 +132,7 @@ _STATED = frozenset(
 
 def observed(
     streams: Sequence[StreamUse],
-    noticed: Sequence[Noticed] = (),
+    noticed: Sequence[StreamFinding] = (),
     submaps: Sequence[Submap] = (),
     events: Sequence[Mapping[str, Any]] = (),
 ) -> list[Finding]:
@@ -133,7 +140,7 @@ def observed(
 
     Parameters
     ----------
-    noticed : sequence of Noticed
+    noticed : sequence of StreamFinding
         Of the raw streams; what is bad in one that was not used is only worth a look.
     submaps : sequence of Submap
         Their reports may hold ``findings``: rows of :meth:`Finding.as_row`, of the run as a whole or of the submap.
@@ -225,7 +232,7 @@ def class_rows(figures: Figures) -> list[dict[str, Any]]:
         dof = m.get(f"{stem}_dof", math.nan)
         row = {"class": stem.removeprefix("honesty_"), "dof": dof, "chi2": ratio * dof, "chi2_per_dof": ratio}
         if dof > 0:
-            row["low"], row["high"], row["verdict"] = two_sided(ratio, dof, CONFIDENCE)
+            row["low"], row["high"], row["verdict"] = two_sided_bounds(ratio, dof, CONFIDENCE)
         out.append(row | {"mean_weight": m.get(f"{stem}_mean_weight")})
     return out
 
@@ -259,19 +266,19 @@ class Judged:
     @property
     def said(self) -> str:
         """``consistent``, ``over-confident`` or ``pessimistic``."""
-        return two_sided(self.ratio, self.dof, CONFIDENCE)[2]
+        return two_sided_bounds(self.ratio, self.dof, CONFIDENCE)[2]
 
     @property
     def level(self) -> Level:
         """One honest run in forty is outside on either side: bad is what one in a thousand is not."""
         if self.said == "consistent":
             return "good"
-        return "bad" if self.ratio > two_sided(self.ratio, self.dof, CERTAIN)[1] else "look"
+        return "bad" if self.ratio > two_sided_bounds(self.ratio, self.dof, CERTAIN)[1] else "look"
 
     @property
     def text(self) -> str:
         """The ratio with its bounds, in words."""
-        low, high, said = two_sided(self.ratio, self.dof, CONFIDENCE)
+        low, high, said = two_sided_bounds(self.ratio, self.dof, CONFIDENCE)
         bounds = f"{CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({self.dof:.4g} degrees of freedom)"
         return f"{self.ratio:.3g}, {bounds}; {(IN_WORDS if self.code == 'nees' else RESIDUALS_IN_WORDS)[said]}"
 
@@ -346,21 +353,21 @@ def _chi2(figures: Figures) -> Finding:
     return Finding("", "chi2", text)
 
 
-def _said(row: Evidence) -> str:
+def _said(row: ConsistencyTest) -> str:
     """A row of evidence with its figures."""
     if row.lasting and row.dof == 1.0:
         return f"{row.name} ({row.value:.1f} σ)"
     return f"{row.name} ({row.value:.3g} at {row.dof:.3g} degrees of freedom)"
 
 
-def judged_trust(figures: Figures) -> Trust | None:
+def judged_trust(figures: Figures) -> CovarianceAssessment | None:
     """Can the covariances be believed, by what the log itself holds? None in folders that do not say."""
     if figures.report.get("evidence") is None:
         return None
-    rows = rows_of_json(figures.report.get("evidence"))
+    rows = tests_of_json(figures.report.get("evidence"))
     fixes = any(r.of == "fixes" for r in rows) or any(c.get("class") == "gps" for c in class_rows(figures))
     bend: Any = figures.report.get("nonlinearity")
-    return trust(rows, fixes=fixes, nonlinearity=float(bend) if number(bend) else 0.0)
+    return assess_covariances(rows, fixes=fixes, nonlinearity=float(bend) if number(bend) else 0.0)
 
 
 def _trust(figures: Figures) -> list[Finding]:
@@ -385,7 +392,7 @@ def _trust(figures: Figures) -> list[Finding]:
             causes.append(
                 "bearings are so vague beside the ranges that a landmark may be anywhere on an arc, and no Gaussian "
                 f"describes that (squared shift by curvature per unknown {figures.report['nonlinearity']:.2g}, from "
-                f"{BENT:g} on maps are surer of themselves than they should be)"
+                f"{MAX_NONLINEARITY:g} on maps are surer of themselves than they should be)"
             )
         text = f"Whether the covariances can be believed cannot be decided from this log: {'; '.join(causes)}.{held}"
         if figures.part("refine"):
@@ -415,7 +422,7 @@ def _tests(figures: Figures) -> list[Finding]:
     def judge(what: str, value: Any, dof: Any, cause: str) -> None:
         if not (number(value) and number(dof) and dof > 0):
             return
-        high = two_sided(float(value), float(dof), CERTAIN)[1]
+        high = two_sided_bounds(float(value), float(dof), CERTAIN)[1]
         if value > high:
             limit = f"an honest run exceeds {high:.3g} less than once in a thousand runs"
             out.append(Finding("bad", "consistency-test", f"{what} is {value:.3g}, and {limit}: {cause}"))

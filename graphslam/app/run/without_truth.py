@@ -16,14 +16,20 @@ from graphslam.core.markup import html_frame
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.bias_test import sum_bias_windows
+from graphslam.evaluate.covariance_assessment import (
+    ConsistencyTest,
+    Of,
+    chi2_ratio_test,
+    largest_score_test,
+    short_window_tests,
+)
 from graphslam.evaluate.gps import FixDistances, fix_distances
 from graphslam.evaluate.gps_innovation import GpsInnovations, gps_innovations
 from graphslam.evaluate.intervals import two_sided_width
-from graphslam.evaluate.loop_consistency import LoopConsistency, find_loops, loop_consistency
+from graphslam.evaluate.loop_consistency import LoopConsistency, find_landmark_loops, loop_consistency
 from graphslam.evaluate.metrics import Metrics
-from graphslam.evaluate.systematic import sums
-from graphslam.evaluate.trust import Evidence, Of, by_score, by_size, of_systematic
-from graphslam.evaluate.without_truth import ClassConsistency, class_consistency
+from graphslam.evaluate.residual_consistency import ClassConsistency, class_consistency
 from graphslam.graph.pose_graph import PoseGraph
 
 OF_THE_MAP = ("submap", "lasting", "dense-submap", "match", "loop", "tie")
@@ -68,8 +74,8 @@ class WithoutTruth:
             rows.append(("loops", r["value"], r["low"], r["high"], r["verdict"], r["dof"]))
         return pd.DataFrame(rows, columns=columns)
 
-    def evidence(self, submaps: Sequence[Submap], *, refined: bool = False) -> list[Evidence]:
-        """Everything that speaks for or against the covariances (:mod:`graphslam.evaluate.trust`).
+    def evidence(self, submaps: Sequence[Submap], *, refined: bool = False) -> list[ConsistencyTest]:
+        """Everything that speaks for or against the covariances (:mod:`graphslam.evaluate.covariance_assessment`).
 
         Parameters
         ----------
@@ -80,8 +86,8 @@ class WithoutTruth:
         rows = self._evidence(submaps)
         return [r for r in rows if r.of == "fixes"] if refined else rows
 
-    def _evidence(self, submaps: Sequence[Submap]) -> list[Evidence]:
-        out = of_systematic(sums([s.report for s in submaps]))
+    def _evidence(self, submaps: Sequence[Submap]) -> list[ConsistencyTest]:
+        out = short_window_tests(sum_bias_windows([s.report for s in submaps]))
         for name, c in self.classes.items():
             of: Of = "map" if name in OF_THE_MAP else "fixes" if name == "gps" else "other"
             chi2, dof = c.chi2, c.dof
@@ -89,22 +95,22 @@ class WithoutTruth:
                 b = self.classes["gps-bias"]
                 chi2, dof = chi2 + b.chi2, dof + b.dof
             if name != "gps-bias" and dof > 0:
-                out += by_size(f"χ² of {name}", of, chi2 / dof, dof * c.independent / max(c.dof, 1e-9))
+                out += chi2_ratio_test(f"χ² of {name}", of, chi2 / dof, dof * c.independent / max(c.dof, 1e-9))
             if c.whiteness is not None and np.isfinite(c.ratio):
                 score = c.whiteness.score if c.whiteness.lasting() else min(c.whiteness.score, 0.0)
-                out.append(by_score(f"residuals of {name} from one to the next", of, score))
+                out.append(largest_score_test(f"residuals of {name} from one to the next", of, score))
         if self.gps is not None:
             for r in self.gps.tests().to_dict("records"):
-                out += by_size(f"withheld fixes, {r['test']}", "fixes", r["value"], r["dof"])
+                out += chi2_ratio_test(f"withheld fixes, {r['test']}", "fixes", r["value"], r["dof"])
                 if r["test"] == "joint" and np.isfinite(r["autocorrelation"]):
                     score = two_sided_width(0.95) * r["autocorrelation"] / r["white"]
-                    out.append(by_score("withheld fixes from one to the next", "fixes", score))
+                    out.append(largest_score_test("withheld fixes from one to the next", "fixes", score))
         if self.fixes is not None and self.fixes.ratio > 1.0:  # one-sided: fixes that lie close say nothing
             f = self.fixes
-            out.append(Evidence("squared distances from the GPS fixes", "fixes", f.ratio, 1.0, f.chance, 1.0))
+            out.append(ConsistencyTest("squared distances from the GPS fixes", "fixes", f.ratio, 1.0, f.chance, 1.0))
         if self.loops is not None:
             r = self.loops.test()
-            out += by_size("loops against each other", "map", r["value"], r["dof"])
+            out += chi2_ratio_test("loops against each other", "map", r["value"], r["dof"])
         return out
 
     def _repr_html_(self) -> str:
@@ -164,7 +170,7 @@ def check_without_truth(
         return WithoutTruth(classes, innovations, None, fixes)
     try:
         known = [graph.as_known(s) for s in submaps]
-        found = find_loops(known, poses, covariance_scale=settings.backend.covariance_scale)
+        found = find_landmark_loops(known, poses, covariance_scale=settings.backend.covariance_scale)
         loops = loop_consistency(found)
     except DataError:  # a chain without a loop has nothing to compare, and the metrics then hold none of it
         return WithoutTruth(classes, innovations, None, fixes)

@@ -18,7 +18,7 @@ from graphslam.app.sessions.merge_dense import MergedSubmaps
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.atomic import write_npz
 from graphslam.core.errors import RunFolderError
-from graphslam.evaluate.without_truth import class_consistency
+from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save
 

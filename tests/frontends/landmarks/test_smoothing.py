@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse, wrap_angle
-from graphslam.evaluate.trust import BENT
+from graphslam.evaluate.covariance_assessment import MAX_NONLINEARITY
 from graphslam_frontends.landmarks.smoothing_kernels import second_order_bias
 from graphslam_frontends.landmarks.summarise import smooth_submap
 from tests.reference.fastslam import measure
@@ -130,7 +130,7 @@ def test_maps_bend_where_bearings_are_vague_beside_ranges():
     sure = np.column_stack([exact, np.tile([0.3**2, 0.01**2], (len(k), 1))])
     maps = [smooth_submap(truth, landmarks, *args, v, SENSOR) for v in (vague, sure)]
     per = [s.nonlinearity() / len(s.gaussian.mean) for s in maps]
-    assert per[0] > BENT
+    assert per[0] > MAX_NONLINEARITY
     assert per[1] < 0.01 * per[0]
 
 

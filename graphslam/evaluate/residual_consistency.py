@@ -18,7 +18,7 @@ from scipy import stats
 
 from graphslam.core.geometry import Array
 from graphslam.evaluate.consistency import Verdict
-from graphslam.evaluate.whiteness import Whiteness, whiteness
+from graphslam.evaluate.whiteness import Whiteness, residual_whiteness
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factors.batch import UniformBatch
 from graphslam.graph.factors.between import BetweenRecord
@@ -34,7 +34,7 @@ LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
 
-def two_sided(ratio: float, dof: float, confidence: float) -> tuple[float, float, Verdict]:
+def two_sided_bounds(ratio: float, dof: float, confidence: float) -> tuple[float, float, Verdict]:
     """Bounds of ``χ²_dof / dof`` and the verdict on ``ratio``."""
     a = (1.0 - confidence) / 2.0
     low, high = (float(stats.chi2.ppf(q, dof) / dof) for q in (a, 1.0 - a))
@@ -114,7 +114,7 @@ class ClassConsistency:
         low, high, verdict = float("nan"), float("nan"), "no redundancy"
         w = self.whiteness
         if np.isfinite(self.ratio):
-            low, high, verdict = two_sided(self.ratio, self.independent, self.confidence)
+            low, high, verdict = two_sided_bounds(self.ratio, self.independent, self.confidence)
             verdict = LASTING if w is not None and w.lasting() else verdict
         return {
             "class": self.name,
@@ -233,7 +233,9 @@ def _whiteness_of(rows: list[tuple[float, Array, Array, Array]], covariance: Joi
         A[np.arange(n), :, at[:, c]] += J[:, :, c]
     flat = A[:, :, held:].reshape(n * d, -1)
     C = np.eye(n * d) - flat @ covariance.columns(needed[held:]) @ flat.T
-    return whiteness(np.array([row[0] for row in rows]), np.stack([row[1] for row in rows]), C.reshape(n, d, n, d))
+    return residual_whiteness(
+        np.array([row[0] for row in rows]), np.stack([row[1] for row in rows]), C.reshape(n, d, n, d)
+    )
 
 
 def _sandwich(covariance: JointCovariance, blocks: Any) -> Array:

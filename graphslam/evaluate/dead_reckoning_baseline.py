@@ -14,7 +14,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry import motion
 
 
-def dead_reckoning(log: SensorLog, path: Trajectory | Array) -> Trajectory | None:
+def dead_reckoned_path(log: SensorLog, path: Trajectory | Array) -> Trajectory | None:
     """Path from the log's motion stream alone, in the frame of the first base; None without one.
 
     Parameters

@@ -8,8 +8,9 @@ value. The word follows from all of them together:
   window, or as a constant error of calibration. Rows share one level (Bonferroni), so that an honest run is called
   wrong in at most :data:`LEVEL` of the cases however many tests it has;
 - *cannot be decided from this log* where the rows could not have seen an error that matters: of motion and sightings,
-  and of fixes if any were used, some row must exclude that variances are :data:`MATTERS` times as large as stated; and
-  where submaps bend by more than :data:`BENT`, so that no Gaussian describes them (all rows hold Gaussians);
+  and of fixes if any were used, some row must exclude that variances are :data:`DETECTABLE_VARIANCE_RATIO` times as
+  large as stated; and where submaps bend by more than :data:`MAX_NONLINEARITY`, so that no Gaussian describes them (all
+  rows hold Gaussians);
 - *pessimistic* if errors are too small in any of them, and by as much as matters, and none of the above;
 - *consistent* else.
 
@@ -25,17 +26,17 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
-from graphslam.evaluate.systematic import Systematic
+from graphslam.evaluate.bias_test import BiasTest
 
 Word = Literal["consistent", "over-confident", "pessimistic", "undecided"]
 Of = Literal["map", "fixes", "other"]
 LEVEL = 0.05
 """Share of honest runs that are called wrong, at most."""
-MATTERS = 1.5
+DETECTABLE_VARIANCE_RATIO = 1.5
 """Ratio of true to stated variances that a decision must exclude."""
 SURE = 0.975
 """Confidence with which it is excluded."""
-BENT = 0.006
+MAX_NONLINEARITY = 0.006
 """Squared shift by curvature per unknown, mean over submaps, from which on nothing is promised. In 80 drawn worlds that
 were as stated NEES/n of all nodes was 1.06 on average below 0.001, 1.20 from there to 0.006, and 1.37 above."""
 LEAST_DOF = 4.0
@@ -43,7 +44,7 @@ LEAST_DOF = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class ConsistencyTest:
     """One test without truth.
 
     Parameters
@@ -76,44 +77,48 @@ class Evidence:
         return self.value * self.dof / max(float(stats.chi2.ppf(1.0 - SURE, self.dof)), 1e-12)
 
 
-def by_size(name: str, of: Of, value: float, dof: float) -> list[Evidence]:
+def chi2_ratio_test(name: str, of: Of, value: float, dof: float) -> list[ConsistencyTest]:
     """A statistic χ²/dof; none where it has hardly any degrees of freedom."""
     if not (np.isfinite(value) and np.isfinite(dof) and dof >= LEAST_DOF):
         return []
     chi2 = value * dof
     large, small = float(stats.chi2.sf(chi2, dof)), float(stats.chi2.cdf(chi2, dof))
-    return [Evidence(name, of, float(value), float(dof), large, small)]
+    return [ConsistencyTest(name, of, float(value), float(dof), large, small)]
 
 
-def by_score(name: str, of: Of, score: float, *, tests: int = 1) -> Evidence:
+def largest_score_test(name: str, of: Of, score: float, *, tests: int = 1) -> ConsistencyTest:
     """A score that is N(0, 1) if nothing lasts, the largest of so many."""
     p = min(1.0, tests * float(stats.norm.sf(score)))
-    return Evidence(name, of, float(score), 1.0, p, 1.0, lasting=True)
+    return ConsistencyTest(name, of, float(score), 1.0, p, 1.0, lasting=True)
 
 
-def of_systematic(found: Systematic | None) -> list[Evidence]:
+def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
     """What the short windows of landmark front ends say: of the size of all noise, of lasting errors and of drifts."""
     if found is None:
         return []
-    out = by_size("χ² of motion and sightings in short windows", "map", found.ratio, found.dof)
+    out = chi2_ratio_test("χ² of motion and sightings in short windows", "map", found.ratio, found.dof)
     p = len(found.taken)
-    out.append(by_score("constant errors of calibration", "map", float(np.sqrt(found.taken.max())), tests=2 * p))
-    drifts = [by_size("errors that last for a window", "map", v, d) for v, d in zip(found.drift, found.drift_dof)]
+    out.append(
+        largest_score_test("constant errors of calibration", "map", float(np.sqrt(found.taken.max())), tests=2 * p)
+    )
+    drifts = [
+        chi2_ratio_test("errors that last for a window", "map", v, d) for v, d in zip(found.drift, found.drift_dof)
+    ]
     worst = min((e[0] for e in drifts if e), key=lambda e: e.too_large, default=None)
     if worst is not None:
         chance = min(1.0, p * worst.too_large)
-        out.append(Evidence(worst.name, "map", worst.value, worst.dof, chance, 1.0, lasting=True))
+        out.append(ConsistencyTest(worst.name, "map", worst.value, worst.dof, chance, 1.0, lasting=True))
     return out
 
 
 @dataclass(frozen=True, slots=True)
-class Trust:
+class CovarianceAssessment:
     """The word, and what it rests on.
 
     Parameters
     ----------
     word : str
-    speaking : tuple of Evidence
+    speaking : tuple of ConsistencyTest
         Rows that decided it: those that are too large or too small; for the other words those that cover it.
     chance : float
         Probability that an honest run has a row like the worst, all rows counted.
@@ -124,13 +129,15 @@ class Trust:
     """
 
     word: Word
-    speaking: tuple[Evidence, ...]
+    speaking: tuple[ConsistencyTest, ...]
     chance: float
     missing: tuple[str, ...] = ()
     bent: bool = False
 
 
-def trust(rows: Sequence[Evidence], *, fixes: bool, nonlinearity: float = 0.0) -> Trust:
+def assess_covariances(
+    rows: Sequence[ConsistencyTest], *, fixes: bool, nonlinearity: float = 0.0
+) -> CovarianceAssessment:
     """The word on all rows.
 
     Parameters
@@ -143,20 +150,24 @@ def trust(rows: Sequence[Evidence], *, fixes: bool, nonlinearity: float = 0.0) -
     m = max(1, sum(1 if r.lasting else 2 for r in rows))
     large = sorted((r for r in rows if m * r.too_large < LEVEL), key=lambda r: r.too_large)
     if large:
-        return Trust("over-confident", tuple(large), min(1.0, m * large[0].too_large))
+        return CovarianceAssessment("over-confident", tuple(large), min(1.0, m * large[0].too_large))
     wanted: dict[Of, str] = {"map": "motion and sightings"}
     if fixes:
         wanted["fixes"] = "fixes"
-    covers = {of: [r for r in rows if r.of == of and not r.lasting and r.upper <= MATTERS] for of in wanted}
+    covers = {
+        of: [r for r in rows if r.of == of and not r.lasting and r.upper <= DETECTABLE_VARIANCE_RATIO] for of in wanted
+    }
     missing = tuple(what for of, what in wanted.items() if not covers[of])
-    bent = nonlinearity > BENT
+    bent = nonlinearity > MAX_NONLINEARITY
     if missing or bent:
-        return Trust("undecided", tuple(r for found in covers.values() for r in found), 1.0, missing, bent)
-    small = [r for r in rows if m * r.too_small < LEVEL and r.value < 1.0 / MATTERS]
+        return CovarianceAssessment(
+            "undecided", tuple(r for found in covers.values() for r in found), 1.0, missing, bent
+        )
+    small = [r for r in rows if m * r.too_small < LEVEL and r.value < 1.0 / DETECTABLE_VARIANCE_RATIO]
     small.sort(key=lambda r: r.too_small)
     if small:
-        return Trust("pessimistic", tuple(small), min(1.0, m * small[0].too_small))
-    return Trust("consistent", tuple(r for found in covers.values() for r in found), 1.0)
+        return CovarianceAssessment("pessimistic", tuple(small), min(1.0, m * small[0].too_small))
+    return CovarianceAssessment("consistent", tuple(r for found in covers.values() for r in found), 1.0)
 
 
 def pooled_nonlinearity(reports: Sequence[Mapping[str, Any]]) -> float:
@@ -169,17 +180,17 @@ def pooled_nonlinearity(reports: Sequence[Mapping[str, Any]]) -> float:
     return sum(v * n for v, n in said) / sum(n for _, n in said) if said else 0.0
 
 
-def rows_of_json(value: Any) -> list[Evidence]:
+def tests_of_json(value: Any) -> list[ConsistencyTest]:
     """Rows as a report holds them; what is none of ours is left out."""
     out = []
     for row in value if isinstance(value, list) else []:
-        if isinstance(row, Mapping) and set(row) == set(Evidence.__slots__):
+        if isinstance(row, Mapping) and set(row) == set(ConsistencyTest.__slots__):
             numbers = [row[k] for k in ("value", "dof", "too_large", "too_small")]
             if all(isinstance(v, (int, float)) for v in numbers) and row["of"] in ("map", "fixes", "other"):
-                out.append(Evidence(**row))
+                out.append(ConsistencyTest(**row))
     return out
 
 
-def rows_as_json(rows: Iterable[Evidence]) -> list[dict[str, Any]]:
+def tests_as_json(rows: Iterable[ConsistencyTest]) -> list[dict[str, Any]]:
     """The same as JSON objects."""
     return [asdict(r) for r in rows]

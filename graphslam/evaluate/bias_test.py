@@ -39,7 +39,7 @@ LEAST_WINDOWS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class BiasKind:
     """One way in which a robot may be miscalibrated.
 
     Parameters
@@ -63,52 +63,52 @@ class Kind:
 
 _TO_UNIT = {"m": 1.0, "°": 180.0 / np.pi, "°/m": 180.0 / np.pi, "%": 100.0}
 KINDS = {
-    "range-scale": Kind(
+    "range-scale": BiasKind(
         "ranges look {} too long", "ranges look {} too short", "%", 0.05, "check the unit and the scale of the ranges"
     ),
-    "range-offset": Kind(
+    "range-offset": BiasKind(
         "ranges look {} too long",
         "ranges look {} too short",
         "m",
         0.2,
         "state the offset of the ranges as frontend.noise.range_offset",
     ),
-    "bearing-offset": Kind(
+    "bearing-offset": BiasKind(
         "bearings look {} too large, as from a sensor that is turned to the right",
         "bearings look {} too small, as from a sensor that is turned to the left",
         "°",
         float(np.deg2rad(2.0)),
         "correct the angle of T_base_sensor",
     ),
-    "mount-x": Kind(
+    "mount-x": BiasKind(
         "the sensor seems to stand {} ahead of its stated place",
         "the sensor seems to stand {} behind its stated place",
         "m",
         0.2,
         "correct x of T_base_sensor",
     ),
-    "mount-y": Kind(
+    "mount-y": BiasKind(
         "the sensor seems to stand {} to the left of its stated place",
         "the sensor seems to stand {} to the right of its stated place",
         "m",
         0.2,
         "correct y of T_base_sensor",
     ),
-    "distance-scale": Kind(
+    "distance-scale": BiasKind(
         "distances of the wheels look {} too long",
         "distances of the wheels look {} too short",
         "%",
         0.05,
         "check the unit, the sign and the scale of the speeds",
     ),
-    "turn-scale": Kind(
+    "turn-scale": BiasKind(
         "turns of the wheels look {} too large",
         "turns of the wheels look {} too small",
         "%",
         0.05,
         "check the unit and the sign of steering or yaw rate, and those of the bearings",
     ),
-    "turn-per-metre": Kind(
+    "turn-per-metre": BiasKind(
         "the wheels seem to turn {} too much to the left",
         "the wheels seem to turn {} too much to the right",
         "°/m",
@@ -120,7 +120,7 @@ KINDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Systematic:
+class BiasTest:
     """Sums over all windows of a run.
 
     Parameters
@@ -168,7 +168,7 @@ ESTIMATED = {
 here."""
 
 
-def sums(reports: Sequence[Mapping[str, Any]]) -> Systematic | None:
+def sum_bias_windows(reports: Sequence[Mapping[str, Any]]) -> BiasTest | None:
     """What the submaps' reports say together; None where none says anything.
 
     Errors that the graph estimates are left free: what they explain is no finding, and of the others counts what is not
@@ -198,10 +198,10 @@ def sums(reports: Sequence[Mapping[str, Any]]) -> Systematic | None:
         none = np.isin(np.arange(len(s)), a) | (own < APART * s)
         score, own = np.where(none, 0.0, score), np.where(none, s, own)
     sigma = np.sqrt(np.maximum(s, scatter) / s / own)
-    return Systematic(windows, chi2, int(total["dof"]) - len(free), score / own, sigma, score**2 / own, drift, dof)
+    return BiasTest(windows, chi2, int(total["dof"]) - len(free), score / own, sigma, score**2 / own, drift, dof)
 
 
-def systematic_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
+def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """Lines of the verdict.
 
     Parameters
@@ -209,7 +209,7 @@ def systematic_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
     reports : sequence of mapping
         Of all submaps of a run.
     """
-    found = sums(reports)
+    found = sum_bias_windows(reports)
     if found is None:
         return []
     names = list(KINDS)
