@@ -11,7 +11,7 @@ from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.evaluate.log_checks import check_log
 from graphslam.evaluate.stream_checks import StreamFinding
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 
 
 def check_source(source: str | Path, *, reader: str | None = None, **options: Any) -> list[StreamFinding]:
@@ -29,7 +29,7 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
         The first line says what was read. What cannot be read at all is a line of level ``bad``.
     """
     try:
-        log = load(source, reader=reader, **options)
+        log = load_recording(source, reader=reader, **options)
     except UnknownNameError:
         raise
     except GraphSlamError as error:

@@ -18,7 +18,7 @@ from graphslam.core.errors import MissingDataError
 from graphslam.core.json_file import check_json
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import read_truth
 from graphslam.join.pose_problem import PoseProblem
@@ -108,7 +108,7 @@ def submap_source(
         scale, identities, truth, submaps, problem = consistent(root, read)
         known = truth if identities != "run" and problem is None else poses_only(truth)
         return SubmapSource(submaps, known, scale if problem is None else 1.0, problem)
-    loaded: Any = path if path.is_file() else load(source)
+    loaded: Any = path if path.is_file() else load_recording(source)
     if isinstance(loaded, Path) and loaded.is_file():
         if submap_poses is None:
             raise MissingDataError(f"{source} holds no submaps; a pose-graph file is cut into some by --submap-poses")

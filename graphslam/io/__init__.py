@@ -3,8 +3,8 @@
 from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
-    "cards": "card",
+    "cards": "find_card",
     "notebook": "load_or_stop",
-    "catalog": "load",
+    "catalog": "load_recording",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -42,9 +42,9 @@ from graphslam.core.records import Gps, LaserScans, Odometry, Stream
 from graphslam.io import ros_messages as ros
 from graphslam.io.clock import usable_records
 from graphslam.io.cloud_logs import IMU_NOISE, ages_of
-from graphslam.io.look import Look
-from graphslam.io.planar_scans import one_layout
+from graphslam.io.planar_scans import unify_layout
 from graphslam.io.recognise import bag_kind
+from graphslam.io.source_probe import SourceProbe
 
 KINDS = {
     "sensor_msgs/msg/LaserScan": "laser",
@@ -213,7 +213,7 @@ class _Bag:
 
         self.path = path
         files = _files(path)
-        kinds = {f: "" if f.is_dir() else bag_kind(Look(f), f) for f in files}
+        kinds = {f: "" if f.is_dir() else bag_kind(SourceProbe(f), f) for f in files}
         self.ros2 = "ROS 1 bag" not in kinds.values()
         self.readers: list[Any] = []
         for f in files:
@@ -287,7 +287,7 @@ def _files(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise MissingDataError("no such file or folder", where=str(path), wanted="a bag")
-    look = Look(path)
+    look = SourceProbe(path)
     metadata = [
         p for p in look.files if p.name == "metadata.yaml" and look.lines(p, 1)[:1] == ["rosbag2_bagfile_information:"]
     ]
@@ -333,7 +333,7 @@ class _Frames:
     def add(self, message: Any, bag_stamp: float, static: bool) -> None:
         for t in message.transforms:
             key = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
-            pose = ros.pose_of(t.transform)
+            pose = ros.pose_of_message(t.transform)
             norm = float(np.linalg.norm(pose[3:]))
             if not np.all(finite_mask(pose)) or abs(norm - 1.0) > 0.05:
                 continue
@@ -608,7 +608,7 @@ def _take_fix(m: Any) -> tuple[list[float], Array, int, int]:
 _TAKE: dict[str, Callable[[Any], Any]] = {
     "laser": _take_laser,
     "imu": _take_imu,
-    "odometry": lambda m: ros.pose_of(m.pose.pose),
+    "odometry": lambda m: ros.pose_of_message(m.pose.pose),
     "gps": _take_fix,
 }
 
@@ -716,7 +716,7 @@ def _laser(
         scans.append((values[::-1] if step < 0 else values, beams))
         reach.append(high)
     times, keep = _kept(r, "laser", {"angles are impossible, or fewer than 2 beams": odd}, counter, notes, where)
-    rows, beams, moved = one_layout([s for s, good in zip(scans, keep) if good])
+    rows, beams, moved = unify_layout([s for s, good in zip(scans, keep) if good])
     counter.drop("laser", f"scan of other beams put on the usual {len(beams)} (kept)", moved)
     stated = [v for v in reach if np.isfinite(v) and v > 0]
     far = max_range or (float(np.median(stated)) if stated else 80.0)

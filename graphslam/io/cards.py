@@ -147,7 +147,7 @@ def list_cards() -> tuple[Card, ...]:
     return tuple(read_card(p) for p in sorted(cards_folder().glob("*.toml")))
 
 
-def card(name: str) -> Card:
+def find_card(name: str) -> Card:
     """The card of that name.
 
     Raises

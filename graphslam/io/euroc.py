@@ -25,8 +25,8 @@ from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Gps, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
-from graphslam.io.look import Look
-from graphslam.io.recognise import euroc_tables, numbers
+from graphslam.io.recognise import euroc_tables, parse_numbers
+from graphslam.io.source_probe import SourceProbe
 from graphslam.io.text_records import find_text_file, read_table
 
 GYRO_BIAS, FORCE_BIAS = 0.1, 0.3
@@ -74,7 +74,7 @@ def read_euroc(
     if not (sigma > 0 and noise_scale > 0 and np.isfinite([sigma, late, noise_scale]).all()):
         raise ConfigError(f"sigma = {sigma}, late = {late}, noise_scale = {noise_scale}; wanted σ and scale above 0")
     counter = DropCounter()
-    tables = euroc_tables(Look(root))
+    tables = euroc_tables(SourceProbe(root))
     a_file = tables.get("imu") or find_text_file(root, "imu0_data.csv")
     sheet = _sheet(a_file)
     stated = read_text(sheet)
@@ -134,7 +134,7 @@ def _sheet(table: Path) -> Path:
 def _reference(path: Path, counter: DropCounter) -> tuple[Array, int]:
     """Rows of stamp, position and quaternion (w first), and how many there were."""
     lines = [s for s in read_text(path).splitlines() if s.strip() and not s.startswith("#")]
-    rows = [numbers(s) or [] for s in lines]
+    rows = [parse_numbers(s) or [] for s in lines]
     table = np.array([r[:8] if len(r) >= 8 else [np.nan] * 8 for r in rows]).reshape(-1, 8)
     norm = np.linalg.norm(np.where(finite_mask(table[:, 4:]), table[:, 4:], 0.0), axis=1)
     bad = {

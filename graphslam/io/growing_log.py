@@ -16,7 +16,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LaserScans, Stream
-from graphslam.io.log_kinds import KINDS, Kind, kind_name
+from graphslam.io.log_kinds import KINDS, StreamKind, kind_name
 
 BEAMS = (LaserScans, RangeScans, PointClouds)
 """Streams whose records are let go of: all others are small, and figures are made of them at the end."""
@@ -160,10 +160,10 @@ class _Held:
         if first < self.ends[0]:
             raise DataError("records that were let go of", where=self.where, got=first, wanted=f"≥ {self.ends[0]}")
         if first == self.ends[0] and last == self.ends[-1] and len(self.parts) > 1:
-            self.parts, self.ends = [joined(self.kind, self.parts)], [first, last]  # next time it is one portion
+            self.parts, self.ends = [join_portions(self.kind, self.parts)], [first, last]  # next time it is one portion
         a = int(np.searchsorted(self.ends, first, side="right")) - 1
         b = max(int(np.searchsorted(self.ends, last, side="left")), a + 1)
-        here = self.parts[a] if b == a + 1 else joined(self.kind, self.parts[a:b])
+        here = self.parts[a] if b == a + 1 else join_portions(self.kind, self.parts[a:b])
         return here.take(slice(first - self.ends[a], last - self.ends[a]))
 
     def discard_before(self, before: int) -> None:
@@ -183,7 +183,7 @@ class _Held:
 class _Spool:
     """Arrays that grow, on disk: raw numbers, one file an array."""
 
-    def __init__(self, kind: Kind, folder: Path) -> None:
+    def __init__(self, kind: StreamKind, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.kind, self.folder = kind, folder
         self.files: dict[str, BinaryIO] = {}
@@ -224,7 +224,7 @@ class _Spool:
         return {n for n, f in {**self.kind.fields, **self.kind.more}.items() if f.shape and f.shape[0] == "n+1"}
 
 
-def joined(kind: Kind, parts: list[Stream]) -> Any:
+def join_portions(kind: StreamKind, parts: list[Stream]) -> Any:
     """Portions of one stream behind each other, as a stream."""
     arrays = [kind.arrays(p) for p in parts]
     out = dict(arrays[0])
@@ -239,7 +239,7 @@ def joined(kind: Kind, parts: list[Stream]) -> Any:
     return kind.stream(out, "records")
 
 
-def _constants(kind: Kind, arrays: Mapping[str, Any]) -> dict[str, Any]:
+def _constants(kind: StreamKind, arrays: Mapping[str, Any]) -> dict[str, Any]:
     """What is the same for all records."""
     shapes = {n: f.shape for n, f in {**kind.fields, **kind.more}.items()}
     return {n: a for n, a in arrays.items() if not (shapes.get(n) and shapes[n][0] in (*ROWS, "n+1"))}

@@ -18,8 +18,8 @@ from graphslam.core.log import SensorLog
 from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.look import Look
 from graphslam.io.recognise import is_tum
+from graphslam.io.source_probe import SourceProbe
 
 # Files in the wild print quaternions with as few as three digits.
 _NORM_TOLERANCE = 1e-2
@@ -119,7 +119,7 @@ def read_tum_log(
         raise ConfigError(f"tum: odometry_sigmas are {odometry_sigmas}; wanted positive numbers")
     file = Path(path)
     if file.is_dir():
-        look = Look(file)
+        look = SourceProbe(file)
         file = next((p for p in look.texts if is_tum(look, p)), file / "trajectory.tum")
     found = read_tum(file)
     if len(found) < 2:

@@ -37,7 +37,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.compact import grid_pieces
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.maps.fuse import FusedMap, fuse_pieces
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import divide_submaps
@@ -69,7 +69,7 @@ class Scene(NamedTuple):
 def scene(name: str, points: int = ALL_POINTS) -> Scene:
     """A scene by name, with so many beams of a step at most."""
     if name not in ("court", "garage", "garage-full"):
-        log = load(name)
+        log = load_recording(name)
         config: Any = build_config(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
         config = dataclasses.replace(config, filter=dataclasses.replace(config.filter, map_beams=0))
     else:

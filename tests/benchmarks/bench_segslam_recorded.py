@@ -27,7 +27,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.plots.evidence import plot_heights, plot_section
 from graphslam.plots.save import save
 from graphslam_frontends.grid.rbpf_grid import run_rbpf
@@ -117,7 +117,7 @@ def figures_of(path: Trajectory, reference: Trajectory, closed: bool) -> dict[st
 
 def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path | None) -> list[Row]:
     """All methods on one log; maps are drawn for the seed 0."""
-    log = load(name)
+    log = load_recording(name)
     if quick:  # before anything is prepared, or most of the time goes into what is cut off
         begins = float(log["reference"].times[0])
         log = log.slice(begins, begins + QUICK_SECONDS)
@@ -176,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     rows: list[Row] = []
     for name in options.names or (QUICK if options.quick else NAMES):
         try:
-            load(name)
+            load_recording(name)
         except MissingDataError:
             print(f"{name} left out: no recording (set GRAPHSLAM_DATA)")
             continue

@@ -53,7 +53,7 @@ from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.io.bags import read_bag
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.cloud_logs import read_clouds, read_kitti
 from graphslam.io.euroc import read_euroc
 from graphslam.io.g2o import read_g2o
@@ -763,5 +763,5 @@ READERS: dict[str, Reader] = {
     "bag-ros1": Reader(bag("ros1"), with_points(read_bag), RANGES, slow=3),
     "bag-ros2": Reader(bag("ros2"), with_points(read_bag), RANGES, slow=3),
     "bag-mcap": Reader(bag("mcap"), with_points(read_bag), RANGES, slow=3),
-    "recognised": Reader(clouds_of("bin", "tum"), with_points(lambda p: load(p))),
+    "recognised": Reader(clouds_of("bin", "tum"), with_points(lambda p: load_recording(p))),
 }

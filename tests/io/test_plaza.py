@@ -10,7 +10,7 @@ import scipy.io
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.plaza import read_plaza
 from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments
 
@@ -119,7 +119,7 @@ def test_a_beacon_must_have_a_number_and_a_place(folder, beacon):
 
 @pytest.mark.data
 def test_the_recording(data_dir):
-    log = load("plaza1")
+    log = load_recording("plaza1")
     assert dict(log.read) == {"controls": 9657, "landmarks": 3529}
     assert not log.dropped
     assert len(log["landmarks"].ranges) == 3529

@@ -43,9 +43,9 @@ def list_data(as_json: bool = JSON) -> None:
 @app.command()
 def info(name: str, as_json: bool = JSON) -> None:
     """Show one card: contents, source, citation, licence terms and known problems."""
-    from graphslam.io.cards import card
+    from graphslam.io.cards import find_card
 
-    c = card(name)
+    c = find_card(name)
     value = {
         "name": c.name,
         "title": c.title,
@@ -72,13 +72,13 @@ def list_readers(
     name: str | None = typer.Argument(None, help="Name of one reader, for its options."), as_json: bool = JSON
 ) -> None:
     """List what can be read, or the options of one reader."""
-    from graphslam.io.readers import reader, readers
+    from graphslam.io.readers import find_reader, list_readers
 
     if name is None:
-        rows = [{"name": n, "reads": r.says} for n, r in readers().items()]
+        rows = [{"name": n, "reads": r.says} for n, r in list_readers().items()]
         emit({"readers": rows}, table(rows), as_json=as_json)
         return
-    r = reader(name)
+    r = find_reader(name)
     options = [
         {"option": o.name, "type": str(o.annotation), "default": None if o.default is None else str(o.default)}
         for o in r.options().values()
@@ -90,7 +90,7 @@ def list_readers(
 @app.command()
 def fetch(name: str, as_json: bool = JSON) -> None:
     """Find a data set on this machine, or download it and check its checksums."""
-    from graphslam.io.fetch import fetch as fetch_files
+    from graphslam.io.fetch import fetch_dataset as fetch_files
 
     log_to_stderr(True)
     folder = fetch_files(name, progress=not as_json)
@@ -110,7 +110,7 @@ def check(
     """
     from graphslam.app.data_check import check_source, summary
     from graphslam.io.cards import list_cards
-    from graphslam.io.catalog import check as check_files
+    from graphslam.io.catalog import check_files as check_files
 
     rows, bad = [], []
     card = next((c for c in list_cards() if c.name == source), None)

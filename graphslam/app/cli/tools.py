@@ -44,11 +44,11 @@ def solve(
 ) -> None:
     """Solve a pose-graph file, and say whether the solution is at its optimum."""
     from graphslam.app.solve_file import solve_file
-    from graphslam.io.catalog import load
+    from graphslam.io.catalog import load_recording
 
     path = Path(file)
     if not path.is_file():
-        found = load(file)
+        found = load_recording(file)
         if not isinstance(found, Path) or not found.is_file():
             raise MissingDataError(
                 f"{file} is not a pose-graph file", wanted="a file, or card/file such as posegraphs/intel"

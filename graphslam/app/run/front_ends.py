@@ -12,7 +12,7 @@ from graphslam.app.run.choice import kind_preset
 from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.io.readers import readers
+from graphslam.io.readers import list_readers
 from graphslam_frontends.base import FrontEnd
 
 GROUP = "graphslam.frontends"
@@ -121,7 +121,7 @@ def preset_of(log: SensorLog, frontend: str) -> tuple[str, bool]:
     """
     name = log.name.partition("/")[0]
     read: Any = log.meta.get("reader")
-    known = readers().get(read.get("name", "")) if isinstance(read, Mapping) else None
+    known = list_readers().get(read.get("name", "")) if isinstance(read, Mapping) else None
     there = cfg.preset_names(frontend)
     own = next((n for n in (name, name.rpartition("-")[0]) if n in there), "")
     kind = next((n for n in ("" if known is None else known.preset, kind_preset(log)) if n in there), "")

@@ -38,7 +38,7 @@ from graphslam.core.log import SensorLog
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies import segslam_report as tables
 from graphslam_studies.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
@@ -188,7 +188,7 @@ def run_smartloc_trial(config: SmartLocTrialConfig, seed: int) -> list[Measureme
 
 
 def _figures(config: SmartLocTrialConfig, seed: int) -> Iterator[Measurement]:
-    log = load("smartloc-gnss") if config.street is None else simulate_satellites(seed, config.street)
+    log = load_recording("smartloc-gnss") if config.street is None else simulate_satellites(seed, config.street)
     halves = windows(log, 2)
     test, training = halves[config.scored], windows(halves[1 - config.scored], config.windows)
     for name, grid in config.grids.items():

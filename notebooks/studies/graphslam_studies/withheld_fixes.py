@@ -43,7 +43,7 @@ from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies.graph.inertial_start import inertial_start, integrate_attitude
 from graphslam_studies.montecarlo.trials import Measurement
@@ -164,7 +164,7 @@ def run_withheld_trial(config: WithheldConfig, seed: int) -> list[Measurement]:
 
 
 def _figures(config: WithheldConfig) -> Iterator[Measurement]:
-    log = load(config.source)
+    log = load_recording(config.source)
     fixes: Gps = log[str(log.of_type(Gps))]
     unit = log.of_type(Imu)
     low, high = config.span

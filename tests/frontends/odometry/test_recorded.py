@@ -16,7 +16,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion import MotionNoise, recorded_odometry
 from graphslam_frontends.odometry.recorded import (
@@ -198,7 +198,7 @@ def test_intervals_that_are_not_there() -> None:
 )
 def test_recorded_lidars_become_steps(data_dir: Path, name: str, scans: int, gaps: int) -> None:
     """One step a scan and several steps a scan: the same robot drives the same way."""
-    recorded = load(name)
+    recorded = load_recording(name)
     if name == "lidar3d-balm-hall":  # 30 s of it: its scans are large
         recorded = recorded.slice(recorded.interval[0], recorded.interval[0] + 30.0)
     drops = DropCounter()
@@ -229,7 +229,7 @@ def test_recorded_lidars_become_steps(data_dir: Path, name: str, scans: int, gap
 
 
 def test_several_clouds_in_a_step(data_dir: Path) -> None:
-    recorded = load("lidar3d-hku1")
+    recorded = load_recording("lidar3d-hku1")
     steps = make_steps(recorded, StepConfig(period=2.0, most_points=100_000))
     per_step = np.diff(steps.offsets)
     assert len(steps) == pytest.approx(recorded.duration / 2.0, abs=2)

@@ -16,7 +16,7 @@ from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.io.carmen import read_carmen
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
@@ -80,7 +80,7 @@ def test_hku1_closes_its_loop_in_spite_of_a_yaw_bias(data_dir: Path) -> None:
     """The odometry, degraded by 0.005 rad/s, ends 6 m from where it began; a match into the first segments mends it."""
     if not (data_dir / "lidar3d_hku1").is_dir():
         pytest.skip("recorded data not found: the folder of GRAPHSLAM_DATA has no lidar3d_hku1/")
-    log = load("lidar3d-hku1")
+    log = load_recording("lidar3d-hku1")
     config = settings(log)
     assert config.steps.yaw_bias == 0.005
     steps = make_steps(log, config.steps)

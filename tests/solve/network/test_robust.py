@@ -17,7 +17,7 @@ from graphslam.core.poses import SE2
 from graphslam.core.random import SeedTree
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import network_values, problem_of_network
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import loop_consensus, odometry_edges
@@ -221,7 +221,7 @@ def test_nothing_but_wrong_loops_is_not_solved() -> None:
 @pytest.mark.data
 @pytest.mark.parametrize("degrees", [0.0, -250.0])
 def test_lecture_hall_with_a_drift_that_nobody_stated(data_dir: Path, degrees: float) -> None:
-    log = load("tuc-slam-lecture-hall")
+    log = load_recording("tuc-slam-lecture-hall")
     velocities = log.velocities.copy()
     velocities[:, 2] += np.deg2rad(degrees) / (log.times[-1] - log.times[0])
     net, times = replace(log, velocities=velocities).to_network(min_similarity=0.5)

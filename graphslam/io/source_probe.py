@@ -21,7 +21,7 @@ MOST_FILES, DEEPEST, HEAD, SAMPLE = 200_000, 5, 1 << 16, 6
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class ReaderMatch:
     """What a reader says of a source.
 
     Parameters
@@ -37,7 +37,7 @@ class Claim:
 
 
 @dataclass
-class Look:
+class SourceProbe:
     """A file or folder."""
 
     path: Path
@@ -53,7 +53,7 @@ class Look:
         """Files by their ending in small letters, that of a compression left out."""
         out: dict[str, list[Path]] = {}
         for p in self.files:
-            out.setdefault(ending(p), []).append(p)
+            out.setdefault(file_ending(p), []).append(p)
         return out
 
     def head(self, path: Path) -> bytes:
@@ -81,7 +81,7 @@ class Look:
         seen: Counter[tuple[Path, str]] = Counter()
         out: list[Path] = []
         for p in self.files:
-            key = (p.parent, ending(p))
+            key = (p.parent, file_ending(p))
             seen[key] += 1
             if seen[key] <= SAMPLE and len(out) < 100 and self.lines(p, 1):
                 out.append(p)
@@ -126,6 +126,6 @@ def plain_name(path: Path) -> str:
     return next((name[: -len(c)] for c in COMPRESSIONS if name.endswith(c)), name)
 
 
-def ending(path: Path) -> str:
+def file_ending(path: Path) -> str:
     """Ending in small letters, with its dot, that of a compression left out."""
     return Path(plain_name(path)).suffix
