@@ -8,7 +8,7 @@ from typing import Any
 from graphslam.app.run.files import read_events, read_options
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig
-from graphslam.backend.sessions import InnerTie, ties_of_network
+from graphslam.backend.sessions import IntraSessionLoop, loops_of_network
 from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
@@ -57,7 +57,7 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
     match = NO_KERNEL if config.match_robust == "none" else RobustKernel(config.match_robust, config.match_width)
     loop = LoopConfig().robust(graph.structure.group.dof)
     loops = _loops(files)
-    for t in ties_of_network(network, match):
+    for t in loops_of_network(network, match):
         _tie(graph, t, loop if (t.i, t.j) in loops else t.robust)
     values = graph.values.copy()
     values.poses = network.poses  # ties count with the weight that they have where the run ended
@@ -65,7 +65,7 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
     return PoseProblem.of_graph(graph)
 
 
-def _tie(graph: PoseGraph, tie: InnerTie, kernel: RobustKernel) -> None:
+def _tie(graph: PoseGraph, tie: IntraSessionLoop, kernel: RobustKernel) -> None:
     graph.add_between(
         tie.i, tie.j, tie.T_ij, tie.covariance, streams=["match"], interval=(0.0, 0.0), evidence="shared-scan",
         robust=kernel,

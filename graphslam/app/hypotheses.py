@@ -25,8 +25,8 @@ from graphslam.app.run.taken import read_taken
 from graphslam.backend.back_end import find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of, solve_choice, solve_hypotheses
-from graphslam.backend.refining import Refined, refine_run
-from graphslam.backend.streams import ImuPart
+from graphslam.backend.refining import RefinedRun, refine_run
+from graphslam.backend.streams import ImuSource
 from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, MissingDataError, RunFolderError
 from graphslam.core.findings import Finding
@@ -67,7 +67,7 @@ class Clearest:
         The chosen one first.
     left_out : int
         Alternatives that were not solved.
-    refined : Refined or None
+    refined : RefinedRun or None
         The chosen one refined by its scans; None where the run is not, or where that was refused.
     refined_map : RunMap or None
         Its fused map.
@@ -77,7 +77,7 @@ class Clearest:
 
     choice: RankedAlternatives
     left_out: int
-    refined: Refined | None = None
+    refined: RefinedRun | None = None
     refined_map: RunMap | None = None
     findings: list[Finding] = field(default_factory=list)
 
@@ -215,7 +215,7 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
         feed = RecordSource(taken.log)
 
     def streams() -> dict[str, Any]:
-        return {"fixes": run.fixes, "gps": gps, "imu": ImuPart(feed, imu) if feed and feed.names(Imu) else None}
+        return {"fixes": run.fixes, "gps": gps, "imu": ImuSource(feed, imu) if feed and feed.names(Imu) else None}
 
     return build_config(BackEndConfig, values.get("backend", {}), "backend"), streams
 

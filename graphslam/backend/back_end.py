@@ -14,10 +14,10 @@ import numpy.typing as npt
 from graphslam.association.identity import find_association_outliers
 from graphslam.association.landmarks import AssociationConfig, associate_landmarks
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
+from graphslam.backend.ambiguous_maps import AmbiguousMaps, ambiguous_maps
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
-from graphslam.backend.rivals import TwoMaps, two_maps
-from graphslam.backend.streams import FixPart, ImuPart, recentred
+from graphslam.backend.streams import GpsSource, ImuSource, repreintegrate_until_converged
 from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
@@ -84,12 +84,12 @@ class BackEnd:
     per_submap_s: list[float] = field(default_factory=list)
     submaps: list[Submap] = field(default_factory=list)
     """With their maps; kept only where loops are looked for."""
-    imu: ImuPart | None = None
+    imu: ImuSource | None = None
     """IMUs of the log; None where there is no log."""
-    fixes: FixPart | None = None
+    fixes: GpsSource | None = None
     """Fixes of the log, where they are to be used as they come."""
     observers: Sequence[Observer] = ()
-    two_maps: TwoMaps | None = None
+    two_maps: AmbiguousMaps | None = None
     """Once it is finished: the graph with either of two groups of loops that cannot both be right, if nothing told."""
 
     def __post_init__(self) -> None:
@@ -228,7 +228,7 @@ class BackEnd:
         self.graph.finish_readings()
         if self.imu is not None:
             self.imu.attach(self.graph)
-        recentred(self.graph, self.solver)
+        repreintegrate_until_converged(self.graph, self.solver)
         if self.graph.gps.config.errors == "fitted" and fit_fix_errors(self.graph) is not None:
             self.solver.solve_to_optimum()
         for _ in range(10):
@@ -244,8 +244,8 @@ class BackEnd:
                 self.undo_loop(loop)
         start = time.perf_counter()
         if self._loops is not None and self._loops.closer is not None:
-            self.two_maps = two_maps(self.graph, self.solver, self._loops.closer)
-        recentred(self.graph, self.solver)
+            self.two_maps = ambiguous_maps(self.graph, self.solver, self._loops.closer)
+        repreintegrate_until_converged(self.graph, self.solver)
         self.split_wrong_identities()
         solution = self.solver.solution()
         self.seconds["solve"] += time.perf_counter() - start

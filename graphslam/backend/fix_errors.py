@@ -126,7 +126,7 @@ class _Innovations:
         at_datum = flat.layout.columns("datum")
         A[at_datum, at_datum] += LOOSE**-2 if isinstance(A, np.ndarray) else np.full(len(at_datum), LOOSE**-2)
         covariance = JointCovariance(flat.layout, A)
-        chosen = [fixes[k] for k in spread_out(len(fixes), MOST[d])]
+        chosen = [fixes[k] for k in spread_fixes(len(fixes), MOST[d])]
         batch = _batch(graph, chosen)
         r, J = batch.terms(*batch.gather(values))
         turn = batch.turns(values)
@@ -210,7 +210,7 @@ def plane_variance(stated: Array) -> Array:
     return np.asarray(0.5 * np.trace(stated[:, :2, :2], axis1=1, axis2=2))
 
 
-def spread_out(n: int, most: int) -> npt.NDArray[np.intp]:
+def spread_fixes(n: int, most: int) -> npt.NDArray[np.intp]:
     """Numbers of at most so many of n fixes: at even steps, or in stretches that are evenly spread."""
     step = -(-n // most)
     if step <= EVERY:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from graphslam.backend.back_end import BackEnd, find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions
-from graphslam.backend.streams import ImuPart
+from graphslam.backend.streams import ImuSource
 from graphslam.core.errors import ConfigError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
@@ -43,13 +43,13 @@ from graphslam_frontends.segslam.segment import KINDS, MATCH
 from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, sampled_chain, submaps_of_segments
 
 
-def built(
+def build_back_end(
     submaps: Sequence[Submap],
     config: BackEndConfig,
     *,
     fixes: Gps | None = None,
     gps: GpsOptions | None = None,
-    imu: ImuPart | None = None,
+    imu: ImuSource | None = None,
 ) -> BackEnd:
     """A back end with a graph of submaps, not yet at its optimum.
 
@@ -57,7 +57,7 @@ def built(
     ----------
     fixes : Gps, optional
         Those that count.
-    imu : ImuPart, optional
+    imu : ImuSource, optional
         Of this graph alone.
     """
     back = BackEnd(config, "batch", imu=imu)
@@ -137,7 +137,7 @@ def solve_choice(
     decided: Sequence[LoopDecision] = (),
     fixes: Gps | None = None,
     gps: GpsOptions | None = None,
-    imu: ImuPart | None = None,
+    imu: ImuSource | None = None,
 ) -> BackEnd:
     """The graph of submaps with some of their matches and loops, solved to its optimum.
 
@@ -150,7 +150,7 @@ def solve_choice(
     decided : sequence of LoopDecision
         Matches that the run decided on with its loops: in the graph as loops are, where they are chosen.
     fixes, gps, imu
-        See :func:`built`.
+        See :func:`build_back_end`.
     """
     bare = []
     # two matches of one pair of submaps are told apart by their support
@@ -165,7 +165,7 @@ def solve_choice(
             else:
                 taken.append(loop)
         bare.append(replace(s, matches=tuple(kept), grid=None))
-    back = built(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps, imu=imu)
+    back = build_back_end(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps, imu=imu)
     back.solver.solve_to_optimum()
     if taken:
         graph = GraphLoops(back.graph, back.solver)
@@ -222,7 +222,7 @@ def _sampled(result: SegSlamResult, count: int, known: Sequence[Ints]) -> list[I
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class TopologyHypothesis:
     """A topology that particles tell, as submaps.
 
     Parameters
@@ -263,7 +263,7 @@ class Hypothesis:
         }
 
 
-def _withdrawn(told: Hypothesis) -> list[Hypothesis]:
+def _withdrawn(told: TopologyHypothesis) -> list[TopologyHypothesis]:
     """A topology without each of its entries in turn, the least supported entry first."""
     out = []
     for k, s in enumerate(told.submaps):
@@ -271,7 +271,7 @@ def _withdrawn(told: Hypothesis) -> list[Hypothesis]:
             rest = replace(s, matches=tuple(x for x in s.matches if x is not m))
             submaps = [*told.submaps[:k], rest, *told.submaps[k + 1 :]]
             support = told.support * max(1.0 - m.support, 0.0)
-            out.append(Hypothesis(told.particle, support, (m.target, s.key), told.chain, submaps, told.grids))
+            out.append(TopologyHypothesis(told.particle, support, (m.target, s.key), told.chain, submaps, told.grids))
     return sorted(out, key=lambda x: -x.support)
 
 
@@ -283,7 +283,7 @@ def hypotheses_of(
     handover: HandoverConfig | None = None,
     samples: int = 0,
     least_support: float = LEAST_SUPPORT,
-) -> tuple[list[Hypothesis], int]:
+) -> tuple[list[TopologyHypothesis], int]:
     """Topologies of a SegMap: those that particles tell, by weight, then the first of them less each of its entries.
 
     Particles that entered different older maps, or none, tell different topologies; and of each entry it may be asked
@@ -319,12 +319,14 @@ def hypotheses_of(
         submaps = submaps_of_segments(
             segmap, chain, drift_by_path(segmap, chain, drift, result.steps), handover, uses=result.steps.uses
         )
-        told.append(Hypothesis(particle, support, None, chain, submaps, own_evidence_of(segmap, chain, submaps)))
+        told.append(
+            TopologyHypothesis(particle, support, None, chain, submaps, own_evidence_of(segmap, chain, submaps))
+        )
     return [*told, *_withdrawn(told[0])[: most - len(kept)]], len(found) - len(kept)
 
 
 def solve_hypotheses(
-    told: Sequence[Hypothesis],
+    told: Sequence[TopologyHypothesis],
     config: BackEndConfig,
     *,
     find: FindConfig | None = None,
@@ -343,7 +345,7 @@ def solve_hypotheses(
     division : DivisionConfig, optional
         How maps are cut into pieces; give the sensor's reach.
     streams : callable
-        Makes ``fixes``, ``gps`` and ``imu`` of one graph more; see :func:`built`.
+        Makes ``fixes``, ``gps`` and ``imu`` of one graph more; see :func:`build_back_end`.
     progress : bool
         Show a bar.
     """
@@ -353,7 +355,7 @@ def solve_hypotheses(
     pieces: dict[int, DividedSubmaps] = {}
     out = []
     for number, h in enumerate(tqdm(told, "hypotheses", disable=not progress, leave=False)):
-        back = built(h.submaps, options, **streams())
+        back = build_back_end(h.submaps, options, **streams())
         back.solver.solve_to_optimum()
         # what is withdrawn must not come back by registration: that is the other hypothesis
         looked = find if h.withdrawn is None else replace(find, rounds=0, appearance=None)

@@ -61,7 +61,7 @@ means."""
 
 
 @dataclass(frozen=True)
-class Refined:
+class RefinedRun:
     """What a refinement made of a run.
 
     Parameters
@@ -89,7 +89,7 @@ def refine_run(
     gps: tuple[Gps, GpsConfig] | None = None,
     graph: PoseGraph | None = None,
     progress: Callable[[str], Any] | None = None,
-) -> tuple[Refined | None, list[Finding]]:
+) -> tuple[RefinedRun | None, list[Finding]]:
     """Refine the solved map of a run, and say what was found.
 
     Parameters
@@ -105,7 +105,7 @@ def refine_run(
 
     Returns
     -------
-    refined : Refined or None
+    refined : RefinedRun or None
         None where the path of the graph stays the result.
     findings : list of Finding
         Lines of the verdict.
@@ -125,12 +125,12 @@ def refine_run(
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
-        drawn, moved = _standing(drawn, base_frames(refined))
+        drawn, moved = _static_submaps(drawn, base_frames(refined))
     except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
         logger.warning("the path is not refined: %s", error)
         return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
     wrong = None if graph is None else wrong_loops(graph, refined)
-    return Refined(found, refined, drawn, path), [*findings_of(found, wrong), *moved]
+    return RefinedRun(found, refined, drawn, path), [*refinement_findings(found, wrong), *moved]
 
 
 def _input(r: Refinement) -> list[Finding]:
@@ -151,7 +151,7 @@ def _input(r: Refinement) -> list[Finding]:
     return [Finding("bad", "input-better", text)]
 
 
-def _standing(submaps: list[Submap], bases: Array) -> tuple[list[Submap], list[Finding]]:
+def _static_submaps(submaps: list[Submap], bases: Array) -> tuple[list[Submap], list[Finding]]:
     """Submaps without what moved, where they carry clouds, and how much that was."""
     if not submaps or bases.shape[1] != 7 or any(s.cloud is None for s in submaps):
         return submaps, []
@@ -224,7 +224,7 @@ SCAN_PAIRS = -1
 """Number of the refinement in a ledger of factors, which are counted from 0."""
 
 
-def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None) -> list[Finding]:
+def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None) -> list[Finding]:
     """What a refinement says of the run, as lines of the verdict.
 
     Parameters

@@ -34,7 +34,7 @@ from graphslam.solve.registry import Solver
 
 
 @dataclass(frozen=True)
-class InnerTie:
+class IntraSessionLoop:
     """A factor between two nodes of one run that are no neighbours: a re-entry or a loop."""
 
     i: int
@@ -52,7 +52,7 @@ class DenseSession:
     ----------
     submaps : list of Submap
         Keys and clock of the common graph.
-    inner : list of InnerTie
+    inner : list of IntraSessionLoop
         Nodes counted from the session's first base.
     shift : float
         Seconds that were added to its clock.
@@ -68,7 +68,7 @@ class DenseSession:
     submaps: list[Submap]
     config: BackEndConfig
     map: SessionMap
-    inner: list[InnerTie]
+    inner: list[IntraSessionLoop]
     shift: float = 0.0
     fixes: Gps | None = None
     gps: GpsOptions = field(default_factory=GpsOptions)
@@ -86,20 +86,20 @@ class DenseSession:
         return np.stack(out)
 
 
-def ties_of_graph(graph: PoseGraph) -> list[InnerTie]:
+def loops_of_graph(graph: PoseGraph) -> list[IntraSessionLoop]:
     """Factors of the graph of a run beside its chain."""
     rows = [r for r in graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
-    return [InnerTie(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
+    return [IntraSessionLoop(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
 
 
-def ties_of_network(net: PoseNetwork, kernel: RobustKernel) -> list[InnerTie]:
+def loops_of_network(net: PoseNetwork, kernel: RobustKernel) -> list[IntraSessionLoop]:
     """The same of the file of a graph, which holds no kernels."""
     out, chained = [], set()
     for (i, j), T, info in zip(net.edges.tolist(), net.measurements, net.information):
         if j == i + 1 and i not in chained:  # the chain itself is made again from the submaps
             chained.add(i)
             continue
-        out.append(InnerTie(i, j, T, _inverse(info), kernel))
+        out.append(IntraSessionLoop(i, j, T, _inverse(info), kernel))
     return out
 
 
@@ -111,7 +111,7 @@ def _inverse(information: Array) -> Array:
     return 0.5 * (P + P.T)
 
 
-def put(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
+def add_session(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
     """Add the chain of a session and its own ties to a graph; where it hangs is another matter.
 
     Parameters
@@ -152,7 +152,7 @@ SESSION = "session"
 
 
 @dataclass(frozen=True)
-class Attached:
+class ConnectedSession:
     """A session that was tied to another one in a graph.
 
     Parameters
@@ -174,7 +174,7 @@ class Attached:
     dropped: int
 
 
-def attach(
+def connect_session(
     graph: PoseGraph,
     solver: Solver,
     known: DenseSession,
@@ -185,7 +185,7 @@ def attach(
     found: tuple[TwoSessions, InterSessionLoops] | None = None,
     use_gps: bool = True,
     progress: bool = False,
-) -> Attached:
+) -> ConnectedSession:
     """Tie a session to one that is in the graph, and solve.
 
     First by places that look alike and agree; then, when it is known where it lies, by places that are near each other,
@@ -212,7 +212,7 @@ def attach(
     if ties.why:
         raise DataError(f"no tie to {known.name}: {ties.why}", where=new.name)
     start = session_start(ties.chosen, graph.values.poses[known_node:], new.chain)
-    node = put(graph, new, start, use_gps=use_gps)
+    node = add_session(graph, new, start, use_gps=use_gps)
     apart = two.thinned(ties.chosen, CandidateConfig().stretch)
     here = [replace(x, i=known_node + x.i, j=node + x.j) for x in apart]
     factors = {_add(graph, x, known, new): x for x in here}
@@ -234,10 +234,10 @@ def attach(
     solver.solve_to_optimum()
     dropped += _winnow(graph, solver, factors)
     logger.info("%s hangs on %s by %d ties", new.name, known.name, len(factors))
-    return Attached(node, known, ties, list(factors.values()), dropped)
+    return ConnectedSession(node, known, ties, list(factors.values()), dropped)
 
 
-def attach_by_gps(
+def connect_by_gps(
     graph: PoseGraph,
     solver: Solver,
     known: DenseSession,
@@ -246,7 +246,7 @@ def attach_by_gps(
     *,
     places: bool = True,
     progress: bool = False,
-) -> Attached:
+) -> ConnectedSession:
     """Tie a session to one that is in the graph by the fixes that both have, and solve.
 
     Parameters
@@ -261,7 +261,7 @@ def attach_by_gps(
         ends.append(s.T_gps_base)
     g = group_of(known.map.increments)
     T_known_new = g.between(ends[0], ends[1])
-    node = put(graph, new, g.compose(graph.values.poses[known_node], T_known_new))
+    node = add_session(graph, new, g.compose(graph.values.poses[known_node], T_known_new))
     solver.solve_to_optimum()
     factors: dict[int, Loop] = {}
     dropped = 0
@@ -271,7 +271,7 @@ def attach_by_gps(
         solver.solve_to_optimum()
         dropped = _winnow(graph, solver, factors)
     logger.info("%s hangs on %s by GPS and %d ties", new.name, known.name, len(factors))
-    return Attached(node, known, None, list(factors.values()), dropped)
+    return ConnectedSession(node, known, None, list(factors.values()), dropped)
 
 
 def _add(graph: PoseGraph, x: Loop, known: DenseSession, new: DenseSession) -> int:

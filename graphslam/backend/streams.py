@@ -48,14 +48,14 @@ def used_fixes(gps: Gps, config: GpsOptions) -> Mask:
     return mask
 
 
-def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
+def split_fixes(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
     """(fixes that become factors, fixes withheld)."""
     mask = used_fixes(gps, config)
     used, withheld = gps.take(mask), gps.take(~mask)
     return used.with_sigma(config.sigma), withheld
 
 
-class FixPart:
+class GpsSource:
     """The fixes of a run: the graph is given them submap by submap, as they come."""
 
     def __init__(self, feed: RecordSource, config: GpsOptions) -> None:
@@ -71,7 +71,7 @@ class FixPart:
         used = self._all
         if used is None:
             whole: Gps = self.feed.part(name)  # type: ignore[assignment]
-            used = split(whole, self.config)[0]
+            used = split_fixes(whole, self.config)[0]
             self._all = used if self.feed.ended else None
         last = int(np.searchsorted(used.times, until, side="right"))
         first, self._given = self._given, max(self._given, last)
@@ -113,7 +113,7 @@ def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObser
     return {config.use: found[config.use]}
 
 
-class ImuPart:
+class ImuSource:
     """The IMUs of a run: axes are looked at, and factors are made, while it goes on."""
 
     def __init__(self, feed: RecordSource, config: ImuOptions) -> None:
@@ -179,7 +179,7 @@ class ImuPart:
         return [name for name in self.imus if name in self._given or name not in spent]
 
 
-def recentred(graph: PoseGraph, solver: Solver) -> None:
+def repreintegrate_until_converged(graph: PoseGraph, solver: Solver) -> None:
     """Solve, preintegrate anew about the biases found, and solve again, until nothing moves."""
     solver.solve_to_optimum()
     for _ in range(RECENTRED):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.backend.fix_errors import GATE, LEAST, _Innovations, fit_fix_errors, spread_out
+from graphslam.backend.fix_errors import GATE, LEAST, _Innovations, fit_fix_errors, spread_fixes
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_transform
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -189,10 +189,10 @@ def test_withheld_fixes_are_foretold_with_the_bias_between_the_used_ones(rng):
 
 
 def test_stretches_are_spread_over_the_log():
-    k = spread_out(3000, 200)
+    k = spread_fixes(3000, 200)
     assert 190 <= len(k) <= 200
     assert k[0] == 0
     assert k[-1] >= 2990
     assert np.sum(np.diff(k) == 3) > 180  # stretches of two minutes, and long times between them
-    assert np.array_equal(spread_out(20, 200), np.arange(20))
-    assert np.array_equal(spread_out(600, 200), np.arange(0, 600, 3))
+    assert np.array_equal(spread_fixes(20, 200), np.arange(20))
+    assert np.array_equal(spread_fixes(600, 200), np.arange(0, 600, 3))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from graphslam.backend.config import BackEndConfig
-from graphslam.backend.hypotheses import Hypothesis, hypotheses_of, solve_hypotheses, topologies, topology
+from graphslam.backend.hypotheses import TopologyHypothesis, hypotheses_of, solve_hypotheses, topologies, topology
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
@@ -31,7 +31,7 @@ CONFIG = BackEndConfig(node_spacing=1.5, level_sigma=0.006, loops=True)
 DIVISION = DivisionConfig(reach=8.5)
 
 
-def solved(result: SegSlamResult, most: int = 5, **options: Any) -> tuple[list[Hypothesis], list[Alternative]]:
+def solved(result: SegSlamResult, most: int = 5, **options: Any) -> tuple[list[TopologyHypothesis], list[Alternative]]:
     told, _ = hypotheses_of(result, most, drift=COURT, **options)
     return told, solve_hypotheses(told, CONFIG, division=DIVISION)
 

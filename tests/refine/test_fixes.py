@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.backend.refining import findings_of
+from graphslam.backend.refining import refinement_findings
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.graph.gps import GpsConfig
@@ -121,9 +121,9 @@ def test_errors_that_last_are_no_news_fix_after_fix(rng):
     g = group_of(truth)
     errors = [np.sqrt(np.mean(g.log(g.between(truth, r.poses))[:, 3:] ** 2)) for r in (white, lasting)]
     assert errors[1] < errors[0]
-    told = {f.code: f for f in findings_of(white)}
+    told = {f.code: f for f in refinement_findings(white)}
     assert told["refine-fixes"].level == "look"
-    assert {f.code: f for f in findings_of(lasting)}["refine-fixes"].level == "good"
+    assert {f.code: f for f in refinement_findings(lasting)}["refine-fixes"].level == "good"
 
 
 def test_fixes_that_do_not_say_where_north_is_hold_nothing(rng):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.backend.refining import findings_of, wrong_loops
+from graphslam.backend.refining import refinement_findings, wrong_loops
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
@@ -70,7 +70,7 @@ def test_motion_noisier_than_stated_is_widened_and_honest():
         found = refine_by_scans(scans, start)
         values.append(nees_of(found, truth)["nees"])
         scales.append(found.scales)
-        said += [f.code for f in findings_of(found)]
+        said += [f.code for f in refinement_findings(found)]
     assert np.all(np.array(scales)[:, 1] > 1.5)  # along the way
     np.testing.assert_allclose(np.array(scales)[:, 0], 1.0, atol=0.3)  # the gyro is as stated
     assert 0.5 < np.mean(values) < 2.0
@@ -129,9 +129,9 @@ def test_loops_that_the_refined_path_contradicts_are_named(drives):
     wrong = wrong_loops(graph, m)
     assert [(i, j) for i, j, *_ in wrong] == [(1, 4)]
     assert wrong[0][2] == pytest.approx(4.0)
-    named = {f.code: f.text for f in findings_of(found, wrong)}
+    named = {f.code: f.text for f in refinement_findings(found, wrong)}
     assert "x1 and x4 by 4.0 m" in named["refine-contradicted"]
-    assert "refine-contradicted" not in {f.code for f in findings_of(found, [])}
+    assert "refine-contradicted" not in {f.code for f in refinement_findings(found, [])}
 
 
 def test_a_scanner_that_is_mounted_askew_is_named():
@@ -145,9 +145,9 @@ def test_a_scanner_that_is_mounted_askew_is_named():
     side, sigma = found.constants["side"]
     assert side == pytest.approx(-a, abs=0.003)
     assert sigma < 0.002
-    named = {f.code: f.text for f in findings_of(found)}
+    named = {f.code: f.text for f in refinement_findings(found)}
     assert "to the right" in named["refine-side"]  # what is ahead seems to lie to the left
-    assert "refine-side" not in {f.code for f in findings_of(refine_by_scans(scans, start))}
+    assert "refine-side" not in {f.code for f in refinement_findings(refine_by_scans(scans, start))}
 
 
 def test_a_clock_that_is_off_is_named(drives):
@@ -157,8 +157,8 @@ def test_a_clock_that_is_off_is_named(drives):
     off, sigma = delayed.constants["clock"]
     assert off == pytest.approx(-0.05, abs=0.012)
     assert abs(off) > 5 * sigma
-    assert "ms too late" in {f.code: f.text for f in findings_of(delayed)}["refine-clock"]
-    assert "refine-clock" not in {f.code for f in findings_of(found)}
+    assert "ms too late" in {f.code: f.text for f in refinement_findings(delayed)}["refine-clock"]
+    assert "refine-clock" not in {f.code for f in refinement_findings(found)}
 
 
 def _delayed(scans: Scans, by: float):
@@ -210,9 +210,9 @@ def test_odometry_better_than_the_start_is_where_the_refinement_begins_again():
     assert found.reckoned > found.agreement[0]
     assert found.agreement[1] >= found.reckoned - 0.005
     assert error(scans.times, found.poses, truth) < 0.02
-    assert "input-better" not in {f.code for f in findings_of(found)}
+    assert "input-better" not in {f.code for f in refinement_findings(found)}
     worse = replace(found, reckoned=found.agreement[1] + 0.1)
-    assert {f.code: f.level for f in findings_of(worse)}["input-better"] == "bad"
+    assert {f.code: f.level for f in refinement_findings(worse)}["input-better"] == "bad"
 
 
 def test_odometry_better_than_all_that_was_made_of_it_is_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +236,7 @@ def test_odometry_better_than_all_that_was_made_of_it_is_the_result(monkeypatch:
     assert found.better
     assert not found.input_better
     assert error(scans.times, found.poses, truth) < 0.01
-    said = {f.code: f.level for f in findings_of(found)}
+    said = {f.code: f.level for f in refinement_findings(found)}
     assert said == {"input-better": "look"}
     # as sure as the motion alone: each step adds its own noise and what lasts, and no scan takes any of it away
     wide = np.sqrt(np.trace(found.covariances[-1][3:, 3:]))

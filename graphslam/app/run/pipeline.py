@@ -42,7 +42,7 @@ from graphslam.app.run.verdict import Figures, observed, verdict
 from graphslam.app.run.without_truth import check_without_truth
 from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.backend.refining import refine_run, refined_ledger
-from graphslam.backend.streams import FixPart, ImuPart, beacons_of, compasses_of, split, used_fixes
+from graphslam.backend.streams import GpsSource, ImuSource, beacons_of, compasses_of, split_fixes, used_fixes
 from graphslam.core.config import build_config, dump_toml, merge_options, options_dict
 from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameError
 from graphslam.core.findings import verdict_json
@@ -356,8 +356,8 @@ def _stored(root: Path, taken: Taken, *, progress: bool) -> tuple[dict[str, Any]
 
 def back_end(feed: RecordSource, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
     """A back end that has its IMUs, and the fixes that are to be used."""
-    fixes = FixPart(feed, settings.gps)
-    back = BackEnd(settings.backend, solver, imu=ImuPart(feed, settings.imu), observers=observers, fixes=fixes)
+    fixes = GpsSource(feed, settings.gps)
+    back = BackEnd(settings.backend, solver, imu=ImuSource(feed, settings.imu), observers=observers, fixes=fixes)
     if not feed.ended:  # compasses and beacons are given whole
         return back
     for name, compass in compasses_of(feed.log, settings.compass).items():
@@ -530,7 +530,7 @@ def _judge(
     solution_metrics(out, solution, len(global_map.landmarks))
     imu_metrics(out, back.graph, drops)
     clock, graph_path = time.perf_counter(), global_map.trajectory
-    fixes = None if gps is None or solution.T_gps_world is None else (split(gps, settings.gps)[0], settings.gps)
+    fixes = None if gps is None or solution.T_gps_world is None else (split_fixes(gps, settings.gps)[0], settings.gps)
     refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=fixes, graph=back.graph)
     seconds_refine = time.perf_counter() - clock
     trim_heap()
@@ -654,7 +654,7 @@ def _judge(
         events=list(back.graph.events),
         ledger=ledger.table(),
         gps=residuals,
-        fixes=None if gps is None or settings.gps.use == "none" else split(gps, settings.gps)[0],
+        fixes=None if gps is None or settings.gps.use == "none" else split_fixes(gps, settings.gps)[0],
         taken=taken,
         truth=truth,
         truth_path=true_path,

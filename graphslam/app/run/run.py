@@ -25,7 +25,7 @@ from graphslam.maps.global_map import GlobalMap
 if TYPE_CHECKING:
     from graphslam.app.run.taken import Taken
     from graphslam.app.run.without_truth import WithoutTruth
-    from graphslam.backend.refining import Refined
+    from graphslam.backend.refining import RefinedRun
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.maps.run_map import RunMap
     from graphslam.solve.solution import Solution
@@ -105,7 +105,7 @@ class Run:
         once, when it is first asked for.
     graph_path : Trajectory or None
         Of a refined run the path of the graph, where the refinement began; from disk without covariances.
-    refined : Refined or None
+    refined : RefinedRun or None
         The path refined by its scans; None for a run read back from disk, whose ``map`` has the refined path.
     two_maps : tuple of two Trajectory, or None
         Where two groups of loops cannot both be right and nothing told which is: the path of the graph with either,
@@ -140,7 +140,7 @@ class Run:
     checks: WithoutTruth | None = None
     fused: RunMap | None = _Part()  # type: ignore[assignment]
     graph_path: Trajectory | None = None
-    refined: Refined | None = None
+    refined: RefinedRun | None = None
     two_maps: tuple[Trajectory, Trajectory] | None = None
 
     def holds(self, part: str) -> bool:

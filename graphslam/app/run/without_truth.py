@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.run.config import RunConfig
-from graphslam.backend.streams import split
+from graphslam.backend.streams import split_fixes
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.markup import html_frame
@@ -184,7 +184,7 @@ def _innovations(graph: PoseGraph, gps: Gps | None, settings: RunConfig) -> GpsI
     if gps is None or graph.values.datum is None:
         return None
     c = settings.gps
-    withheld = split(gps, c)[1]
+    withheld = split_fixes(gps, c)[1]
     most, n = MOST_FORETOLD[graph.dim], len(withheld.times)
     if n > most:  # their joint covariance grows with the square of their number
         withheld = withheld.take(np.unique(np.linspace(0, n - 1, most).astype(int)))

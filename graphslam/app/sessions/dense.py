@@ -13,7 +13,7 @@ from graphslam.app.run.files import read_options, read_report
 from graphslam.app.run.outputs import refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig, GpsOptions
-from graphslam.backend.sessions import DenseSession, InnerTie, ties_of_graph, ties_of_network
+from graphslam.backend.sessions import DenseSession, IntraSessionLoop, loops_of_graph, loops_of_network
 from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
 from graphslam.core.network import PoseNetwork
@@ -94,19 +94,19 @@ def _in_common(s: Submap, keys: dict[int, int], name: str, shift: float) -> Subm
     return replace(s.of_session(name), key=keys[s.key], interval=(a + shift, b + shift), trajectory=moved, matches=())
 
 
-def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:
+def _inner(run: Run, config: BackEndConfig) -> list[IntraSessionLoop]:
     """Factors of a run's graph beside the chain: of the graph itself, or of its file."""
     if _options(run, "backend", BackEndConfig).node_spacing != config.node_spacing:
         raise DataError(
             "a run whose submaps have no inner nodes cannot be tied", where=run.name, wanted="backend.node_spacing > 0"
         )
     if run.holds("graph") and run.graph is not None:
-        return ties_of_graph(run.graph)
+        return loops_of_graph(run.graph)
     net = None if run.folder is None else consistent(run.folder, lambda root: _graph_of(run, root))
     if net is None:
         raise DataError("a run does not say how its submaps hang together", where=run.name, wanted="its graph.g2o")
     kernel = NO_KERNEL if config.match_robust == "none" else RobustKernel(config.match_robust, config.match_width)
-    return ties_of_network(net, kernel)
+    return loops_of_network(net, kernel)
 
 
 def _graph_of(run: Run, root: Path) -> PoseNetwork | None:

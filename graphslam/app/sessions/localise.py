@@ -18,7 +18,7 @@ from graphslam.app.run.outputs import open_run
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import load_log_source
 from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_maps
-from graphslam.backend.sessions import DenseSession, attach, put
+from graphslam.backend.sessions import DenseSession, add_session, connect_session
 from graphslam.core.errors import DataError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
@@ -191,10 +191,10 @@ def _localise(
         return Localisation(ties.why, ties, [])
     graph = PoseGraph(known.submaps[0].dim)
     solver = make_solver(solver_name, graph)
-    put(graph, known)
+    add_session(graph, known)
     solver.solve_to_optimum()
     try:
-        at = attach(graph, solver, known, 0, new, config=config, found=(two, ties), progress=progress)
+        at = connect_session(graph, solver, known, 0, new, config=config, found=(two, ties), progress=progress)
     except SolverError as error:
         return Localisation(str(error), ties, [])
     end = graph.submaps[-1].exit_node

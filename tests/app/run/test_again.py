@@ -20,7 +20,7 @@ from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.pipeline import again
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import solve_choice
-from graphslam.backend.streams import ImuPart
+from graphslam.backend.streams import ImuSource
 from graphslam.core.config import build_config
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.core.log import SensorLog
@@ -83,7 +83,7 @@ def test_with_imu_factors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert run.graph.imu.used
     remade(tmp_path / "run")
     settings = build_config(cfg.RunConfig, {"imu": {"use": "auto"}})
-    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(RecordSource(short), settings.imu))
+    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuSource(RecordSource(short), settings.imu))
     back.finish()
     assert back.graph.objective().total == pytest.approx(run.metric("objective"), rel=1e-6)
 

@@ -22,7 +22,7 @@ from graphslam.app.run.surface import scanned_path
 from graphslam.app.sessions.dense import session_of
 from graphslam.app.sessions.localise import localise
 from graphslam.app.sessions.merge_surface import surface_of_sessions
-from graphslam.backend.sessions import attach, put
+from graphslam.backend.sessions import add_session, connect_session
 from graphslam.core import se3
 from graphslam.core.atomic import read_npz
 from graphslam.core.errors import ConfigError, DataError, RunFolderError, SolverError
@@ -269,13 +269,13 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
     for ties, named in ((wrong, r"b: \d+ ties to a agree .* looks alike"), (found, "")):
         graph = PoseGraph(3)
         solver = make_solver("batch", graph)
-        put(graph, known)
+        add_session(graph, known)
         solver.solve_to_optimum()
         if named:
             with pytest.raises(SolverError, match=named):
-                attach(graph, solver, known, 0, new, found=(two, ties), config=InterSessionConfig(heard=1))
+                connect_session(graph, solver, known, 0, new, found=(two, ties), config=InterSessionConfig(heard=1))
         else:
-            assert len(attach(graph, solver, known, 0, new, found=(two, ties)).used) >= 2
+            assert len(connect_session(graph, solver, known, 0, new, found=(two, ties)).used) >= 2
 
 
 def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.backend.streams import recentred
+from graphslam.backend.streams import repreintegrate_until_converged
 from graphslam.core.geometry import Array
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.pose_graph import PoseGraph
@@ -21,7 +21,7 @@ from graphslam.solve.registry import Solver
 
 
 @dataclass(frozen=True, slots=True)
-class Rival:
+class AlternativeMap:
     """One of two maps.
 
     Parameters
@@ -40,7 +40,7 @@ class Rival:
 
 
 @dataclass(frozen=True, slots=True)
-class TwoMaps:
+class AmbiguousMaps:
     """Both maps, and what is in dispute between them.
 
     Parameters
@@ -51,7 +51,7 @@ class TwoMaps:
         earlier ends and of the later ones.
     """
 
-    maps: tuple[Rival, Rival]
+    maps: tuple[AlternativeMap, AlternativeMap]
     places: list[dict[str, Any]]
 
     def facts(self) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class TwoMaps:
         }
 
 
-def two_maps(graph: PoseGraph, solver: Solver, closer: LoopCloser) -> TwoMaps | None:
+def ambiguous_maps(graph: PoseGraph, solver: Solver, closer: LoopCloser) -> AmbiguousMaps | None:
     """The graph with either side of what could not be decided; None where all could be, or it bears neither side.
 
     The graph is left as it was, at its optimum.
@@ -86,16 +86,16 @@ def two_maps(graph: PoseGraph, solver: Solver, closer: LoopCloser) -> TwoMaps | 
     if not pairs:
         return None
 
-    def made(side: int) -> Rival:
+    def made(side: int) -> AlternativeMap:
         with closer.with_trial_loops([n for pair in pairs for n in pair[side]]) as inside:
-            recentred(graph, solver)
+            repreintegrate_until_converged(graph, solver)
             s = solver.solution(gap=False)
-            return Rival(tuple(inside), s.trajectory(), s.node_times, s.poses.copy())
+            return AlternativeMap(tuple(inside), s.trajectory(), s.node_times, s.poses.copy())
 
     maps = made(0), made(1)
     if not any(m.loops for m in maps):
         return None
-    return TwoMaps(maps, [_place(closer, pair, maps[0].node_times) for pair in pairs])
+    return AmbiguousMaps(maps, [_place(closer, pair, maps[0].node_times) for pair in pairs])
 
 
 def _place(closer: LoopCloser, pair: tuple[Sequence[int], Sequence[int]], times: Array) -> dict[str, Any]:
