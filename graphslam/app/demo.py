@@ -17,7 +17,7 @@ from graphslam.core.atomic import part_path
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam.plots.segments import plot_segments
 from graphslam_frontends.segslam.progress import SegSlamProgress
 
@@ -111,5 +111,5 @@ class DemoProgress(Observer):
         title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closed yet"
         ax = plot_segments(None, paths, truth=truth, title=title)
         part = part_path(self.picture, ".png")
-        save(ax, part)
+        save_figure(ax, part)
         part.replace(self.picture)

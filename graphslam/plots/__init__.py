@@ -26,6 +26,6 @@ _EXPORTS = {
     "surface": "plot_surface",
     "terrain": "plot_bands plot_terrain",
     "trajectory": "plot_gps_residuals",
-    "without_truth": "plot_innovations plot_loop_matrix",
+    "residual_consistency": "plot_innovations plot_loop_matrix",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -29,7 +29,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.catalog import load_recording
 from graphslam.plots.evidence import plot_heights, plot_section
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_frontends.grid.rbpf_grid import run_rbpf
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
@@ -146,7 +146,7 @@ def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path |
         for method, (path, _) in reversed(paths.items()):
             grid = path_map(steps, path, config.filter.voxel_size)
             draw = plot_section if grid.dim == 2 else plot_heights
-            print(f"  {save(draw(grid, title=f'{name}, {method}'), out / f'{name}.{method}.png')}")
+            print(f"  {save_figure(draw(grid, title=f'{name}, {method}'), out / f'{name}.{method}.png')}")
     return rows
 
 

@@ -41,7 +41,7 @@ from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.plots import style
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_studies.plots.study_time import plot_cumulative_time
 from tests.reference.gps_maps import plot_gps_maps
 
@@ -355,7 +355,7 @@ def draw(table: pd.DataFrame, results: Results, gps: Gps, folder: Path) -> None:
         part = table[table["algorithm"].isin(names)].replace({"algorithm": names})
         plot_cumulative_time(ax, part, algorithms=list(names.values()), log=True, title=f"{title}, CPU time")
         style.legend(ax, outside=False, loc="lower right", fontsize="x-small")
-    save(left, folder / "victoria_park_time.png")
+    save_figure(left, folder / "victoria_park_time.png")
     shown = {
         "dead reckoning": "dead reckoning",
         "EKF, one map, nearest": "EKF, one map, nearest",
@@ -370,4 +370,4 @@ def draw(table: pd.DataFrame, results: Results, gps: Gps, folder: Path) -> None:
     paths = {label: results.maps[name][0] for name, label in shown.items()}
     marks = {label: results.maps[name][1] for name, label in shown.items() if len(results.maps[name][1])}
     axes = plot_gps_maps(paths, gps, landmarks=marks)
-    save(axes[0], folder / "victoria_park_maps.png")
+    save_figure(axes[0], folder / "victoria_park_maps.png")

@@ -9,7 +9,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_compose
 from graphslam.plots.segments import (
-    Tie,
+    DrawnMatch,
     plot_entropies,
     plot_samples,
     plot_scores,
@@ -90,7 +90,7 @@ def test_segments_stand_where_the_sample_puts_them_and_matches_join_them() -> No
 
 def test_other_planes_and_impossible_ones() -> None:
     p = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
-    ax = plot_segments(None, [p], ties=[Tie(p[0], p[1])], plane="xz")
+    ax = plot_segments(None, [p], ties=[DrawnMatch(p[0], p[1])], plane="xz")
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), p[:, [0, 2]])
     assert ax.get_ylabel() == "z [m]"
     with pytest.raises(DataError, match="cannot be drawn"):

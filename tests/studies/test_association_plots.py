@@ -9,7 +9,7 @@ import pytest
 from graphslam.core.errors import DataError
 from graphslam.evaluate.gps_innovation import GpsInnovations
 from graphslam.evaluate.loop_consistency import LandmarkLoops, loop_consistency
-from graphslam.plots.without_truth import plot_innovations, plot_loop_matrix
+from graphslam.plots.residual_consistency import plot_innovations, plot_loop_matrix
 from graphslam_studies.plots.association import plot_runs
 
 

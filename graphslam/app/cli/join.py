@@ -136,9 +136,9 @@ def compare(
     value: dict[str, Any] = comparing.methods_json(found)
     if figure is not None:
         from graphslam.plots.comparison import comparison_figure
-        from graphslam.plots.save import save
+        from graphslam.plots.save import save_figure
 
-        save(comparison_figure(found), figure)
+        save_figure(comparison_figure(found), figure)
     said = compare_verdict(value["methods"])
     value["verdict"] = [f.as_row() for f in said]
     text = [table(comparing.comparison_rows(value["methods"])), *(f.text for f in said)]

@@ -92,7 +92,7 @@ def _drawn(folder: ReportFolder) -> list[Markup]:
 def _session_ties(folder: ReportFolder) -> list[Markup]:
     """Ties between sessions over the paths of both."""
     from graphslam.plots.loops import plot_loops
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
     ties = [e for e in folder.events or [] if e.get("event") == "between" and e.get("group") == SESSION]
     if not ties:
@@ -106,7 +106,7 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
         ax = plot_loops(None, path, nodes, ends, title="ties between sessions, from above")
     except GraphSlamError as error:
         return [missing("ties between sessions over their paths: ", _said(folder, error), ".")]
-    return [picture(png(ax), "Paths of the sessions in the common frame, and the places that tie them")]
+    return [picture(figure_png(ax), "Paths of the sessions in the common frame, and the places that tie them")]
 
 
 def _said(folder: ReportFolder, error: Exception) -> str:
@@ -116,7 +116,7 @@ def _said(folder: ReportFolder, error: Exception) -> str:
 
 def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Markup]:
     from graphslam.plots.loops import plot_loops
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
     n = len(nodes)
     rows = [r for r in folder.loop_rows if 0 <= r["i"] < n and 0 <= r["j"] < n]
@@ -128,7 +128,9 @@ def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Ma
         ax = plot_loops(None, path, nodes, ends, names=names, title="loops over the path, from above")
     except DataError as error:
         return [missing("loops over the path: ", error, ".")]
-    out = [picture(png(ax), "Loops over the path, by their numbers in the ledger: in the graph, undone, refused")]
+    out = [
+        picture(figure_png(ax), "Loops over the path, by their numbers in the ledger: in the graph, undone, refused")
+    ]
     lost = len(folder.loop_rows) - len(rows)
     return [*out, note(f"{lost} loops have no node that could be drawn.")] if lost else out
 
@@ -149,7 +151,7 @@ def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, base
     except (GraphSlamError, KeyError, TypeError, IndexError, ValueError) as error:
         return [missing("NEES by submap: ", _said(folder, error), ".")]
     from graphslam.plots.consistency import plot_consistency
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
     dof = covariances.shape[-1]
     made = Consistency(
@@ -160,6 +162,6 @@ def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, base
     )
     text = "NEES/n of the ends of the submaps against the truth, with the 95 % bounds of an honest run"
     return [
-        picture(png(ax), text),
+        picture(figure_png(ax), text),
         note(join_parts(["Ends of one run share their errors: they lie in or out together."])),
     ]

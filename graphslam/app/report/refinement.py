@@ -71,6 +71,6 @@ def _bias(found: Mapping[str, Any]) -> list[Markup]:
     if not knots:
         return []
     from graphslam.plots.refined import plot_yaw_bias
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
-    return [picture(png(plot_yaw_bias(None, knots)), "Bias of the yaw rate at its knots")]
+    return [picture(figure_png(plot_yaw_bias(None, knots)), "Bias of the yaw rate at its knots")]

@@ -46,7 +46,7 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
     """
     from graphslam.plots.evidence import plot_heights, plot_section
     from graphslam.plots.fused_map import plot_cut, plot_storey
-    from graphslam.plots.save import save as saved
+    from graphslam.plots.save import save_figure as saved
 
     def save(ax: Any, file: Path) -> Path:
         out = saved(ax, file)

@@ -230,16 +230,16 @@ def write_surface(
 
 def draw_surface(made: RunSurface, figures: Path, *, name: str) -> list[Path]:
     """Pictures from aslant: by height, by session where there are several, and by σ of its place where it is known."""
-    from graphslam.plots.save import save
+    from graphslam.plots.save import save_figure
     from graphslam.plots.surface import plot_surface
 
     v, t = made.mesh.vertices, made.mesh.triangles
     ax = plot_surface(v, t, v[:, 2], label="height [m]", title=f"{name}: surface")
-    out = [save(ax, figures / "surface.png")]
+    out = [save_figure(ax, figures / "surface.png")]
     if np.any(made.session > 0):
         ax = plot_surface(v, t, (made.session + 1).astype(np.float64), label="session", title=f"{name}: who saw it")
-        out.append(save(ax, figures / "surface_sessions.png"))
+        out.append(save_figure(ax, figures / "surface_sessions.png"))
     if np.any(np.isfinite(made.sigma)):
         ax = plot_surface(v, t, 1e3 * made.sigma, label="σ of the place [mm]", title=f"{name}: how sure the surface is")
-        out.append(save(ax, figures / "surface_sigma.png"))
+        out.append(save_figure(ax, figures / "surface_sigma.png"))
     return out

@@ -388,10 +388,10 @@ def write_terrain(folder: OutputFiles, made: RunTerrain, *, generation: str | No
 
 def draw_terrain(made: RunTerrain, figures: Path, *, name: str) -> list[Path]:
     """Pictures of the classes, and in green, red and white."""
-    from graphslam.plots.save import save
+    from graphslam.plots.save import save_figure
     from graphslam.plots.terrain import plot_terrain
 
     path = made.path[:, :2]
-    out = [save(plot_terrain(made.map, path=path, title=f"{name}: terrain"), figures / "terrain.png")]
+    out = [save_figure(plot_terrain(made.map, path=path, title=f"{name}: terrain"), figures / "terrain.png")]
     ax = plot_terrain(made.map, plain=True, title=f"{name}: free, hazard, unknown")
-    return [*out, save(ax, figures / "terrain_plain.png")]
+    return [*out, save_figure(ax, figures / "terrain_plain.png")]

@@ -20,7 +20,7 @@ from graphslam.core.atomic import write_npz
 from graphslam.core.errors import RunFolderError
 from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.io.tum import write_tum
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 
 MOST_STATES = 6000
 """Of a graph with more free scalars χ² is not told by class: that takes dense matrices where kernels are at work."""
@@ -119,7 +119,7 @@ def _finish(folder: Generation, merged: MergedMap | MergedSubmaps) -> None:
     """What both kinds of merged maps have."""
     folder.write_lines("events.jsonl", merged.graph.events)
     folder.write_json("metrics.json", merged.metrics.to_dict("records"))
-    save(merged.plot(), folder.figures / "map.png")
+    save_figure(merged.plot(), folder.figures / "map.png")
     folder.write_text("ledger.csv", merged.graph.ledger.table().to_csv(index=False))
     classes = class_consistency(merged.graph) if merged.solution.states <= MOST_STATES else {}
     report = dict(merged.report)

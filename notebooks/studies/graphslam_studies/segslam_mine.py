@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_frontends.segslam.config import SegmentCandidateConfig, SegSlamConfig
 from graphslam_studies import segslam_report as tables
 from graphslam_studies.plots.association import plot_runs
@@ -58,7 +58,7 @@ class SegSlamMine(GridStudy):
         if not visits.empty:
             worst = visits.groupby(["world", "run", "algorithm"], sort=False)["value"].max().reset_index()
             ax = plot_runs(worst, label="greatest error at a second visit [m]")
-            made.append(save(ax, folder / "visit_error.png"))
+            made.append(save_figure(ax, folder / "visit_error.png"))
         for world in dict.fromkeys(table["world"].astype(str)):
             made += path_figure(table, world, folder)
         return made

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.axes import Axes
 
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_studies.plots.algorithms import algorithm_label
 from graphslam_studies.plots.study import plot_ci, plot_error_panels, plot_rms_panels
 from graphslam_studies.plots.study_local import plot_local_consistency
@@ -40,7 +40,7 @@ def save_paper_figures(table: pd.DataFrame, timings: pd.DataFrame, folder: Path)
         t, seconds = table[table["world"] == world], timings[timings["world"] == world]
 
         def keep(ax: Axes, name: str, world: str = str(world)) -> None:
-            made.append(save(ax, folder / f"{name}-{world}.png"))
+            made.append(save_figure(ax, folder / f"{name}-{world}.png"))
 
         for name in _present(t, "error_x", ERRORS_OF):
             title = f"World {world}: {algorithm_label(name)}, one run"
