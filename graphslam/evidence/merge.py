@@ -77,7 +77,7 @@ def merge_grids(grid: GridTree, other: GridTree, pose: Any = None) -> int:
         with pool.lock:
             old = pool.bricks[_ids(bricks, part)]
         write_packed(work, part, _sum(old, values, *grid.model.clamp_steps))
-    grid.take(work)
+    grid.replace_contents(work)
     return found
 
 

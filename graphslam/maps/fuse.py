@@ -261,7 +261,7 @@ class FusedMap:
                 empty += gone_empty
             changed = np.concatenate(written)
             with defer_interrupts():
-                self._grid.take(work)
+                self._grid.replace_contents(work)
                 self._posed = posed
                 for name in gone:
                     del self._pieces[name], self._wanted[name]

@@ -316,7 +316,7 @@ class GridFilter:
                 threads=self.config.threads,
             )
             for i in np.flatnonzero(first_of != np.arange(len(p))).tolist():
-                p.grids[i].take(p.grids[int(first_of[i])])
+                p.grids[i].replace_contents(p.grids[int(first_of[i])])
             p.ages = p.ages + np.array([not g.locked for g in p.grids], dtype=np.int64)
             self.tally.rays += report.rays
             self.tally.dropped_rays += report.dropped
