@@ -33,11 +33,11 @@ def demo_log(preset: str, seed: int) -> SensorLog:
         raise UnknownNameError("size of the demo", preset, PRESETS)
     if preset == "garage":
         return simulate("garage", seed=seed)
-    from graphslam.sim.court import court
     from graphslam.sim.crawler import simulate_crawler
     from graphslam.sim.crawler_config import CrawlerConfig
+    from graphslam.sim.ring_hall import ring_hall
 
-    return simulate_crawler(court(seed=seed), seed, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=seed), seed, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool = True) -> Run:

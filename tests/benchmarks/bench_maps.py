@@ -41,10 +41,10 @@ from graphslam.io.catalog import load_recording
 from graphslam.maps.fuse import FusedMap, fuse_pieces
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import divide_submaps
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam.sim.garage import garage
+from graphslam.sim.ring_hall import ring_hall
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
@@ -74,7 +74,7 @@ def scene(name: str, points: int = ALL_POINTS) -> Scene:
         config = dataclasses.replace(config, filter=dataclasses.replace(config.filter, map_beams=0))
     else:
         crawler = crawler_preset("full" if name == "garage-full" else "light")
-        log = simulate_crawler(court(seed=9) if name == "court" else garage("A"), seed=9, config=crawler)
+        log = simulate_crawler(ring_hall(seed=9) if name == "court" else garage("A"), seed=9, config=crawler)
         reach = 8.0 if name == "court" else 25.0
         config = SegSlamFrontEndConfig(
             steps=StepConfig(max_range=reach, level_floors=True), filter=GridFilterConfig(walk_scale=0.5)

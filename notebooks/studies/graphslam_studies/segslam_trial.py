@@ -24,9 +24,9 @@ from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.refined import heading_error
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from graphslam.sim.world import DRAWN, World
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_error_model import FilterDrift
@@ -115,7 +115,7 @@ class GridTrialConfig:
         layout = self.layout
         if layout == "drawn":
             layout = f"{DRAWN}{1 + int(SeedTree(seed).child('layout').generator().integers(10**9))}"
-        made = court(seed=seed) if self.world == "court" else mesh_world(self.world, layout=layout, seed=seed)
+        made = ring_hall(seed=seed) if self.world == "court" else mesh_world(self.world, layout=layout, seed=seed)
         return replace(made, speed=self.speed * made.speed)
 
 

@@ -27,9 +27,9 @@ from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import LoopDecision
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.faults.kills import snapshot
 from tests.reference.cloud_front_end import CloudConfig, CloudFrontEnd
 
@@ -37,7 +37,7 @@ from tests.reference.cloud_front_end import CloudConfig, CloudFrontEnd
 @pytest.fixture(scope="module")
 def log() -> SensorLog:
     """Nearly one and a half times round a block: the way comes back to where it was."""
-    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.app.run.test_pipeline_space import Ring as HandedOver
 from tests.app.run.test_pipeline_space import ring as flat_ring
 from tests.reference.imu_ring import STEP, ring
@@ -178,7 +178,7 @@ def test_its_options_are_checked():
 
 def test_a_simulated_robot_is_as_it_is_mounted(tmp_path):
     """SegSLAM on a robot whose IMU it uses: looked at, and nothing is said against it; turned round, it is named."""
-    log = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    log = simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
     options = {"frontend": {"filter": {"particles": 1}}, "map": {"fuse": False}, "refine": {"use": False}}
     r = pipeline.run(log, frontend="segslam", seed=2, config=options, progress=False)
     assert [e["verdict"] for e in r.events if e["event"] == "imu-axes"] == ["as stated"]

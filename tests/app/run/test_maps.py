@@ -29,9 +29,9 @@ from graphslam.io.log_store import save_log
 from graphslam.io.tum import read_tum
 from graphslam.maps.fuse import fuse_pieces
 from graphslam.maps.run_map import floor_bands, make_run_map, nodes_by_submap
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.app.cli.test_cli import graphslam, refused
 from tests.reference.small_maps import same_map
 
@@ -39,7 +39,7 @@ from tests.reference.small_maps import same_map
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """SegSLAM of three particles in the small court, twice round a corner, by its preset."""
-    log = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    log = simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
     options = {"frontend": {"filter": {"particles": 3}}, "refine": {"use": False}}  # it is the map of the graph
     out = tmp_path_factory.mktemp("run") / "run"
     return run(log, frontend="segslam", seed=2, out=out, config=options, progress=False)

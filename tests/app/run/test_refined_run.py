@@ -33,9 +33,9 @@ from graphslam.io.tum import read_tum
 from graphslam.maps import run_map
 from graphslam.maps.contradictions import Contradictions
 from graphslam.maps.refined import base_frames, refined_map
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.faults.kills import snapshot
 from tests.reference.small_maps import same_map
 
@@ -44,7 +44,7 @@ OPTIONS: dict[str, Any] = {"frontend": {"filter": {"particles": 1}}}
 
 def drive(seed: int) -> SensorLog:
     """Twice round a corner of one court, by a robot of its own."""
-    return simulate_crawler(court(seed=9), seed, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), seed, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def made(log: SensorLog, out: Path, *, seed: int = 2, resume: bool = False, **options: Any) -> Run:

@@ -21,9 +21,9 @@ from graphslam.core.poses import group_of
 from graphslam.loops import loops as decisions
 from graphslam.loops.conflicting_groups import AMBIGUOUS
 from graphslam.loops.measure import Loop, LoopMeasurer
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.faults.kills import snapshot
 
 OPTIONS: dict[str, Any] = {
@@ -37,7 +37,7 @@ OPTIONS: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def log() -> SensorLog:
     """Twice round a corner: SegSLAM enters its first map again."""
-    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def shifted(loops: Sequence[Loop]) -> list[Loop]:

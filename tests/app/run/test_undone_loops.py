@@ -19,9 +19,9 @@ from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.join.registry import join_by_method
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.app.cli.test_cli import graphslam
 from tests.faults.kills import snapshot
 
@@ -36,7 +36,7 @@ OPTIONS: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def log() -> SensorLog:
     """Twice round a corner: SegSLAM enters its first map again."""
-    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def go_on(log: SensorLog, folder: Path, *, resume: bool = True) -> Run:

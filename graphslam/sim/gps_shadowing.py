@@ -19,7 +19,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.se3 import se3_transform
 from graphslam.sim.campus_config import CampusConfig
 from graphslam.sim.crawler_sensors import ornstein_uhlenbeck
-from graphslam.sim.drive import Motion
+from graphslam.sim.drive import RouteMotion
 from graphslam.sim.raycast import RayCaster
 
 Mask = npt.NDArray[np.bool_]
@@ -27,7 +27,7 @@ _ROUND = 24  # directions in which the nearest wall is looked for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fixes:
+class GpsFixSeries:
     """Positions of an antenna.
 
     Parameters
@@ -52,7 +52,7 @@ class Fixes:
     seen: tuple[Array, npt.NDArray[np.int64]]
 
 
-def draw_sky(config: CampusConfig, tree: SeedTree) -> Array:
+def draw_satellites(config: CampusConfig, tree: SeedTree) -> Array:
     """Directions of satellites ``(s, 3)``, even over the sky above the mask."""
     rng = tree.child("sky").generator()
     up = rng.uniform(np.sin(config.mask), 1.0, config.satellites)
@@ -61,7 +61,7 @@ def draw_sky(config: CampusConfig, tree: SeedTree) -> Array:
     return np.column_stack([level * np.cos(turn), level * np.sin(turn), up])
 
 
-def in_view(caster: RayCaster, antennas: Array, sky: Array) -> Mask:
+def satellites_in_view(caster: RayCaster, antennas: Array, sky: Array) -> Mask:
     """Which satellites ``(s, 3)`` each antenna ``(n, 3)`` sees past everything ``(n, s)``."""
     n, s = len(antennas), len(sky)
     rays = np.hstack([np.repeat(antennas, s, axis=0), np.tile(sky, (n, 1))])
@@ -78,8 +78,8 @@ def nearest_wall(caster: RayCaster, antennas: Array) -> Array:
 
 
 def measure_gps(
-    motion: Motion, caster: RayCaster, config: CampusConfig, drawn: dict[str, float], tree: SeedTree
-) -> Fixes:
+    motion: RouteMotion, caster: RayCaster, config: CampusConfig, drawn: dict[str, float], tree: SeedTree
+) -> GpsFixSeries:
     """Fixes along a drive.
 
     Parameters
@@ -92,8 +92,8 @@ def measure_gps(
     c, scale = config, config.noise_scale
     times = np.arange(0.0, motion.duration, 1.0 / c.gps_rate)
     antennas = se3_transform(motion.poses(times), np.broadcast_to(np.array(c.lever), (len(times), 3)))
-    sky = draw_sky(c, tree)
-    seen, wall = in_view(caster, antennas, sky), nearest_wall(caster, antennas)
+    sky = draw_satellites(c, tree)
+    seen, wall = satellites_in_view(caster, antennas, sky), nearest_wall(caster, antennas)
 
     shape, dt = (len(times), c.satellites), 1.0 / c.gps_rate
 
@@ -126,7 +126,7 @@ def measure_gps(
         found.append((C @ H.T @ (scale * error[k, used[k]]))[:3])
         stated.append(sigma**2 * C[:3, :3])
     index = np.array(rows, dtype=np.int64)
-    return Fixes(
+    return GpsFixSeries(
         times=times[index],
         positions=antennas[index] + np.array(found).reshape(-1, 3),
         covariances=np.array(stated).reshape(-1, 3, 3),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.core.random import SeedTree
-from graphslam.sim.clutter import KeepClear, scatter
+from graphslam.sim.clutter import KeepClear, scatter_obstacles
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.route import plan_route
 from graphslam.sim.world import World, describe_route
@@ -34,7 +34,7 @@ _FIXED = (
 _CORNERS = ((12.0, 0.0), (12.0, 8.0), (0.0, 8.0), (0.0, 0.0))
 
 
-def court(*, seed: int = 0) -> World:
+def ring_hall(*, seed: int = 0) -> World:
     """The court.
 
     Parameters
@@ -60,7 +60,7 @@ def court(*, seed: int = 0) -> World:
     rng = SeedTree(seed).child("court").generator()
     clear = KeepClear(route, margin=0.62)
     strips = ((x0, y0, x1, y0 + 1.2), (x0, y1 - 1.2, x1, y1), (x1 - 1.2, y0, x1, y1), (x0, y0, x0 + 1.2, y1))
-    things = sum(scatter(mesh, strip, 0.0, 3, clear, rng) for strip in strips)
+    things = sum(scatter_obstacles(mesh, strip, 0.0, 3, clear, rng) for strip in strips)
     vertices, triangles = mesh.build()
     about = describe_route(route)
     # the first corridor and the third, either way round
