@@ -84,17 +84,17 @@ def reference() -> dict[str, str]:
     assert spec.loader is not None
     gs = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(gs)
-    verbs = """# Verbs
+    functions = """# Functions
 
-What `import graphslam as gs` offers to call. Angles are in radians, lengths in metres, times in seconds, unless a name
-says otherwise. What goes wrong is a `GraphSlamError`, or a [child](errors.md) of it.
+The functions of `import graphslam as gs`. Angles are in radians, lengths in metres, times in seconds, unless a name
+says otherwise. Errors are a `GraphSlamError` or a [subclass](errors.md).
 """
-    types = "# Types\n\nWhat the verbs take and give.\n"
+    types = "# Types\n\nArguments and results of the functions.\n"
     return {
-        "reference/verbs.md": verbs + entries({**gs._VERBS, **gs._LISTS}, members=False),
+        "reference/verbs.md": functions + entries({**gs._VERBS, **gs._LISTS}, members=False),
         "reference/types.md": types + entries(gs._TYPES, members=True),
-        "reference/front-ends.md": "# Front ends\n\nBy name for `gs.run(..., frontend=)`; options of each under its "
-        "configuration.\n" + entries(FRONT_ENDS, members=True),
+        "reference/front-ends.md": "# Front ends\n\nUse the name in `gs.run(..., frontend=)`. The options are "
+        "the fields of its configuration.\n" + entries(FRONT_ENDS, members=True),
         "reference/parts.md": parts(),
         "reference/errors.md": "# Errors\n\n::: graphslam.core.errors\n    options:\n      show_root_heading: false\n",
     }
@@ -115,11 +115,12 @@ FRONT_ENDS = {
 
 
 def parts() -> str:
-    """The faces of the rooms, and the tutorials that use each name."""
-    text = """# Parts
+    """The public names of the packages, and the tutorials that use each name."""
+    text = """# Modules
 
-What the verbs are made of, by room of the [house](../architecture.md): the tutorials use these names, and so may you.
-They change more often than verbs and types do. `from graphslam.plots import plot_scan`, or `gs.plots.plot_scan`.
+The public names of the packages ([architecture](../architecture.md)). The tutorials use them, and you can use them too.
+They change more often than functions and types. Example: `from graphslam.plots import plot_scan`, or
+`gs.plots.plot_scan`.
 """
     uses = {p.stem: p.read_text(encoding="utf-8") for p in sorted((ROOT / "notebooks").glob("*.ipynb"))}
     for room in sorted(p.parent.name for p in (ROOT / "graphslam").glob("*/__init__.py")):
@@ -147,12 +148,12 @@ def entries(names: dict[str, str], *, members: bool) -> str:
 
 
 def command_line() -> str:
-    """The help of every verb."""
+    """The help of every command."""
     from graphslam.app.cli import app
 
     group = typer.main.get_command(app)
-    text = ["# Command line\n\nThe same verbs, with `--json` for one JSON object on stdout. Shells complete them after "
-            "`graphslam --install-completion`.\n"]  # fmt: skip
+    text = ["# Command line\n\nAll commands. `--json` prints one JSON object on stdout. For completion in the shell "
+            "run `graphslam --install-completion`.\n"]  # fmt: skip
 
     def add(command: Any, path: str) -> None:
         context = click.Context(command, info_name=path, terminal_width=100, max_content_width=100)

@@ -38,7 +38,7 @@ def default_methods(submaps: Material) -> tuple[str, ...]:
 
     if submaps.states <= MOST:
         return DEFAULT_METHODS
-    logger.warning("no EKF: %d states are more than the %d that a dense filter has room for", submaps.states, MOST)
+    logger.warning("no EKF: %d states, a dense filter is limited to %d", submaps.states, MOST)
     return tuple(m for m in DEFAULT_METHODS if m != "ekf")
 
 
@@ -59,7 +59,7 @@ def map_nees(
     """
     error, known = _errors(estimate, keys, truth, chart)
     if len(known) == 0:
-        raise DataError("neither a pose nor a landmark has a truth", got=len(truth.keys), wanted="common keys or ids")
+        raise DataError("no pose and no landmark has ground truth", got=len(truth.keys), wanted="common keys or ids")
     if estimate.information is not None and len(known) == estimate.states:
         return joint_nees(error[np.argsort(known)], information=estimate.information), len(known)
     return joint_nees(error, covariance=estimate.covariance_block(known)), len(known)
@@ -75,13 +75,13 @@ def _errors(
         rows, have = exits[i], truth.exit_poses[j]
         if have.shape[1] != estimate.poses.shape[1]:
             raise DataError(
-                "truth is of another dimension", got=have.shape, wanted=(len(have), estimate.poses.shape[1])
+                "ground truth has another dimension", got=have.shape, wanted=(len(have), estimate.poses.shape[1])
             )
         d = group_of(have).dof
         return pose_error(estimate.poses[rows], have).ravel(), (d * (rows[:, None] - 1) + np.arange(d)).ravel()
     g = group_of(estimate.poses)
     if truth.exit_poses.shape[1] != g.size:
-        raise DataError("truth is of another dimension", got=truth.exit_poses.shape, wanted=f"(m, {g.size})")
+        raise DataError("ground truth has another dimension", got=truth.exit_poses.shape, wanted=f"(m, {g.size})")
     m = len(estimate.poses) - 1
     i, j = match_ids(np.asarray(keys), truth.keys)
     poses, landmarks = estimate.poses[1:].copy(), estimate.landmarks.copy()  # what has no truth has no error

@@ -15,7 +15,7 @@ from graphslam.io.catalog import load_recording
 
 
 def check_source(source: str | Path, *, reader: str | None = None, **options: Any) -> list[StreamFinding]:
-    """What can be told to be wrong with a source: of its files, of what is in them, and of what it is good for.
+    """Check a source for errors: its files, their content, and whether a front end can use it.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     Returns
     -------
     list of StreamFinding
-        The first line says what was read. What cannot be read at all is a line of level ``bad``.
+        The first line describes the log. An unreadable source is a line of level ``bad``.
     """
     try:
         log = load_recording(source, reader=reader, **options)
@@ -35,16 +35,16 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     except GraphSlamError as error:
         return [StreamFinding("", Finding("bad", "unreadable", str(error)))]
     if not isinstance(log, SensorLog):
-        text = f"{type(log).__name__}: no log of sensors, of which nothing is checked here."
+        text = f"{type(log).__name__}: not a sensor log — not checked. `graphslam solve` checks pose-graph files."
         return [StreamFinding("", Finding("", "read", text))]
     said = [StreamFinding("", Finding("", "read", f"{reading_line(log) or log.name}."))]
     said += [
-        StreamFinding("", Finding("", "left-out", f"Left out by the reader: {n} {what}.")) for what, n in _lost(log)
+        StreamFinding("", Finding("", "left-out", f"dropped by the reader: {n} {what}.")) for what, n in _lost(log)
     ]
     said += check_log(log)
     try:
         choice = choose_front_end(log)
-        said.append(StreamFinding("", Finding("", "front-end", f"A run would use {choice.frontend}: {choice.why}.")))
+        said.append(StreamFinding("", Finding("", "front-end", f"front end: {choice.frontend} — {choice.why}.")))
     except MissingDataError as error:
         said.append(StreamFinding("", Finding("look", "no-front-end", str(error))))
     return said
@@ -59,7 +59,7 @@ def summary(found: list[StreamFinding]) -> str:
     bad = sum(n.finding.level == "bad" for n in found)
     look = sum(n.finding.level == "look" for n in found)
     if bad:
-        return f"{bad} fault{'s' if bad > 1 else ''}: mend {'these' if bad > 1 else 'it'} before a run."
+        return f"{bad} error{'s' if bad > 1 else ''} found. Correct {'them' if bad > 1 else 'it'} before a run."
     if look:
-        return f"No fault; {look} line{'s' if look > 1 else ''} to look at."
-    return "No fault was found."
+        return f"No error; check {look} warning{'s' if look > 1 else ''}."
+    return "No error found." if any(n.finding.code == "front-end" for n in found) else "Nothing was checked."

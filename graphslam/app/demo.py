@@ -76,7 +76,7 @@ class DemoProgress(Observer):
 
     def __enter__(self) -> DemoProgress:
         self.bar = tqdm(desc="SegSLAM", unit="step", disable=not self.shown, leave=False, dynamic_ncols=True)
-        self.bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
+        self.bar.set_postfix_str("compiling (first run only, ~30 s)")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -94,7 +94,7 @@ class DemoProgress(Observer):
             self.drawn = n
         where = f"{at.length:.0f} m, {n} segments"
         if self.drawn:
-            where += f", look at {self.picture}"
+            where += f"; see {self.picture}"
         if last:
             self.bar.set_description("segments → graph → fused map")
         self.bar.set_postfix_str(where, refresh=last)
@@ -108,7 +108,7 @@ class DemoProgress(Observer):
             from graphslam.core.poses import group_of, remove_roll_pitch
 
             truth = truth.transformed(group_of(truth.poses).inverse(remove_roll_pitch(truth.poses[0])))
-        title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closed yet"
+        title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closure yet"
         ax = plot_segments(None, paths, truth=truth, title=title)
         part = part_path(self.picture, ".png")
         save_figure(ax, part)

@@ -49,7 +49,7 @@ def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PosePro
         )
     if len(network) != graph.structure.count("x") or network.dim != graph.dim:
         raise DataError(
-            "the graph of the run is not of its submaps",
+            "the graph of the run does not belong to its submaps",
             where=str(files / "graph.g2o"),
             got=f"{len(network)} poses",
             wanted=f"{graph.structure.count('x')}",

@@ -40,10 +40,10 @@ def map_to_enu(run: Run, heading: float | None) -> Array:
     scored = run.gps.get("all")
     if scored is not None:
         if heading is not None:
-            raise ConfigError("the GPS of this run says how its map lies: leave the heading out")
+            raise ConfigError("the GPS of this run defines the heading; do not give one")
         return scored.T_gps_map
     if heading is None:
-        raise ConfigError("this run has no GPS: give the heading of its first base, degrees clockwise from north")
+        raise ConfigError("this run has no GPS; give the heading of its first base, in degrees clockwise from north")
     if not np.isfinite(heading):
         raise ConfigError(f"heading = {heading}; wanted degrees clockwise from north")
     return np.array([0.0, 0.0, np.deg2rad(90.0 - heading)])
@@ -171,7 +171,7 @@ def export(
             raise ConfigError(f"{format} writes a folder: name it (out)")
         return _write_dense(opened, Path(out), format, datum, heading)
     if out is None and home is None:
-        raise ConfigError("a run without a folder needs a file name to be exported to")
+        raise ConfigError("this run has no folder; give a file name (out)")
 
     def write(target: Path, what: Run) -> None:
         if format in PATHS:

@@ -110,7 +110,7 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
     every = choices_of_matches(run.submaps, config.match_support, loops=loops, undone=undone)
     choices = dict(list(every.items())[:MOST])
     if len(every) > MOST:
-        logger.warning("%d of %d choices of matches and loops are solved", MOST, len(every))
+        logger.warning("solved %d of %d choices of matches and loop closures", MOST, len(every))
     alternatives = []
     for name, chosen in tqdm(choices.items(), desc="choices", unit="graph", disable=not progress):
         back = solve_choice(run.submaps, chosen, config, loops=loops, decided=decided, **streams())
@@ -204,7 +204,7 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
     gps: GpsOptions = build_config(GpsOptions, values.get("gps", {}), "gps")
     if gps.use != "none" and run.fixes is None:
         raise MissingDataError(
-            f"{run.folder}: the graph of this run holds GPS, and its fixes are not in the folder",
+            f"{run.folder}: the graph of this run has GPS factors, but its fixes are not in the folder",
             wanted="fixes.npz, or a run with gps.use = none",
         )
     imu: ImuOptions = build_config(ImuOptions, values.get("imu", {}), "imu")

@@ -29,22 +29,25 @@ def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Seq
     out = [_state(row, estimate)]
     judged = {j.code: j for j in join_judged(row)}
     if chi2 := judged.get("chi2"):
-        out.append(Finding(chi2.level, "chi2", f"χ²/dof at the optimum: {chi2.text}."))
+        out.append(Finding(chi2.level, "chi2", f"chi-square at the optimum: {chi2.text}."))
     elif row.get("dof") is not None and row["objective_polished"] is not None:
-        text = "χ² says nothing of the covariances: nothing in these submaps is redundant that could contradict."
+        text = "covariances: not tested by chi-square — no measurement in these submaps is redundant."
         out.append(Finding("", "chi2", text))
     if nees := judged.get("nees"):
         before: Any = row.get("nees_unpolished")
-        said = f"; before the refinement {before / nees.dof:.3g}" if number(before) else ""
-        out.append(Finding(nees.level, "nees", f"NEES/n against the truth: {nees.text}{said}."))
+        said = f"; before refinement {before / nees.dof:.3g}" if number(before) else ""
+        out.append(Finding(nees.level, "nees", f"NEES (ground truth): {nees.text}{said}."))
     if left_out:
-        text = f"Not part of it, because joiners take submaps and what ties them alone: {', '.join(left_out)}."
+        text = (
+            f"not included: {', '.join(left_out)} — map-joining methods use submaps and the constraints between them "
+            "only."
+        )
         out.append(Finding("", "left-out", text))
     return out
 
 
 def join_judged(row: Mapping[str, Any]) -> list[Judged]:
-    """What the covariances of a joined map were held against."""
+    """Ratios that test the covariances of a joined map."""
     out = []
     best: Any = row["objective_polished"]
     if (dof := row.get("dof") or 0) > 0 and number(best):
@@ -71,19 +74,21 @@ def join_headline(row: Mapping[str, Any], findings: Sequence[Finding], *, submap
     marks = f", {row['landmarks']} landmarks" if row["landmarks"] else ""
     judged = join_judged(row)
     known = any(j.code == "nees" for j in judged)
-    facts = [f"{in_metres(length)} through {submaps} submaps{marks}", "" if known else "true error not known"]
+    facts = [f"{in_metres(length)} through {submaps} submaps{marks}", "" if known else "true error unknown"]
     return headline(findings, facts, judged, known=known)
 
 
 def _state(row: Mapping[str, Any], estimate: SubmapEstimate) -> Finding:
     own, best = row["objective"], row["objective_polished"]
     if best is None:
-        text = f"As the method leaves it, not refined: χ² {own:.6g}; its optimum is not known."
+        text = f"solution: χ² {own:.6g} — not refined; the optimum is unknown."
         return Finding("look", "state", text)
     if not estimate.converged:
-        return Finding("bad", "state", f"Not solved: the refinement did not reach an optimum (χ² {best:.6g}).")
-    gap = f", {own - best:.3g} below where the method left it" if own > best else ""
-    return Finding("good", "state", f"Solved: at a least-squares optimum, χ² {best:.6g}{gap}.")
+        return Finding(
+            "bad", "state", f"solution: χ² {best:.6g} — not converged; the refinement did not reach an optimum."
+        )
+    gap = f"; the method alone is {own - best:.3g} higher" if own > best else ""
+    return Finding("good", "state", f"solution: χ² {best:.6g} — converged to a least-squares optimum{gap}.")
 
 
 def compare_verdict(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
@@ -99,8 +104,8 @@ def compare_verdict(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
         return []
     low, high = min(ends.values()), max(ends.values())
     if high - low <= SAME * max(low, 1.0):
-        text = f"All {len(ends)} methods end at one optimum, χ² {low:.6g}."
+        text = f"optimum: χ² {low:.6g} — the same for all {len(ends)} methods."
         return [Finding("good", "one-optimum", text)]
     best = ", ".join(m for m, value in ends.items() if value - low <= SAME * max(low, 1.0))
-    text = f"The methods end at different optima, χ² {low:.6g} ({best}) to {high:.6g}: the higher ones are local."
+    text = f"optimum: χ² {low:.6g} ({best}) to {high:.6g} — the higher ones are local."
     return [Finding("look", "one-optimum", text)]

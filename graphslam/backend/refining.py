@@ -34,35 +34,34 @@ logger = logging.getLogger(__name__)
 CONTRADICTED = 3.0
 """χ² of the walk of the yaw bias by its degrees of freedom beyond which scans of passes and motion contradict."""
 WIDENED = 1.5
-"""σ of the motion that the scans show, in multiples of what is stated, from which it is told."""
+"""Ratio of estimated to assumed σ of the motion from which it is reported."""
 NAMED = {
-    "scale": (0.03, "distances of the odometry are {v:.1%} too {sign} (scale of the wheels)", 1.0, ("long", "short")),
+    "scale": (0.03, "odometry distances {v:.1%} too {sign} (wheel scale)", 1.0, ("long", "short")),
     "side": (
         0.009,
-        "the scanner looks {v:.2f}° to the {sign} of the way that the odometry tells (its mounting)",
+        "scanner yaw {v:.2f}° to the {sign} of the odometry direction (mounting)",
         57.29578,
         ("left", "right"),
     ),
     "rise": (
         0.009,
-        "the scanner looks {v:.2f}° {sign} the way that the odometry tells (its mounting)",
+        "scanner pitch {v:.2f}° {sign} the odometry direction (mounting)",
         57.29578,
         ("below", "above"),
     ),
     "clock": (
         0.02,
-        "the stamps of the motion are {v:.0f} ms too {sign} beside those of the scans",
+        "odometry stamps {v:.0f} ms too {sign} relative to the scans",
         1e3,
         ("early", "late"),
     ),
 }
-"""Lasting errors that are named: beyond which size, in which words, in multiples of their unit, and what their sign
-means."""
+"""Systematic errors that are reported: smallest size, text, unit factor, and the words for their sign."""
 
 
 @dataclass(frozen=True)
 class RefinedRun:
-    """What a refinement made of a run.
+    """Result of a refinement.
 
     Parameters
     ----------
@@ -99,9 +98,9 @@ def refine_run(
     m : GlobalMap
         Solved.
     gps : (Gps, GpsConfig), optional
-        Fixes that are in the graph, and how they entered: they hold the refined path, too.
+        Fixes that are in the graph, and their options; the refined path uses them, too.
     graph : PoseGraph, optional
-        What the map was solved from: its loops are held against the refined path.
+        The graph of the map; its loop closures are compared with the refined path.
 
     Returns
     -------
@@ -118,8 +117,8 @@ def refine_run(
         found = refine_by_scans(scans, start, config, gps=gps, progress=progress)
         if not found.better:
             text = (
-                "The path was not refined by its scans: they agree less at the refined path "
-                f"({found.agreement[1]:.0%}) than at the graph's ({found.agreement[0]:.0%}), so the graph's stays."
+                f"refinement: not used — scans agree in {found.agreement[1]:.0%} of the points along the refined "
+                f"path and in {found.agreement[0]:.0%} along the graph's path, which is the result."
             )
             return None, [Finding("look", "refine-refused", text), *_input(found)]
         refined = refined_map(m, found, submaps)
@@ -127,8 +126,10 @@ def refine_run(
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
         drawn, moved = _static_submaps(drawn, base_frames(refined))
     except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
-        logger.warning("the path is not refined: %s", error)
-        return None, [Finding("look", "refine-failed", f"The path could not be refined by its scans: {error}.")]
+        logger.warning("refinement failed: %s", error)
+        return None, [
+            Finding("look", "refine-failed", f"refinement: failed — {error}. The graph's path is the result.")
+        ]
     wrong = None if graph is None else wrong_loops(graph, refined)
     return RefinedRun(found, refined, drawn, path), [*refinement_findings(found, wrong), *moved]
 
@@ -137,16 +138,15 @@ def _input(r: Refinement) -> list[Finding]:
     """Is the odometry that came in better than what came out?"""
     if r.left is not None:
         text = (
-            f"The odometry of the log is better than what was made of it: scans agree in {r.reckoned:.1%} of the "
-            f"points along it, in {r.agreement[0]:.1%} along the graph's path and in {r.left:.1%} along the refined "
-            "one. So the path is the odometry's, and as sure as its own noise says; no loop is closed in it."
+            f"scan agreement: odometry {r.reckoned:.1%}, graph {r.agreement[0]:.1%}, refined {r.left:.1%} of the "
+            "points — the odometry is best and is the result; its covariance is the odometry's, without loop closures."
         )
         return [Finding("look", "input-better", text)]
     if not r.input_better:
         return []
     text = (
-        f"The odometry of the log is better than this result: scans agree in {r.reckoned:.1%} of the points along it, "
-        f"here in {max(r.agreement):.1%}. Use its path, or state its noise as small as it is."
+        f"scan agreement: odometry {r.reckoned:.1%}, this result {max(r.agreement):.1%} of the points — the odometry "
+        "is better. Use its path, or reduce its assumed noise."
     )
     return [Finding("bad", "input-better", text)]
 
@@ -157,7 +157,7 @@ def _static_submaps(submaps: list[Submap], bases: Array) -> tuple[list[Submap], 
         return submaps, []
     moving = moving_points(submaps, bases[:-1])
     gone, every = sum(int(m.sum()) for m in moving), sum(len(m) for m in moving)
-    text = f"{gone} of {every} points ({gone / max(every, 1):.1%}) lie on things that moved and are not in the map."
+    text = f"moving objects: {gone} of {every} points ({gone / max(every, 1):.1%}) — removed from the map."
     return without_moving(submaps, moving), [Finding("", "moving", text)] if gone else []
 
 
@@ -181,7 +181,7 @@ def wrong_loops(graph: PoseGraph, m: GlobalMap) -> list[tuple[int, int, float, f
 
 
 def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> tuple[Ledger, list[Finding]]:
-    """What a refined path spends: every scan with motion and gravity once; all factors of the graph were its start.
+    """Measurements of a refined path: scans, motion and gravity, once each; the graph was its initial guess.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
     Returns
     -------
     findings : list of Finding
-        What is spent, and which streams of the graph the refined path does not hold.
+        Measurements used, and streams of the graph that the refined path does not use.
     """
     out, entries = ledger.as_start(), ledger.entries()
     streams = frozenset().union(*(s.uses for s in submaps))
@@ -207,15 +207,15 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
     factors = len({e.factor_id for e in entries})
     spent = ", ".join(sorted(streams | gravity)) or "the scans"
     text = (
-        f"The refined path spends {spent} once (scan-pairs). The {factors} factors of the graph, its exits, matches "
-        "and loops, were its start and enter no sum."
+        f"measurements of the refined path: {spent} — each used once (scan-pairs). The {factors} factors of the graph "
+        "are only its initial guess."
     )
     found = [Finding("", "refine-evidence", text)]
     lost = sorted({e.stream.partition("/")[0] for e in entries if e.kind == EXCLUSIVE} - streams)
     if lost:
-        text = f"The refined path does not hold {', '.join(lost)}: the graph that was its start did."
+        text = f"streams used by the graph only: {', '.join(lost)} — not used in the refined path."
         if some := sorted(gravity.intersection(lost)):
-            text += f" Of {', '.join(some)} it holds gravity."
+            text += f" It uses the gravity direction of {', '.join(some)}."
         found.append(Finding("look", "refine-streams", text))
     return out, found
 
@@ -225,7 +225,7 @@ SCAN_PAIRS = -1
 
 
 def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None) -> list[Finding]:
-    """What a refinement says of the run, as lines of the verdict.
+    """Findings of a refinement, as lines of the verdict.
 
     Parameters
     ----------
@@ -236,64 +236,63 @@ def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, fl
         return _input(r)
     last = r.rounds[-1]
     text = (
-        f"The path was refined by its scans: {last.pairs} points on surfaces of other steps, {last.passes} of them of "
-        f"other passes, with a spread of {1e3 * last.spread:.0f} mm; scans agree in {r.agreement[1]:.0%} of the points "
-        f"(before: {r.agreement[0]:.0%}; along the odometry alone: {r.reckoned:.0%})."
+        f"scan agreement of the refined path: {r.agreement[1]:.0%} of the points (before: {r.agreement[0]:.0%}, "
+        f"odometry: {r.reckoned:.0%}) — {last.pairs} point-to-surface pairs, {last.passes} of them of other "
+        f"traversals, residual spread {1e3 * last.spread:.0f} mm."
     )
     out = [Finding("good", "refined", text)]
     out += _input(r)
     if (f := r.fixes) is not None:
         text = (
-            f"{f.used} fixes hold the refined path; they lie {f.rms:.2f} m from it (RMS), with a median χ² of "
-            f"{f.typical:.2f} times that of errors as stated."
+            f"GPS fixes in the refinement: {f.used}, {f.rms:.2f} m RMS from the path — median χ² is {f.typical:.2f} "
+            "times the expected one."
         )
         if f.left:
-            text += f" {f.left} others were left out: before, after or in a gap of the path."
+            text += f" {f.left} others are outside the path in time."
         if f.wild:
-            text += f" {f.wild} of them are farther off than chance allows and count little."
+            text += f" {f.wild} are outliers and have a low weight."
         if f.contradicted:
             text += (
-                " So errors of fixes are larger than stated, or last: state gps.bias_sigma and gps.bias_time, or a "
-                "larger gps.sigma; the covariance of this path is too small."
+                " GPS errors are larger than assumed or time-correlated, so the covariance of this path is too small. "
+                "Set gps.bias_sigma and gps.bias_time, or a larger gps.sigma."
             )
         out.append(Finding("look" if f.contradicted else "good", "refine-fixes", text))
     if wrong:
         some = "; ".join(f"x{i} and x{j} by {d:.1f} m, {np.rad2deg(t):.0f}°" for i, j, d, t in wrong[:4])
         text = (
-            f"{len(wrong)} loops of the graph contradict the scans between their places, and bent its path: nodes "
-            f"{some}. The refined path does not follow them; undo them if the graph shall not, either."
+            f"loop closures that contradict the scans: {len(wrong)} ({some}) — they deform the graph's path, not the "
+            "refined one. Remove them with `graphslam loops RUN --undo N`."
         )
         out.append(Finding("look", "refine-contradicted", text))
     elif wrong is None and len(r.refused):
         a, b = r.times[r.refused].T
         some = "; ".join(f"{x:.0f} s and {y:.0f} s" for x, y in list(zip(a, b))[:4])
         text = (
-            f"{len(r.refused)} pairs of places of the start contradict the scans between them by more than 1 m or 6° "
-            f"and were left apart ({some}): look at its loops there."
+            f"initial pairs of places that contradict the scans: {len(r.refused)} by more than 1 m or 6° ({some}) — "
+            "not used. Check the loop closures there."
         )
         out.append(Finding("look", "refine-contradicted", text))
     if r.other is not None and r.other.apart > r.rounds[-1].distance:
         text = (
-            f"Begun at the graph's path and at the odometry's, the refinement ended {r.other.apart:.2f} m apart. The "
-            f"path from the {'odometry' if r.other.taken else 'graph'} was kept, since its scans agree better "
-            f"({r.other.kept:.1%} of the points against {r.other.left:.1%}): look at the map before you trust it."
+            f"refinement from two initial paths: {r.other.apart:.2f} m apart — the one from the "
+            f"{'odometry' if r.other.taken else 'graph'} was kept, its scans agree better ({r.other.kept:.1%} of the "
+            f"points, the other {r.other.left:.1%}). Check the map."
         )
         out.append(Finding("look", "refine-two-paths", text))
     if r.motion > CONTRADICTED:
         text = (
-            f"Scans of other passes bend the motion more than the gyro can (χ²/dof {r.motion:.1f}): a place was taken "
-            "for another one, or the sensor moved on the robot. The refined path and its covariance are not to be "
-            "trusted."
+            f"chi-square of the motion in the refinement: {r.motion:.1f} per degree of freedom [≤ {CONTRADICTED:g}] — "
+            "a loop closure is false, or the sensor moved on the robot. Do not use the refined path."
         )
         out.append(Finding("bad", "refine-motion", text))
     if (times := float(max(r.scales.max(), r.walk))) > WIDENED:
-        what = "the yaw bias walks" if r.walk >= r.scales.max() else "the motion is"
-        text = f"Scans show that {what} {times:.1f} times as noisy as the log or the front end states; taken as seen."
+        what = "yaw bias" if r.walk >= r.scales.max() else "motion"
+        text = f"{what} noise: {times:.1f} times the assumed σ — estimated by the refinement, and used there."
         out.append(Finding("look", "refine-widened", text))
     if r.alike > WIDENED:
         text = (
-            "Points of one scan err alike, as those of a line of the scanner or of a slanted wall do: sums of their "
-            f"residuals vary {r.alike:.1f} times as much as independent errors would. The covariance is so much larger."
+            f"correlation of points within a scan: variance of residual sums {r.alike:.1f} times that of independent "
+            "errors — the covariance is scaled by it."
         )
         out.append(Finding("", "refine-alike", text))
     for name, (limit, words, unit, signs) in NAMED.items():
@@ -301,5 +300,5 @@ def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, fl
             v, sigma = r.constants[name]
             if abs(v) > limit and abs(v) > 5.0 * sigma:
                 what = words.format(v=abs(v) * unit, sign=signs[int(v < 0)])
-                out.append(Finding("look", f"refine-{name}", f"Scans and motion differ all along: {what}."))
+                out.append(Finding("look", f"refine-{name}", f"systematic error between scans and motion: {what}."))
     return out

@@ -73,13 +73,13 @@ class Estimate:
         """The same with the verdict of the gates."""
         why = ""
         if not abs(self.value) > SURE * self.sigma:
-            why = "no more than chance"
+            why = "not significant"
         elif self.name.endswith("_scale") and self.sigma > VAGUE:
-            why = f"a scale that is told to ± {100 * self.sigma:.0f} % only says more of noise than of wheels"
+            why = f"an uncertainty of ± {100 * self.sigma:.0f} % is too large for a scale"
         elif not self.gain > GAIN:
-            why = f"it gains {max(self.gain, 0.0):.1f} nats over noise alone, and more than {GAIN:g} are asked for"
+            why = f"log-likelihood +{max(self.gain, 0.0):.1f} nats, more than {GAIN:g} needed"
         elif abs(self.value - self.other) > AGREE * math.hypot(self.sigma, self.other_sigma):
-            why = f"windows of another length say {estimate_text(self.name, self.other, self.other_sigma)}"
+            why = f"windows of another length give {estimate_text(self.name, self.other, self.other_sigma)}"
         return replace(self, why_not=why)
 
 
@@ -110,34 +110,34 @@ class Prediction:
 
     def in_words(self) -> str:
         """What they say."""
-        said = f"{self.count} {self.what} are"
+        test = f"cross-validation on {self.count} {self.what}: log-likelihood"
         gain = self.gains["all"]
         if self.taken == "all":
-            return f"{said} likelier under it than under what the log states, by {gain:.0f} nats"
+            return f"{test} +{gain:.0f} nats with the estimated noise and calibration"
         if self.taken == "noise":
             less = self.gains["noise"] - gain
-            return f"{said} likelier under its noise alone than with its lasting errors, by {less:.0f} nats"
-        return f"{said} likelier under what the log states, by {-gain:.0f} nats"
+            return f"{test} +{less:.0f} nats with the estimated noise alone, without the systematic errors"
+        return f"{test} {gain:.0f} nats with the estimated noise and calibration"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """What a log says of its own noise.
+    """Noise and systematic errors estimated from a log.
 
     Parameters
     ----------
     kind : str
-        What was looked at: ``sightings``, ``ranges``, ``scans`` or ``clouds``.
+        Data used: ``sightings``, ``ranges``, ``scans`` or ``clouds``.
     corrections : Corrections
-        What is applied.
+        Corrections to apply.
     noise : mapping of str to float
         Standard deviations, as they were fitted.
     notes : tuple of Finding
-        What else is to be said.
+        Further findings.
     data : str
-        Of how much of the log it is made.
+        Part of the log that was used.
     prediction : Prediction or None
-        Of data that it was not made from; what they refuse is not applied. None: it was not asked.
+        Cross-validation; estimates that fail it are not applied. None: not done.
     """
 
     kind: str
@@ -149,7 +149,7 @@ class Calibration:
     prediction: Prediction | None = None
 
     def judged(self, prediction: Prediction) -> Calibration:
-        """The same without what withheld data refuse."""
+        """The same without estimates that fail the cross-validation."""
         found = replace(self, prediction=prediction)
         if prediction.taken == "all":
             return found
@@ -158,45 +158,46 @@ class Calibration:
         return replace(found, estimates=tuple(refused), corrections=kept)
 
     def findings(self) -> list[Finding]:
-        """Lines of a verdict: what is applied, what is not, and why."""
+        """Lines of a verdict: corrections that are applied, those that are not, and why."""
         against = self.contradictions()
         if against:
-            text = f"From {self.data}: {', '.join(against)}. No sensor that works errs so much: a unit, a sign, a "
-            text += (
-                "mounting or one of the streams is wrong, and which one cannot be told. Nothing was calibrated; the "
+            text = (
+                f"{', '.join(against)} (from {self.data}) — implausibly large: a unit, a sign, a mounting or a stream "
             )
-            text += "defaults of the noise are used. To do: `graphslam data check`."
+            text += "is wrong. Nothing was calibrated; default noise is used. To do: `graphslam data check`."
             return [Finding("bad", "calibration-contradiction", text)]
         out = []
         taken = "all" if self.prediction is None else self.prediction.taken
         if self.prediction is not None:
-            text = f"From {self.data}: {self.prediction.in_words()}"
-            text += {"all": ".", "noise": ": the lasting errors are left as they are.", "nothing": ": it is refused."}[
-                taken
-            ]
+            text = f"{self.prediction.in_words()} ({self.data})"
+            text += {
+                "all": " — used.",
+                "noise": " — systematic errors are not corrected.",
+                "nothing": " — the estimate is not used.",
+            }[taken]
             out.append(
                 Finding("", "calibrated", text) if taken == "all" else Finding("look", "calibration-refused", text)
             )
         for e in self.estimates:
             said = estimate_text(e.name, e.value, e.sigma)
             if e.applied:
-                text = f"Calibrated from {self.data}: {said}: {MENDED[e.name]} (gain {e.gain:.0f} nats)."
+                text = f"calibration from {self.data}: {said} — {MENDED[e.name]} (log-likelihood +{e.gain:.0f} nats)."
                 out.append(Finding("", "calibrated", text))
-            elif e.why_not != "no more than chance":
-                text = f"From {self.data}: {said}, perhaps; left as it is: {e.why_not}."
+            elif e.why_not != "not significant":
+                text = f"calibration from {self.data}: {said} — not corrected: {e.why_not}."
                 out.append(Finding("look", "calibration-left", text))
-        chance = [NAMES[e.name] for e in self.estimates if e.why_not == "no more than chance"]
+        chance = [NAMES[e.name] for e in self.estimates if e.why_not == "not significant"]
         if chance:
-            out.append(Finding("", "calibrated", f"No lasting error was found of {' or '.join(chance)}."))
+            out.append(Finding("", "calibrated", f"systematic errors of {' and '.join(chance)}: none found."))
         if self.noise:
-            text = f"Noise from {self.data}: {noise_text(self.noise)}{', not used' * (taken == 'nothing')}."
+            text = f"noise from {self.data}: {noise_text(self.noise)}{', not used' * (taken == 'nothing')}."
             if self.corrections.widen_only:
-                text += " Where the log states a larger one, that one counts."
+                text += " A larger σ in the log is kept."
             out.append(Finding("", "calibrated", text))
         return [*out, *self.notes]
 
     def contradictions(self) -> list[str]:
-        """What is too large for an error of sensors that work, in words; then nothing of the calibration is used."""
+        """Implausibly large estimates, in words; with any of them nothing of the calibration is used."""
         out = [estimate_text(e.name, e.value, e.sigma) for e in self.estimates if e.contradiction]
         large = {k: v for k, v in self.noise.items() if v > LARGEST_NOISE.get(k, math.inf)}
         return out + ([f"noise {noise_text(large)}"] if large else [])
@@ -225,15 +226,15 @@ class Calibration:
 
 NAMES = {
     "yaw_bias": "the yaw rate",
-    "distance_scale": "the distances of the motion",
+    "distance_scale": "the odometry distances",
     "turn_per_metre": "the turn per metre",
     "turn_scale": "the turns",
-    "range_scale": "the scale of the ranges",
-    "range_offset": "the zero of the ranges",
-    "sensor_yaw": "the sensor's direction",
+    "range_scale": "the range scale",
+    "range_offset": "the range offset",
+    "sensor_yaw": "the sensor yaw",
     "clock": "the clocks",
-    "mount_x": "the sensor's place",
-    "mount_y": "the sensor's place",
+    "mount_x": "the sensor position",
+    "mount_y": "the sensor position",
 }
 MENDED = {
     "yaw_bias": "subtracted",
@@ -242,8 +243,8 @@ MENDED = {
     "turn_scale": "divided out",
     "range_scale": "divided out",
     "range_offset": "subtracted",
-    "sensor_yaw": "put right",
-    "clock": "put right",
+    "sensor_yaw": "corrected",
+    "clock": "corrected",
 }
 
 
@@ -253,9 +254,9 @@ def estimate_text(name: str, value: float, sigma: float) -> str:
     if name == "yaw_bias":
         return f"yaw rate {deg(abs(value)):.3f} ± {deg(sigma):.3f} deg/s too {'high' if value > 0 else 'low'}"
     if name == "distance_scale":
-        return f"distances of the motion {100 * abs(np.expm1(value)):.2f} ± {100 * sigma:.2f} % too {_long(value)}"
+        return f"odometry distances {100 * abs(np.expm1(value)):.2f} ± {100 * sigma:.2f} % too {_long(value)}"
     if name == "turn_per_metre":
-        return f"the motion turns {deg(abs(value)):.3f} ± {deg(sigma):.3f} deg/m too far to the {_left(value)}"
+        return f"odometry turns {deg(abs(value)):.3f} ± {deg(sigma):.3f} deg/m too far to the {_left(value)}"
     if name == "turn_scale":
         return f"turns {100 * abs(value):.2f} ± {100 * sigma:.2f} % too {'large' if value > 0 else 'small'}"
     if name == "range_scale":
@@ -263,29 +264,31 @@ def estimate_text(name: str, value: float, sigma: float) -> str:
     if name == "range_offset":
         return f"ranges {abs(value):.3f} ± {sigma:.3f} m too {_long(value)}"
     if name == "sensor_yaw":
-        return f"sensor turned {deg(abs(value)):.2f} ± {deg(sigma):.2f} deg further to the {_left(value)} than stated"
+        return (
+            f"sensor turned {deg(abs(value)):.2f} ± {deg(sigma):.2f} deg further to the {_left(value)} than configured"
+        )
     if name == "mount_x":
-        return f"sensor {abs(value):.3f} ± {sigma:.3f} m further {'ahead' if value > 0 else 'back'} than stated"
+        return f"sensor {abs(value):.3f} ± {sigma:.3f} m further {'ahead' if value > 0 else 'back'} than configured"
     if name == "mount_y":
-        return f"sensor {abs(value):.3f} ± {sigma:.3f} m further to the {_left(value)} than stated"
+        return f"sensor {abs(value):.3f} ± {sigma:.3f} m further to the {_left(value)} than configured"
     if name == "clock":
-        return f"stamps of the motion {abs(value):.3f} ± {sigma:.3f} s too {'late' if value > 0 else 'early'}"
+        return f"odometry stamps {abs(value):.3f} ± {sigma:.3f} s too {'late' if value > 0 else 'early'}"
     return f"{name} {value:.4g} ± {sigma:.2g}"
 
 
 def noise_text(noise: dict[str, float]) -> str:
     """Standard deviations as a list."""
     units = {
-        "along_metre": ("along the way", "m/√m"),
-        "along_second": ("along the way", "m/√s"),
+        "along_metre": ("along the path", "m/√m"),
+        "along_second": ("along the path", "m/√s"),
         "lateral_metre": ("to the side", "m/√m"),
         "heading_metre": ("heading", "rad/√m"),
         "heading_radian": ("heading", "rad/√rad"),
         "heading_second": ("heading", "rad/√s"),
         "range_sigma": ("ranges", "m"),
         "bearing_sigma": ("bearings", "rad"),
-        "range_visit": ("ranges of one visit", "m"),
-        "bearing_visit": ("bearings of one visit", "rad"),
+        "range_visit": ("ranges per visit", "m"),
+        "bearing_visit": ("bearings per visit", "rad"),
     }
     found = [f"{units[k][0]} {v:.3g} {units[k][1]}" for k, v in noise.items() if k in units]
     return ", ".join(found)

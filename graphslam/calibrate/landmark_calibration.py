@@ -131,7 +131,7 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
     _enough(long, seen)
     notes: list[Finding] = []
     if held:
-        text = f"{', '.join(held)} cannot be told from this log: held at what the log says."
+        text = f"{', '.join(held)}: not observable in this log — the values of the log are kept."
         notes.append(Finding("", "calibrated", text))
     if effort.clock:
         clock = profile_clock(short, seen)
@@ -167,7 +167,7 @@ def _ranges_alone(seen: SightingLog, effort: CalibrationBudget, seed: int) -> tu
     until = end - begin if effort.windows is None else min(effort.poses / max(_rate(seen), 1e-9), end - begin)
     found = L.smooth_ranges(seen, until, seed=seed)
     if found is None:
-        raise DataError("too few ranges to calibrate with", where=seen.log.name)
+        raise DataError("too few ranges to calibrate", where=seen.log.name)
     whole, half = found
     estimates, whole, half = cross_check_windows(whole, whole.objective(), half)
     noise, lasts = combine_noise(half, whole)
@@ -177,8 +177,8 @@ def _ranges_alone(seen: SightingLog, effort: CalibrationBudget, seed: int) -> tu
     if ratio.applied:
         size = "large" if ratio.value < 0 else "small"
         text = (
-            "Which of ranges and wheels has the right metre cannot be told from this log: the wheels' is taken. Path "
-            f"and map are {abs(ratio.value):.1%} too {size} if the ranges' is right, and no covariance knows of it."
+            f"scale: ranges and wheels differ by {abs(ratio.value):.1%} — the scale of the wheels is used. If the "
+            f"ranges are right, path and map are that much too {size}; the covariances do not include this."
         )
         notes.append(Finding("look", "metre", text))
     if lasts or alike > ALIKE:
@@ -377,20 +377,20 @@ def _count(seen: SightingLog, seconds: float, effort: CalibrationBudget) -> int 
 def _enough(s: Smoothing, seen: SightingLog) -> None:
     n = sum(len(w.rows) for w in s.windows)
     if n < 50:
-        raise DataError("too few sightings of landmarks that are seen twice", where=seen.log.name, got=n, wanted=50)
+        raise DataError(
+            "too few observations of landmarks that are observed twice", where=seen.log.name, got=n, wanted=50
+        )
 
 
 def _data(s: Smoothing) -> str:
     n = sum(len(w.rows) for w in s.windows)
-    return f"{len(s.windows)} windows with {n} sightings"
+    return f"{len(s.windows)} windows with {n} observations"
 
 
 def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
     r = [s.sigmas["range"] for s in (short, long)]
-    text = f"Range errors last (sigma {r[0]:.3g} m in short windows, {r[1]:.3g} m in long ones; residuals of one "
-    text += (
-        f"landmark are alike by {alike:.2f}): what is seen from one side again and again is less sure than it looks."
-    )
+    text = f"range errors: σ {r[0]:.3g} m in short windows, {r[1]:.3g} m in long ones, autocorrelation per landmark "
+    text += f"{alike:.2f} — time-correlated. Treat landmarks seen from one side only as less certain than reported."
     return Finding("look", "errors-last", text)
 
 

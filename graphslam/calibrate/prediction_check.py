@@ -83,7 +83,7 @@ def predict_withheld_sightings(
     gains = {"all": before - every}
     if c.without_constants() != c:
         gains["noise"] = before - score(c.without_constants())[0]
-    return Prediction(what="sightings that were withheld", count=n, gains=gains)
+    return Prediction(what="withheld observations", count=n, gains=gains)
 
 
 LEAST = 20

@@ -238,20 +238,18 @@ def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
     scale, moved = _distance(p)
     estimates.append(scale)
     noise |= moved
-    data = f"{len(p)} matches of scans"
+    data = f"{len(p)} scan matches"
     kind = "scans" if steps.dim == 2 else "clouds"
     if steps.dim == 3:
-        text = (
-            f"Scan matching cannot measure odometry better than this; it is an upper limit: {noise['along_metre']:.3g}"
-        )
-        text += f" m/√m and {math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m."
+        text = f"odometry noise: upper limit {noise['along_metre']:.3g} m/√m and "
+        text += f"{math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m — limited by scan matching."
         notes.append(Finding("", "calibrated", text))
     found = calibration_of(kind, estimates, noise, notes, data)
     return found if found.contradictions() else found.judged(cross_validate(p, found, widen=kind == "scans"))
 
 
 def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Prediction:
-    """Matches of one half of the log held against what the other half tells of the constants and the noise.
+    """Two-fold cross-validation: matches of one half of the log under the estimate of the other half.
 
     Blocks of the log take turns: each is predicted from those of the other kind.
 
@@ -286,7 +284,7 @@ def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Predicti
                 v = g[test] @ r.sigmas[1:] ** 2
                 v = r.sigmas[0] ** 2 + (np.maximum(v, stated[test]) if widen else v)
                 gains[name] += before - student_likelihood(e[test] - columns[test] @ r.value, v)
-    return Prediction(what="matches, each half of the log foretold from the other,", count=len(p), gains=gains)
+    return Prediction(what="scan matches", count=len(p), gains=gains)
 
 
 def student_likelihood(e: Array, variances: Array) -> float:
@@ -328,8 +326,11 @@ def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, flo
             names = rest[int(tried[1].score < tried[0].score)]
             full = regress_errors(p.heading, np.column_stack([columns[n] for n in names]), grows)
             kept = next(n for n in pair if n in names)
-            text = f"{NAMES[pair[0]].capitalize()} and {NAMES[pair[1]]} cannot be told apart in this log (correlation "
-            text += f"{rho:.2f}): what they do together is taken for an error of {NAMES[kept]}."
+            text = (
+                f"errors of {NAMES[pair[0]]} and {NAMES[pair[1]]}: correlation {rho:.2f} in this log — only an error "
+                "of "
+            )
+            text += f"{NAMES[kept]} is estimated."
             notes.append(Finding("", "calibrated", text))
     out = []
     groups = [p.apart == a for a in np.unique(p.apart)]

@@ -71,39 +71,39 @@ KINDS = {
         "ranges look {} too short",
         "m",
         0.2,
-        "state the offset of the ranges as frontend.noise.range_offset",
+        "set the range offset frontend.noise.range_offset",
     ),
     "bearing-offset": BiasKind(
-        "bearings look {} too large, as from a sensor that is turned to the right",
-        "bearings look {} too small, as from a sensor that is turned to the left",
+        "bearings look {} too large (sensor rotated to the right)",
+        "bearings look {} too small (sensor rotated to the left)",
         "°",
         float(np.deg2rad(2.0)),
         "correct the angle of T_base_sensor",
     ),
     "mount-x": BiasKind(
-        "the sensor seems to stand {} ahead of its stated place",
-        "the sensor seems to stand {} behind its stated place",
+        "the sensor seems to be {} ahead of its configured position",
+        "the sensor seems to be {} behind its configured position",
         "m",
         0.2,
         "correct x of T_base_sensor",
     ),
     "mount-y": BiasKind(
-        "the sensor seems to stand {} to the left of its stated place",
-        "the sensor seems to stand {} to the right of its stated place",
+        "the sensor seems to be {} to the left of its configured position",
+        "the sensor seems to be {} to the right of its configured position",
         "m",
         0.2,
         "correct y of T_base_sensor",
     ),
     "distance-scale": BiasKind(
-        "distances of the wheels look {} too long",
-        "distances of the wheels look {} too short",
+        "wheel distances look {} too long",
+        "wheel distances look {} too short",
         "%",
         0.05,
         "check the unit, the sign and the scale of the speeds",
     ),
     "turn-scale": BiasKind(
-        "turns of the wheels look {} too large",
-        "turns of the wheels look {} too small",
+        "wheel turns look {} too large",
+        "wheel turns look {} too small",
         "%",
         0.05,
         "check the unit and the sign of steering or yaw rate, and those of the bearings",
@@ -222,25 +222,25 @@ def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
         level: Level = "bad" if found.ratio > UNDERSTATED else "look"
         left = (found.chi2 - found.taken[best]) / found.dof if certain.any() else found.ratio
         text = (
-            f"Wheels and sightings do not fit one map: χ²/dof is {found.ratio:.3g} over {found.windows} short windows, "
-            f"and an honest run exceeds {found.bound:.3g} less than once in a thousand runs. "
+            f"χ²/dof of odometry and observations: {found.ratio:.3g} over {found.windows} short windows "
+            f"[≤ {found.bound:.3g} in 999 of 1000 consistent runs] — they do not fit one map. "
         )
         if left > found.bound:
             text += (
-                "No small error of calibration explains it: units, signs, identities and constant values of the "
-                "sightings and the wheels are to be looked at, or they state too little noise."
+                "No small calibration error explains it. Check units, signs, ids and constant values of the "
+                "observations and the odometry, or increase their noise."
             )
         else:
-            text += "The error of calibration below explains it."
+            text += "The calibration error below explains it."
         out.append(Finding(level, "residuals", text))
     excess = found.chi2 - found.dof
     if certain.any() and (not misfit or found.taken[best] > HALF * excess):
         others = [k for k in np.argsort(-found.taken) if k != best and found.taken[k] > AS_MUCH * found.taken[best]]
         said = [_said(names[k], found.error[k], found.sigma[k]) for k in (best, *others)]
         large = abs(found.error[best]) > KINDS[names[best]].careful
-        text = f"The residuals are systematic: {said[0]}"
+        text = f"systematic residuals: {said[0]}"
         if len(said) > 1:
-            text += "; or, which this run can tell apart badly or not at all, " + "; or ".join(said[1:])
+            text += "; or, hardly distinguishable in this run, " + "; or ".join(said[1:])
         mends = dict.fromkeys(KINDS[names[k]].mend for k in (best, *others))
         text += f". To do: {'; or '.join(mends)}."
         out.append(Finding("bad" if large else "look", "calibration", text))
@@ -251,6 +251,6 @@ def _said(name: str, error: float, sigma: float) -> str:
     k = KINDS[name]
     if k.unit == "%" and error < -1.0:  # a factor below zero
         what = k.less.partition(" look ")[0]
-        return f"{what} look turned round, {1.0 + error:.2f} ± {sigma:.2g} times what they should be"
+        return f"{what} look reversed, {1.0 + error:.2f} ± {sigma:.2g} times the expected value"
     to = _TO_UNIT[k.unit]
     return (k.more if error > 0 else k.less).format(f"{to * abs(error):.3g} ± {to * sigma:.2g} {k.unit}")

@@ -96,13 +96,12 @@ def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
     """What the short windows of landmark front ends say: of the size of all noise, of lasting errors and of drifts."""
     if found is None:
         return []
-    out = chi2_ratio_test("χ² of motion and sightings in short windows", "map", found.ratio, found.dof)
+    out = chi2_ratio_test("χ² of odometry and observations in short windows", "map", found.ratio, found.dof)
     p = len(found.taken)
-    out.append(
-        largest_score_test("constant errors of calibration", "map", float(np.sqrt(found.taken.max())), tests=2 * p)
-    )
+    out.append(largest_score_test("calibration errors", "map", float(np.sqrt(found.taken.max())), tests=2 * p))
     drifts = [
-        chi2_ratio_test("errors that last for a window", "map", v, d) for v, d in zip(found.drift, found.drift_dof)
+        chi2_ratio_test("time-correlated errors within windows", "map", v, d)
+        for v, d in zip(found.drift, found.drift_dof)
     ]
     worst = min((e[0] for e in drifts if e), key=lambda e: e.too_large, default=None)
     if worst is not None:
@@ -151,7 +150,7 @@ def assess_covariances(
     large = sorted((r for r in rows if m * r.too_large < LEVEL), key=lambda r: r.too_large)
     if large:
         return CovarianceAssessment("over-confident", tuple(large), min(1.0, m * large[0].too_large))
-    wanted: dict[Of, str] = {"map": "motion and sightings"}
+    wanted: dict[Of, str] = {"map": "odometry and observations"}
     if fixes:
         wanted["fixes"] = "fixes"
     covers = {

@@ -41,22 +41,20 @@ def sighting_findings(
     lost = {k.partition(": ")[2]: n for k, n in dropped.items() if name is not None and k.startswith(f"{name}: ")}
     reasons = [f"{n} {k}" for k, n in lost.items()]
     if seen - used - trimmed > 0:
-        reasons.append(f"{seen - used - trimmed} that no landmark explains, or a single one")
+        reasons.append(f"{seen - used - trimmed} without a landmark, or the only one of it")
     if after := sum(int(r.get("after_gap", 0)) for r in reports):
         reasons.append(f"{after} right after a gap without wheels and scans")
     if trimmed:
         reasons.append(f"{trimmed} trimmed as outliers")
     why = ", ".join(reasons)
-    out = [
-        Finding("", "sightings", f"Sightings used of those offered: {used} of {offered}{': ' + why if why else ''}.")
-    ]
+    out = [Finding("", "sightings", f"observations used: {used} of {offered}{' — ' + why if why else ''}.")]
     if offered == 0 or used == 0:
-        text = f"No sighting was used ({offered} offered{': ' + why if why else ''}): the path is that of the wheels."
+        text = f"observations used: 0 of {offered}{', ' + why if why else ''} — the path is that of the odometry."
         out.append(Finding("bad", "sightings-not-used", text))
     elif used < HALF * offered:
         text = (
-            f"Only {used} of {offered} sightings were used ({why}): wheels and sightings hardly agree on where "
-            "landmarks are seen again. Check units, signs and identities of the sightings, and the speeds."
+            f"observations used: {used} of {offered} ({why}) — odometry and observations disagree on where landmarks "
+            "are. Check units, signs and ids of the observations, and the speeds."
         )
         out.append(Finding("bad", "sightings-not-used", text))
     return out + _particles(reports) + _gaps(reports)
@@ -66,8 +64,8 @@ def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """One particle, or covariances made of particles that have few independent ones left."""
     if any(r.get("particles") == 1 and r.get("association") != "known" for r in reports):
         text = (
-            "A single particle decided which sighting is of which landmark, and no other could contradict it. Set "
-            "frontend.particles to 20 or more."
+            "particles: 1 — its data association cannot be compared with another one. Set frontend.particles to 20 or "
+            "more."
         )
         return [Finding("look", "particles", text)]
     made = [r for r in reports if "ancestors" in r and r.get("handover", "moments") == "moments"]
@@ -76,9 +74,8 @@ def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
         return []
     least = min(int(r["ancestors"]) for r in few)
     text = (
-        f"In {len(few)} of {len(made)} maps made of particles fewer than {LEAST_ANCESTORS} of the first particles have "
-        f"descendants (least: {least}): the covariances are the scatter of next to nothing, and too small. Use more "
-        "particles, shorter submaps, or rbpf-ekf, which smooths its submaps."
+        f"particle ancestors: fewer than {LEAST_ANCESTORS} in {len(few)} of {len(made)} submaps (least: {least}) — the "
+        "particles are depleted and the covariances too small. Use more particles, shorter submaps, or rbpf-ekf."
     )
     return [Finding("bad", "particles", text)]
 
@@ -89,21 +86,19 @@ def _gaps(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
     for r in reports:
         for g in r.get("gaps", ()):
             text = (
-                f"No motion was recorded from {g['begin']:.1f} to {g['end']:.1f} s ({g['end'] - g['begin']:.1f} s). It "
-                f"was bridged by {g['speed']:.2f} ± {g['speed_sigma']:.2g} m/s and {np.rad2deg(g['yaw_rate']):.1f} ± "
-                f"{np.rad2deg(g['yaw_rate_sigma']):.2g} °/s, which is how the robot drives elsewhere in the log; "
+                f"gap in the odometry: {g['begin']:.1f} to {g['end']:.1f} s ({g['end'] - g['begin']:.1f} s) — bridged "
+                f"with the mean motion of the log, {g['speed']:.2f} ± {g['speed_sigma']:.2g} m/s and "
+                f"{np.rad2deg(g['yaw_rate']):.1f} ± {np.rad2deg(g['yaw_rate_sigma']):.2g} °/s; "
             )
             if not g["unseen"]:
-                out.append(Finding("look", "motion-gap", text + "the sightings went on, and decide."))
+                out.append(Finding("look", "motion-gap", text + "landmark observations continue there."))
             elif r["scans"] == 1:
-                text += (
-                    "no sighting came either, so the map is split there. Look whether the place is right afterwards."
-                )
+                text += "no observations either, so the map is split there. Check the pose after the gap."
                 out.append(Finding("look", "motion-gap", text))
             else:
                 text += (
-                    "no sighting came either, and a single map over the whole log cannot hold so large an uncertainty. "
-                    "Use rbpf-ekf or ekf, which split their maps there."
+                    "no observations either, which is too uncertain for a single map. Use rbpf-ekf or ekf, which split "
+                    "the map there."
                 )
                 out.append(Finding("bad", "motion-gap", text))
     return out

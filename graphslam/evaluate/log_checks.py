@@ -73,9 +73,8 @@ def check_log(log: SensorLog) -> list[StreamFinding]:
 
 
 _UNPLACED = (
-    "Where the sensor of {0} sits on the robot is not known: the log has no transform to its frame, and it is taken as "
-    "at the base, looking ahead. Give it with --reader-option mount=[x, y, z, roll, pitch, yaw] (metres, radians), or "
-    "record tf_static."
+    "mounting of {0}: unknown, the log has no transform to its frame — the base pose is assumed. Set it with "
+    "--reader-option mount=[x, y, z, roll, pitch, yaw] (metres, radians), or record tf_static."
 )
 
 
@@ -94,8 +93,8 @@ def _gyro(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
     fastest = float(np.percentile(np.abs(imu.angular_rate), 99.9))
     if fastest > GYRO:
         text = (
-            f"The gyro of {name} reaches {fastest:.3g} rad/s, and no IMU of a robot measures more than {GYRO:g}: its "
-            "rates seem to be in degrees per second."
+            f"gyro of {name}: up to {fastest:.3g} rad/s [≤ {GYRO:g}] — probably in degrees per second. Convert it to "
+            "rad/s."
         )
         return [Finding("bad", "gyro-unit", text)]
     if any(isinstance(s, VelocityControls) for s in log.streams.values()):
@@ -124,11 +123,11 @@ def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding
     stuck = log.meta.get("point_times") == "constant"
     if not stuck and not moved > BENT:
         return []
-    said = "have a field of times, and it is the same for all points of a scan" if stuck else "have no times"
-    bent = f"; at the usual speed a scan is bent by {moved:.2f} m" if np.isfinite(moved) else ""
+    said = "the same for all points of a scan" if stuck else "none"
+    bent = f", which distorts a scan by {moved:.2f} m at the usual speed" if np.isfinite(moved) else ""
     text = (
-        f"Points of {name} {said}{bent}, if nobody straightened it. Switch times of points on in the driver of the "
-        "lidar, or straighten the scans before."
+        f"point times of {name}: {said}{bent} — scans cannot be deskewed. Switch on point times in the lidar driver, "
+        "or deskew the scans before."
     )
     return [Finding("bad" if stuck and not moved <= BENT else "look", "points-without-times", text)]
 
@@ -159,5 +158,5 @@ def _scans_and_motion(log: SensorLog) -> list[StreamFinding]:
         steps = make_steps(part, config)
         return [StreamFinding(scanner, f) for f in motion_findings(check_motion(steps))]
     except GraphSlamError as error:
-        text = f"{scanner} and {', '.join(motion)} cannot be put together: {error}"
+        text = f"{scanner} and {', '.join(motion)}: cannot be combined — {error}"
         return [StreamFinding(scanner, Finding("bad", "scans-and-motion", text))]

@@ -364,7 +364,8 @@ def _contradiction(graph: PoseGraph) -> None:
     if ways.ratio > high:
         graph.log_event("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
         logger.warning(
-            "submaps and IMU contradict each other (χ²/dof %.1f, at most %.1f): one of them states too little noise",
+            "submaps and IMU contradict each other: χ²/dof %.1f [≤ %.1f]; the assumed noise of one of them is too "
+            "small",
             ways.ratio,
             high,
         )

@@ -38,9 +38,7 @@ def check_speeds(wheels: VelocityControls, name: str) -> list[Finding]:
     """Wheels that never turn: a robot that is to map something moves."""
     if len(wheels.times) < 2 or wheels.speed.any():
         return []
-    text = (
-        f"{name} says that the robot never moved: the speed is 0 in all {len(wheels.times)} records. Is it connected?"
-    )
+    text = f"speed of {name}: 0 in all {len(wheels.times)} records — the robot never moves. Check that it is connected."
     return [Finding("bad", "wheels-still", text)]
 
 

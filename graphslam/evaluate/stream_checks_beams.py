@@ -41,7 +41,7 @@ def check_beams(stream: Scanner, name: str) -> list[Finding]:
         For the sentences.
     """
     if len(stream.times) == 0:
-        return [Finding("bad", "scans-missing", f"{name} holds no scan at all.")]
+        return [Finding("bad", "scans-missing", f"{name}: no scans.")]
     if isinstance(stream, PointClouds):
         every = -(-len(stream) // MOST_CLOUDS)
         same = repeated_clouds(stream.cloud(k) for k in range(min(len(stream), MOST_CLOUDS)))
@@ -87,8 +87,8 @@ def _silent(stream: Scanner, name: str, count: npt.NDArray[np.int64]) -> list[Fi
     share = float(none.mean())
     if share < 0.5 and lengths[worst] < SILENT:
         return []
-    said = f"{int(none.sum())} of {len(t)} scans of {name} hold no return"
-    where = f"the longest stretch is {lengths[worst]:.1f} s from {t[runs[worst][0]]:.2f} s"
+    said = f"scans of {name} without a return: {int(none.sum())} of {len(t)}"
+    where = f"longest stretch {lengths[worst]:.1f} s from {t[runs[worst][0]]:.2f} s"
     if isinstance(stream, PointClouds):
         cause = "the clouds are empty"
     else:
@@ -98,7 +98,7 @@ def _silent(stream: Scanner, name: str, count: npt.NDArray[np.int64]) -> list[Fi
         cause = f"most beams there are {most}"
         if most == "at or beyond max_range":
             cause += f", {stream.max_range:g} m (are the ranges in millimetres?)"
-    text = f"{said}; {where}; {cause}. The map knows nothing of it, and the path there is that of the odometry."
+    text = f"{said}; {where}; {cause} — the path there is that of the odometry."
     return [Finding("bad" if share > 0.5 else "look", "scans-silent", text)]
 
 
@@ -107,8 +107,8 @@ def _constant(name: str, low: Array, high: Array, count: npt.NDArray[np.int64]) 
     if flat.mean() <= SOME:
         return []
     text = (
-        f"{int(flat.sum())} of {len(flat)} scans of {name} have the same range in all beams "
-        f"({np.median(low[flat]):.3g} m): the sensor or its driver is stuck. Leave the stream out, or mend it."
+        f"scans of {name} with one range in all beams: {int(flat.sum())} of {len(flat)} "
+        f"({np.median(low[flat]):.3g} m) — the sensor or its driver is stuck. Leave the stream out, or repair it."
     )
     return [Finding("bad", "scans-constant", text)]
 
@@ -118,8 +118,8 @@ def _repeated(name: str, same: Mask) -> list[Finding]:
     if share <= SOME:
         return []
     text = (
-        f"{int(same.sum())} of {len(same)} scans of {name} are the one before, number for number: the driver sends "
-        "scans twice, or the sensor is stuck. Front ends on grids leave them out."
+        f"scans of {name} equal to the one before: {int(same.sum())} of {len(same)} — the driver sends scans twice, or "
+        "the sensor is stuck. Front ends on grids ignore them."
     )
     return [Finding("bad" if share > 0.5 else "look", "scans-repeated", text)]
 
@@ -131,5 +131,5 @@ def _unit(name: str, middle: Array) -> list[Finding]:
     if NEAREST <= usual <= FARTHEST:
         return []
     unit = "kilometres" if usual < NEAREST else "millimetres"
-    text = f"Half of the returns of {name} are {'nearer' if usual < NEAREST else 'farther'} than {usual:.3g} m: "
+    text = f"median range of {name}: {usual:.3g} m [{NEAREST:g}, {FARTHEST:g}] — "
     return [Finding("bad", "scans-unit", text + f"the ranges seem to be in {unit}, wanted metres.")]

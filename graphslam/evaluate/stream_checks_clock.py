@@ -43,7 +43,7 @@ def _unit(name: str, t: np.ndarray) -> list[Finding]:
     seems = "milliseconds" if usual < 3e4 else "microseconds" if usual < 3e7 else "nanoseconds"
     if usual < FASTEST:
         seems = "a unit much longer than a second"
-    text = f"Records of {name} are {usual:.3g} s apart: the stamps seem to be in {seems}, wanted seconds."
+    text = f"stamp interval of {name}: {usual:.3g} s — the stamps seem to be in {seems}, wanted seconds."
     return [Finding("bad", "stamps-unit", text)]
 
 
@@ -55,8 +55,8 @@ def _jumps(name: str, t: np.ndarray) -> list[Finding]:
     worst = int(k[np.argmax(dt[k])])
     more = f", and {len(k) - 1} more jumps of {JUMP:g} s or more" if len(k) > 1 else ""
     text = (
-        f"The stamps of {name} jump by {dt[worst]:.1f} s after record {worst} (at {t[worst]:.3f} s){more}: a clock was "
-        "set meanwhile, or the recording stopped. Cut the log there, or subtract the jump from what comes after."
+        f"stamps of {name}: jump of {dt[worst]:.1f} s after record {worst} (at {t[worst]:.3f} s){more} — a clock was "
+        "set, or the recording paused. Cut the log there, or subtract the jump from the later stamps."
     )
     return [Finding("bad", "clock-jump", text)]
 
@@ -73,10 +73,10 @@ def _overlap(log: SensorLog) -> list[tuple[str, Finding]]:
         if common >= TOGETHER * shorter:
             continue
         spans = [f"{n} from {s.times[0]:.3f} to {s.times[-1]:.3f} s" for n, s in ((a, x), (b, y))]
-        said = "have no time in common" if common <= 0 else f"share only {common:.1f} s"
+        said = "no time in common" if common <= 0 else f"only {common:.1f} s in common"
         text = (
-            f"{a} and {b} {said}: {spans[0]}, {spans[1]}. Their clocks have different zeros or units, or they are of "
-            "two drives; bring them onto one clock."
+            f"{a} and {b}: {said} ({spans[0]}, {spans[1]}) — their clocks have different zeros or units, or they are "
+            "of two drives. Convert them to one clock."
         )
         out.append((b, Finding("bad", "no-common-time", text)))
     return out
@@ -92,8 +92,8 @@ def _order(read: Mapping[str, int], dropped: Mapping[str, int]) -> list[tuple[st
         if share <= REORDERED:
             continue
         text = (
-            f"{n} records of {name} ({100 * share:.1f} %) were left out: {reason}. Look whether two drivers write into "
-            "one stream, or whether the stamps are those of arrival; stamps of the measurement rise."
+            f"records of {name} left out: {n} ({100 * share:.1f} %), {reason} — two drivers write into one stream, or "
+            "the stamps are arrival times. Use the stamps of the measurements."
         )
         out.append((name, Finding("bad" if share > 0.01 else "look", "stamps-order", text)))
     return out

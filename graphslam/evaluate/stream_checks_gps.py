@@ -41,7 +41,7 @@ def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
         Its motion stream, if it has a planar one, is what the fixes are compared with.
     """
     if len(gps.times) == 0:
-        return [Finding("look", "gps-empty", f"{name} holds no fix.")]
+        return [Finding("look", "gps-empty", f"{name}: no fixes.")]
     try:
         stream, motion = motion_stream(log)
     except MissingDataError:
@@ -51,9 +51,9 @@ def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
     inside = (gps.times >= motion.times[0]) & (gps.times <= motion.times[-1])
     if not inside.any():
         text = (
-            f"{name} and {stream} have no time in common: fixes from {gps.times[0]:.1f} to {gps.times[-1]:.1f} s, "
-            f"motion from {motion.times[0]:.1f} to {motion.times[-1]:.1f} s. Their clocks "
-            "have different zeros; bring them onto one clock."
+            f"{name} and {stream}: no time in common (fixes from {gps.times[0]:.1f} to {gps.times[-1]:.1f} s, motion "
+            f"from {motion.times[0]:.1f} to {motion.times[-1]:.1f} s) — their clocks have different zeros. Convert "
+            "them to one clock."
         )
         return [Finding("bad", "gps-clock", text)]
     fixes, t = gps.positions[inside, :2], gps.times[inside]
@@ -62,7 +62,7 @@ def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
         return []
     way = float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
     if way > MOVED and len(fixes) > 2 and bool(np.all(fixes == fixes[0])):
-        text = f"{name} is stuck: all {len(fixes)} fixes are the same while the wheels drive {way:.0f} m."
+        text = f"{name}: all {len(fixes)} fixes equal while the wheels drive {way:.0f} m — the receiver is stuck."
         return [Finding("bad", "gps-stuck", text)]
     return _chords(fixes, path, float(np.median(gps.sigma)), name, stream)
 
@@ -94,8 +94,8 @@ def _chords(fixes: Array, path: Array, sigma: float, name: str, stream: str) -> 
             "they are probably degrees of longitude and latitude" if degrees and ratio < 0.01 else "check the unit"
         )
         text = (
-            f"{name} moves {ratio:.3g} times as far as {stream} says (median of {len(a)} stretches): {probably}. "
-            "Positions are metres in a local frame, x east and y north."
+            f"distances of {name}: {ratio:.3g} times those of {stream} (median of {len(a)} stretches) — {probably}. "
+            "Give positions in metres in a local frame, x east and y north."
         )
         return [Finding("bad", "gps-scale", text)]
     turn = [np.unwrap(np.arctan2(d[:, 1], d[:, 0])) for d in (a, b)]
@@ -104,9 +104,8 @@ def _chords(fixes: Array, path: Array, sigma: float, name: str, stream: str) -> 
         slope = float(np.sum(ta * tb) / np.sum(tb**2))
         if slope < 0.0:
             text = (
-                f"{name} turns the other way round than {stream} (turns are {slope:.2f} times those of the wheels): "
-                "its axes are probably swapped or one is reversed. Wanted x east, y north; or the steering has the "
-                "wrong sign."
+                f"turns of {name}: {slope:.2f} times those of {stream} — its axes are probably swapped or one is "
+                "reversed, or the steering has the wrong sign. Give x east, y north."
             )
             return [Finding("bad", "gps-mirrored", text)]
     return []

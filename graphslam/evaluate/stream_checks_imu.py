@@ -42,7 +42,7 @@ def check_imu(imu: Imu, name: str) -> list[Finding]:
         For the sentences.
     """
     if len(imu.times) == 0:
-        return [Finding("bad", "imu-missing", f"{name} holds no record at all.")]
+        return [Finding("bad", "imu-missing", f"{name}: no records.")]
     return [*_gravity(imu, name), *_limits(imu, name), *_stuck(imu, name)]
 
 
@@ -53,10 +53,10 @@ def _gravity(imu: Imu, name: str) -> list[Finding]:
     if abs(usual - 1.0) <= GRAVITY_OFF:
         cause = "the accelerometer seems to be in g"
     elif usual < GRAVITY_OFF * GRAVITY:
-        cause = "gravity seems to be taken off already, or the accelerometer gives nothing"
+        cause = "gravity seems to be removed already, or the accelerometer gives no data"
     else:
         cause = "unit or scale of the accelerometer is wrong"
-    text = f"The specific force of {name} is {usual:.3g} m/s² in the median, and gravity is {GRAVITY:.2f}: {cause}."
+    text = f"specific force of {name}: median {usual:.3g} m/s² [gravity: {GRAVITY:.2f}] — {cause}."
     return [Finding("bad", "imu-gravity", text)]
 
 
@@ -85,9 +85,8 @@ def _limits(imu: Imu, name: str) -> list[Finding]:
             count, runs = _longest_runs(v)
             if count:
                 text = (
-                    f"The {what} of {name} stands at its greatest value ({np.abs(v).max():.3g} {unit} on "
-                    f"{'xyz'[axis]}) for {count} records in {runs} stretches: it is saturated there, and the true "
-                    "value is larger. Headings after such a turn are wrong by what is missing."
+                    f"{what} of {name}: {count} records at the limit ({np.abs(v).max():.3g} {unit} on {'xyz'[axis]}) "
+                    f"in {runs} stretches — saturated; headings after these turns are wrong."
                 )
                 out.append(Finding("bad", "imu-saturated", text))
     return out
@@ -102,7 +101,8 @@ def _stuck(imu: Imu, name: str) -> list[Finding]:
     if not len(long):
         return []
     text = (
-        f"{int(long.sum())} records of {name} in {len(long)} stretches repeat the one before: the unit is stuck there."
+        f"records of {name} equal to the one before: {int(long.sum())} in {len(long)} stretches — the IMU is stuck "
+        "there."
     )
     return [Finding("bad", "imu-stuck", text)]
 
@@ -189,12 +189,12 @@ def check_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding]:
         return []
     if found.correlation < LEAST_ALIKE:
         text = (
-            f"Turns by {name} about the base's z axis have little to do with those of the wheels (correlation "
-            f"{found.correlation:.2f}): the axes of the unit or its mounting (T_base_imu) may be wrong."
+            f"yaw rates of {name} and of the wheels: correlation {found.correlation:.2f} [≥ {LEAST_ALIKE:g}] — the IMU "
+            "axes or the mounting (T_base_imu) may be wrong."
         )
         return [Finding("look", "turns-disagree", text)]
     out = []
-    said = f"Turns by {name} are {found.slope:.3g} ± {found.sigma:.2g} times those of the wheels"
+    said = f"turns of {name}: {found.slope:.3g} ± {found.sigma:.2g} times those of the wheels"
     size = abs(found.slope)
     if not 1.0 / SLIP <= size <= SLIP:
         cause = "one of them is in another unit"
@@ -202,13 +202,13 @@ def check_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding]:
             cause = "the gyro seems to be in degrees, wanted rad/s"
         elif abs(np.log(size * 180.0 / np.pi)) < np.log(SLIP):
             cause = "the wheels' yaw rate seems to be in degrees, wanted rad/s"
-        out.append(Finding("bad", "turns-disagree", f"{said}: {cause}."))
+        out.append(Finding("bad", "turns-disagree", f"{said} — {cause}."))
     elif found.slope < 0:
-        cause = "left and right wheel are swapped, or an axis of the gyro is turned round"
-        out.append(Finding("look", "turns-disagree", f"{said}: {cause}."))
+        cause = "left and right wheel are swapped, or a gyro axis is reversed"
+        out.append(Finding("look", "turns-disagree", f"{said} — {cause}."))
     if abs(found.lag) > LATE:
         order = "after" if found.lag > 0 else "before"
-        said = f"Turns of {name} come {abs(found.lag):.2f} s {order} those of the wheels"
-        text = f"{said}: their clocks are not the same."
+        said = f"turns of {name}: {abs(found.lag):.2f} s {order} those of the wheels"
+        text = f"{said} — their clocks differ."
         out.append(Finding("bad", "clocks-disagree", text))
     return out

@@ -50,18 +50,17 @@ def check_odometry(motion: Odometry | VelocityControls, name: str) -> list[Findi
     k = np.flatnonzero((way > LEAP) & (speed > LEAP_TIMES * max(usual, 0.05)))
     if len(k):
         text = (
-            f"The pose of {name} leaps by {way[k[0]]:.1f} m in {dt[k[0]]:.2f} s at {motion.times[k[0] + 1]:.3f} s"
-            f" (record {k[0] + 1}; such leaps: {len(k)}), and the robot usually drives up to {usual:.2g} m/s: the "
-            "odometry was set back, or it is a pose corrected by another map. Give the raw odometry, or cut the log."
+            f"jumps of {name}: {len(k)}, first {way[k[0]]:.1f} m in {dt[k[0]]:.2f} s at {motion.times[k[0] + 1]:.3f} s "
+            f"(record {k[0] + 1}; usual speed up to {usual:.2g} m/s) — the odometry was reset, or corrected by another "
+            "map. Give the raw odometry, or cut the log."
         )
         out.append(Finding("bad", "odometry-leaps", text))
     if g.dim == 2 and not out:
         ahead, side = np.abs(xi[:, g.position][:, 0]).sum(), np.abs(xi[:, g.position][:, 1]).sum()
         if ahead + side > 5.0 and side > SIDEWAYS * ahead:
             text = (
-                f"By {name} the robot drives {side:.3g} m sideways and {ahead:.3g} m ahead: its heading is not where "
-                "it drives. Headings in degrees, counted from north or clockwise, swapped axes, or another order of "
-                "the quaternion look like that; wanted radians, to the left, zero along x."
+                f"motion of {name}: {side:.3g} m sideways and {ahead:.3g} m ahead — the heading does not follow the "
+                "motion. Give headings in radians, counted from x to the left; check axes and quaternion order."
             )
             out.append(Finding("look", "heading-not-ahead", text))
     return out
@@ -70,17 +69,19 @@ def check_odometry(motion: Odometry | VelocityControls, name: str) -> list[Findi
 def _too_fast(speed: Array, rate: Array, name: str) -> list[Finding]:
     out = []
     for values, limit, share, unit, code, why in (
-        (speed, FASTEST, 25, "m/s", "speed-unit", "in millimetres or centimetres"),
-        (rate, FASTEST_TURN, 1, "rad/s", "turn-unit", "in degrees, wanted radians"),
+        (speed, FASTEST, 25, "m/s", "speed-unit", "millimetres or centimetres"),
+        (rate, FASTEST_TURN, 1, "rad/s", "turn-unit", "degrees instead of radians"),
     ):
         usual = float(np.percentile(values, 100 - share)) if len(values) else 0.0
         if usual > limit:
-            text = f"By {name} the robot moves at {usual:.3g} {unit} or more for {share} % of the time: is it {why}?"
+            what = "speed" if unit == "m/s" else "yaw rate"
+            text = (
+                f"{what} of {name}: above {usual:.3g} {unit} in {share} % of the records [≤ {limit:g}] — {why}, or "
+                "wrong stamps. Check unit and stamps."
+            )
             out.append(Finding("bad", code, text))
     if len(out) == 2:
-        text = (
-            f"{out[0].text.partition(':')[0]}, and turns as fast: its stamps are too dense, or not those of the drive."
-        )
+        text = f"{out[0].text.partition(' — ')[0]} — yaw rates are as high: the stamps are too dense or wrong."
         return [Finding("bad", "stamps-unit", text)]
     return out
 
@@ -106,10 +107,10 @@ class MotionFault:
 _DEG = float(np.pi / 180.0)
 HYPOTHESES = (
     MotionFault("speeds seem to be in km/h, wanted m/s: divide them by 3.6", speed=1 / 3.6),
-    MotionFault("speeds seem to be 3.6 times too small (m/s taken for km/h)", speed=3.6),
+    MotionFault("speeds seem to be 3.6 times too small (m/s read as km/h)", speed=3.6),
     MotionFault("speeds or distances of the motion seem to be in millimetres, wanted metres", speed=1e-3),
     MotionFault("speeds or distances of the motion seem to be in centimetres, wanted metres", speed=1e-2),
-    MotionFault("the speed has the wrong sign: the robot drives ahead where the log says back", speed=-1.0),
+    MotionFault("the speed has the wrong sign: the robot drives forward where the log has backward", speed=-1.0),
     MotionFault("yaw rates or headings seem to be in degrees, wanted radians", turn=_DEG),
     MotionFault("yaw rates or headings seem to be divided by 57.3 once too often", turn=1 / _DEG),
     MotionFault("turns and bearings have opposite signs: both count to the left, seen from above", turn=-1.0),
@@ -154,9 +155,8 @@ def check_sighted_motion(z: LandmarkObservations, name: str, log: SensorLog) -> 
     if least > BETTER * as_is:
         return []
     text = (
-        f"Landmarks of {name} do not stay in place while the robot moves: from one sighting to the next they shift by "
-        f"{100 * as_is:.0f} % of their range (median of {len(first)} pairs), and by {100 * least:.0f} % if one thing "
-        f"is changed: {HYPOTHESES[k].text}."
+        f"shift of landmarks of {name} between observations: {100 * as_is:.0f} % of their range (median of "
+        f"{len(first)} pairs), only {100 * least:.0f} % after one change — {HYPOTHESES[k].text}."
     )
     return [Finding("bad", "sightings-and-motion", text)]
 

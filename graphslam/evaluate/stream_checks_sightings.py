@@ -44,18 +44,19 @@ def check_sightings(z: LandmarkObservations, name: str, log: SensorLog) -> list[
     out = []
     if len(z.ranges) >= LEAST_PAIRS and np.ptp(z.ranges) == 0.0:
         text = (
-            f"All {len(z.ranges)} ranges of {name} are {z.ranges[0]:g} m: the sensor is stuck, or ranges were not read."
+            f"ranges of {name}: all {len(z.ranges)} are {z.ranges[0]:g} m — the sensor is stuck, or ranges were not "
+            "read."
         )
         out.append(Finding("bad", "ranges-constant", text))
     beyond = int(np.sum(np.abs(z.bearings) > 2.0 * np.pi))
     if beyond:
-        text = f"{beyond} of {len(z.bearings)} bearings of {name} are beyond a full turn: they are probably in degrees."
+        text = f"bearings of {name}: {beyond} of {len(z.bearings)} beyond a full turn — probably in degrees."
         out.append(Finding("bad", "bearings-degrees", text))
     copies = sum(_same(z, k) for k in range(1, len(z.times)))
     if copies > COPIES * len(z.times):
         text = (
-            f"{copies} of {len(z.times)} scans of {name} are exact copies of the one before: the driver repeats its "
-            "last scan, and every copy counts as new. Keep the first of each."
+            f"scans of {name} equal to the one before: {copies} of {len(z.times)} — the driver repeats its last scan, "
+            "and each copy counts as a measurement. Keep the first of each."
         )
         out.append(Finding("bad", "scans-repeated", text))
     return out + _ranges_and_way(z, name, log)
@@ -66,9 +67,7 @@ def check_steering(controls: SteeringControls, name: str) -> list[Finding]:
     beyond = int(np.sum(np.abs(controls.steering) > 0.5 * np.pi))
     if not beyond:
         return []
-    text = (
-        f"{beyond} of {len(controls.steering)} steering angles of {name} are beyond 90°: they are probably in degrees."
-    )
+    text = f"steering angles of {name}: {beyond} of {len(controls.steering)} beyond 90° — probably in degrees."
     return [Finding("bad", "steering-degrees", text)]
 
 
@@ -97,7 +96,7 @@ def _ranges_and_way(z: LandmarkObservations, name: str, log: SensorLog) -> list[
         raise DataError(
             "ranges hardly change while the robot drives: are they in kilometres?",
             where=f"{log.name}/{name}",
-            got=f"{change.sum():.3g} m in all between sightings of the same landmarks, over {moved.sum():.3g} m of way",
+            got=f"ranges to the same landmarks change by {change.sum():.3g} m over {moved.sum():.3g} m of path",
             wanted="ranges in metres",
         )
     too_much = change > moved + noise
@@ -105,9 +104,9 @@ def _ranges_and_way(z: LandmarkObservations, name: str, log: SensorLog) -> list[
         return []
     times = float(np.median(change[too_much] / np.maximum(moved[too_much], 1e-3)))
     text = (
-        f"In {int(too_much.sum())} of {len(moved)} pairs of sightings the range to the same landmark of {name} changes "
-        f"by more than the robot moves (median {times:.3g} times as much): ranges are too long or in another unit, "
-        "distances of the wheels too short, or identities wrong."
+        f"range changes of {name}: larger than the motion of the robot in {int(too_much.sum())} of {len(moved)} pairs "
+        f"of observations (median factor {times:.3g}) — ranges are too long or in another unit, wheel distances too "
+        "short, or ids wrong."
     )
     return [Finding("bad", "ranges-and-way", text)]
 

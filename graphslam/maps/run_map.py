@@ -200,7 +200,7 @@ def make_run_map(
         raise MissingDataError(
             "submaps have no evidence grids or clouds to make a map of",
             got=f"{len(bare)} of {len(submaps)} without",
-            wanted="a run of a front end with dense maps: segslam, scan-window, kiss-icp, rbpf-grid",
+            wanted="a run of a front end with dense maps: segslam, scan-window, lidar-odometry, rbpf-grid",
         )
     nodes = nodes_by_submap(submaps, m)
     division = DivisionConfig() if reach is None else DivisionConfig(reach=reach + REACH_MARGIN)

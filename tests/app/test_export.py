@@ -121,7 +121,7 @@ def test_without_gps_the_user_says_where_the_first_base_looks(run):
 def test_what_cannot_be_exported_is_refused(run, tmp_path):
     with pytest.raises(UnknownNameError, match="kml"):
         export(run, DATUM, format="kmz")
-    with pytest.raises(ConfigError, match="leave the heading out"):
+    with pytest.raises(ConfigError, match="defines the heading"):
         export(run, DATUM, heading=3.0)
     with pytest.raises(GeometryError, match="latitude"):
         export(run, (95.0, 0.0))

@@ -90,7 +90,11 @@ def test_clouds_and_loops_are_where_the_graph_has_them(tmp_path: Path) -> None:
     seen, file = Seen(), tmp_path / "run.rrd"
     options = {**SPACE, "backend": {"loops": True, "look_every": 2}}
     run = gs.run(
-        clouds(), frontend="kiss-icp", config=options, progress=False, observers=[LiveView("building", file), seen]
+        clouds(),
+        frontend="lidar-odometry",
+        config=options,
+        progress=False,
+        observers=[LiveView("building", file), seen],
     )
     rows = read_back(file)
     for s in run.submaps:

@@ -174,7 +174,7 @@ def runs(draws: int, first: int, seconds: float) -> None:
         log = simulate_lidar(mesh_world(world, seed=seed, **layout), seed, config, most=seconds)
         for what, options in RUNS.items():
             options = {**options, "map": {"fuse": False}}
-            run = gs.run(log, frontend="kiss-icp", config=options, progress=False)
+            run = gs.run(log, frontend="lidar-odometry", config=options, progress=False)
             value = run.metrics.set_index("key")["value"]
             path = run.map.trajectory
             truth = log.truth.trajectory.interpolate(path.times)

@@ -1,6 +1,6 @@
 """Peak memory and CPU seconds of a whole run, stage by stage.
 
-    python -m tests.benchmarks.bench_memory [--quick] [--length 2400] [--source LOG] [--frontend kiss-icp] [--limit 1.5]
+    python -m tests.benchmarks.bench_memory [--quick] [--length 2400] [--source LOG] [--frontend lidar-odometry] [--limit 1.5]
 
 Without a source: a lidar of 16 lines is driven through the streets of a simulated campus at 3 m/s, five scans a second,
 and what a user would have is written to a folder, ``velodyne/*.bin`` and ``times.txt``. This process then runs a front
@@ -115,7 +115,7 @@ def main() -> None:
     p.add_argument("--quick", action="store_true")
     p.add_argument("--length", type=float, default=2400.0)
     p.add_argument("--source")
-    p.add_argument("--frontend", default="kiss-icp")
+    p.add_argument("--frontend", default="lidar-odometry")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--limit", type=float, default=1.5)
     p.add_argument("--no-refine", action="store_true")

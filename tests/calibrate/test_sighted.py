@@ -121,7 +121,7 @@ def test_run_of_an_unknown_log_is_calibrated_and_says_so(log, tmp_path) -> None:
     assert run.metric("nees_aligned_poses_per_dof") < 0.1 * stated.metric("nees_aligned_poses_per_dof")
     assert run.metric("path_rmse_aligned") < stated.metric("path_rmse_aligned")
     said = [f.text for f in run.verdict if f.code == "calibrated"]
-    assert any("stamps of the motion" in s for s in said)
+    assert any("odometry stamps" in s for s in said)
     given = read_toml(tmp_path / "run" / "config.toml")["calibrate"]["given"]
     assert given["clock"] == pytest.approx(ROBOT.clock, abs=0.05)
     before = (tmp_path / "run" / "config.toml").read_bytes()
@@ -158,8 +158,8 @@ def test_impossible_figures_are_refused(name) -> None:
 
 def test_advice_names_the_cause_and_no_scale_on_covariances(log) -> None:
     run = gs.run(log, config={**OPTIONS, "calibrate": {"use": "none"}}, progress=False)
-    causes = [f.text for f in run.verdict if f.code == "calibration" and "A cause of the disagreement" in f.text]
-    assert any("stamps of the motion" in c for c in causes)
+    causes = [f.text for f in run.verdict if f.code == "calibration" and "a cause of the disagreement" in f.text]
+    assert any("odometry stamps" in c for c in causes)
     (note,) = join_note(run)
     assert "calibration" in note
     assert "covariance_scale=" not in note

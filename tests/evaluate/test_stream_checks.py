@@ -47,10 +47,10 @@ def test_sound_streams_are_left_alone(seed: int, robot: SensorLog) -> None:
         (put.ranges(lambda r: 0.001 * r), "scans-unit", "kilometres"),
         (put.every(3.0), "scans-constant", "3 m"),
         (put.twice, "scans-repeated", "100 of 200"),
-        (put.stuck, "scans-repeated", "number for number"),
+        (put.stuck, "scans-repeated", "driver sends scans twice"),
         (put.blind(10.0), "scans-silent", "from 12.20 s"),
-        (put.no_scan, "scans-missing", "no scan"),
-        (put.speed(0.0), "wheels-still", "never moved"),
+        (put.no_scan, "scans-missing", "no scans"),
+        (put.speed(0.0), "wheels-still", "never moves"),
     ],
 )
 def test_scans_and_wheels(inject: put.Inject, code: str, word: str) -> None:

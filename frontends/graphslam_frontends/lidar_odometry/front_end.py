@@ -1,4 +1,4 @@
-"""The front end ``kiss-icp``: LiDAR odometry, cut into short submaps that carry a cloud and an evidence grid."""
+"""The front end ``lidar-odometry``: LiDAR odometry, cut into short submaps that carry a cloud and an evidence grid."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class LidarSubmapConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarFrontEndConfig:
-    """The front end ``kiss-icp``."""
+    """The front end ``lidar-odometry``."""
 
     stream: str | None = None
     """Stream of point clouds; None: the first of the log."""
@@ -147,7 +147,7 @@ class FollowedScan:
 
 @dataclass(frozen=True, slots=True)
 class LidarFrontEnd(FrontEnd):
-    """The front end ``kiss-icp``.
+    """The front end ``lidar-odometry``.
 
     Needs a stream of point clouds, and takes an IMU where there is one. It draws nothing, and says of every scan what
     the scans up to it let it say. A run that is resumed follows the scans again from the start, since window and
@@ -156,7 +156,7 @@ class LidarFrontEnd(FrontEnd):
 
     config: LidarFrontEndConfig = field(default_factory=LidarFrontEndConfig)
     _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
-    name: ClassVar[str] = "kiss-icp"
+    name: ClassVar[str] = "lidar-odometry"
 
     def follow(
         self,

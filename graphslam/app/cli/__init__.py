@@ -1,4 +1,4 @@
-"""The command line: verbs, exit codes, and the one place where errors become a line of text.
+"""The command line: commands, exit codes, and the one place where errors become a line of text.
 
 Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage; 130 interrupted, and one line how to go on.
 """
@@ -109,13 +109,13 @@ def main() -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """What a user reads of an error: ours as they are, those of the machine with what can be done."""
+    """Message of an error: ours unchanged, those of the system with advice."""
     if isinstance(error, (KeyboardInterrupt, Interrupted)):
         return f"interrupted; {_go_on(sys.argv[1:])}"
     if isinstance(error, MemoryError):  # NumPy says how much was asked for
-        return f"not enough memory; use a smaller part of the data, or another machine. {error}".strip()
+        return f"not enough memory; use a smaller part of the data, or a machine with more memory. {error}".strip()
     if isinstance(error, RecursionError):
-        return "something is nested too deeply to be followed; look for a damaged file among those given"
+        return "an input file is nested too deeply; check the input files for a damaged one"
     if isinstance(error, OSError):
         files = [str(f) for f in (error.filename, error.filename2) if f is not None]
         advice = _ADVICE.get(error.errno or 0, "")
@@ -124,15 +124,15 @@ def one_line(error: BaseException) -> str:
 
 
 def _go_on(arguments: list[str]) -> str:
-    """How an interrupted command is continued."""
+    """How to resume an interrupted command."""
     command = shlex.join(["graphslam", *arguments])
     verb = next((a for a in arguments if not a.startswith("-")), "")
     if verb == "run":
         again = command if "--resume" in arguments else f"{command} --resume"
-        return f"finished submaps are kept; go on with: {again}"
+        return f"finished submaps are saved; resume with: {again}"
     if verb in ("demo", "study"):
-        return f"what is finished is kept; go on with: {command}"
-    return "files that were there before are as they were"
+        return f"finished parts are saved; resume with: {command}"
+    return "existing files are unchanged"
 
 
 def _end_bars() -> None:
@@ -151,10 +151,10 @@ def _drop_output() -> None:
 
 
 _ADVICE = {
-    errno.ENOSPC: "; make room and run the same command again: what is finished is kept",
-    errno.EDQUOT: "; make room and run the same command again: what is finished is kept",
-    errno.EFBIG: "; the limit on the size of files is too low (ulimit -f)",
-    errno.EMFILE: "; the limit on open files is too low (ulimit -n)",
+    errno.ENOSPC: "; free disk space and run the same command again: finished parts are saved",
+    errno.EDQUOT: "; free disk space and run the same command again: finished parts are saved",
+    errno.EFBIG: "; increase the file size limit (ulimit -f)",
+    errno.EMFILE: "; increase the limit of open files (ulimit -n)",
 }
 
 

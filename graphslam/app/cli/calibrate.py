@@ -13,27 +13,25 @@ from graphslam.core.config import dump_toml
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verb to the command line."""
+    """Add the command to the command line."""
     app.command()(calibrate)
 
 
 def calibrate(
-    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data-set card."),
-    frontend: str | None = typer.Option(
-        None, help="Front end that is to read the log. Default: one that reads what is in it."
-    ),
-    quick: bool = typer.Option(False, "--quick", help="A part of the log, some seconds of work: as inside a run."),
+    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
+    frontend: str | None = typer.Option(None, help="Front end that reads the log. Default: by the streams of the log."),
+    quick: bool = typer.Option(False, "--quick", help="Use a part of the log, as inside a run (some seconds)."),
     reader: str | None = READER,
     reader_option: list[str] = READER_OPTION,
     preset: str | None = PRESET,
     config: Path | None = typer.Option(None, help="TOML file with options, as for a run."),
     setting: list[str] = typer.Option([], "--set", help="Set one option, as a.b=value. May be repeated."),
     seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
-    out: Path | None = typer.Option(None, help="TOML file for the result; `graphslam run --config FILE` takes it."),
+    out: Path | None = typer.Option(None, help="TOML file for the result; use it with `graphslam run --config FILE`."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Tell noise, biases and scales of a robot's sensors from its log alone, without truth."""
+    """Estimate sensor noise, biases and scale factors from a log (no ground truth needed)."""
     from graphslam.app.run.calibration import calibrate_log
 
     options = run_options(config, setting)

@@ -15,7 +15,7 @@ app = typer.Typer(
 
 @app.command("list")
 def list_data(as_json: bool = JSON) -> None:
-    """List all cards, and whether their files are on this machine."""
+    """List all data sets, and whether their files are on this machine."""
     from graphslam.io.cards import list_cards
     from graphslam.io.catalog import locate
 
@@ -42,7 +42,7 @@ def list_data(as_json: bool = JSON) -> None:
 
 @app.command()
 def info(name: str, as_json: bool = JSON) -> None:
-    """Show one card: contents, source, citation, licence terms and known problems."""
+    """Show one data set: contents, source, citation, licence terms and known problems."""
     from graphslam.io.cards import find_card
 
     c = find_card(name)
@@ -71,7 +71,7 @@ def info(name: str, as_json: bool = JSON) -> None:
 def list_readers(
     name: str | None = typer.Argument(None, help="Name of one reader, for its options."), as_json: bool = JSON
 ) -> None:
-    """List what can be read, or the options of one reader."""
+    """List the readers, or the options of one reader."""
     from graphslam.io.readers import find_reader, list_readers
 
     if name is None:
@@ -89,7 +89,7 @@ def list_readers(
 
 @app.command()
 def fetch(name: str, as_json: bool = JSON) -> None:
-    """Find a data set on this machine, or download it and check its checksums."""
+    """Find a data set on this machine, or download it and verify its checksums."""
     from graphslam.io.fetch import fetch_dataset as fetch_files
 
     log_to_stderr(True)
@@ -99,7 +99,7 @@ def fetch(name: str, as_json: bool = JSON) -> None:
 
 @app.command()
 def check(
-    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data-set card."),
+    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     reader: str | None = READER,
     reader_option: list[str] = READER_OPTION,
     max_size: str | None = MAX_SIZE,

@@ -12,38 +12,38 @@ from graphslam.app.cli.run import JSON, MAX_SIZE
 from graphslam.app.cli.terminal import emit, table, verdict_text
 
 SUBMAP_POSES = typer.Option(
-    None, "--submap-poses", help="Number of poses of a submap, into which a pose-graph file is cut."
+    None, "--submap-poses", help="Cut a pose-graph file into submaps with this number of poses."
 )
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verbs to the command line."""
+    """Add the commands to the command line."""
     app.command()(join)
     app.command()(compare)
 
 
 def join(
     source: str = typer.Argument(
-        ..., help="Folder of submaps, folder of a run, name of a card of submaps, or pose-graph file."
+        ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
     ),
     method: str = typer.Option(
         "eif-tree", help="Name of the method: eif-tree, eif-sequential, eif-online, ekf, isam2 or batch."
     ),
-    polish: bool = typer.Option(True, help="Continue from the joined map to the least-squares optimum."),
+    polish: bool = typer.Option(True, help="Refine the joined map to the least-squares optimum."),
     associate: str = typer.Option(
         "given", help="How landmarks are associated: given (by their ids), nearest or joint."
     ),
     scale: float | None = typer.Option(
-        None, help="Factor on the covariances of the submaps. Default: that of the run."
+        None, help="Factor on the covariances of the submaps. Default: the value of the run."
     ),
-    workers: int | None = typer.Option(None, help="Number of processes that share the joins of eif-tree."),
+    workers: int | None = typer.Option(None, help="Number of processes for eif-tree."),
     cluster: str | None = typer.Option(None, help="Address of a Dask scheduler that runs the joins of eif-tree."),
     submap_poses: int | None = SUBMAP_POSES,
     out: Path | None = typer.Option(None, help="Folder for the results joined.npz and nodes.tum."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Join submaps into one map with one method, refine it, and say whether its covariances are honest."""
+    """Join submaps into one map with one method, refine it, and check its covariances."""
     import numpy as np
 
     from graphslam.app.compare import JSON_COLUMNS, join_json, keys_of
@@ -95,21 +95,21 @@ def join(
 
 def compare(
     source: str = typer.Argument(
-        ..., help="Folder of submaps, folder of a run, name of a card of submaps, or pose-graph file."
+        ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
     ),
     methods: str | None = typer.Option(
         None, help="Names of methods, separated by commas. Default: all except eif-online."
     ),
-    polish: bool = typer.Option(True, help="Continue from the result of every method to the least-squares optimum."),
+    polish: bool = typer.Option(True, help="Refine the result of every method to the least-squares optimum."),
     associate: str = typer.Option(
         "given", help="How landmarks are associated: given (by their ids), nearest or joint."
     ),
     scale: float | None = typer.Option(
-        None, help="Factor on the covariances of the submaps. Default: that of the run."
+        None, help="Factor on the covariances of the submaps. Default: the value of the run."
     ),
     memory: bool = typer.Option(True, help="Measure the peak memory of every method in a process of its own."),
     submap_poses: int | None = SUBMAP_POSES,
-    figure: Path | None = typer.Option(None, help="PNG file for a figure of the methods before and after refinement."),
+    figure: Path | None = typer.Option(None, help="PNG file for a plot of the methods before and after refinement."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
@@ -143,8 +143,8 @@ def compare(
     value["verdict"] = [f.as_row() for f in said]
     text = [table(comparing.comparison_rows(value["methods"])), *(f.text for f in said)]
     if s.truth is None:
-        text.append("No truth is known of these submaps: NEES and CI are not known, either.")
+        text.append("NEES and CI: not tested — these submaps have no ground truth.")
     elif n := found["nees_dof"].iloc[0]:
         low, high, _ = two_sided_bounds(1.0, float(n), CONFIDENCE)
-        text.append(f"An honest map has NEES/n between {low:.3g} and {high:.3g} in 95 % of the runs (n = {n}).")
+        text.append(f"NEES/n of a consistent map: [{low:.3g}, {high:.3g}] in 95 % of the runs (n = {n}).")
     emit(value, "\n".join(text), as_json=as_json)

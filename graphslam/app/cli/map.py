@@ -18,7 +18,7 @@ CANDIDATES = (
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verb to the command line."""
+    """Add the command to the command line."""
     app.command("map")(make_map)
 
 
@@ -28,57 +28,57 @@ def make_map(
     minimum_entropy: bool = typer.Option(
         False,
         "--minimum-entropy",
-        help="Solve the run with other choices of its matches and loops too, and keep the clearest map that its own "
-        "graph does not contradict (clearest.*) and the runners-up (alternatives/).",
+        help="Solve the run also with other subsets of its matches and loop closures. Keep the map with the lowest "
+        "entropy that its graph does not contradict (clearest.*) and the next ones (alternatives/).",
     ),
     hypotheses: int = typer.Option(
         0,
         min=0,
-        help="Solve so many topologies that the particles of a SegSLAM run told, for which its log is read once more; "
-        "the clearest map and the others are kept in the same way.",
+        help="Solve the N topologies sampled by the SegSLAM particles (re-reads the log). The maps are kept as with "
+        "--minimum-entropy.",
     ),
     log: str | None = typer.Option(
-        None, help="With --hypotheses, --terrain, --surface: card or folder of the log of the run, if it was moved."
+        None, help="With --hypotheses, --terrain, --surface: data set name or folder of the log, if it was moved."
     ),
     terrain: bool = typer.Option(
         False,
         "--terrain",
-        help="Only the terrain: where a vehicle can drive. The log of the run is read once more along its solved path.",
+        help="Make only the terrain: where a vehicle can drive (re-reads the log along the solved path).",
     ),
     surface: bool = typer.Option(
         False,
         "--surface",
-        help="Only the surface, as PLY, GLB and OBJ. The log of the run is read once more along its solved path.",
+        help="Make only the surface, as PLY, GLB and OBJ (re-reads the log along the solved path).",
     ),
     voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
     colour: str = typer.Option(
-        "height", help="With --surface: height, piece (node it hangs on), session, sigma, or terrain."
+        "height", help="With --surface: height, piece (node it is attached to), session, sigma, or terrain."
     ),
     sensor_height: float | None = typer.Option(
-        None, help="With --terrain: height of the scanner above the ground [m]. Default: found from the ground itself."
+        None, help="With --terrain: height of the scanner above the ground [m]. Default: estimated from the scans."
     ),
     low: float | None = typer.Option(
-        None, help="Lower bound of the floor plans above the path [m]. Default: that of the run."
+        None, help="Lower bound of the floor plans above the path [m]. Default: the value of the run."
     ),
     high: float | None = typer.Option(
-        None, help="Upper bound of the floor plans above the path [m]. Default: that of the run."
+        None, help="Upper bound of the floor plans above the path [m]. Default: the value of the run."
     ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Make the fused map of a run again from its folder, with other choices if asked."""
+    """Make the fused map of a finished run again from its folder, with other options."""
     from graphslam.app.run.remake_map import remake_map
 
     if terrain:
         if grid or minimum_entropy or hypotheses:
-            raise ConfigError("--terrain makes the terrain alone: leave --grid, --minimum-entropy and --hypotheses out")
+            raise ConfigError("--terrain makes only the terrain; remove --grid, --minimum-entropy and --hypotheses")
         if surface:
-            raise ConfigError("--terrain and --surface are made one after the other: name one of them")
+            raise ConfigError("--terrain and --surface exclude each other; give one of them")
         _make_terrain(run, log, sensor_height, as_json)
         return
     if surface:
         if grid or minimum_entropy or hypotheses:
-            raise ConfigError("--surface makes the surface alone: leave --grid, --minimum-entropy and --hypotheses out")
+            raise ConfigError("--surface makes only the surface; remove --grid, --minimum-entropy and --hypotheses")
         _make_surface(run, log, voxel, colour, as_json)
         return
     made = remake_map(
@@ -94,19 +94,22 @@ def make_map(
         value |= {"candidates": rows, "chosen_because": found.choice.why(), "left_out": found.left_out}
         text += f"\n\n{table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {found.choice.why()}"
         if found.choice.scale > 1.0:
-            text += f"\nevery χ² was divided by {found.choice.scale:.2f}, the least χ²/dof of graphs with most ties"
+            text += (
+                f"\nevery χ² was divided by {found.choice.scale:.2f}, the smallest χ²/dof of the graphs with most "
+                "constraints"
+            )
         if found.findings:
             value["refinement"] = [f.as_row() for f in found.findings]
-            text += "".join(f"\nof the chosen one: {f.text}" for f in found.findings)
+            text += "".join(f"\nchosen map: {f.text}" for f in found.findings)
         if found.refined_map is not None:
             value["refined_entropy"] = found.refined_map.fused.entropy()
-            text += f"\nentropy of its refined map: {value['refined_entropy']:.1f}"
-        text += f"\npaths and graphs of all: {run / 'alternatives'}"
+            text += f"\nentropy of the refined map: {value['refined_entropy']:.1f}"
+        text += f"\npaths and graphs of all candidates: {run / 'alternatives'}"
         if found.left_out:
-            text += f"\n{found.left_out} more were not solved"
+            text += f"\n{found.left_out} more candidates were not solved"
     value |= {"out": str(run), "files": [str(p) for p in made.files], "figures": [str(p) for p in made.figures]}
     value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s, "move": made.map.move_s}
-    text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; figures: {', '.join(p.name for p in made.figures)}"
+    text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; plots: {', '.join(p.name for p in made.figures)}"
     emit(value, text, as_json=as_json)
 
 

@@ -13,7 +13,7 @@ SHOWN = ("loop", "verdict", "source", "submap_i", "submap_j", "fitness", "chi2",
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verbs to the command line."""
+    """Add the commands to the command line."""
     app.command()(loops)
     app.command()(report)
     app.command()(export)
@@ -21,20 +21,22 @@ def register(app: typer.Typer) -> None:
 
 def loops(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
-    history: bool = typer.Option(False, help="Show all decisions, also those that a later one replaced."),
+    history: bool = typer.Option(False, help="Show all decisions, also replaced ones."),
     every: bool = typer.Option(False, "--all", help="Show also the candidates that the registration rejected."),
-    undo: int | None = typer.Option(None, help="Remove the loop with this number, solve again, and update the run."),
-    redo: int | None = typer.Option(None, help="Add the loop with this number again after it was undone."),
+    undo: int | None = typer.Option(
+        None, help="Remove the loop closure with this number, solve again, and update the run."
+    ),
+    redo: int | None = typer.Option(None, help="Add the loop closure with this number again after --undo."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """List the loops of a run: source, gates, χ², weight, effect, and why each was accepted or not."""
+    """List the loop closures of a run: source, gates, χ², weight, effect, and the reason of each decision."""
     from graphslam.app.run.files import loops_of_run
     from graphslam.app.run.loops import redo_loop, undo_loop
     from graphslam.core.errors import ConfigError
 
     if undo is not None and redo is not None:
-        raise ConfigError("--undo and --redo together; give one of them")
+        raise ConfigError("--undo and --redo exclude each other; give one of them")
     if undo is not None:
         ledger = undo_loop(run, undo, progress=not as_json)
     elif redo is not None:
@@ -54,13 +56,13 @@ def loops(
 
 
 def report(
-    run: Path = typer.Argument(..., help="Folder that run, demo or merge wrote; it may be unfinished."),
+    run: Path = typer.Argument(..., help="Folder of run, demo or merge; the run may be unfinished."),
     out: Path | None = typer.Option(None, help="HTML file to write. Default: report.html in the folder."),
     show: bool = typer.Option(False, "--open", help="Open the page in the browser."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Write one self-contained HTML page of a run: verdict, figures, metrics, graph, loops, ledger and events."""
+    """Write one self-contained HTML page of a run: verdict, plots, metrics, graph, loop closures, ledger, events."""
     from graphslam.app.report.report import report_and_file
 
     made, file = report_and_file(run, out)
@@ -71,7 +73,7 @@ def report(
         import webbrowser
 
         if not webbrowser.open(file.resolve().as_uri()):
-            lines.append("no browser was found to show it in")
+            lines.append("no browser found; open the file by hand")
     value = {"run": str(run), "page": str(file), "kind": made.kind, "bytes": size, "missing": made.problems}
     emit(value, "\n".join(lines), as_json=as_json)
 

@@ -30,13 +30,11 @@ MAX_SIZE = typer.Option(
     callback=_limit,
     help="Largest decompressed size of one input file, for example 8G. Default: 2G.",
 )
-READER = typer.Option(None, help="Name of the reader (`graphslam data readers`). Default: what recognises the source.")
+READER = typer.Option(None, help="Name of the reader (`graphslam data readers`). Default: detected from the content.")
 READER_OPTION = typer.Option(
     [], "--reader-option", help="Option of the reader, as name=value (`graphslam data readers NAME`). May be repeated."
 )
-PRESET = typer.Option(
-    None, help="Name of the source whose preset is taken, or none. Default: that of the log, or of its kind."
-)
+PRESET = typer.Option(None, help="Name of the preset, or none. Default: by the data set, or by its kind.")
 
 
 def reader_options(settings: list[str]) -> dict[str, Any]:
@@ -56,28 +54,26 @@ SHORT = (
     *("nees_per_dof", "nees_dof", "ci", "map_entropy", "seconds_total", "times_real_time"),
 )
 """Figures that are printed without ``--all``."""
-EVERY = typer.Option(False, "--all", help="Print all figures; without it those that a reader asks for first.")
+EVERY = typer.Option(False, "--all", help="Print all metrics. Default: a summary.")
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verbs to the command line."""
+    """Add the commands to the command line."""
     app.command()(run)
     app.command()(demo)
     app.command()(simulate)
 
 
 def run(
-    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data-set card."),
+    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     frontend: str | None = typer.Option(
-        None, help="Name of the front end that turns the log into submaps. Default: by what the log holds."
+        None, help="Name of the front end that makes submaps from the log. Default: by the streams of the log."
     ),
     solver: str = typer.Option("isam2", help="Name of the solver: isam2, lm, batch, gnc or pcg."),
     reader: str | None = READER,
     reader_option: list[str] = READER_OPTION,
     preset: str | None = PRESET,
-    config: Path | None = typer.Option(
-        None, help="TOML file with options; they replace those of the preset of the source."
-    ),
+    config: Path | None = typer.Option(None, help="TOML file with options; they replace those of the preset."),
     setting: list[str] = typer.Option([], "--set", help="Set one option, as a.b=value. May be repeated."),
     seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
     out: Path = typer.Option(..., help="Folder for the results of the run."),
@@ -85,17 +81,17 @@ def run(
     saved: list[Path] = typer.Option(
         [], "--continue", help="Folder of an earlier run; both become one graph in OUT/continued. May be repeated."
     ),
-    live: bool = typer.Option(False, "--live", help="Show the map in the viewer Rerun while it is made."),
+    live: bool = typer.Option(False, "--live", help="Show the map in the viewer Rerun during the run."),
     live_file: Path | None = typer.Option(
         None,
         "--live-file",
-        help="Record what the viewer would show; replay it with `rerun FILE`.",
+        help="Record the viewer data to a file; replay it with `rerun FILE`.",
     ),
     max_size: str | None = MAX_SIZE,
     every: bool = EVERY,
     as_json: bool = JSON,
 ) -> None:
-    """Make a map from a recorded log: submaps, factor graph, solution, map, and a verdict on how far to trust it."""
+    """Make a map from a recorded log: submaps, factor graph, solution, map, and a verdict on its consistency."""
     from graphslam.app.run.pipeline import run as run_pipeline
 
     options = run_options(config, setting)
@@ -141,18 +137,18 @@ def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
 
 
 def figures(result: Any, every: bool) -> list[str]:
-    """Table of the figures of a run, and how many of them it leaves out."""
+    """Table of the metrics of a run, and how many of them are not shown."""
     rows = result.metrics.to_dict("records")
     shown = [r for r in rows if every or r["key"] in SHORT]
     left = len(rows) - len(shown)
-    more = [f"({left} more figures: --all, or metrics.json)"] if left else []
+    more = [f"({left} more metrics: --all, or metrics.json)"] if left else []
     return [table(shown, ["key", "value", "unit"]), *more]
 
 
 def _summary(result: Any, out: Path, every: bool = False) -> str:
     dropped = result.report["records_dropped"]
     lines = figures(result, every)
-    lines += [f"dropped: {n} {what}" for what, n in dropped.items()]
+    lines += [f"dropped {n} {what}" for what, n in dropped.items()]
     lines += join_note(result)
     lines += ["", *verdict_text(result.headline, result.verdict), ""]
     lines.append(f"written to {out}: report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}")
@@ -178,20 +174,19 @@ def join_note(result: Any) -> list[str]:
     low, high, said = two_sided_bounds(chi2, dof, CERTAIN)
     if said == "consistent":
         return []
-    text = f"note: join χ²/dof is {chi2:.3g}; for {dof:.4g} degrees of freedom 999 of 1000 honest runs lie between "
-    text += f"{low:.3g} and {high:.3g}. "
+    text = (
+        f"note: χ²/dof of the join: {chi2:.3g} [{low:.3g}, {high:.3g} in 999 of 1000 consistent runs; {dof:.4g} dof]. "
+    )
     causes = [f.code for f in result.verdict if f.code in CAUSES and f.level in ("look", "bad")]
     if said == "over-confident" and causes:
         named = ", ".join(f"“{c}”" for c in dict.fromkeys(causes))
-        return [f"{text}The verdict names a cause ({named}): mend that before any covariance is scaled"]
+        return [f"{text}The verdict names a cause ({named}): correct it before you scale covariances"]
     scale = result.report["covariance_scale"] * chi2
-    return [f"{text}Without another cause: --set backend.covariance_scale={scale:.2g}"]
+    return [f"{text}If there is no other cause, use --set backend.covariance_scale={scale:.2g}"]
 
 
 def demo(
-    out: Path = typer.Option(
-        Path("demo-run"), help="Folder for the results. If it holds an unfinished demo, that demo is continued."
-    ),
+    out: Path = typer.Option(Path("demo-run"), help="Folder for the results. An unfinished demo in it is resumed."),
     seed: int = typer.Option(0, help="Seed for sensor noise, clutter and the filter."),
     preset: str = typer.Option("garage", help="World of the demo: garage, or quick for a small one."),
     every: bool = EVERY,
@@ -205,7 +200,7 @@ def demo(
     text = (
         f"{chr(10).join(figures(result, every))}"
         f"\n\n{chr(10).join(verdict_text(result.headline, result.verdict))}"
-        f"\n\nfigures: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
+        f"\n\nplots: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
         f"\nreport: {out / 'report.html'}"
         f"\nmap: {out / 'map.ply'} (points), {out / 'map.bt'} (OctoMap), floor plans {out}/map-level*.yaml"
     )
@@ -217,11 +212,11 @@ def simulate(
     world: str = typer.Argument(
         ..., help="Name of the world: landmark-field, point-field, garage, mine, building, court or campus."
     ),
-    out: Path = typer.Option(..., help="Folder for the log; the true path and map are written with it."),
-    seed: int = typer.Option(0, help="Seed for sensor noise and for the movable things in the world."),
+    out: Path = typer.Option(..., help="Folder for the log, with the true path and map."),
+    seed: int = typer.Option(0, help="Seed for sensor noise and for movable objects in the world."),
     layout: str | None = typer.Option(
         None,
-        help="Layout of the garage: A, B, C or D; of the mine: once or twice round. drawn-17: drawn by that number.",
+        help="Layout of the garage: A, B, C or D; of the mine: once or twice round. drawn-17: random, seed 17.",
     ),
     preset: str | None = typer.Option(
         None,
@@ -229,14 +224,14 @@ def simulate(
         "Other worlds: light, full or two-scanners.",
     ),
     world_seed: int | None = typer.Option(
-        None, help="Seed of the place alone: sessions with one of these and different --seed share a place."
+        None, help="Seed of the place: sessions with the same --world-seed and different --seed share a place."
     ),
     setting: list[str] = typer.Option(
         [], "--set", help="Set one parameter of the world or the robot, as name=value. May be repeated."
     ),
     as_json: bool = JSON,
 ) -> None:
-    """Simulate a robot in a world and write its log, with the truth and all noise parameters."""
+    """Simulate a robot in a world and write its log, with ground truth and all noise parameters."""
     from graphslam.app.worlds import simulate as make
     from graphslam.app.worlds import write_simulated
 

@@ -12,7 +12,7 @@ from graphslam.app.cli.terminal import emit, table
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verbs to the command line."""
+    """Add the commands to the command line."""
     app.command()(merge)
     app.command()(localise)
 
@@ -27,13 +27,13 @@ def merge(
     ),
     solver: str = typer.Option("batch", help="Name of the solver: isam2, lm, batch, gnc or pcg."),
     identity_gate: float = typer.Option(
-        25.0, help="Sightings with a larger χ² (2 degrees of freedom) become separate landmarks. 0: never."
+        25.0, help="Observations with a larger χ² (2 degrees of freedom) become separate landmarks. 0: never."
     ),
     tolerance: float = typer.Option(0.5, help="Largest distance of matching landmarks after alignment [m]."),
     surface: bool = typer.Option(
         False,
         "--surface",
-        help="Dense submaps in space: write the surface of all sessions, too. Their logs are read again.",
+        help="Dense 3-D submaps: also write the surface of all sessions (re-reads their logs).",
     ),
     voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
     colour: str = typer.Option("session", help="With --surface: session, height, piece, or sigma."),
@@ -59,7 +59,7 @@ def merge(
 def localise(
     run: Path = typer.Argument(..., help="Folder of a run with dense submaps: the map."),
     source: str = typer.Argument(
-        ..., help="What to localise: folder of another run, folder of a log, or name of a card."
+        ..., help="Submaps to localise: folder of another run, folder of a log, or name of a data set."
     ),
     submap: list[int] = typer.Option([], help="Localise only the submap with this key. May be repeated."),
     begin: float | None = typer.Option(None, help="Use a log from this time on [s]."),

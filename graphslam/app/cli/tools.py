@@ -13,7 +13,7 @@ from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, U
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verbs to the command line."""
+    """Add the commands to the command line."""
     app.command()(solve)
     app.command()(relax)
     app.command("eval")(evaluate)
@@ -21,7 +21,9 @@ def register(app: typer.Typer) -> None:
 
 
 def solve(
-    file: str = typer.Argument(..., help="Pose-graph file (.g2o, .graph or .txt, also .xz, .gz, .bz2), or CARD/FILE."),
+    file: str = typer.Argument(
+        ..., help="Pose-graph file (.g2o, .graph or .txt, also .xz, .gz, .bz2), or DATA-SET/FILE."
+    ),
     solver: str = typer.Option("lm", help="Name of the solver: lm, isam2, gnc or pcg."),
     repair: bool = typer.Option(
         False,
@@ -34,7 +36,7 @@ def solve(
     out: Path | None = typer.Option(None, help="g2o file to write the solution to."),
     starts: str | None = typer.Option(
         None,
-        help="Start values: all, or names such as chordal,tree. Default: one, and others only in case of doubt.",
+        help="Initial values: all, or names such as chordal,tree. Default: one, and others only in case of doubt.",
     ),
     certify: bool = typer.Option(
         False, "--certify", help="Check whether the solution is certified as the global optimum."
@@ -42,7 +44,7 @@ def solve(
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Solve a pose-graph file, and say whether the solution is at its optimum."""
+    """Solve a pose-graph file, and check whether the solution is at its optimum."""
     from graphslam.app.solve_file import solve_file
     from graphslam.io.catalog import load_recording
 
@@ -51,7 +53,7 @@ def solve(
         found = load_recording(file)
         if not isinstance(found, Path) or not found.is_file():
             raise MissingDataError(
-                f"{file} is not a pose-graph file", wanted="a file, or card/file such as posegraphs/intel"
+                f"{file} is not a pose-graph file", wanted="a file, or data-set/file such as posegraphs/intel"
             )
         path = found
     names = None if starts is None else "all" if starts == "all" else starts.split(",")

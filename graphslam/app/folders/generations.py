@@ -106,7 +106,7 @@ def outputs(folder: str | os.PathLike[str]) -> Path:
     if target is None:
         return home
     if not (home / target).is_dir():
-        raise FormatError("names a generation that is not there", where=str(home / CURRENT), got=target)
+        raise FormatError("refers to a missing generation", where=str(home / CURRENT), got=target)
     return home / target
 
 
@@ -157,7 +157,7 @@ def check_same(first: tuple[Path, Any], *others: tuple[Path, Any]) -> None:
     for other, found in others:
         if found is not None and known is not None and str(found) != str(known):
             raise FormatError(
-                f"is not of one state with {file.name}: one of them was copied or changed alone",
+                f"does not belong to the same state as {file.name}: one of them was copied or changed alone",
                 where=str(other),
                 got=f"generation {found}",
                 wanted=str(known),

@@ -128,7 +128,7 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
         made = path_consistency(m.trajectory, read_tum(file, dim=m.dim), chart=chart_of(folder))
     except GraphSlamError as error:
         said = " ".join(str(error).replace(f"{folder.path}/", "").split())
-        folder.problems.setdefault("truth.tum", f"gives no curve of NEES: {said}")
+        folder.problems.setdefault("truth.tum", f"no NEES curve: {said}")
         return []
     if len(made.rows) < 2:
         return []
@@ -136,19 +136,19 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     low, high, _ = two_sided_bounds(1.0, made.dof, CONFIDENCE)
     inside = float(np.mean((ratio >= low) & (ratio <= high)))
     said = (
-        f"Every pose of the path against the truth, first base fixed; {_BOUNDS} bounds of one pose with "
-        f"{made.dof} degrees of freedom, {low:.3g} to {high:.3g}; {_percent(inside)} of {len(ratio)} poses are inside. "
-        "Neighbours share their errors: they lie in or out together."
+        f"NEES of every pose (ground truth, first base fixed); {_BOUNDS} bounds of one pose with {made.dof} degrees of "
+        f"freedom [{low:.3g}, {high:.3g}]; {_percent(inside)} of {len(ratio)} poses are inside. Errors of neighbours "
+        "are correlated."
     )
     if made.certain:
-        said += f" Left out: {made.certain} with a singular covariance, as that of the first base is."
+        said += f" Not shown: {made.certain} poses with a singular covariance, such as the first base."
     panels = [axis.panel("NEES/dof of the path", said, ratio, honest=1.0, bounds=(low, high), log=True)]
     for k, name in enumerate(made.names):
         turn = name == "heading"
         scale = np.rad2deg(1.0) if turn else 1.0
         errors, sigmas = scale * made.errors[:, k], scale * made.sigmas[:, k]
         out = float(np.mean(np.abs(errors) > SIGMAS * sigmas))
-        said = f"True less estimated, ± {SIGMAS:g} σ; {_percent(out)} outside (honest: 5 %)."
+        said = f"Ground truth minus estimate, ± {SIGMAS:g} σ; {_percent(out)} outside (consistent: 5 %)."
         panels.append(
             axis.panel(f"Error of {name}", said, errors, unit="°" if turn else "m", honest=0.0, sigmas=sigmas)
         )
@@ -169,25 +169,25 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
         low, high, _ = two_sided_bounds(1.0, d, CONFIDENCE)
         inside = float(np.mean((nis / d >= low) & (nis / d <= high)))
         said = (
-            f"Fixes that the graph was not given, against where it predicts them; {_BOUNDS} bounds of one fix, "
-            f"{low:.3g} to {high:.3g}; {_percent(inside)} of {len(nis)} are inside."
+            f"Withheld GPS fixes against their prediction by the graph; {_BOUNDS} bounds of one fix "
+            f"[{low:.3g}, {high:.3g}]; {_percent(inside)} of {len(nis)} are inside."
         )
         if folder.part("refine"):
-            said += " Predicted by the graph, before the refinement."
+            said += " The prediction is that of the graph before refinement."
         name = "NIS/dof of withheld GPS"
         out = [axis.panel(name, said, nis / d, kind="dots", honest=1.0, bounds=(low, high), log=True)]
         for k, of in enumerate("xyz"[:d]):
-            said = f"Fix less prediction along {of} of the GPS frame, ± {SIGMAS:g} σ of both."
+            said = f"Fix minus prediction, {of} of the GPS frame, ± {SIGMAS:g} σ of both."
             name, half = f"Withheld GPS, {of}", sigma[:, k]
             out.append(axis.panel(name, said, v[:, k], unit="m", kind="dots", honest=0.0, sigmas=half))
         return out
-    for name, said in (("withheld", "the graph was not given them"), ("all", "as the metrics take them")):
+    for name, said in (("withheld", "withheld from the graph"), ("all", "as in the metrics")):
         try:
             scored = read_gps_residuals(folder.path / f"gps_{name}.npz")
         except GraphSlamError:
             continue
         if len(scored.times):
-            text = f"Fixes to the antenna on the path; {said}. Their prediction has no bounds here."
+            text = f"Distance of fixes to the antenna on the path; {said}. No bounds available."
             return [_Axis.at(path, scored.times).panel("Distance to GPS", text, scored.errors, unit="m", kind="dots")]
     return []
 
@@ -199,7 +199,7 @@ def _innovations(folder: ReportFolder) -> tuple[Array, Array, Array, Array] | No
         return None
     n, wide = len(found["times"]), {len(row) for k in ("innovations", "sigmas") for row in found[k]}
     if {len(found[k]) for k in ("innovations", "sigmas", "nis")} != {n} or len(wide) != 1 or not wide <= {2, 3}:
-        folder.problems["run.json"] = "innovations of withheld fixes that do not fit each other"
+        folder.problems["run.json"] = "has inconsistent innovations of withheld fixes"
         return None
     times, v, sigma, nis = (np.array(found[k], dtype=np.float64) for k in ("times", "innovations", "sigmas", "nis"))
     return times, v, sigma, nis
@@ -214,8 +214,8 @@ def _kinds(folder: ReportFolder) -> list[dict[str, Any]]:
     ]
     if not rows:
         return []
-    said = f"At the optimum, with the {_BOUNDS} bounds of honest noise: above them too much is believed."
-    return [{"name": "χ²/dof by kind of factor", "said": said, "unit": "", "kind": "rows", "log": True, "rows": rows}]
+    said = f"At the optimum, with {_BOUNDS} bounds. Above them the assumed noise is too small, below them too large."
+    return [{"name": "χ²/dof by class of factor", "said": said, "unit": "", "kind": "rows", "log": True, "rows": rows}]
 
 
 def _six(value: float) -> float:

@@ -19,19 +19,19 @@ from graphslam.io.submap_store import read_truth
 from graphslam.io.tum import read_tum
 
 CAPTIONS = {
-    "map.png": "The map: path with 95 % ellipses, landmarks where there are any; truth, GPS, dead reckoning if known",
-    "refined.png": "The path of the graph and the path refined by scans: distances from the truth, or from each other",
+    "map.png": "Map: path with 95 % ellipses, landmarks; ground truth, GPS and dead reckoning if available",
+    "refined.png": "Path of the graph and refined path: errors against ground truth, or their difference",
     "side.png": "The path from the side",
     "submaps.png": "Submaps at their solved poses",
     "fused.png": "Fused evidence grid at the solved poses",
     "fused_above.png": "Fused evidence grid from above",
     "fused_cut.png": "Fused evidence grid, cut from the side",
-    "terrain.png": "Terrain: what a vehicle can drive over, and what it cannot",
+    "terrain.png": "Terrain: passable and not passable for a vehicle",
     "terrain_plain.png": "Terrain: free, hazard, unknown",
     "gps_residuals.png": "Distances to the GPS fixes",
     "gps_innovations.png": "Withheld GPS fixes against their prediction",
-    "loops.png": "Loops of landmark submaps against each other",
-    "progress.png": "Segments as they came in, before any loop was closed in the graph",
+    "loops.png": "Loop closures of landmark submaps: disagreement",
+    "progress.png": "Segments before any loop closure",
 }
 
 MOST_NAMES = 60
@@ -53,12 +53,12 @@ def figures(folder: ReportFolder) -> Markup:
     for name in [*levels, *order[at:], *rest, *(["progress.png"] if "progress.png" in made else [])]:
         parts.append(picture(made[name], _caption(name)))
     if not made:
-        parts.append(missing("pictures of the run: the folder has none in figures/."))
+        parts.append(missing("plots of the run: figures/ has none."))
     elif "map.png" not in made:
         parts.append(missing("the map (figures/map.png)."))
     if folder.kind == "run" and not any(n.startswith("fused") for n in made):
         said = folder.report.get(
-            "map_left_out", "the submaps have no evidence grids or clouds, or the map was not asked for."
+            "map_left_out", "the submaps have no evidence grids or clouds, or no map was requested."
         )
         parts.append(missing("a fused map: ", said))
     return section("figures", "Figures", *parts)
@@ -69,21 +69,21 @@ def _caption(name: str) -> str:
         return CAPTIONS[name]
     stem = name.removesuffix(".png")
     if stem.startswith("fused_level"):
-        return f"Fused evidence grid, storey {stem.removeprefix('fused_level')}"
+        return f"Fused evidence grid, floor {stem.removeprefix('fused_level')}"
     return stem.replace("_", " ")
 
 
 def _drawn(folder: ReportFolder) -> list[Markup]:
     """Loops over the path, NEES submap by submap: from what the folder holds."""
     if folder.kind == "interrupted":
-        return [missing("loops over the path, and NEES by submap: the run was not finished.")]
+        return [missing("loop closures on the path, and NEES by submap: the run is not finished.")]
     if folder.kind == "merged":
         return _session_ties(folder)
     try:
         m = read_map(folder.path)
     except GraphSlamError as error:
         folder.problems["map.npz"] = _said(folder, error)
-        return [missing("loops over the path, and NEES by submap: map.npz ", folder.problems["map.npz"], ".")]
+        return [missing("loop closures on the path, and NEES by submap: map.npz ", folder.problems["map.npz"], ".")]
     bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
     loops = _loops(folder, m.node_poses, m.trajectory.poses)
     return [*loops, *_nees(folder, m.node_poses, m.node_covariances, bases)]
@@ -96,17 +96,17 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
 
     ties = [e for e in folder.events or [] if e.get("event") == "between" and e.get("group") == SESSION]
     if not ties:
-        return [missing("ties between sessions over their paths: there are none that are places.")]
+        return [missing("loop closures between sessions: none from place recognition.")]
     try:
         nodes = read_merged_dense(folder.path)["nodes"]
         paths = [read_tum(f).positions[:, :2] for f in sorted(folder.path.glob("trajectory_*.tum"))]
         gap = np.full((1, 2), np.nan)  # lifts the pen
         path = np.concatenate([x for p in paths for x in (p, gap)])
         ends = [(e["i"], e["j"], "accepted") for e in ties]
-        ax = plot_loops(None, path, nodes, ends, title="ties between sessions, from above")
+        ax = plot_loops(None, path, nodes, ends, title="loop closures between sessions, from above")
     except GraphSlamError as error:
-        return [missing("ties between sessions over their paths: ", _said(folder, error), ".")]
-    return [picture(figure_png(ax), "Paths of the sessions in the common frame, and the places that tie them")]
+        return [missing("loop closures between sessions: ", _said(folder, error), ".")]
+    return [picture(figure_png(ax), "Paths of the sessions in the common frame, and loop closures between them")]
 
 
 def _said(folder: ReportFolder, error: Exception) -> str:
@@ -125,27 +125,25 @@ def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Ma
     try:
         ends = [(int(r["i"]), int(r["j"]), str(r["verdict"])) for r in rows]
         names = [r["loop"] for r in rows] if len(rows) <= MOST_NAMES else None
-        ax = plot_loops(None, path, nodes, ends, names=names, title="loops over the path, from above")
+        ax = plot_loops(None, path, nodes, ends, names=names, title="loop closures, from above")
     except DataError as error:
-        return [missing("loops over the path: ", error, ".")]
-    out = [
-        picture(figure_png(ax), "Loops over the path, by their numbers in the ledger: in the graph, undone, refused")
-    ]
+        return [missing("loop closures on the path: ", error, ".")]
+    out = [picture(figure_png(ax), "Loop closures by their number in the ledger: accepted, undone, rejected")]
     lost = len(folder.loop_rows) - len(rows)
-    return [*out, note(f"{lost} loops have no node that could be drawn.")] if lost else out
+    return [*out, note(f"{lost} loop closures have no node to draw.")] if lost else out
 
 
 def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, bases: np.ndarray) -> list[Markup]:
     try:
         truth = read_truth(folder.path)
         if truth is None:
-            return [missing("NEES by submap: no truth in the folder.")]
+            return [missing("NEES by submap: no ground truth in the folder.")]
         keys = np.array([int(e["key"]) for e in folder.submaps], dtype=np.int64)
         if len(bases) != len(keys) + 1:
-            raise DataError("nodes are not those of the submaps", got=len(bases) - 1, wanted=len(keys))
+            raise DataError("nodes do not match the submaps", got=len(bases) - 1, wanted=len(keys))
         here = np.isin(truth.keys, keys)
         if not np.any(here):
-            return [missing("NEES by submap: the truth is of none of its submaps.")]
+            return [missing("NEES by submap: no ground truth for these submaps.")]
         end = bases[1 + np.searchsorted(keys, truth.keys[here])]
         d2 = nees(*map_errors(nodes[end], covariances[end], truth.exit_poses[here], chart_of(folder)))
     except (GraphSlamError, KeyError, TypeError, IndexError, ValueError) as error:
@@ -160,8 +158,8 @@ def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, base
     ax = plot_consistency(
         None, {"this run": made}, submaps=truth.keys[here], title=f"n = {dof}, first base fixed, one run"
     )
-    text = "NEES/n of the ends of the submaps against the truth, with the 95 % bounds of an honest run"
+    text = "NEES/n of the submap end poses (ground truth), with the 95 % bounds of a consistent run"
     return [
         picture(figure_png(ax), text),
-        note(join_parts(["Ends of one run share their errors: they lie in or out together."])),
+        note(join_parts(["Errors of one run are correlated: neighbours are inside or outside together."])),
     ]

@@ -124,7 +124,7 @@ def read_folder(path: str | Path, root: Path) -> ReportFolder:
         kind = "interrupted"
     else:
         raise RunFolderError(
-            f"{home}: no run folder (neither config.toml nor merge.json); give one that run, demo or merge wrote"
+            f"{home}: not a run folder (neither config.toml nor merge.json); give the folder of a run, demo or merge"
         )
     out = ReportFolder(root, home, kind)
 
@@ -145,7 +145,7 @@ def read_folder(path: str | Path, root: Path) -> ReportFolder:
         out.report = attempt("run.json", lambda: read_report(root), {})
     if kind == "interrupted":
         for name in ("run.json", "metrics.json", "events.jsonl", "ledger.csv"):
-            out.problems[name] = "is not there: it is written when a run is finished"
+            out.problems[name] = "is missing; it is written when a run is finished"
         return out
     out.metrics = attempt("metrics.json", lambda: _metrics(root, "metrics.json"), [])
     if not any(is_time(r.get("key")) for r in out.metrics):  # an older version kept them there
@@ -177,7 +177,7 @@ def _metrics(root: Path, name: str) -> list[dict[str, Any]]:
 
 def _index(root: Path) -> list[dict[str, Any]]:
     if not (root / "submaps" / "index.json").is_file():
-        raise RunFolderError("no submap was finished")
+        raise RunFolderError("no finished submap")
     return SubmapStore(root / "submaps").entries
 
 

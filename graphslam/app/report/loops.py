@@ -34,17 +34,17 @@ def loops(folder: ReportFolder) -> Markup:
     # what the registration itself refused is most of a long run, and least of what one looks for
     short = [r for r in rows if not str(r["why"]).startswith("registration")]
     hidden = [r for r in rows if str(r["why"]).startswith("registration")]
-    parts: list[Any] = [note(f"Loops: {len(rows)}; {said}. The same by “graphslam loops”; take one out with --undo.")]
-    parts.append(_ledger(short) if short else note("None but those below."))
+    parts: list[Any] = [note(f"Loop closures: {len(rows)}; {said}. `graphslam loops` lists them; --undo removes one.")]
+    parts.append(_ledger(short) if short else note("Only those below."))
     if hidden:
-        parts.append(folded(f"{len(hidden)} refused by their registration", _ledger(hidden)))
+        parts.append(folded(f"{len(hidden)} rejected by registration", _ledger(hidden)))
     parts += _history(folder)
     parts.append(
         note(
-            "χ² against the graph without the loop; weight of the robust kernel at the solution, 0 of a loop that is "
-            "not in the graph; effect: by how much it raised the objective, foreseen and measured, and what of that "
-            "earlier factors bear; – : not measured (front-end matches have a support and no registration here). "
-            "docs/loops.md says what each gate asks."
+            "χ²: against the graph without this loop closure. weight: of the robust kernel at the solution, 0 if it is "
+            "not in the graph. effect: predicted and measured increase of the cost, and the part of earlier factors. "
+            "– : not measured (front-end matches have a support and no registration). The gates are explained in the "
+            "documentation of loop closures."
         )
     )
     return section("loops", title, *parts, *_ties(folder))
@@ -54,12 +54,12 @@ def _none(folder: ReportFolder) -> Markup:
     backend = folder.config.get("backend", {})
     asked = backend.get("loops") is True if isinstance(backend, Mapping) else False
     if folder.kind == "merged":
-        return note("No loops in the events; ties between sessions, where they are places, are below.")
+        return note("No loop closures within sessions. Loop closures between sessions are below.")
     if asked:
-        return note("Loops were looked for; there was no candidate.")
+        return note("No candidates were found.")
     return note(
-        "None: the back end was not asked to look for loops (backend.loops), and the front end handed over no matches. "
-        "Landmarks seen again close loops by themselves, as factors of their submaps."
+        "None: the search is off (backend.loops), and the front end gave no matches. Landmarks that are observed again "
+        "close loops as factors of their submaps."
     )
 
 
@@ -85,7 +85,7 @@ def _history(folder: ReportFolder) -> list[Markup]:
         return []
     columns = {k: COLUMNS[k] for k in ("loop", "verdict", "chi2", "weight", "effect", "why")}
     of = sum(n > 1 for n in times.values())
-    return [folded(f"{of} loops were decided on more than once: each decision in order", html_table(rows, columns))]
+    return [folded(f"{of} loop closures with several decisions, in order", html_table(rows, columns))]
 
 
 def _ties(folder: ReportFolder) -> list[Markup]:
@@ -100,12 +100,15 @@ def _ties(folder: ReportFolder) -> list[Markup]:
                 said = "accepted" if c.get("accepted") else "rejected"
                 rows.append(Row({**c, "session": s.get("name"), "verdict": said}, said))
     if not rows:
-        return [html_element("h3", "Ties between sessions"), note("No places were compared: see the sessions above.")]
+        return [
+            html_element("h3", "Loop closures between sessions"),
+            note("No places were compared. See the sessions above."),
+        ]
     columns = {
         **{"session": "session", "verdict": "verdict", "submap_map": "submap in the map", "submap_here": "submap here"},
         **{"i": "node i", "j": "node j", "source": "source", "score": "score", "why": "why", "gates": "gates"},
     }
-    return [html_element("h3", "Ties between sessions"), html_table(rows, columns, class_="ties")]
+    return [html_element("h3", "Loop closures between sessions"), html_table(rows, columns, class_="ties")]
 
 
 def hypotheses(folder: ReportFolder) -> Markup:

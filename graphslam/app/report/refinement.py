@@ -10,19 +10,19 @@ from graphslam.app.report.markup import missing, note, picture, section
 from graphslam.core.markup import Markup, html_table, is_numeric, pair_list
 
 MEANING = {
-    "scale": ("scale of the wheels, distance too long by", "share"),
-    "side": ("mounting: scanner looks to the left of the way", "rad"),
-    "rise": ("mounting: scanner looks below the way", "rad"),
-    "clock": ("stamps of the motion early beside those of the scans", "s"),
-    "roll": ("lasting error of gravity's roll", "rad"),
-    "pitch": ("lasting error of gravity's pitch", "rad"),
-    "bend": ("wheels turn too much for each metre", "rad/m"),
-    "turn": ("wheels turn too much for each radian", "share"),
+    "scale": ("wheel scale, distance too long by", "share"),
+    "side": ("mounting: scanner yaw to the left of the path direction", "rad"),
+    "rise": ("mounting: scanner pitch below the path direction", "rad"),
+    "clock": ("odometry stamps early relative to the scans", "s"),
+    "roll": ("constant error of the gravity direction, roll", "rad"),
+    "pitch": ("constant error of the gravity direction, pitch", "rad"),
+    "bend": ("wheel turn error per metre", "rad/m"),
+    "turn": ("wheel turn error per radian", "share"),
 }
-"""Lasting errors: in words, and their unit."""
+"""Systematic errors: in words, and their unit."""
 BEFORE_AFTER = (
-    ("aligned error of the path [m]", "path_rmse_aligned_graph", "path_rmse_aligned"),
-    ("share of the points of the scans that agree", "refine_agreement_graph", "refine_agreement"),
+    ("path error, aligned [m]", "path_rmse_aligned_graph", "path_rmse_aligned"),
+    ("share of scan points that agree", "refine_agreement_graph", "refine_agreement"),
     ("entropy of the fused map [nat m³, in the plane nat m²]", "map_entropy_graph", "map_entropy"),
     ("known volume of the fused map [m³, in the plane m²]", "map_known_volume_graph", "map_known_volume"),
 )
@@ -33,9 +33,9 @@ def refinement(folder: ReportFolder) -> Markup:
     title = "Refinement by scans"
     found = folder.part("refine")
     if folder.kind != "run":
-        return section("refinement", title, note("Of finished single runs alone."))
+        return section("refinement", title, note("Only for finished single runs."))
     if not found:
-        return section("refinement", title, note("The path is that of the graph: the verdict says why, where it may."))
+        return section("refinement", title, note("No refinement; the path is that of the graph. See the verdict."))
     m = folder.values()
     rows = [{"what": w, "graph": m[a], "refined": m[b]} for w, a, b in BEFORE_AFTER if a in m and b in m]
     parts: list[Any] = [html_table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
@@ -43,18 +43,15 @@ def refinement(folder: ReportFolder) -> Markup:
     rounds = found.get("rounds") or []
     columns = {
         **{"distance": "pairs within [m]", "range_sigma": "σ of a range [m]"},
-        **{"surface_sigma": "σ of a surface [m]", "pairs": "pairs", "passes": "of other passes"},
-        **{"spread": "spread of the residuals [m]", "moved": "path moved by [m]"},
+        **{"surface_sigma": "σ of a surface [m]", "pairs": "pairs", "passes": "of other traversals"},
+        **{"spread": "residual spread [m]", "moved": "path moved by [m]"},
     }
     parts.append(html_table(rounds, columns) if rounds else missing("rounds of the refinement."))
     apart = found.get("left_apart") or []
     if apart:
         listed = {f"{k + 1}": f"{a:.1f} s and {b:.1f} s" for k, (a, b) in enumerate(apart[:20])}
-        parts += [
-            note(f"Places that the graph drew together and the scans contradict ({len(apart)}):"),
-            pair_list(listed),
-        ]
-    parts.append(note("What the refined path spends, and what was only its start: see the part on evidence."))
+        parts += [note(f"Pairs of places in the graph that contradict the scans ({len(apart)}):"), pair_list(listed)]
+    parts.append(note("The measurements of the refined path are listed under evidence."))
     return section("refinement", title, *parts)
 
 
@@ -63,7 +60,7 @@ def _constants(found: Mapping[str, Any]) -> Markup:
     for name, entry in (found.get("constants") or {}).items():
         words, unit = MEANING.get(name, (name, ""))
         rows.append({"what": words, "value": entry["value"], "sigma": entry["sigma"], "unit": unit})
-    return html_table(rows, {"what": "lasting error", "value": "value", "sigma": "σ", "unit": "unit"})
+    return html_table(rows, {"what": "systematic error", "value": "value", "sigma": "σ", "unit": "unit"})
 
 
 def _bias(found: Mapping[str, Any]) -> list[Markup]:
@@ -73,4 +70,4 @@ def _bias(found: Mapping[str, Any]) -> list[Markup]:
     from graphslam.plots.refined import plot_yaw_bias
     from graphslam.plots.save import figure_png
 
-    return [picture(figure_png(plot_yaw_bias(None, knots)), "Bias of the yaw rate at its knots")]
+    return [picture(figure_png(plot_yaw_bias(None, knots)), "Yaw rate bias at its knots")]

@@ -47,7 +47,7 @@ _PARTS = {
 }
 _TITLES = {
     "run": "Report of a run",
-    "interrupted": "Report of a run that was not finished",
+    "interrupted": "Report of an unfinished run",
     "merged": "Report of a merge",
 }
 

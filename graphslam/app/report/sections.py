@@ -30,11 +30,11 @@ from graphslam.evaluate.metrics import is_time
 from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.ledger import EXCLUSIVE
 
-BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is honest"}
+BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is consistent"}
 ROUTINE = frozenset(
     {"submap", "attitude", "between", "loop", "match-not-used"}
 )  # told elsewhere in the page, or once a submap
-_UNFINISHED = "the run was not finished."
+_UNFINISHED = "the run is not finished."
 
 
 def what_was_run(folder: ReportFolder) -> Markup:
@@ -44,14 +44,14 @@ def what_was_run(folder: ReportFolder) -> Markup:
     if folder.kind == "merged":
         facts = {"merged by": r.get("by"), "solver": r.get("solver")}
         columns = {
-            **{"name": "session", "source": "source", "submaps": "submaps", "hangs_on": "hangs on"},
+            **{"name": "session", "source": "source", "submaps": "submaps", "hangs_on": "attached to"},
             **{"common_landmarks": "common landmarks", "rejected": "rejected", "alignment_rms": "alignment rms [m]"},
-            **{"gps": "GPS", "ties": "ties", "ties_dropped": "ties dropped"},
+            **{"gps": "GPS", "ties": "loop closures", "ties_dropped": "loop closures dropped"},
             "T_world_first_base": "first base (x y θ, or x y z qx qy qz qw)",
         }
         shown = {k: v for k, v in columns.items() if any(k in s for s in folder.sessions)}
         parts += [pair_list(facts), html_table(folder.sessions, shown) if shown else missing("sessions in merge.json.")]
-        parts.append(note("Options and versions are those of the single runs: see their own reports."))
+        parts.append(note("Options and versions are in the reports of the single runs."))
         return section("run", "What was run", *parts)
     said = said if isinstance(said, dict) else {}
     names = ("source", "frontend", "solver", "seed")
@@ -61,18 +61,18 @@ def what_was_run(folder: ReportFolder) -> Markup:
     versions = folder.part("versions")
     parts.append(pair_list(versions) if versions else missing("versions; ", _why(folder, "run.json")))
     if folder.config:
-        parts.append(folded("Every option with its value (config.toml)", html_element("pre", _toml(folder.config))))
+        parts.append(folded("All options (config.toml)", html_element("pre", _toml(folder.config))))
     else:
         parts.append(missing("options; ", _why(folder, "config.toml")))
     if folder.part("source_meta"):
-        parts.append(folded("What the log says of itself", pair_list(_flat(folder.part("source_meta")))))
+        parts.append(folded("Metadata of the log", pair_list(_flat(folder.part("source_meta")))))
     return section("run", "What was run", *parts)
 
 
 def records(folder: ReportFolder) -> Markup:
     """What was read, what was dropped and why, what was flagged."""
     if folder.kind == "merged":
-        return section("records", "Records", note("A merge reads submaps and no records."))
+        return section("records", "Records", note("A merge reads submaps, not records."))
     title = "Records read, dropped, flagged"
     if not folder.report:
         said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "run.json")
@@ -93,9 +93,9 @@ def records(folder: ReportFolder) -> Markup:
 
 def _use(stream: str, ledger: pd.DataFrame | None) -> str:
     if ledger is None:
-        return "not known"
+        return "unknown"
     n = int(ledger.loc[ledger["stream"].astype(str) == stream, "factor_id"].nunique())
-    return f"in {n} factor{'s' * (n != 1)}" if n else "in no factor: for scores alone, or not used"
+    return f"in {n} factor{'s' * (n != 1)}" if n else "in no factor (only for evaluation, or not used)"
 
 
 def metrics(folder: ReportFolder) -> Markup:
@@ -113,13 +113,13 @@ def metrics(folder: ReportFolder) -> Markup:
         cells = {**r, "direction": BETTER.get(str(r.get("direction")), "")}
         out.append(cells | dict(zip(("bounds", "said"), bounds.get(key, ("", "")))))
     columns = {
-        **{"key": "metric", "value": "value", "unit": "unit", "direction": "which way"},
-        **{"bounds": f"{CONFIDENCE * 100:g} % bounds", "said": "against them"},
+        **{"key": "metric", "value": "value", "unit": "unit", "direction": "direction"},
+        **{"bounds": f"{CONFIDENCE * 100:g} % bounds", "said": "verdict"},
     }
     return section(
         "metrics",
         "Metrics",
-        note("What each means: docs/how-to.md, docs/concepts.md, docs/without-truth.md. – : no value."),
+        note("The metrics are explained in the documentation. – : no value."),
         html_table(out, columns),
     )
 
@@ -154,14 +154,14 @@ def times(folder: ReportFolder) -> Markup:
         seconds = {"merge": folder.report["seconds"]}
     rows = [r for r in timed if not str(r["key"]).startswith("seconds_")]
     if not seconds and not rows:
-        said = _UNFINISHED if folder.kind == "interrupted" else "the folder does not say."
+        said = _UNFINISHED if folder.kind == "interrupted" else "not in the folder."
         return section("times", "Times", missing("seconds of the stages; ", said))
     parts: list[Any] = [html_table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
     if rows:
         parts.append(html_table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
     resumed = folder.values().get(RESUMED, folder.report.get(RESUMED))
     if is_numeric(resumed) and resumed:
-        parts.append(note(f"{resumed:.0f} submaps were there already: the run was resumed."))
+        parts.append(note(f"resumed run: {resumed:.0f} submaps were already finished."))
     return section("times", "Times", *parts)
 
 
@@ -181,20 +181,20 @@ def graph(folder: ReportFolder) -> Markup:
     }
     parts: list[Any] = [pair_list(facts)]
     if not g:
-        parts.append(missing("numbers of nodes and factors; the folder does not say them."))
+        parts.append(missing("numbers of nodes and factors."))
     rows = class_rows(figures_of(folder))
     if not rows:
-        return section("graph", "Graph", *parts, missing("χ² by kind of factor."))
+        return section("graph", "Graph", *parts, missing("χ² by class of factor."))
     columns = {
-        **{"class": "kind of factor", "factors": "factors", "rows": "scalars", "dof": "dof", "chi2": "χ²"},
+        **{"class": "class of factor", "factors": "factors", "rows": "scalars", "dof": "dof", "chi2": "χ²"},
         **{"chi2_per_dof": "χ²/dof", "low": f"{CONFIDENCE * 100:g} % from", "high": "to", "verdict": "verdict"},
         **{"mean_weight": "mean weight", "least_weight": "least weight"},
     }
     parts.append(html_table([Row(r, str(r.get("verdict", ""))) for r in rows], columns))
     parts.append(
         note(
-            "dof: scalars less what of the unknowns a kind determined; χ² without robust kernels; weights are those "
-            "that the kernels gave. Below the bounds a kind is believed too little, above them too much."
+            "dof: number of scalars minus the unknowns determined by the class. χ²: without robust kernels. Weights: "
+            "of the kernels. Above the bounds the assumed noise is too small, below them too large."
         )
     )
     return section("graph", "Graph", *parts)
@@ -202,12 +202,12 @@ def graph(folder: ReportFolder) -> Markup:
 
 def evidence(folder: ReportFolder) -> Markup:
     """Which streams were spent where, and what was declared to be shared."""
-    title = "Evidence: which stream went where"
+    title = "Evidence: use of each stream"
     if folder.ledger is None:
         return section("evidence", title, missing("the ledger of evidence; ", _why(folder, "ledger.csv")))
     t = folder.ledger.assign(factor=[_kind_of_factor(f) for f in folder.ledger["factor"].astype(str)])
     if t.empty:
-        return section("evidence", title, note("Nothing was spent."))
+        return section("evidence", title, note("No measurement was used."))
     t["length"] = t["t_end"] - t["t_start"]
     groups = []
     for (stream, factor, kind), of in t.groupby(["stream", "factor", "kind"], sort=True):
@@ -217,8 +217,8 @@ def evidence(folder: ReportFolder) -> Markup:
             | {"first": first, "last": last, "seconds": float(of["length"].sum())}
         )
     columns = {
-        **{"stream": "stream", "factor": "spent by", "factors": "factors", "kind": "kind", "first": "from [s]"},
-        **{"last": "to [s]", "seconds": "seconds spent"},
+        **{"stream": "stream", "factor": "used by", "factors": "factors", "kind": "kind", "first": "from [s]"},
+        **{"last": "to [s]", "seconds": "seconds"},
     }
     return section(
         "evidence",
@@ -226,7 +226,7 @@ def evidence(folder: ReportFolder) -> Markup:
         html_table(groups, columns),
         html_element("h3", "Declared exceptions"),
         _exceptions(t),
-        note("Kind “measurement”: spent once, a second spending is refused. Row by row in ledger.csv."),
+        note("Kind “measurement”: used once; a second use is rejected. All rows are in ledger.csv."),
     )
 
 
@@ -235,7 +235,7 @@ def _exceptions(t: pd.DataFrame) -> Markup:
     rows = []
     for (kind, said), of in shared.groupby(["kind", "note"], sort=True):
         rows.append({"kind": kind, "factors": int(of["factor_id"].nunique()), "note": said})
-    return html_table(rows, {"kind": "kind", "factors": "factors", "note": "why it may"}) if rows else note("None.")
+    return html_table(rows, {"kind": "kind", "factors": "factors", "note": "reason"}) if rows else note("None.")
 
 
 def _kind_of_factor(label: str) -> str:
@@ -261,9 +261,9 @@ def events(folder: ReportFolder) -> Markup:
     parts: list[Any] = [html_table(rows, ["event", "times"]) if rows else note("None.")]
     if lines:
         listed = item_list(lines)
-        parts.append(listed if len(lines) <= 20 else folded(f"All {len(lines)} that are no routine", listed))
+        parts.append(listed if len(lines) <= 20 else folded(f"All {len(lines)} other events", listed))
     else:
-        parts.append(note("No event but routine ones."))
+        parts.append(note("No other events."))
     return section("events", "Events", *parts)
 
 
@@ -275,12 +275,12 @@ def _line(event: Mapping[str, Any]) -> Markup:
 def problems(folder: ReportFolder) -> Markup:
     """What is not in the page, and why."""
     lines = [join_parts([html_element("code", name), " ", why]) for name, why in sorted(folder.problems.items())]
-    body = item_list(lines) if lines else note("Nothing that this kind of folder holds.")
+    body = item_list(lines) if lines else note("Nothing.")
     return section("missing", "What is missing", body)
 
 
 def _why(folder: ReportFolder, name: str) -> str:
-    return f"{name} {folder.problems.get(name, 'does not say')}."
+    return f"{name} {folder.problems.get(name, 'has no entry')}."
 
 
 def _toml(config: Mapping[str, Any]) -> str:
@@ -299,7 +299,7 @@ def _flat(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
 
 
 def figures_of(folder: ReportFolder) -> Figures:
-    """What the verdict is read from."""
+    """Input of the verdict."""
     return Figures(folder.report, folder.values(), folder.events or [], folder.sessions)
 
 
@@ -315,15 +315,15 @@ def verdict_lines(folder: ReportFolder) -> tuple[Finding, list[Finding]]:
 def interrupted(folder: ReportFolder) -> list[Finding]:
     """Lines of a run that was not finished."""
     return [
-        Finding("bad", "interrupted", f"Not finished. {stopped(folder)}"),
-        Finding("", "resume", "Go on with it: the same command once more, of “run” with --resume."),
+        Finding("bad", "interrupted", f"run: not finished — {stopped(folder)}"),
+        Finding("", "resume", "resume: run the same command again (`graphslam run` with --resume)."),
     ]
 
 
 def stopped(folder: ReportFolder) -> str:
     """Where an interrupted run stopped."""
     if not folder.submaps:
-        return "It stopped before its first submap was finished."
+        return "it stopped before the first submap was finished."
     last = folder.submaps[-1]
     try:
         until = f"{float(last['interval'][1]):.2f} s"
@@ -331,6 +331,6 @@ def stopped(folder: ReportFolder) -> str:
     except (KeyError, TypeError, ValueError, IndexError):
         until = first = "an unknown time"
     return (
-        f"It stopped after submap {last.get('key')} ({len(folder.submaps)} submaps, {first} to {until} of the log); "
-        "nothing was solved yet that is on disk. How much of the log was left is not in the folder."
+        f"it stopped after submap {last.get('key')} ({len(folder.submaps)} submaps, {first} to {until} of the log); "
+        "there is no solution yet."
     )

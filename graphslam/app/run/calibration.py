@@ -40,13 +40,13 @@ UNSAID = 0.3
 """σ of where a sensor stands whose place nobody stated [m]."""
 CERTAIN, DISAGREE = 0.999, 1.5
 """Submaps whose join has a χ² by degree of freedom above both limits disagree, and the cause is looked for."""
-OWN = "Noise and lasting errors are those of the settings made for this very set; nothing was estimated from the log."
+OWN = "noise and calibration: preset of this data set — not estimated from the log."
 
 
 def prepared(
     log: SensorLog, front: FrontEnd, config: CalibrateConfig, options: Mapping[str, Any], *, own: bool, seed: int
 ) -> tuple[SensorLog, CalibrateConfig, list[Finding], Calibration | None]:
-    """The log as the front end is to see it, the figures that were applied to it, and what is to be said.
+    """The log with corrections, the calibration options, findings, and the estimate.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def prepared(
         Is there a preset for this very set?
     """
     if config.given is not None:  # what a user wrote down stands before what would be estimated
-        said = [Finding("", "calibrated", "Noise and lasting errors are those given in calibrate.given.")]
+        said = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
         return apply_corrections(log, config.given), config, said, None
     if config.use == "none" or not looks_at(front):
         return log, config, [], None
@@ -68,7 +68,7 @@ def prepared(
         given = chosen(found.corrections, front, options)
         return apply_corrections(log, given), replace(config, given=given), found.findings(), found
     except GraphSlamError as error:
-        said = [Finding("", "calibrated", f"Noise could not be told from the log: {error}. Its defaults are used.")]
+        said = [Finding("", "calibrated", f"noise: default values — not estimated from the log: {error}.")]
         return log, config, said, None
 
 
@@ -83,15 +83,15 @@ def calibrate_log(
     reader_options: Mapping[str, Any] | None = None,
     preset: str | None = None,
 ) -> Calibration:
-    """What a log says of the noise and the lasting errors of its own sensors, without truth and presets' noise.
+    """Estimate sensor noise and systematic errors from a log (no ground truth, no noise of a preset).
 
     Parameters
     ----------
     source : card name, folder, or SensorLog
     frontend : str, optional
-        The front end that is to read the log; by default one that reads what is in it.
+        Front end that reads the log. Default: by the streams of the log.
     quick : bool
-        As inside a run: a part of the log, some seconds of work.
+        Use a part of the log, as inside a run (some seconds).
     seed : int
     config : mapping, optional
         Options over those of the source's preset, as for a run: how scans and landmarks are read.
@@ -101,12 +101,12 @@ def calibrate_log(
     Returns
     -------
     Calibration
-        ``corrections`` [SI units, rad], σ of each, ``config()`` for :func:`run`, and why what was not told was not.
+        ``corrections`` [SI units, rad], σ of each, ``config()`` for :func:`run`, and reasons for missing estimates.
 
     Raises
     ------
     GraphSlamError
-        Or one of its children: the log says nothing of its noise.
+        Or one of its children: the log does not determine its noise.
 
     Examples
     --------
@@ -154,7 +154,7 @@ def calibration(log: SensorLog, front: FrontEnd, effort: CalibrationBudget, *, s
     """What the log says of its noise, of the streams that the front end reads."""
     kind = front_kind(front)
     if kind is None:
-        raise DataError(f"front end {front.name} reads nothing that can be calibrated", where=log.name)
+        raise DataError(f"front end {front.name} has no data to calibrate", where=log.name)
     return calibrate_streams(log, kind, effort, front.config, seed=seed)
 
 
@@ -222,9 +222,9 @@ def named_causes(
     out = []
     for e in found.estimates:
         if e.applied and e.name not in own:
-            text = f"A cause of the disagreement: {estimate_text(e.name, e.value, e.sigma)} (gain {e.gain:.0f} nats). "
-            text += "To do: --set calibrate.use=always, or `graphslam calibrate`; a scale on covariances is no cure."
-            out.append(Finding("bad", "calibration", text))
+            text = f"{estimate_text(e.name, e.value, e.sigma)} — a cause of the disagreement between submaps
+            (log-likelihood " text += f"+{e.gain:.0f} nats). To do: --set calibrate.use=always, or `graphslam
+            calibrate`." out.append(Finding("bad", "calibration", text))
     return out
 
 
@@ -246,19 +246,13 @@ def lasting_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
         return []
     said = [estimate_text(r["name"], r["value"], r["sigma"]) for r in sure]
     rest = [f"± {_sigma_in_words(r)}" for r in facts if r not in sure]
-    text = (
-        "Constant errors of wheels and sensor were estimated with the map, and its covariances hold what is not told "
-    )
-    text += "of them"
-    if said:
-        text += f": {'; '.join(said)}"
-    text += f". Not told from zero: {', '.join(rest)}." if rest else "."
+    text = f"systematic errors estimated with the map: {'; '.join(said) or 'none significant'}"
+    text += f" — not significant: {', '.join(rest)}." if rest else "."
+    text += " The covariances include their uncertainty."
     out = [Finding("", "lasting", text)]
     if wild:
-        text = (
-            f"{'; '.join(estimate_text(r['name'], r['value'], r['sigma']) for r in wild)}: far more than a sensor that "
-        )
-        text += "works errs. To do: check its unit, its sign and its mounting; `graphslam data check`."
+        text = f"{'; '.join(estimate_text(r['name'], r['value'], r['sigma']) for r in wild)} — implausibly large. "
+        text += "To do: check unit, sign and mounting of the sensor; `graphslam data check`."
         out.append(Finding("bad", "lasting", text))
     return out
 
@@ -270,9 +264,9 @@ def _sigma_in_words(row: Mapping[str, Any]) -> str:
     if name == "turn_per_metre":
         return f"{np.rad2deg(s):.3f} deg/m of the turns"
     if name == "sensor_yaw":
-        return f"{np.rad2deg(s):.2f} deg of the sensor's direction"
+        return f"{np.rad2deg(s):.2f} deg of the sensor yaw"
     if name.startswith("mount"):
-        return f"{s:.3f} m of where the sensor stands, {'ahead' if name == 'mount_x' else 'to the left'}"
+        return f"{s:.3f} m of the sensor position ({'forward' if name == 'mount_x' else 'left'})"
     return f"{s:.3f} m of the ranges" if name == "range_offset" else f"{100 * s:.2f} % of {NAMES[name]}"
 
 

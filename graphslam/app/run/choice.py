@@ -51,23 +51,21 @@ def choose_front_end(log: SensorLog) -> Choice:
 
     moves = has(SteeringControls, VelocityControls, Odometry)
     if has(LandmarkObservations) and moves:
-        return Choice("rbpf-ekf", "sightings of landmarks with odometry")
+        return Choice("rbpf-ekf", "landmark observations with odometry")
     if has(SteeringControls) and has(LaserScans):
-        return Choice("rbpf-ekf", "planar laser of a steered car, in whose scans it looks for trunks")
+        return Choice("rbpf-ekf", "planar laser of a car-like robot; trunks are detected in the scans")
     if has(RangeScans) and (moves or has(Imu)):
-        return Choice("segslam", "spinning scanners with motion")
+        return Choice("segslam", "spinning scanners with odometry")
     if has(PointClouds):
         if not any(isinstance(s, Odometry) and _in_space(s) for s in log.streams.values()):
-            return Choice("kiss-icp", "clouds of a 3-D lidar, which it follows without other sensors")
+            return Choice("lidar-odometry", "point clouds of a 3-D LiDAR; the odometry is computed from them")
         if "clouds" in log.meta.get("unplaced", ()):
-            return Choice(
-                "kiss-icp", "clouds of a 3-D lidar whose place on the robot is not known, so without odometry"
-            )
-        return Choice("segslam", "clouds of a 3-D lidar with odometry")
+            return Choice("lidar-odometry", "point clouds of a 3-D LiDAR with unknown mounting, so without odometry")
+        return Choice("segslam", "point clouds of a 3-D LiDAR with odometry")
     if has(LaserScans) and moves:
         return Choice("segslam", "planar laser with odometry")
     held = ", ".join(f"{n} ({type(s).__name__}, {len(s.times)} records)" for n, s in log.streams.items()) or "nothing"
-    raise MissingDataError("no front end makes a map of this log", where=log.name, got=held, wanted=_wanted(log))
+    raise MissingDataError("no front end can map this log", where=log.name, got=held, wanted=_wanted(log))
 
 
 def _in_space(odometry: Odometry) -> bool:
@@ -79,16 +77,18 @@ def _in_space(odometry: Odometry) -> bool:
 def _wanted(log: SensorLog) -> str:
     kinds = {type(s) for s in log.streams.values()}
     if LaserScans in kinds:
-        return "odometry beside the laser scans (wheels, or poses of the robot)"
+        return "odometry in addition to the laser scans (wheels, or poses of the robot)"
     if LandmarkObservations in kinds:
-        return "odometry or velocities beside the sightings"
+        return "odometry or velocities in addition to the landmark observations"
     if PointObservations in kinds:
         return 'local maps by graphslam.local_maps(log, "points"), joined by graphslam.join_submaps'
     if Pseudoranges in kinds:
-        return "scans or sightings of landmarks; pseudoranges alone are solved by `graphslam study smartloc`"
+        return "scans or landmark observations; pseudoranges alone are solved by `graphslam study smartloc`"
     if Gps in kinds and Imu in kinds:
-        return "scans, clouds or sightings; IMU and fixes alone are solved by `graphslam study withheld-fixes`"
-    return "laser scans with odometry, clouds, or sightings of landmarks with odometry"
+        return (
+            "scans, clouds or landmark observations; IMU and GPS alone are solved by `graphslam study withheld-fixes`"
+        )
+    return "laser scans with odometry, clouds, or landmark observations with odometry"
 
 
 def kind_preset(log: SensorLog) -> str:

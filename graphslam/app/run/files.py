@@ -202,9 +202,7 @@ def read_map(root: Path) -> GlobalMap:
     m, d = len(a["node_times"]), a["node_covariances"].shape[1]
     bases = a.get("base_nodes")
     if bases is not None and len(bases) and (bases.min() < 0 or bases.max() >= m or np.any(np.diff(bases) <= 0)):
-        raise FormatError(
-            "array 'base_nodes' names nodes that are not there", where=where, wanted=f"rising, 0 … {m - 1}"
-        )
+        raise FormatError("array 'base_nodes' refers to missing nodes", where=where, wanted=f"rising, 0 … {m - 1}")
     if d != {3: 3, 7: 6}.get(a["node_poses"].shape[1]):
         raise FormatError("poses and covariances do not fit", where=where, got=(a["node_poses"].shape, d))
     try:
@@ -241,7 +239,7 @@ def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
     a = read_npz(file, fmt=ASSOCIATION_FORMAT, fields=ASSOCIATION)
     o = a["offsets"]
     if o[0] != 0 or np.any(np.diff(o) < 0) or o[-1] != len(a["ids"]) or len(np.unique(a["keys"])) != len(a["keys"]):
-        raise FormatError("offsets do not partition the identities, or a key stands twice", where=str(file))
+        raise FormatError("offsets do not partition the identities, or a key is repeated", where=str(file))
     return {int(k): a["ids"][o[i] : o[i + 1]] for i, k in enumerate(a["keys"])}
 
 
@@ -332,7 +330,7 @@ def _cell(text: str, kind: type, where: str) -> Any:
     except (ValueError, OverflowError):
         raise FormatError("not a number", where=where, got=repr(text[:40])) from None
     if not abs(value) <= (2**62 if kind is int else LARGEST):
-        raise FormatError("a number that cannot be used", where=where, got=text[:40], wanted="finite numbers")
+        raise FormatError("not a finite number", where=where, got=text[:40], wanted="finite numbers")
     return value
 
 

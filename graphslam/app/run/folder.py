@@ -19,6 +19,7 @@ from typing import Any
 
 from graphslam.app.folders.generations import check_links, is_empty, outputs, sweep
 from graphslam.app.folders.lock import locked, make_folder
+from graphslam.app.run.front_ends import RENAMED
 from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
@@ -72,7 +73,7 @@ class RunFolder:
             if folder._begun():
                 if not resume:
                     raise RunFolderError(
-                        f"{folder.path}: holds a run already; --resume goes on with it, or choose another --out"
+                        f"{folder.path}: holds a run already; resume it with --resume, or choose another --out"
                     )
                 folder._check_same(old, config)
             else:
@@ -99,11 +100,15 @@ class RunFolder:
         except ConfigError as error:
             raise RunFolderError(f"{self.path}: damaged ({error})") from None
         now = tomllib.loads(dump_toml(config))
+        if isinstance(before.get("run"), dict) and before["run"].get("frontend") in RENAMED:
+            before["run"]["frontend"] = RENAMED[before["run"]["frontend"]]
         if isinstance(before.get("run"), dict) and "log" not in before["run"]:
-            logger.warning("%s: an older version did not note which log it read; it is taken to be this one", self.path)
+            logger.warning(
+                "%s: written by an older version without the name of its log; assuming it is this one", self.path
+            )
             now["run"].pop("log", None)
         for key, a, b in _differences(before, now):
-            what = "the log is another one: " if key.startswith("run.log.") else ""
+            what = "another log is given: " if key.startswith("run.log.") else ""
             raise RunFolderError(f"{self.path}: cannot resume, {what}{key} was {a!r} and is {b!r} now")
 
     @property

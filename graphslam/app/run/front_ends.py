@@ -16,6 +16,8 @@ from graphslam.io.readers import list_readers
 from graphslam_frontends.base import FrontEnd
 
 GROUP = "graphslam.frontends"
+RENAMED = {"kiss-icp": "lidar-odometry"}
+"""Front ends by their name in older run folders."""
 
 
 def front_end_names() -> list[str]:
@@ -25,8 +27,12 @@ def front_end_names() -> list[str]:
 
 def check_name(name: str) -> None:
     """See that a front end of that name is installed."""
-    if name not in front_end_names():
-        raise UnknownNameError("front end", name, front_end_names())
+    known = front_end_names()
+    if name in known:
+        return
+    if name in RENAMED:
+        raise ConfigError(f"front end {name!r} is now called {RENAMED[name]!r}; use that name")
+    raise UnknownNameError("front end", name, known)
 
 
 def name_of(front: str | FrontEnd | type[FrontEnd]) -> str:
@@ -46,11 +52,10 @@ def _kind(name: str | type[FrontEnd]) -> tuple[Any, Any]:
     """Class of a front end and its configuration class."""
     if isinstance(name, type):
         return name, typing.get_type_hints(name)["config"]
-    found = [e for e in entry_points(group=GROUP) if e.name == name]
-    if not found:
-        raise UnknownNameError("front end", name, front_end_names())
+    check_name(name)
+    found = next(e for e in entry_points(group=GROUP) if e.name == name)
     try:
-        kind = found[0].load()
+        kind = found.load()
     except ImportError as error:
         raise GraphSlamError(f"front end {name!r} cannot be imported ({error})") from error
     return kind, typing.get_type_hints(kind)["config"]

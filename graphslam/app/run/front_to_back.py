@@ -33,7 +33,7 @@ class ProgressBar(Observer):
         first, last = log.interval
         self.bar = tqdm(total=round(last - first, 1), unit="s", desc=log.name, disable=not shown, leave=False)
         self.bar.bar_format = "{l_bar}{bar}| {n:.0f}/{total:.0f} s [{elapsed}<{remaining}{postfix}]"
-        self.bar.set_postfix_str("kernels are compiled at their first use ever, about half a minute")
+        self.bar.set_postfix_str("compiling (first run only, ~30 s)")
 
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         """A step."""

@@ -156,7 +156,9 @@ def _write_files(new: Generation, run: Run) -> None:
         try:
             write_taken(root, run.taken, mark["generation"])
         except FormatError as error:
-            logger.warning("no loop of this run can be undone: what its graph was made of is not stored (%s)", error)
+            logger.warning(
+                "no loop closure of this run can be undone: the inputs of its graph are not stored (%s)", error
+            )
     new.write_lines("events.jsonl", [{"event": GENERATION_EVENT, **mark}, *run.events])
     if run.ledger is not None:
         new.write_text("ledger.csv", run.ledger.to_csv(index=False))
@@ -328,16 +330,16 @@ def _refined_of(run: Run, store: Path) -> list[Submap]:
     submaps, where = read_submaps(store, load_grid=load_spilled), str(store)
     have, wanted = [s.key for s in submaps], [s.key for s in run.submaps]
     if have != wanted:
-        raise FormatError("refined submaps are not those of the run", where=where, got=have[:9], wanted=wanted[:9])
+        raise FormatError("refined submaps do not belong to this run", where=where, got=have[:9], wanted=wanted[:9])
     frames = base_frames(run.map)
     g = group_of(frames)
     exits = g.between(frames[:-1], frames[1:])
     if submaps[0].dim != run.map.dim:
-        raise FormatError("refined submaps are of another dimension", where=where, got=submaps[0].dim)
+        raise FormatError("refined submaps have another dimension", where=where, got=submaps[0].dim)
     off = np.abs(g.log(g.between(exits, np.array([s.exit_pose for s in submaps]))))
     if off.max() > SAME_FRAME:
         raise FormatError(
-            "refined submaps do not lie along the path of map.npz: one of them was copied or changed alone",
+            "refined submaps do not match the path of map.npz; copy the whole folder",
             where=where,
             got=f"{off.max():.3g} m or rad apart",
             wanted="0",
@@ -352,7 +354,7 @@ def _check_submaps(home: Path, root: Path) -> None:
     have, wanted = [e["key"] for e in SubmapStore(home).entries], [*read_association(root)]
     if have != wanted:
         raise FormatError(
-            "submaps are not those that the map was made of (association.npz); run again with --resume",
+            "submaps do not match association.npz; run again with --resume",
             where=str(home / "submaps" / "index.json"),
             got=f"{len(have)} submaps",
             wanted=f"{len(wanted)}, to key {wanted[-1] if wanted else None}",

@@ -287,7 +287,7 @@ def finished(
 
     best = solve()
     while best.denied and front.draws and work.settled is None and not undo and work.draw + 1 < settings.backend.draws:
-        logger.warning("passes of the map still deny each other: submaps are made anew of other random numbers")
+        logger.warning("overlapping submaps still contradict each other: making submaps again with another seed")
         bars = [ProgressBar(log, progress)]
         work = work.drawn_anew(back_end(RecordSource(log), settings, effective["run"]["solver"], bars))
         work.step()
@@ -478,7 +478,7 @@ def _solved(
     if settings.backend.loops != "auto" or not first.denied:
         return
     looking = replace(settings, backend=replace(settings.backend, loops=True))
-    logger.warning("passes of the map deny each other: looking for loops between submaps")
+    logger.warning("overlapping submaps contradict each other: searching loop closures between submaps")
     other = back_end(RecordSource(taken.log), looking, effective["run"]["solver"], ())
     for s in submaps:
         other.add(s)

@@ -71,9 +71,7 @@ def remake_map(
         Heights of the floor plans above the path [m]; default the run's.
     """
     if minimum_entropy and hypotheses:
-        raise ConfigError(
-            "a run is solved with other choices of its matches or with other topologies, not both at once"
-        )
+        raise ConfigError("minimum_entropy and hypotheses exclude each other; give one of them")
     home = Path(folder)
     if not (outputs(home) / "run.json").is_file():
         open_run(home)  # says what is wrong
@@ -189,9 +187,9 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     submaps = refined or read_submaps(root, load_grid=load_spilled)
     if not has_maps(submaps):
         raise MissingDataError(
-            f"{root}: the run has no evidence grids or clouds to make a map of",
+            f"{root}: the run has no evidence grids or clouds, so there is no dense map",
             got=f"front end {run.report.get('frontend')}",
-            wanted="a run of a front end with dense maps: segslam, scan-window, kiss-icp, rbpf-grid",
+            wanted="a run of a front end with dense maps: segslam, scan-window, lidar-odometry, rbpf-grid",
         )
     values = read_options(root)
     heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}

@@ -164,7 +164,7 @@ class Run:
     @property
     def headline(self) -> Finding:
         """The first line of the verdict: what was made, how far it is to be trusted, what to do."""
-        return headline_of_json(self.report.get("verdict")) or Finding("", "headline", "There is no verdict.")
+        return headline_of_json(self.report.get("verdict")) or Finding("", "headline", "No verdict.")
 
     def to_pandas(self) -> pd.DataFrame:
         """The path at full rate, a row an instant, in the frame of the first base: :meth:`Trajectory.to_pandas`."""

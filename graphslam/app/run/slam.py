@@ -180,8 +180,8 @@ class Slam:
         if self._run is not None:
             return self._run.map
         if self._work is None or not self._work.submaps:
-            why = self.waits_for or "the first one lasts until its records have come"
-            raise MissingDataError(f"no submap is finished: {why}", where=self._feed.name)
+            why = self.waits_for or "the first submap ends after its last record"
+            raise MissingDataError(f"no submap is finished yet: {why}", where=self._feed.name)
         back, submaps = self._work.back, self._work.submaps
         here = make_solution(
             self._asked["solver"], back.graph, state_of(back.graph), iterations=0, gap=None, seconds=0.0
@@ -251,7 +251,7 @@ class Slam:
 def _waits_for(front: FrontEnd, settings: cfg.RunConfig) -> str:
     """What has to wait for the end of the log; empty where nothing has."""
     if not front.incremental():
-        return f"the front end {front.name} works on the whole log"
+        return f"the front end {front.name} needs the whole log"
     for what, use in (("imu", settings.imu.use), ("compass", settings.compass.use), ("beacons", settings.beacons.use)):
         if use != "none":
             return f"{what}.use = {use!r} needs the whole log"

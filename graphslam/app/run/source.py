@@ -41,12 +41,12 @@ def log_of_run(said: Mapping[str, Any], log: str | Path | SensorLog | None = Non
         if log is not None or Path(said["source"]).exists():
             raise
         raise MissingDataError(
-            "the log of the run cannot be read from here",
+            "the log of the run cannot be read from this folder",
             where=said["source"],
             got="no data set or path of this name",
             wanted="the folder in which the run was started, or where the log is now (--log, log=…)",
         ) from error
     digest = log_digest(source)
     if said.get("log", digest) != digest:
-        raise DataError("the log is not that of the run", where=source.name, got=digest, wanted=said["log"])
+        raise DataError("this is not the log of the run", where=source.name, got=digest, wanted=said["log"])
     return source

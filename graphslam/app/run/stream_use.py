@@ -1,4 +1,4 @@
-"""What became of every stream of a log in a run: records offered, records used, and why the others were not."""
+"""Use of every stream of a log in a run: records offered, records used, and why the others were not."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ Role = Literal["input", "gps", "imu", "compass", "beacons", "unused"]
 
 @dataclass(frozen=True, slots=True)
 class StreamUse:
-    """What became of one stream.
+    """Use of one stream.
 
     Parameters
     ----------
     role : {"input", "gps", "imu", "compass", "beacons", "unused"}
-        What it was there for: ``input`` of the front end; something that the graph was given; or nothing in this run.
+        ``input`` of the front end, a stream of the graph, or not used in this run.
     offered : int
         Records that the log holds.
     used : int
-        Records whose time and stream a factor spends (the ledger).
+        Records that a factor uses (by the ledger).
     asked : bool
         The configuration asks for it by a setting of its own.
     why : str
@@ -60,7 +60,7 @@ def stream_use(
     Parameters
     ----------
     graph : PoseGraph
-        Finished; its ledger says what was spent.
+        Finished; its ledger lists the records that were used.
     dropped : mapping of str to int
         Records dropped by the front end and the graph, per ``"stream: reason"``.
     streams_used : frozenset of str
@@ -92,11 +92,11 @@ def stream_use(
                 why = "gps.use is none"
             elif used == 0 and spent.any():
                 why = (
-                    f"its {int(spent.sum())} fixes on the path span less than {settings.gps.baseline:g} m, on the "
-                    "ground or in the map, so that the heading of their frame stays unknown"
+                    f"its {int(spent.sum())} fixes on the path span less than {settings.gps.baseline:g} m, so the "
+                    "heading of their frame cannot be estimated"
                 )
             elif used < len(times) and settings.gps.use != "all":
-                why = f"gps.use is {settings.gps.use}: the others are kept back to test with"
+                why = f"gps.use is {settings.gps.use}; the others are withheld as a test"
         elif isinstance(stream, Imu):
             asked = settings.imu.use == name or settings.imu.use == "auto"
             role, why = "imu", left_out.get(name, "") if asked else "imu.use is none"
@@ -107,12 +107,12 @@ def stream_use(
             asked, role = True, "beacons"
         if asked and role in ("compass", "beacons") and 0 < used < len(times):
             every = (settings.compass if role == "compass" else settings.beacons).every
-            why = f"one in {every:g} s is used, and none outside the path" if every else ""
+            why = f"limited to one every {every:g} s and to the time of the path" if every else ""
         if used < len(times) and not why:
             reasons = [f"{n} {k}" for k, n in lost.items()]
             outside = len(times) - used
             if outside and role != "unused":
-                reasons.append(f"{outside} at times that no factor spends")
-            why = ", ".join(reasons) or ("nothing in this run reads it" if role == "unused" else "")
+                reasons.append(f"{outside} at times that no factor covers")
+            why = ", ".join(reasons) or ("no part of this run reads it" if role == "unused" else "")
         out.append(StreamUse(name, role, len(times), used, asked, why))
     return out

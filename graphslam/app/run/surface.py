@@ -128,7 +128,7 @@ class RunSurface:
 
         if by == "terrain":
             if terrain is None:
-                raise MissingDataError("a surface is coloured by terrain of a run whose terrain was made before")
+                raise MissingDataError("colour by terrain needs the terrain; make it with graphslam map --terrain")
             return class_colours(terrain.at(self.mesh.vertices))
         if by == "piece":  # neighbours along the path differ
             return vertex_colours(np.asarray((7.0 * self.owner) % 20.0, dtype=np.float64), "tab20")
@@ -190,7 +190,7 @@ def read_surface(
     begin = time.process_time()
     mesh = zero_set(layer.bricks(), layer.config.voxel)
     if not len(mesh.triangles):
-        raise DataError("the scans show no surface", where=streams, wanted="points that lie densely beside each other")
+        raise DataError("the scans show no surface", where=streams, wanted="dense points")
     seconds = time.process_time() - begin
     nodes = np.array([*layer.pieces, -1])[vertex_owners(mesh, layer)]
     session = np.where(nodes >= 0, np.searchsorted(first, nodes, side="right") - 1, -1)
@@ -237,9 +237,9 @@ def draw_surface(made: RunSurface, figures: Path, *, name: str) -> list[Path]:
     ax = plot_surface(v, t, v[:, 2], label="height [m]", title=f"{name}: surface")
     out = [save_figure(ax, figures / "surface.png")]
     if np.any(made.session > 0):
-        ax = plot_surface(v, t, (made.session + 1).astype(np.float64), label="session", title=f"{name}: who saw it")
+        ax = plot_surface(v, t, (made.session + 1).astype(np.float64), label="session", title=f"{name}: by session")
         out.append(save_figure(ax, figures / "surface_sessions.png"))
     if np.any(np.isfinite(made.sigma)):
-        ax = plot_surface(v, t, 1e3 * made.sigma, label="σ of the place [mm]", title=f"{name}: how sure the surface is")
+        ax = plot_surface(v, t, 1e3 * made.sigma, label="σ of the position [mm]", title=f"{name}: σ of the surface")
         out.append(save_figure(ax, figures / "surface_sigma.png"))
     return out

@@ -117,9 +117,9 @@ def read_taken(folder: Path) -> tuple[Taken, str | None]:
     """Read it, and the generation that it is of."""
     if not (folder / "taken.npz").is_file() or not (folder / INPUTS / INDEX_NAME).is_file():
         raise MissingDataError(
-            "the run does not hold what its graph was made of (taken.npz, inputs/)",
+            "the run folder has no inputs of its graph (taken.npz, inputs/)",
             where=str(folder),
-            wanted="a run of this version: run it again with --resume, which makes no submap anew",
+            wanted="a run of this version; run it again with --resume, finished submaps are reused",
         )
     log, a = load_log(folder / INPUTS), read_npz(folder / "taken.npz", fmt=TAKEN_FORMAT)
     try:

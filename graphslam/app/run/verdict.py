@@ -1,6 +1,7 @@
-"""The verdict of a run: is it solved, is it honest, is it whole, and was everything used that was asked for.
+"""The verdict of a run: is it solved, is it consistent, is it complete, and was all requested data used.
 
-"Reported" means: a line here. The command line prints the lines, ``--json`` and ``run.json`` hold them, the report
+"Reported" means: a line here, of the form ``subject: value [bounds] — meaning`` and, where something is to be done,
+one imperative sentence. The command line prints the lines, ``--json`` and ``run.json`` hold them, the report
 shows them. What follows from the stored figures is worked out anew wherever it is shown (:func:`stated`); what only the
 run itself saw (:func:`observed`) is read from ``run.json``.
 """
@@ -29,22 +30,22 @@ from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
 from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.maps.contradictions import LOOK
 
-TWO_MAPS_DO = "see which of both is right there, or give GPS there and run again"
+TWO_MAPS_DO = "check which of the two is right there, or add GPS there and run again"
 """Of two maps that explain a log."""
 CONFIDENCE = 0.95
 CERTAIN = 0.999
-"""A test that an honest run fails less often than once in a thousand runs is no accident."""
+"""A test that a consistent run fails less often than once in a thousand runs is no accident."""
 IN_WORDS = {
-    "consistent": "inside them: the errors are as large as the covariances say",
-    "over-confident": "above them: the errors are larger than the covariances say (over-confident)",
-    "pessimistic": "below them: the errors are smaller than the covariances say (pessimistic)",
+    "consistent": "errors match the covariances",
+    "over-confident": "errors are larger than the covariances (over-confident)",
+    "pessimistic": "errors are smaller than the covariances (pessimistic)",
 }
 RESIDUALS_IN_WORDS = {
-    "consistent": "inside them: residuals are as large as the noise that was stated leaves them",
-    "over-confident": "above them: residuals are larger than the noise that was stated leaves them",
-    "pessimistic": "below them: residuals are smaller than the noise that was stated leaves them",
+    "consistent": "residuals match the noise model",
+    "over-confident": "residuals are larger than the noise model explains",
+    "pessimistic": "residuals are smaller than the noise model expects",
 }
-"""Of residuals, which were fitted: what they say of the errors of the map, the line on its covariances says."""
+"""Of fitted residuals; the line on the covariances is about the errors of the map."""
 CERTAIN_OVER_CONFIDENT = two_sided_width(CERTAIN) / two_sided_width(CONFIDENCE)
 """Ratio of the two-sided bounds of a normal variable at the two levels."""
 EXACT = 1e-12
@@ -52,13 +53,13 @@ EXACT = 1e-12
 SMALL_GAP = 1e-6
 """Of the objective: an objective above the optimum by less is at it."""
 FLAGGED = 0.05
-"""Share of the submaps of honest runs that front ends may flag by chance."""
+"""Share of the submaps of consistent runs that front ends may flag by chance."""
 QUARTER = 0.25
 """Share of the records of a stream that was asked for and of which a part may be kept back; below, as for MOSTLY."""
 ALIKE = 2
-"""Submaps of which the same is said in full; of more their keys are told."""
+"""Submaps whose equal findings are shown in full; of further ones only the keys are listed."""
 DENIED = 0.1
-"""Share of solid points that another pass denies from which a map is to be distrusted."""
+"""Share of occupied voxels contradicted by overlapping submaps from which a map is bad."""
 MOSTLY = 0.95
 """Share of the records of a stream below which the verdict asks to look at what became of the others."""
 
@@ -136,7 +137,7 @@ def observed(
     submaps: Sequence[Submap] = (),
     events: Sequence[Mapping[str, Any]] = (),
 ) -> list[Finding]:
-    """Lines on what became of every stream, what was noticed in it, and what the front end says.
+    """Lines on the use of every stream, on anomalies in it, and the findings of the front end.
 
     Parameters
     ----------
@@ -148,15 +149,23 @@ def observed(
         Of the graph; ``outlier``, ``beacon-not-placed`` and ``readings-dropped`` become lines.
     """
     counts = "; ".join(s.in_words() for s in streams)
-    out = [Finding("", "streams", f"Records used of those offered: {counts}.")] if streams else []
+    out = [Finding("", "streams", f"records used: {counts}.")] if streams else []
     for s in streams:
         if s.used == 0 and s.asked:
-            out.append(Finding("bad", f"{s.role}-not-used", f"{s.name} was asked for and not used: {s.why}."))
+            out.append(
+                Finding(
+                    "bad",
+                    f"{s.role}-not-used",
+                    f"{s.name}: 0 of {s.offered} records used, although requested — {s.why}.",
+                )
+            )
         elif s.used == 0 and s.role == "input":
-            text = f"Nothing of {s.name} was used ({s.offered} records): {s.why}."
+            text = f"{s.name}: 0 of {s.offered} records used — {s.why}."
             out.append(Finding("look", "stream-not-used", text))
         elif (s.asked and s.used < QUARTER * s.offered) or (s.role == "input" and s.used < MOSTLY * s.offered):
-            out.append(Finding("look", "stream-part-used", f"Only {s.in_words()}: {s.why}."))
+            out.append(
+                Finding("look", "stream-part-used", f"{s.name}: {s.used} of {s.offered} records used — {s.why}.")
+            )
     used = {s.name for s in streams if s.used}
     for n in noticed:
         level: Level = "look" if n.finding.level == "bad" and n.stream not in used else n.finding.level
@@ -165,7 +174,7 @@ def observed(
 
 
 def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
-    """What front ends say of submaps; of what they say of many, the first in full and the keys of the others."""
+    """Findings of front ends on submaps; of equal ones the first in full and the keys of the others."""
     said = [(s.key, f) for s in submaps for row in s.report.get("findings", ()) if (f := Finding.from_row(row))]
     told: dict[tuple[Level, str], list[int]] = {}
     out = []
@@ -178,43 +187,41 @@ def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
     for (level, code), keys in told.items():
         if more := keys[ALIKE:]:
             some = ", ".join(map(str, more[:12])) + (", …" if len(more) > 12 else "")
-            text = f"The same ({code}) is said of {len(more)} more submaps: {some}; their reports have the figures."
+            text = f"{code}: {len(more)} more submaps ({some}) — details are in their reports."
             out.append(Finding(level, code, text))
     return out
 
 
 def _of_events(events: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """What the graph left out by its own judgement."""
+    """Measurements that the graph left out."""
     out = []
     taken = Counter(str(e["group"]) for e in events if e.get("event") == "outlier")
     if taken:
         counts = ", ".join(f"{n} of class {group}" for group, n in sorted(taken.items()))
-        text = (
-            f"Graduated non-convexity took out {taken.total()} factors as outliers: {counts}. Each is named in events."
-        )
+        text = f"outliers: {taken.total()} factors ({counts}) — removed by graduated non-convexity; see events."
         out.append(Finding("look", "outliers", text))
     out += [_fix_errors(e) for e in events if e.get("event") == "gps-errors"]
     for e in events:
         if e.get("event") == "beacon-not-placed":
-            text = f"Beacon {e['beacon']} has no place after {e['distances']} distances: {e['why']}."
+            text = f"beacon {e['beacon']}: no position after {e['distances']} distances — {e['why']}."
             out.append(Finding("look", "beacon-not-placed", text))
     return out
 
 
 def _fix_errors(e: Mapping[str, Any]) -> Finding:
-    """What the log told of the errors of its fixes, and what was made of it."""
+    """Estimated errors of the GPS fixes, and how the graph models them."""
     text = ""
     if e.get("wild"):
-        text = f"{e['wild']} of {e['fixes']} fixes lie wide of the map and of the others, and were taken out. "
+        text = f"GPS outliers: {e['wild']} of {e['fixes']} fixes — far from the map and from the other fixes; removed. "
     if e.get("bias_sigma"):
         text += (
-            f"Errors of the fixes last: a part of {e['bias_sigma']:.3g} m that fades over {e['bias_time']:.3g} s, and "
-            f"a white part of {e['white']:.2g} times the stated σ, are likelier than white noise by "
-            f"{e['gain'] / 2:.3g} nats. The graph has a bias for every fix (gps.errors=stated believes the receiver "
-            "instead)."
+            f"GPS errors: a time-correlated part (σ {e['bias_sigma']:.3g} m, time constant {e['bias_time']:.3g} s) and "
+            f"a white part of {e['white']:.2g} times the receiver's σ — log-likelihood +{e['gain'] / 2:.3g} nats over "
+            "white noise; the graph estimates a bias for every fix. Use --set gps.errors=stated to keep the receiver's "
+            "σ."
         )
     elif e.get("white", 1.0) > 1.0:
-        text += f"Errors of the fixes are {e['white']:.2g} times as large as stated, and are taken for so large."
+        text += f"GPS errors: {e['white']:.2g} times the receiver's σ — the σ of every fix was scaled by it."
     return Finding("look", "gps-correlated" if e.get("bias_sigma") else "gps-errors", text.strip())
 
 
@@ -246,7 +253,7 @@ def whole_chi2(figures: Figures) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A ratio that is 1 where covariances are honest, held against its bounds.
+    """A ratio that is 1 where covariances are consistent, and its bounds.
 
     Parameters
     ----------
@@ -270,17 +277,17 @@ class Judged:
 
     @property
     def level(self) -> Level:
-        """One honest run in forty is outside on either side: bad is what one in a thousand is not."""
+        """One consistent run in forty is outside on either side; bad is less likely than one in a thousand."""
         if self.said == "consistent":
             return "good"
         return "bad" if self.ratio > two_sided_bounds(self.ratio, self.dof, CERTAIN)[1] else "look"
 
     @property
     def text(self) -> str:
-        """The ratio with its bounds, in words."""
+        """``1.02 per degree of freedom [0.94, 1.06; 4321 dof] — residuals match the noise model``."""
         low, high, said = two_sided_bounds(self.ratio, self.dof, CONFIDENCE)
-        bounds = f"{CONFIDENCE * 100:g} % bounds {low:.3g} to {high:.3g} ({self.dof:.4g} degrees of freedom)"
-        return f"{self.ratio:.3g}, {bounds}; {(IN_WORDS if self.code == 'nees' else RESIDUALS_IN_WORDS)[said]}"
+        meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[said]
+        return f"{self.ratio:.3g} per degree of freedom [{low:.3g}, {high:.3g}; {self.dof:.4g} dof] — {meaning}"
 
 
 def judged_chi2(figures: Figures) -> Judged | None:
@@ -299,7 +306,7 @@ def of_the_start(figures: Figures, chi2: Judged) -> bool:
 def judged_nees(figures: Figures) -> list[Judged]:
     """NEES against the truth, where it is known, in each gauge in which it was taken."""
     m = dict(figures.metrics)
-    gauges = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after an alignment")]
+    gauges = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after alignment")]
     bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]
     if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and number(m.get(k))]:
         m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
@@ -320,48 +327,44 @@ def _state(figures: Figures) -> Finding:
     m = figures.metrics
     converged = figures.report.get("converged", m.get("converged"))
     if converged is None:
-        return Finding("bad", "state", "Whether it is solved is not known: the folder does not say.")
+        return Finding(
+            "bad", "state", "solution: unknown — the run folder does not record whether the solver converged."
+        )
     if not converged:
-        return Finding("bad", "state", "Not solved: the graph is not at its optimum.")
+        return Finding("bad", "state", "solution: not converged — the graph is not at its optimum.")
     objective, gap = m.get("objective", m.get("join_chi2")), m.get("gap")
-    value = "" if objective is None else f", objective {objective:.6g} (Σ rᵀ P⁻¹ r)"
+    value = "at the optimum" if objective is None else f"cost {objective:.6g} (Σ rᵀ P⁻¹ r)"
     if gap is None:
-        text = f"Solved: at the optimum by the solver's own test{value}; no gap to a batch solution was measured."
+        text = f"solution: {value} — converged by the solver's own test; not compared with a batch solution."
         return Finding("good", "state", text)
     scale = max(abs(objective or 0.0), 1.0)
     small = gap <= SMALL_GAP * scale
-    text = "no higher than" if small else f"{gap:.3g} above"
-    return Finding(
-        "good" if small else "look",
-        "state",
-        f"Solved: at the optimum{value}, {text} what a batch solution reaches from there.",
-    )
+    text = "a batch solution from there is no lower" if small else f"a batch solution from there is lower by {gap:.3g}"
+    return Finding("good" if small else "look", "state", f"solution: {value} — converged; {text}.")
 
 
 def _chi2(figures: Figures) -> Finding:
     if j := judged_chi2(figures):
         if of_the_start(figures, j):
-            text = (
-                f"χ²/dof of the graph at which the refined path began: {j.text}. The refined path does not rest on it."
-            )
+            text = f"chi-square of the initial graph: {j.text}. The refined path does not depend on it."
             return Finding("", "chi2", text)
-        return Finding(j.level, "chi2", f"χ²/dof of the whole graph: {j.text}.")
+        return Finding(j.level, "chi2", f"chi-square of the graph: {j.text}.")
     if whole_chi2(figures) is None:
-        text = "χ² of the whole graph against its bounds: not known, or nothing in it is redundant."
+        text = "chi-square of the graph: not tested — no redundant measurements, or degrees of freedom unknown."
     else:
-        text = "χ² of the whole graph is 0: nothing in it is redundant that could contradict."
+        text = "chi-square of the graph: not tested — no measurement in this log is redundant."
     return Finding("", "chi2", text)
 
 
 def _said(row: ConsistencyTest) -> str:
-    """A row of evidence with its figures."""
+    """One test with its value."""
     if row.lasting and row.dof == 1.0:
         return f"{row.name} ({row.value:.1f} σ)"
     return f"{row.name} ({row.value:.3g} at {row.dof:.3g} degrees of freedom)"
 
 
 def judged_trust(figures: Figures) -> CovarianceAssessment | None:
-    """Can the covariances be believed, by what the log itself holds? None in folders that do not say."""
+    """Are the covariances consistent, by the tests that need no ground truth? None in folders without their results."""
     if figures.report.get("evidence") is None:
         return None
     rows = tests_of_json(figures.report.get("evidence"))
@@ -371,52 +374,49 @@ def judged_trust(figures: Figures) -> CovarianceAssessment | None:
 
 
 def _trust(figures: Figures) -> list[Finding]:
-    """Can the covariances be believed? Nothing here was held against a truth, and the line says what it rests on."""
+    """Are the covariances consistent? The line names the tests; none of them uses ground truth."""
     found = judged_trust(figures)
     if found is None:
         return []
     said = "; ".join(_said(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
-    rest = "It rests on residuals and on what was withheld, not on a truth"
+    rest = "Tested with residuals and withheld data, without ground truth"
     if figures.report.get("identities") == "run" and figures.metrics.get("landmarks", 0.0) > 0:
-        rest += ", and takes for granted that landmarks were told apart rightly"
+        rest += "; correct data association is assumed"
     if found.word == "over-confident":
-        text = f"Covariances are too small: over-confident. What speaks against them: {said}. {rest}."
+        text = f"covariances: over-confident — above the bounds: {said}. {rest}."
         return [Finding("bad" if found.chance < 1.0 - CERTAIN else "look", "trust", text)]
     if found.word == "undecided":
-        held = f" What is known: {said}." if said else ""
+        held = f" Available tests: {said}." if said else ""
         causes = []
         if found.missing:
-            errors = " and of ".join(found.missing)
-            causes.append(f"nothing in it could have seen that errors of {errors} are larger than stated")
+            errors = " and ".join(found.missing)
+            causes.append(f"no redundant measurement in this log can show larger errors of {errors} than assumed")
         if found.bent:
             causes.append(
-                "bearings are so vague beside the ranges that a landmark may be anywhere on an arc, and no Gaussian "
-                f"describes that (squared shift by curvature per unknown {figures.report['nonlinearity']:.2g}, from "
-                f"{MAX_NONLINEARITY:g} on maps are surer of themselves than they should be)"
+                "bearing noise is much larger than range noise, so submap posteriors are not Gaussian "
+                f"(nonlinearity {figures.report['nonlinearity']:.2g} [< {MAX_NONLINEARITY:g}])"
             )
-        text = f"Whether the covariances can be believed cannot be decided from this log: {'; '.join(causes)}.{held}"
+        text = f"covariances: {'not tested' if found.missing else 'undecided'} — {'; '.join(causes)}.{held}"
         if figures.part("refine"):
-            text += " The refined path takes its noise from its own residuals, which therefore do not judge it."
+            text += " The noise of the refined path was estimated from its own residuals, so they cannot test it."
+        if found.missing:
+            text += " Add loop closures, GPS or control points."
         return [Finding("", "trust", text)]
     if found.word == "pessimistic":
-        text = (
-            f"Covariances are larger than they need be: pessimistic. Too small are {said}; nothing lasts from one "
-            f"residual to the next. {rest}."
-        )
+        text = f"covariances: pessimistic — below the bounds: {said}; residuals are not time-correlated. {rest}."
         return [Finding("look", "trust", text)]
-    text = f"Covariances are consistent with all that this log can check: {said}. {rest}."
+    text = f"covariances: consistent — {said}. {rest}."
     return [Finding("good", "trust", text)]
 
 
 def _nees(figures: Figures) -> list[Finding]:
-    one = "One run: a sample, not a proof."
-    said = [(j, f"NEES/dof against the truth ({j.about}): {j.text}. {one}") for j in judged_nees(figures)]
-    none = "No truth was known, or none to compare with: nothing is said of the true error."
+    said = [(j, f"NEES ({j.about}): {j.text}. One run is one sample.") for j in judged_nees(figures)]
+    none = "NEES: not tested — no ground truth for this result."
     return [Finding(j.level, "nees", text) for j, text in said] or [Finding("", "nees", none)]
 
 
 def _tests(figures: Figures) -> list[Finding]:
-    """Tests without truth that an honest run hardly ever fails; those that it passes are in the metrics."""
+    """Failed tests without ground truth; those that a run passes are in the metrics."""
     out: list[Finding] = []
 
     def judge(what: str, value: Any, dof: Any, cause: str) -> None:
@@ -424,152 +424,145 @@ def _tests(figures: Figures) -> list[Finding]:
             return
         high = two_sided_bounds(float(value), float(dof), CERTAIN)[1]
         if value > high:
-            limit = f"an honest run exceeds {high:.3g} less than once in a thousand runs"
-            out.append(Finding("bad", "consistency-test", f"{what} is {value:.3g}, and {limit}: {cause}"))
+            bounds = f"[≤ {high:.3g} in 999 of 1000 consistent runs]"
+            out.append(Finding("bad", "consistency-test", f"{what}: {value:.3g} {bounds} — {cause}"))
 
     for row in class_rows(figures):
-        cause = "these measurements contradict the others, or state too little noise."
+        cause = "these measurements contradict the others, or their assumed noise is too small."
         last = row.get("correlation_time")
         dof = float(row["dof"]) / (float(last or 1.0) if number(last) else 1.0) if number(row.get("dof")) else None
-        judge(f"χ²/dof of the factors of kind “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
+        judge(f"χ²/dof of factors “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
         # a refined path holds fixes; the other factors of the graph were its start
         if row.get("verdict") == LASTING and (row.get("class") == "gps" or not figures.part("refine")):
             out.append(_lasting(row))
     m = figures.metrics
-    cause = "the fixes are wrong, more correlated or less exact than they say, or the map is."
-    judge("NIS/dof of the withheld fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
+    cause = "GPS errors are larger or more correlated than assumed, or the map is wrong."
+    judge("NIS/dof of withheld GPS fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
     median, expected, chance = (m.get(f"gps_distance_{k}") for k in ("median", "expected", "chance"))
     if median is not None and expected is not None and chance is not None and chance < LEVEL:
         text = (
-            f"The fixes, of which none was used, lie {median:.3g} m from the path (the median); the covariances of "
-            f"path and fixes explain {expected:.2g} m: {cause} With --set gps.use=all they hold the map."
+            f"distance of unused GPS fixes from the path: median {median:.3g} m [{expected:.2g} m expected] — {cause} "
+            "Use the fixes with --set gps.use=all."
         )
         out.append(Finding("bad" if chance < 1.0 - CERTAIN else "look", "gps-contradicts", text))
     alike, white = m.get("gps_nis_joint_autocorrelation"), m.get("gps_nis_joint_white")
     if alike is not None and white is not None and abs(alike) > white * CERTAIN_OVER_CONFIDENT:
-        text = f"Errors of withheld fixes are alike from one to the next (correlation {alike:.2f}; independent ones "
-        text += f"stay within ± {white:.2f} in 95 % of the runs): {_LASTS}"
+        text = f"autocorrelation of withheld GPS errors: {alike:.2f} [± {white:.2f}] — {_LASTS}"
         out.append(Finding("look", "gps-correlated", text))
-    cause = (
-        "submaps that saw the same landmarks disagree by more than they say; noise, mounting or association is wrong."
-    )
-    judge("Disagreement of loops over its expectation", m.get("loops_value"), m.get("loops_dof"), cause)
+    cause = "submaps with common landmarks disagree; noise, mounting or data association is wrong."
+    judge("disagreement of loop closures, relative to its expectation", m.get("loops_value"), m.get("loops_dof"), cause)
     return out
 
 
 _LASTS = (
-    "errors of the receiver last for longer than the time between fixes, and every fix counts as new. State them with "
+    "receiver errors are correlated over more than one fix interval, but every fix counts as independent. Set "
     "gps.bias_sigma, or a larger gps.sigma."
 )
 
 
 def _lasting(row: Mapping[str, Any]) -> Finding:
-    """Residuals that are alike from one to the next: the map follows errors that last."""
+    """Autocorrelated residuals: the map follows time-correlated errors."""
     text = (
-        f"Residuals of the factors of kind “{row.get('class')}” are alike from one to the next (correlation "
-        f"{float(row['lag1']):.2f}, {float(row['lag1_score']):.1f} σ; it lasts for "
-        f"{float(row['correlation_time']):.3g} of them), whatever their size (χ²/dof "
-        f"{float(row['chi2_per_dof']):.3g}): the map follows errors that last and is over-confident. "
+        f"autocorrelation of “{row.get('class')}” residuals: {float(row['lag1']):.2f}, that is "
+        f"{float(row['lag1_score']):.1f} σ (correlation length {float(row['correlation_time']):.3g} residuals, χ²/dof "
+        f"{float(row['chi2_per_dof']):.3g}) — the map follows time-correlated errors and is over-confident"
     )
     if row.get("class") == "gps":
-        text += _LASTS[0].upper() + _LASTS[1:]
-        return Finding("look", "gps-correlated", text)
-    return Finding("look", "correlated", text)
+        return Finding("look", "gps-correlated", f"{text}: {_LASTS}")
+    return Finding("look", "correlated", f"{text}. Add these errors to the noise model.")
 
 
 def _certificate(figures: Figures) -> Finding:
     found = figures.report.get("certificate")
     if found is None:
-        text = "Whether the optimum is the global one is not known: no certificate was asked for."
+        text = "global optimum: not tested — no certificate was requested."
         return Finding("", "certificate", text)
     text = str(found.get("verdict", found) if isinstance(found, Mapping) else found)
-    return Finding("good" if text.startswith("certified") else "look", "certificate", f"Global optimum: {text}")
+    return Finding("good" if text.startswith("certified") else "look", "certificate", f"global optimum: {text}")
 
 
 def _flagged(figures: Figures) -> list[Finding]:
-    """Submaps that the front end flags: honest ones are flagged now and then, by chance."""
+    """Submaps that the front end flags; consistent ones are flagged now and then, by chance."""
     counts = figures.part("flagged_submaps")
     flagged, n = counts.get("any", 0), figures.metrics.get("submaps", 0.0)
     if not (number(flagged) and flagged):
         return []
     why = ", ".join(f"{v:g} for {k}" for k, v in counts.items() if k != "any" and number(v))
-    text = f"{flagged:g} of {n:g} submaps were flagged by the front end ({why})"
+    text = f"submaps flagged by the front end: {flagged:g} of {n:g} ({why})"
     usual = by_chance(int(n), FLAGGED, CERTAIN)
     if flagged <= usual:
-        return [Finding("", "flagged", f"{text}: not more than chance flags.")]
-    return [Finding("look", "flagged", f"{text}; chance flags more than {usual:g} in one honest run of a thousand.")]
+        return [Finding("", "flagged", f"{text} [≤ {usual:g} by chance] — no more than chance.")]
+    return [Finding("look", "flagged", f"{text} [≤ {usual:g} by chance] — more than chance.")]
 
 
 def _passes(found: Mapping[str, Any]) -> list[Finding]:
-    """Do submaps that came to one place by two ways show the same?"""
+    """Do overlapping submaps of independent traversals agree?"""
     share, points, doubted = found.get("share"), found.get("points"), found.get("doubted")
     if not (isinstance(share, float) and isinstance(points, int) and points and isinstance(doubted, list)):
         return []
-    text = f"{1 - share:.1%} of {points} solid points of submaps stand in others that came there by another way"
+    text = f"map overlap: {1 - share:.1%} of {points} occupied voxels agree [≥ {1 - LOOK:.0%}]"
     if share <= LOOK and len(doubted) < 2:
-        return [Finding("good", "passes", f"{text}.")]
+        return [Finding("good", "passes", f"{text} — no contradiction found.")]
     pairs = ", ".join(f"{p[0]} and {p[1]}" for p in doubted[:3] if isinstance(p, list) and len(p) == 2)
     most = f" (most in submaps {pairs})" if pairs else ""
     text += (
-        f"; {share:.1%} lie where these saw nothing{most}. Walls stand twice in the map where a loop is wrong or was "
-        "not closed, unless so much was moved between the passes: look at the map. Other seeds (--seed), or the noise "
-        "that the log states (--set calibrate.use=none), may find the loops that this run did not."
+        f" — {share:.1%} are free space in other submaps{most}: a loop closure is wrong or missing, or objects moved. "
+        "Look for double walls in the map; try another seed (--seed 1) or --set calibrate.use=none."
     )
     return [Finding("bad" if share > DENIED else "look", "passes", text)]
 
 
 def _attempts(rows: Any) -> list[Finding]:
-    """Of several graphs that were solved, which one was kept, and why."""
+    """Which of several solved graphs is the result, and why."""
     if not (isinstance(rows, list) and len(rows) > 1 and all(isinstance(r, Mapping) for r in rows)):
         return []
     draws = len({r.get("draw") for r in rows})
-    told = []
+    shares = []
     for r in rows:
         share = r.get("share")
-        denied = f"{share:.1%}" if isinstance(share, float) else "an unknown share"
+        value = f"{share:.1%}" if isinstance(share, float) else "unknown"
         of = f" of draw {r.get('draw')}" if draws > 1 else ""
-        told.append(f"{'with loops that were looked for' if r.get('loops') else 'with matches alone'}{of} {denied}")
+        shares.append(f"{'with searched loop closures' if r.get('loops') else 'with matches only'}{of} {value}")
     kept = next((k for k, r in enumerate(rows) if r.get("kept")), None)
     if kept is None:
         return []
     what = f"of {draws} draws of the particles" if draws > 1 else "of the same submaps"
     text = (
-        f"{len(rows)} graphs {what} were tried. Passes of their maps deny so much of each other's points: "
-        f"{', '.join(told)}. Number {kept + 1} is the result"
-        + ("; its loops are those of `graphslam loops`." if rows[kept].get("loops") else ".")
+        f"graphs tried: {len(rows)} {what} — contradicted voxels {', '.join(shares)}. Number {kept + 1} is the result"
+        + ("; `graphslam loops` lists its loop closures." if rows[kept].get("loops") else ".")
     )
     settled = isinstance(share := rows[kept].get("share"), float) and share <= LOOK
     return [Finding("" if settled else "look", "passes-attempts", text)]
 
 
 def _two_maps(found: Mapping[str, Any]) -> list[Finding]:
-    """Groups of loops that cannot both be right, of which neither is in the graph: with either it is another map."""
+    """Two groups of loop closures that exclude each other; neither is in the graph."""
     if not found:
         return []
     first, second = (_listed(loops) for loops in found["loops"])
     places = found["places"]
     spans = [" and ".join(f"{a:.0f} to {b:.0f} s" for a, b in p["times"]) for p in places]
     more = "; ".join(spans[:3]) + ("; …" if len(spans) > 3 else "")
-    each = " Each of these places by itself may be as in the one or as in the other." if len(places) > 1 else ""
+    each = " Each of these places may follow either map." if len(places) > 1 else ""
     text = (
-        f"Two maps explain this log: one with {first}, one with {second}. Both cannot be right, and neither submaps "
-        f"nor path tell which is. Nodes lie up to {found['apart_max']:.2f} m apart in them (at "
-        f"{found['apart_max_time']:.0f} s; median {found['apart_median']:.2f} m). In dispute is how these stretches "
-        f"lie to each other: {more}.{each} The map of this run has neither group, so that it drifts there; the other "
-        f"two are in two_maps/ and in the map of the report. To do: {TWO_MAPS_DO}."
+        f"ambiguous loop closures: two maps, one with {first}, one with {second} — both fit the log, only one can be "
+        f"right. Nodes differ by up to {found['apart_max']:.2f} m (at {found['apart_max_time']:.0f} s; median "
+        f"{found['apart_median']:.2f} m). Disputed is the relative pose of these stretches: {more}.{each} The map of "
+        f"this run uses neither group and drifts there; both maps are in two_maps/ and in the report. "
+        f"To do: {TWO_MAPS_DO}."
     )
     return [Finding("bad", "two-maps", text)]
 
 
 def _listed(loops: Sequence[int]) -> str:
     shown = ", ".join(str(n) for n in loops[:6]) + (", …" if len(loops) > 6 else "")
-    return f"loop{'s' * (len(loops) != 1)} {shown}" if loops else "none of them"
+    return f"loop{'s' * (len(loops) != 1)} {shown}" if loops else "none of these loops"
 
 
 def _left_out(figures: Figures) -> list[Finding]:
     out: list[Finding] = []
     if figures.report.get("map_left_out"):
-        out.append(Finding("look", "map-left-out", f"No fused map was made: {figures.report['map_left_out']}"))
+        out.append(Finding("look", "map-left-out", f"fused map: not made — {figures.report['map_left_out']}"))
     if figures.report.get("map_coarser"):
         out.append(Finding("look", "map-coarser", str(figures.report["map_coarser"])))
     out += [*_passes(figures.part("map_passes")), *_attempts(figures.report.get("map_attempts")), *_flagged(figures)]
@@ -579,22 +572,20 @@ def _left_out(figures: Figures) -> list[Finding]:
         if e.get("event") == "imu-axes" and e.get("verdict") == "unlike":
             moved, missed = e["turns"]
             text = (
-                f"IMU {e.get('stream')}: the path turns otherwise than the gyro does, whatever its axes are: by "
-                f"{missed:.2g} rad/s, where the gyro turns by {moved:.2g} rad/s. The path follows something else than "
-                "the place, or unit or clock of the gyro is wrong."
+                f"IMU {e.get('stream')}: yaw rates of path and gyro differ by {missed:.2g} rad/s (gyro: {moved:.2g} "
+                "rad/s) for any mounting — the path is wrong, or unit or clock of the gyro is."
             )
             out.append(Finding("bad", "imu-and-path", text))
         if e.get("event") == "imu-axes" and e.get("verdict") == "not checked":
-            why = f"could not be checked ({e.get('why')})"
-            text = f"IMU {e.get('stream')}: whether its axes are those of its mounting {why}."
+            text = f"IMU {e.get('stream')}, axes: not tested — {e.get('why')}."
             out.append(Finding("", "imu-axes", text))
         if e.get("event") == "imu-contradicted":
             text = f"IMU {e.get('stream', '')}".strip()
-            line = f"{text} and submaps contradict each other: one of them states too little noise."
+            line = f"{text}: contradicts the submaps — the assumed noise of one of them is too small."
             out.append(Finding("bad", "imu-contradicted", line))
     for s in figures.sessions:
         common, rejected = s.get("common_landmarks"), s.get("rejected")
         if isinstance(common, int) and isinstance(rejected, int) and rejected > common:
-            text = f"{common} common landmarks agree, {rejected} do not: it may not be the same place."
-            out.append(Finding("bad", "session", f"Session {s.get('name')}: {text}"))
+            text = f"{common} common landmarks agree, {rejected} do not — it may be another place."
+            out.append(Finding("bad", "session", f"session {s.get('name')}: {text}"))
     return out

@@ -1,4 +1,4 @@
-"""The checks of a run that need no truth: χ² per class, withheld GPS and its prediction, loops against each other."""
+"""Checks without ground truth: χ² per class, prediction of withheld GPS, loop closures against each other."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MOST_FORETOLD = {2: 1000, 3: 300}
 
 @dataclass(frozen=True)
 class WithoutTruth:
-    """What a run says of its own honesty.
+    """Consistency checks of a run without ground truth.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class WithoutTruth:
     fixes: FixDistances | None = None
 
     def table(self) -> pd.DataFrame:
-        """One row a test: value (honest: 1), two-sided bounds, verdict, and the dof behind the bounds."""
+        """One row per test: value (consistent: 1), two-sided bounds, verdict, and the dof behind the bounds."""
         columns = ["test", "value", "low", "high", "verdict", "dof"]
         rows = []
         for c in self.classes.values():
@@ -75,7 +75,7 @@ class WithoutTruth:
         return pd.DataFrame(rows, columns=columns)
 
     def evidence(self, submaps: Sequence[Submap], *, refined: bool = False) -> list[ConsistencyTest]:
-        """Everything that speaks for or against the covariances (:mod:`graphslam.evaluate.covariance_assessment`).
+        """All tests of the covariances (:mod:`graphslam.evaluate.covariance_assessment`).
 
         Parameters
         ----------
@@ -98,19 +98,19 @@ class WithoutTruth:
                 out += chi2_ratio_test(f"χ² of {name}", of, chi2 / dof, dof * c.independent / max(c.dof, 1e-9))
             if c.whiteness is not None and np.isfinite(c.ratio):
                 score = c.whiteness.score if c.whiteness.lasting() else min(c.whiteness.score, 0.0)
-                out.append(largest_score_test(f"residuals of {name} from one to the next", of, score))
+                out.append(largest_score_test(f"autocorrelation of {name} residuals", of, score))
         if self.gps is not None:
             for r in self.gps.tests().to_dict("records"):
-                out += chi2_ratio_test(f"withheld fixes, {r['test']}", "fixes", r["value"], r["dof"])
+                out += chi2_ratio_test(f"withheld GPS, {r['test']}", "fixes", r["value"], r["dof"])
                 if r["test"] == "joint" and np.isfinite(r["autocorrelation"]):
                     score = two_sided_width(0.95) * r["autocorrelation"] / r["white"]
-                    out.append(largest_score_test("withheld fixes from one to the next", "fixes", score))
+                    out.append(largest_score_test("autocorrelation of withheld GPS errors", "fixes", score))
         if self.fixes is not None and self.fixes.ratio > 1.0:  # one-sided: fixes that lie close say nothing
             f = self.fixes
-            out.append(ConsistencyTest("squared distances from the GPS fixes", "fixes", f.ratio, 1.0, f.chance, 1.0))
+            out.append(ConsistencyTest("squared distances from GPS fixes", "fixes", f.ratio, 1.0, f.chance, 1.0))
         if self.loops is not None:
             r = self.loops.test()
-            out += chi2_ratio_test("loops against each other", "map", r["value"], r["dof"])
+            out += chi2_ratio_test("loop closures against each other", "map", r["value"], r["dof"])
         return out
 
     def _repr_html_(self) -> str:
@@ -126,7 +126,7 @@ def check_without_truth(
     gps: Gps | None,
     settings: RunConfig,
 ) -> WithoutTruth:
-    """Run the checks and add their figures to the metrics.
+    """Run the checks and add their values to the metrics.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ import numpy as np
 from graphslam.app.folders.generations import outputs
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.files import read_options
-from graphslam.app.run.front_ends import make_front_end
+from graphslam.app.run.front_ends import RENAMED, make_front_end
 from graphslam.app.run.outputs import open_run
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import load_log_source
@@ -172,7 +172,8 @@ def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
     if folder is None or not folder.is_file():
         raise DataError("a run without a folder does not say its front end's options", where=run.name)
     options = read_options(folder.parent)
-    front: Any = make_front_end(str(run.report["frontend"]), options.get("frontend", {}))
+    name = str(run.report["frontend"])
+    front: Any = make_front_end(RENAMED.get(name, name), options.get("frontend", {}))
     seed = SeedTree(int(run.report["seed"])).child("localise")
     submaps = list(front.submaps(log, seed=seed, after=None, drops=DropCounter()))
     if not submaps:

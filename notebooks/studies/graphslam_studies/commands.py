@@ -17,16 +17,16 @@ def study(
         ...,
         help=", ".join(plugins("graphslam.studies")) + ", or your own as module:object.",
     ),
-    trials: int | None = typer.Option(None, help="Number of trials in each world. Default: that of the study."),
+    trials: int | None = typer.Option(None, help="Number of trials in each world. Default: by the study."),
     workers: int | None = typer.Option(None, help="Number of processes. Default: the trials run in this process."),
     cluster: str | None = typer.Option(None, help="Address of a Dask scheduler that runs the trials."),
-    out: Path = typer.Option(..., help="Folder of the study. If it holds an unfinished study, that one is continued."),
+    out: Path = typer.Option(..., help="Folder of the study. An unfinished study in it is resumed."),
     quick: bool = typer.Option(False, "--quick", help="Run the small version of the study."),
     worlds: str = typer.Option("", help="Names of worlds of the study, separated by commas. Default: all."),
     seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
     as_json: bool = JSON,
 ) -> None:
-    """Run a Monte-Carlo study: all algorithms on the same data, one table, a report, figures. It resumes itself."""
+    """Run a Monte-Carlo study: all algorithms on the same data; a table, a report, plots. Resumes an unfinished one."""
     from graphslam_studies.montecarlo.study import study as run_study
 
     result = run_study(

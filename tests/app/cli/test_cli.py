@@ -78,8 +78,8 @@ def test_join_and_compare_print_the_documented_json(run_folder):
     value = json.loads(done.stdout)
     (row,) = value["methods"]
     assert [line["code"] for line in value["verdict"]] == ["state", "chi2", "nees"]
-    assert "at a least-squares optimum" in value["verdict"][0]["text"]
-    assert f"({row['dof']} degrees of freedom)" in value["verdict"][1]["text"]
+    assert "converged to a least-squares optimum" in value["verdict"][0]["text"]
+    assert f"; {row['dof']} dof]" in value["verdict"][1]["text"]
     assert row["nees_unpolished"] != row["nees"]
     assert set(row) == keys
     assert row["objective_polished"] <= row["objective"]

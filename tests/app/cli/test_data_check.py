@@ -163,7 +163,7 @@ def test_headings_in_degrees_and_stamps_out_of_order(tmp_path: Path) -> None:
     assert "out of order" in found["stamps-order"]
     rows = np.column_stack([t, pose[:, :2], 0.5 * np.pi - pose[:, 2]])
     np.savetxt(folder / "odometry.csv", rows, delimiter=",", header="t,x,y,theta", comments="")
-    assert "counted from north" in faults(checked(folder)[1])["heading-not-ahead"]
+    assert "counted from x" in faults(checked(folder)[1])["heading-not-ahead"]
     rows = np.column_stack([1e-3 * t, pose])
     np.savetxt(folder / "odometry.csv", rows, delimiter=",", header="t,x,y,theta", comments="")
     assert {"stamps-unit", "unreadable"} & faults(checked(folder)[1]).keys()

@@ -66,11 +66,11 @@ def test_shells_complete_verbs() -> None:
 @pytest.mark.parametrize(
     ("typed", "said"),
     [
-        ("run my log --out r", "go on with: graphslam run my log --out r --resume"),
-        ("run a --resume --out r", "go on with: graphslam run a --resume --out r"),
-        ("-v demo", "go on with: graphslam -v demo"),
-        ("study x --out s", "go on with: graphslam study x --out s"),
-        ("report r", "as they were"),
+        ("run my log --out r", "resume with: graphslam run my log --out r --resume"),
+        ("run a --resume --out r", "resume with: graphslam run a --resume --out r"),
+        ("-v demo", "resume with: graphslam -v demo"),
+        ("study x --out s", "resume with: graphslam study x --out s"),
+        ("report r", "unchanged"),
     ],
 )
 def test_ctrl_c_says_how_to_go_on(typed: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +108,7 @@ def test_a_run_prints_the_figures_that_are_asked_for_first(run: Run, tmp_path: P
     CliRunner().invoke(app, ["simulate", "landmark-field", "--preset", "quick", "--out", str(gs_log)])
     typed = ["run", str(gs_log), "--set", "frontend.particles=5", "--out", str(tmp_path / "r")]
     short = CliRunner().invoke(app, typed).stdout
-    figures = short.split("more figures")[0].splitlines()
+    figures = short.split("more metrics")[0].splitlines()
     assert len(figures) < 20
     assert any(line.startswith("nees_per_dof") for line in figures)
     every = CliRunner().invoke(app, [*typed[:-1], str(tmp_path / "s"), "--all"]).stdout

@@ -226,7 +226,7 @@ def test_a_run_without_truth_shows_what_it_has(tmp_path: Path) -> None:
     report = json.loads((out / "run.json").read_text())
     found = act(make_report(out).html, tmp_path, LOOK + "return look();", before=RECORDED, width=390)
     (shown,) = found.values()
-    assert list(found) == ["χ²/dof by kind of factor"]
+    assert list(found) == ["χ²/dof by class of factor"]
     told = {w[0].rsplit("  ", 1)[0]: float(w[0].rsplit("  ", 1)[1]) for w in shown["words"] if "  " in w[0]}
     classes = [c for c in report["graph"]["classes"] if c["chi2_per_dof"] is not None and c["dof"] > 0]
     assert told == pytest.approx({c["class"]: c["chi2_per_dof"] for c in classes}, rel=1e-3)

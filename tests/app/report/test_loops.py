@@ -103,12 +103,12 @@ def test_matches_of_a_front_end(folder: Path) -> None:
     assert [r["verdict"] for r in rows] == ["accepted"] * 3 + ["rejected"]
     assert rows[-1]["why"] == "support 0.10 is too little"
     page = Page((folder / PAGE).read_text(encoding="utf-8"))
-    assert "Loops over the path" in page.sections["figures"]
-    assert "NEES/n of the ends" in page.sections["figures"]
-    kinds = {r["kind of factor"]: r for r in page.table("graph", "kind of factor").records()}
+    assert "Loop closures by their number" in page.sections["figures"]
+    assert "NEES/n of the submap end poses" in page.sections["figures"]
+    kinds = {r["class of factor"]: r for r in page.table("graph", "class of factor").records()}
     assert set(kinds) == {"dense-submap", "match", "gps"}
     assert kinds["match"]["factors"] == "3"
-    declared = {r["kind"]: r for r in page.table("evidence", "why it may").records()}
+    declared = {r["kind"]: r for r in page.table("evidence", "reason").records()}
     assert declared["shared-scan"]["factors"] == "3"
 
 
@@ -209,7 +209,7 @@ def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
     page = Page(make_report(tmp_path).html)
     page.check_alone()
     assert len(page.sources) == 1
-    assert "places that tie them" in page.sections["figures"]
+    assert "loop closures between them" in page.sections["figures"]
     ties = page.table("loops", "submap in the map").records()
     assert [(r["verdict"], r["why"], r["gates"]) for r in ties] == [
         ("accepted", "agrees", "a 0.5"),

@@ -85,13 +85,13 @@ def test_a_run_writes_its_page(folder: Path, whole: Page) -> None:
     assert figures < set(shown)
     assert len(shown) == len(figures) + 1  # NEES by submap
     assert all(s.startswith(b"\x89PNG\r\n\x1a\n") for s in shown)
-    assert page.sections["missing"].endswith("Nothing that this kind of folder holds.")
+    assert page.sections["missing"].endswith("Nothing.")
 
 
 def test_the_verdict_is_that_of_the_figures(folder: Path, whole: Page) -> None:
     m = {r["key"]: r["value"] for r in json.loads((folder / "metrics.json").read_text())}
     lines = {text.split(":")[0].split(".")[0]: (kind, text) for kind, text in whole.verdict}
-    kind, text = lines["Solved"]
+    kind, text = lines["solution"]
     assert kind == "good"
     assert f"{m['objective']:.6g}" in text
     classes = json.loads((folder / "run.json").read_text())["graph"]["classes"]
@@ -100,11 +100,11 @@ def test_the_verdict_is_that_of_the_figures(folder: Path, whole: Page) -> None:
     assert chi2 == pytest.approx(m["objective"])
     states = sum(c["rows"] for c in classes) - dof
     assert states == pytest.approx(m["states"], abs=1e-6)
-    kind, text = lines["χ²/dof of the whole graph"]
-    assert text.startswith(f"χ²/dof of the whole graph: {chi2 / dof:.3g}, 95 % bounds ")
-    low, high = (float(x) for x in re.search(r"bounds (\S+) to (\S+)", text).groups())
+    kind, text = lines["chi-square of the graph"]
+    assert text.startswith(f"chi-square of the graph: {chi2 / dof:.3g} per degree of freedom [")
+    low, high = (float(x) for x in re.search(r"\[(\S+), (\S+);", text).groups())
     assert (kind == "good") == (low < chi2 / dof < high)
-    assert ("inside them" in text) == (low < chi2 / dof < high)
+    assert ("residuals match" in text) == (low < chi2 / dof < high)
     assert any(f"{m['nees_per_dof']:.3g}" in text for _, text in lines.values())
 
 
@@ -113,9 +113,9 @@ def test_the_verdict_is_that_of_the_figures(folder: Path, whole: Page) -> None:
     [
         ("nees_per_dof", 9.0, "bad", "over-confident"),
         ("nees_per_dof", 0.01, "look", "pessimistic"),
-        ("gap", 5.0, "look", "5 above"),
-        ("gap", 1e-9, "good", "no higher than"),
-        ("gap", None, "good", "no gap"),
+        ("gap", 5.0, "look", "lower by 5"),
+        ("gap", 1e-9, "good", "is no lower"),
+        ("gap", None, "good", "not compared with a batch"),
     ],
 )
 def test_the_verdict_follows_them(copy: Path, key: str, value: float | None, kind: str, said: str) -> None:
@@ -129,7 +129,7 @@ def test_the_verdict_follows_them(copy: Path, key: str, value: float | None, kin
 def test_an_unsolved_run_is_called_so(copy: Path) -> None:
     report = json.loads((copy / "run.json").read_text())
     (copy / "run.json").write_text(json.dumps(report | {"converged": False}))
-    assert read(copy).verdict[0] == ("bad", "Not solved: the graph is not at its optimum.")
+    assert read(copy).verdict[0] == ("bad", "solution: not converged — the graph is not at its optimum.")
 
 
 def test_an_imu_of_other_axes_is_told_at_once(copy: Path) -> None:
@@ -145,7 +145,7 @@ def test_an_imu_of_other_axes_is_told_at_once(copy: Path) -> None:
 def test_metrics_stand_with_unit_direction_and_bounds(folder: Path, whole: Page) -> None:
     rows = json.loads((folder / "metrics.json").read_text())
     page = whole
-    shown = {r["metric"]: r for r in page.table("metrics", "metric", "which way").records()}
+    shown = {r["metric"]: r for r in page.table("metrics", "metric", "direction").records()}
     times = {r["metric"]: r for r in page.table("times", "metric", "value").records()}
     m = {r["key"]: r["value"] for r in rows}
     missing = []
@@ -164,14 +164,14 @@ def test_metrics_stand_with_unit_direction_and_bounds(folder: Path, whole: Page)
     for name in ("honesty_gps_chi2_per_dof", "gps_nis_each_value"):
         stem = name.removesuffix("_chi2_per_dof").removesuffix("_value")
         assert shown[name]["95 % bounds"] == f"{m[f'{stem}_low']:.3g} to {m[f'{stem}_high']:.3g}"
-    assert shown["pose_rmse"]["which way"] == "lower is better"
-    assert shown["nees_per_dof"]["which way"] == "1 is honest"
+    assert shown["pose_rmse"]["direction"] == "lower is better"
+    assert shown["nees_per_dof"]["direction"] == "1 is consistent"
     assert "times_real_time" in times
 
 
 def test_graph_records_and_evidence(folder: Path, whole: Page) -> None:
     report, page = json.loads((folder / "run.json").read_text()), whole
-    rows = {r["kind of factor"]: r for r in page.table("graph", "kind of factor").records()}
+    rows = {r["class of factor"]: r for r in page.table("graph", "class of factor").records()}
     for c in report["graph"]["classes"]:
         r = rows[c["class"]]
         assert (r["factors"], r["verdict"]) == (str(c["factors"]), c["verdict"])
@@ -180,7 +180,7 @@ def test_graph_records_and_evidence(folder: Path, whole: Page) -> None:
     assert set(rows) == {"submap", "gps"}
     read_ = {r["stream"]: r for r in page.table("records", "stream", "used").records()}
     assert {k: int(r["records"]) for k, r in read_.items()} == report["records_read"]
-    spent = {(r["stream"], r["spent by"]): r for r in page.table("evidence", "spent by").records()}
+    spent = {(r["stream"], r["used by"]): r for r in page.table("evidence", "used by").records()}
     assert set(spent) == {
         ("controls", "submap"),
         ("landmarks", "submap"),
@@ -189,7 +189,7 @@ def test_graph_records_and_evidence(folder: Path, whole: Page) -> None:
     }
     assert spent["gps", "GPS fix"]["factors"] == rows["gps"]["factors"]
     assert read_["gps"]["used"] == f"in {rows['gps']['factors']} factors"
-    assert "What the log says of itself" in page.sections["run"]
+    assert "Metadata of the log" in page.sections["run"]
     assert "particles = 20" in page.sections["run"]
 
 
@@ -220,7 +220,7 @@ def test_an_interrupted_run_says_where_it_stopped(copy: Path) -> None:
         assert "Missing: " in page.sections[name], name
     assert not page.sources
     shutil.rmtree(copy / "submaps")
-    assert "before its first submap" in read(copy).verdict[0][1]
+    assert "before the first submap" in read(copy).verdict[0][1]
 
 
 @pytest.mark.parametrize(
@@ -315,9 +315,9 @@ def test_the_command_line(copy: Path, tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path, copy: Path) -> None:
-    with pytest.raises(RunFolderError, match="no run folder"):
+    with pytest.raises(RunFolderError, match="not a run folder"):
         make_report(tmp_path / "nothing")
-    with pytest.raises(RunFolderError, match="no run folder"):
+    with pytest.raises(RunFolderError, match="not a run folder"):
         make_report(copy / "submaps")
     with pytest.raises(RunFolderError, match="cannot be written"):
         write_report(copy, tmp_path / "no" / "such" / "folder.html")
@@ -335,7 +335,7 @@ def test_two_sessions_in_one_map(log: SensorLog, tmp_path: Path) -> None:
     assert [r["session"] for r in rows] == [s.name for s in merged.sessions]
     assert [int(r["submaps"]) for r in rows] == [len(s.keys) for s in merged.sessions]
     assert page.verdict[0][0] == "good"
-    (kind,) = page.table("graph", "kind of factor").records()
+    (kind,) = page.table("graph", "class of factor").records()
     assert float(kind["χ²"]) == pytest.approx(merged.solution.objective, rel=1e-5)
     n = len(merged.solution.landmark_ids)
     free = 3 * (len(merged.solution.poses) - 1) + 2 * n

@@ -26,7 +26,7 @@ def chosen(path: Path, **options: object) -> tuple[str, str]:
 def test_clouds_without_poses_are_followed_and_with_poses_these_are_used(tmp_path: Path) -> None:
     folder = small.cloud_folder(tmp_path / "a", "bin", table="tum")
     assert chosen(folder) == ("segslam", "clouds")
-    assert chosen(folder, poses="none")[0] == "kiss-icp"
+    assert chosen(folder, poses="none")[0] == "lidar-odometry"
 
 
 def test_planar_laser_and_tables(tmp_path: Path) -> None:
@@ -57,10 +57,10 @@ def test_wheels_in_space_and_a_lidar_of_unknown_place_are_not_what_clouds_are_pu
         return write_mcap(tmp_path / f"{name}.mcap", messages)
 
     assert chosen(bag("good", flat=False, placed=True))[0] == "segslam"
-    assert chosen(bag("wheels", flat=True, placed=True))[0] == "kiss-icp"
+    assert chosen(bag("wheels", flat=True, placed=True))[0] == "lidar-odometry"
     lost = bag("lost", flat=False, placed=False)
     assert load_recording(lost).meta["unplaced"] == ["clouds"]
-    assert chosen(lost)[0] == "kiss-icp"
+    assert chosen(lost)[0] == "lidar-odometry"
     assert load_recording(lost, mount=(0, 0, 0, 0, 0, 0)).meta["unplaced"] == []
 
 

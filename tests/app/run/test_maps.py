@@ -194,9 +194,9 @@ def test_topologies_of_the_particles_become_graphs(finished: Run, tmp_path: Path
     assert len({(folder / r["files"][0]).read_bytes() for r in kept}) == len(kept)
     assert "hypothesis 0" in (folder / "report.html").read_text()
 
-    refused("map", folder, "--hypotheses", "2", "--minimum-entropy", "--log", log, saying="not both at once")
+    refused("map", folder, "--hypotheses", "2", "--minimum-entropy", "--log", log, saying="exclude each other")
     save_log(finished.log.slice(0.0, 20.0), tmp_path / "other")
-    refused("map", folder, "--hypotheses", "2", "--log", tmp_path / "other", saying="not that of the run")
+    refused("map", folder, "--hypotheses", "2", "--log", tmp_path / "other", saying="not the log of the run")
     foreign = replace(finished, folder=tmp_path / "foreign")
     shutil.copytree(folder, tmp_path / "foreign")
     config = tmp_path / "foreign" / "config.toml"

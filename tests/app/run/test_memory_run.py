@@ -36,7 +36,7 @@ def log() -> SensorLog:
 
 
 def go(log: SensorLog, out: Path, **how: Any) -> Run:
-    return gs.run(log, frontend="kiss-icp", config=OPTIONS, out=out, progress=False, **how)
+    return gs.run(log, frontend="lidar-odometry", config=OPTIONS, out=out, progress=False, **how)
 
 
 @pytest.fixture(scope="module")

@@ -201,7 +201,7 @@ def test_every_submap_says_why_it_ended(result):
 
 
 def test_missing_streams_and_names_are_refused(log):
-    with pytest.raises(MissingDataError, match="odometry or velocities beside the sightings"):
+    with pytest.raises(MissingDataError, match="odometry or velocities in addition to the landmark observations"):
         gs.run(replace(log, streams={"landmarks": log["landmarks"]}), progress=False)
     with pytest.raises(MissingDataError, match=r"no front end .* got controls .* wanted laser scans with odometry"):
         gs.run(replace(log, streams={"controls": log["controls"]}), progress=False)

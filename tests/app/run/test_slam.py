@@ -98,12 +98,12 @@ def fed(log: SensorLog, slam: Slam, seed: int = 0) -> None:
     [
         ("ekf", landmarks, LANDMARKS),
         ("rbpf-ekf", landmarks, {**LANDMARKS, "frontend": {"particles": 10}}),
-        ("kiss-icp", clouds, CLOUDS),
-        ("kiss-icp", carried, CLOUDS),
-        ("kiss-icp", wheeled, CLOUDS),
+        ("lidar-odometry", clouds, CLOUDS),
+        ("lidar-odometry", carried, CLOUDS),
+        ("lidar-odometry", wheeled, CLOUDS),
         ("segslam", beams, BEAMS),
     ],
-    ids=["ekf", "rbpf-ekf", "kiss-icp", "kiss-icp-imu", "kiss-icp-wheels", "segslam"],
+    ids=["ekf", "rbpf-ekf", "lidar-odometry", "lidar-odometry-imu", "lidar-odometry-wheels", "segslam"],
 )
 def test_a_fed_run_is_the_run_over_the_stored_log(
     frontend: str, log: Any, config: dict[str, Any], tmp_path: Path
@@ -123,8 +123,8 @@ def test_a_fed_run_is_the_run_over_the_stored_log(
     assert set(a) == set(b)
     assert [n for n in a if a[n] != b[n]] == []
     bridged = sum(s.report.get("scans_bridged", 0) for s in run.submaps)
-    assert (bridged > 0) == (frontend == "kiss-icp" and "wheels" in log.streams)
-    if frontend not in ("ekf", "kiss-icp"):
+    assert (bridged > 0) == (frontend == "lidar-odometry" and "wheels" in log.streams)
+    if frontend not in ("ekf", "lidar-odometry"):
         return
     # the records themselves are those that were given
     gs.run(log, frontend=frontend, seed=4, out=tmp_path / "own", config=config, preset="none", progress=False)
@@ -160,7 +160,7 @@ def test_what_was_fed_is_on_the_map_before_the_end_and_looking_at_it_changes_not
 def test_beams_that_were_used_leave_the_memory() -> None:
     log = clouds()
     bytes_of_all = sum(c.nbytes for c in log["clouds"])
-    most, slam = 0, gs.Slam("kiss-icp", config=CLOUDS)
+    most, slam = 0, gs.Slam("lidar-odometry", config=CLOUDS)
     tracemalloc.start()
     for name, part in in_portions(log, 0, most=1):
         slam.add(part, name)
@@ -214,7 +214,7 @@ def test_a_front_end_that_fails_closes_it(tmp_path: Path) -> None:
 
 def test_what_needs_the_whole_log_is_named() -> None:
     assert "ekf-slam" in gs.Slam("ekf-slam").waits_for
-    assert "imu" in gs.Slam("kiss-icp", config={"imu": {"use": "auto"}}).waits_for
+    assert "imu" in gs.Slam("lidar-odometry", config={"imu": {"use": "auto"}}).waits_for
     assert "calibration" in gs.Slam("ekf", config={"calibrate": {"use": "always"}}).waits_for
     assert gs.Slam("ekf").waits_for == ""
     with pytest.raises(UnknownNameError):

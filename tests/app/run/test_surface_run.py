@@ -76,7 +76,7 @@ def test_what_is_written(made: tuple[RunSurface, PointClouds, Trajectory], tmp_p
     assert all(p.stat().st_size > 10_000 for p in drawn)
     with pytest.raises(UnknownNameError, match="colour"):
         made[0].colours("taste")
-    with pytest.raises(MissingDataError, match="made before"):
+    with pytest.raises(MissingDataError, match="needs the terrain"):
         made[0].colours("terrain")
 
 

@@ -173,9 +173,9 @@ def test_points_are_moved_by_a_matrix_as_by_the_quaternion() -> None:
 
 
 def test_a_log_that_is_not_where_it_was_is_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(MissingDataError, match=r"drive.*cannot be read from here.*the folder in which the run"):
+    with pytest.raises(MissingDataError, match=r"drive.*cannot be read from this folder.*the folder in which the run"):
         log_of_run({"source": "drive/of/somebody"})
     (tmp_path / "empty.log").write_text("")
     with pytest.raises(GraphSlamError) as caught:
         log_of_run({"source": str(tmp_path / "empty.log")})
-    assert "cannot be read from here" not in str(caught.value)  # what is there has an error of its own
+    assert "cannot be read from this folder" not in str(caught.value)  # what is there has an error of its own

@@ -93,9 +93,9 @@ def test_both_maps_are_in_the_folder_with_their_loops(finished: Run) -> None:
 def test_the_verdict_says_so_in_one_line_and_the_report_shows_both(finished: Run) -> None:
     (line,) = [f for f in finished.verdict if "two-maps" in f.code]
     assert line.level == "bad"
-    assert line.text.startswith("Two maps explain this log")
-    assert f"{finished.report['two_maps']['apart_max']:.2f} m apart" in line.text
-    assert "To do: see which of both is right" in line.text
+    assert line.text.startswith("ambiguous loop closures: two maps")
+    assert f"{finished.report['two_maps']['apart_max']:.2f} m (at" in line.text
+    assert "To do: check which of the two is right" in line.text
     assert finished.headline.level == "bad"
     assert finished.folder is not None
     drawn = scene(read_folder(finished.folder, finished.folder))
@@ -103,7 +103,7 @@ def test_the_verdict_says_so_in_one_line_and_the_report_shows_both(finished: Run
     layers = {x["name"]: x for x in drawn["layers"]}
     a, b = layers["two maps, the first"], layers["two maps, the second"]
     assert a["xyz"] != b["xyz"]
-    assert "Two maps explain this log" in (finished.folder / "report.html").read_text()
+    assert "ambiguous loop closures: two maps" in (finished.folder / "report.html").read_text()
 
 
 def test_the_same_seed_gives_the_same_bytes(log: SensorLog, finished: Run, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The front end ``kiss-icp``: submaps of a log, the same when resumed; a whole run by the public verbs."""
+"""The front end ``lidar-odometry``: submaps of a log, the same when resumed; a whole run by the public verbs."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -87,7 +87,7 @@ def test_times_of_points_are_stored_with_a_log(log, tmp_path):
 
 def test_a_run_ends_with_a_refined_path_and_a_map(log, tmp_path):
     options = {"submap": {"length": 2.0, "points": 500}}
-    run = gs.run(log, frontend="kiss-icp", out=tmp_path / "run", config={"frontend": options}, progress=False)
+    run = gs.run(log, frontend="lidar-odometry", out=tmp_path / "run", config={"frontend": options}, progress=False)
     assert run.metrics.set_index("key")["value"]["path_rmse_aligned"] < 0.03
     assert (tmp_path / "run" / "trajectory_graph.tum").exists()
     assert (tmp_path / "run" / "map.ply").exists()
