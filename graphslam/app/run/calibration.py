@@ -222,9 +222,9 @@ def named_causes(
     out = []
     for e in found.estimates:
         if e.applied and e.name not in own:
-            text = f"{estimate_text(e.name, e.value, e.sigma)} — a cause of the disagreement between submaps
-            (log-likelihood " text += f"+{e.gain:.0f} nats). To do: --set calibrate.use=always, or `graphslam
-            calibrate`." out.append(Finding("bad", "calibration", text))
+            text = f"{estimate_text(e.name, e.value, e.sigma)} — a cause of the disagreement between submaps "
+            text += f"(log-likelihood +{e.gain:.0f} nats). To do: --set calibrate.use=always, or `graphslam calibrate`."
+            out.append(Finding("bad", "calibration", text))
     return out
 
 

@@ -83,7 +83,7 @@ def attitude_terms(poses: Array, tilt: Array, direction: Array) -> tuple[Array, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeRecord:
-    """Where gravity points, seen from a node; see :mod:`graphslam.graph.attitude` for the residual.
+    """Where gravity points, seen from a node; see :mod:`graphslam.graph.factors.attitude` for the residual.
 
     Parameters
     ----------
