@@ -16,7 +16,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, DetectorSettings
 from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe_terrain
-from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, plan_path, save_cost_map
+from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, plan_vehicle_path, save_cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
 from graphslam.maps.terrain.tables import (
     BINS,
@@ -489,27 +489,27 @@ def test_ways_lead_round_hazards_and_never_through_them() -> None:
     wall[:, 3] = np.repeat(np.arange(-20, 4), 20)
     p.add(wall)
     costs = cost_map(p.classify(), VEHICLE)
-    way = plan_path(costs, np.array([1.0, 0.0]), np.array([5.0, 0.0]))
+    way = plan_vehicle_path(costs, np.array([1.0, 0.0]), np.array([5.0, 0.0]))
     assert way is not None
     off = np.hypot(way.points[:, 0] - 3.05, np.maximum(way.points[:, 1] - 0.35, 0.0))
     assert off.min() >= 0.5 * VEHICLE.width - 0.06
     assert way.length == pytest.approx(np.sum(np.linalg.norm(np.diff(way.points, axis=0), axis=1)))
-    assert plan_path(costs, np.array([1.0, 0.0]), np.array([3.05, -0.5])) is None
+    assert plan_vehicle_path(costs, np.array([1.0, 0.0]), np.array([3.05, -0.5])) is None
     with pytest.raises(DataError, match="outside the terrain map"):
-        plan_path(costs, np.array([-9.0, 0.0]), np.array([5.0, 0.0]))
+        plan_vehicle_path(costs, np.array([-9.0, 0.0]), np.array([5.0, 0.0]))
     # of several goals the cheapest to reach, closed ones left out
     near = np.array([[5.0, 0.0], [2.0, 0.5], [3.05, -0.5]])
-    to_one = plan_path(costs, np.array([1.0, 0.0]), near)
+    to_one = plan_vehicle_path(costs, np.array([1.0, 0.0]), near)
     assert to_one is not None
     assert np.hypot(*(to_one.points[-1] - near[1])) < 0.1
     # a vehicle that stands too near to a wall leaves it on its own side
     stands = np.array([2.75, -0.5])
     assert not np.isfinite(costs.cost[costs.index(stands)])
-    out = plan_path(costs, stands, near[1])
+    out = plan_vehicle_path(costs, stands, near[1])
     assert out is not None
     assert np.array_equal(out.points[0], stands)
     assert np.all(out.points[:, 0] <= 2.8)
-    assert plan_path(costs, np.array([3.05, -0.5]), near[1]) is None  # … but nothing leads out of a hazard
+    assert plan_vehicle_path(costs, np.array([3.05, -0.5]), near[1]) is None  # … but nothing leads out of a hazard
 
 
 def test_what_only_coarse_bands_say_costs_but_does_not_close() -> None:

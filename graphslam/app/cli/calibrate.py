@@ -14,7 +14,7 @@ from graphslam.core.config import dump_toml
 
 def register(app: typer.Typer) -> None:
     """Add the command to the command line."""
-    app.command()(calibrate)
+    app.command("calibrate")(calibrate)
 
 
 def calibrate(

@@ -40,7 +40,7 @@ def list_data(as_json: bool = JSON) -> None:
     emit({"data": rows}, table(text), as_json=as_json)
 
 
-@app.command()
+@app.command("info")
 def info(name: str, as_json: bool = JSON) -> None:
     """Show one data set: contents, source, citation, licence terms and known problems."""
     from graphslam.io.cards import find_card
@@ -87,7 +87,7 @@ def list_readers(
     emit(value, f"{name}: {r.says}\n{table(options, ['option', 'type', 'default'])}", as_json=as_json)
 
 
-@app.command()
+@app.command("fetch")
 def fetch(name: str, as_json: bool = JSON) -> None:
     """Find a data set on this machine, or download it and verify its checksums."""
     from graphslam.io.fetch import fetch_dataset as fetch_files
@@ -97,7 +97,7 @@ def fetch(name: str, as_json: bool = JSON) -> None:
     emit({"name": name, "folder": str(folder)}, str(folder), as_json=as_json)
 
 
-@app.command()
+@app.command("check")
 def check(
     source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     reader: str | None = READER,

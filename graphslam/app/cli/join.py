@@ -18,8 +18,8 @@ SUBMAP_POSES = typer.Option(
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(join)
-    app.command()(compare)
+    app.command("join")(join)
+    app.command("compare")(compare)
 
 
 def join(

@@ -14,9 +14,9 @@ SHOWN = ("loop", "verdict", "source", "submap_i", "submap_j", "fitness", "chi2",
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(loops)
-    app.command()(report)
-    app.command()(export)
+    app.command("loops")(loops)
+    app.command("report")(report)
+    app.command("export")(export)
 
 
 def loops(

@@ -59,9 +59,9 @@ EVERY = typer.Option(False, "--all", help="Print all metrics. Default: a summary
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(run)
-    app.command()(demo)
-    app.command()(simulate)
+    app.command("run")(run)
+    app.command("demo")(demo)
+    app.command("simulate")(simulate)
 
 
 def run(

@@ -13,8 +13,8 @@ from graphslam.app.cli.terminal import emit, table
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(merge)
-    app.command()(localise)
+    app.command("merge")(merge)
+    app.command("localise")(localise)
 
 
 def merge(

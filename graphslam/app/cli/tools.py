@@ -14,10 +14,10 @@ from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, U
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(solve)
-    app.command()(relax)
+    app.command("solve")(solve)
+    app.command("relax")(relax)
     app.command("eval")(evaluate)
-    app.command()(doctor)
+    app.command("doctor")(doctor)
 
 
 def solve(

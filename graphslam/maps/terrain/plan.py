@@ -106,7 +106,7 @@ class PlannedPath:
     length: float
 
 
-def plan_path(costs: CostMap, start: Array, goal: Array) -> PlannedPath | None:
+def plan_vehicle_path(costs: CostMap, start: Array, goal: Array) -> PlannedPath | None:
     """The cheapest way from a place to another one, or to one of several; None where there is none.
 
     Moves go to the eight neighbours; the cost of a move is its length times the mean cost of both cells.
