@@ -54,7 +54,7 @@ def _lost(log: SensorLog) -> list[tuple[str, int]]:
     return [(what, n) for what, n in log.dropped.items() if not what.endswith("(kept)")]
 
 
-def summary(found: list[StreamFinding]) -> str:
+def check_summary(found: list[StreamFinding]) -> str:
     """The last line: whether to run."""
     bad = sum(n.finding.level == "bad" for n in found)
     look = sum(n.finding.level == "look" for n in found)

@@ -14,14 +14,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from graphslam.app.folders.generations import check_same, consistent
+from graphslam.app.folders.generations import check_same, read_consistently
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.run import Run
+from graphslam.app.run.run_inputs import read_inputs
 from graphslam.app.run.source import log_of_run
-from graphslam.app.run.taken import read_taken
 from graphslam.backend.back_end import find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of, solve_choice, solve_hypotheses
@@ -58,7 +58,7 @@ MOST = 16
 
 
 @dataclass(frozen=True)
-class Clearest:
+class MinimumEntropyMap:
     """Alternative graphs of a run, judged.
 
     Parameters
@@ -82,7 +82,7 @@ class Clearest:
     findings: list[Finding] = field(default_factory=list)
 
 
-def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Clearest:
+def minimum_entropy_loops(run: Run, made: RunMap, *, progress: bool = True) -> MinimumEntropyMap:
     """Solve a finished run with every choice of its matches and loops, and judge the graphs and their maps.
 
     SegSLAM draws map samples and takes the one of least entropy. A run hands over one settled chain, whose matches
@@ -122,12 +122,12 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
         facts = {"matches": len(chosen) - taken, "loops": taken}
         alternatives.append(Alternative(name, back.graph, solution, candidate, facts))
     choice = rank_alternatives(alternatives, model=made.fused.grid.model, progress=progress)
-    return _refined(run, Clearest(choice, len(every) - len(choices)), run.submaps)
+    return _refined(run, MinimumEntropyMap(choice, len(every) - len(choices)), run.submaps)
 
 
-def clearest_of_topologies(
+def minimum_entropy_topology(
     run: Run, most: int, *, log: str | Path | SensorLog | None = None, progress: bool = True
-) -> Clearest:
+) -> MinimumEntropyMap:
     """Solve the topologies that the particles of a SegSLAM run told, and judge the graphs and their maps.
 
     The folder holds one chain of segments; the others are in the particles. So the front end works through the log once
@@ -171,17 +171,17 @@ def clearest_of_topologies(
         progress=progress,
     )
     model = next(iter(told[0].grids.values())).model
-    found = Clearest(rank_alternatives(alternatives, model=model, progress=progress), left_out)
+    found = MinimumEntropyMap(rank_alternatives(alternatives, model=model, progress=progress), left_out)
     return _refined(run, found, told[found.choice.best.number].submaps)
 
 
-def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
+def _refined(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
     """The chosen alternative refined by the scans of the run, where the run is refined; all are judged without that."""
     if run.folder is None:
         return found
     values = read_options(run.folder)
     config: RefineConfig = build_config(RefineConfig, values.get("refine", {}), "refine")
-    taken, generation = consistent(run.folder, read_taken) if config.use else (None, None)
+    taken, generation = read_consistently(run.folder, read_inputs) if config.use else (None, None)
     if taken is None or taken.scans is None:
         return found
     check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
@@ -210,7 +210,7 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
     imu: ImuOptions = build_config(ImuOptions, values.get("imu", {}), "imu")
     feed: RecordSource | None = None
     if imu.use != "none" and run.folder is not None:
-        taken, generation = consistent(run.folder, read_taken)
+        taken, generation = read_consistently(run.folder, read_inputs)
         check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
         feed = RecordSource(taken.log)
 
@@ -220,8 +220,8 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
     return build_config(BackEndConfig, values.get("backend", {}), "backend"), streams
 
 
-def write_clearest(
-    folder: Path, found: Clearest, *, bands: Mapping[str, tuple[float, float]] | None = None
+def write_minimum_entropy(
+    folder: Path, found: MinimumEntropyMap, *, bands: Mapping[str, tuple[float, float]] | None = None
 ) -> list[Path]:
     """Keep the alternatives in a run folder.
 

@@ -122,11 +122,11 @@ def _measure_here(folder: str, method: str, polish: bool) -> float:
     return max(peak - before, 0) / 1e6
 
 
-def main(arguments: Sequence[str]) -> None:
+def measure_and_print(arguments: Sequence[str]) -> None:
     """Entry of the measuring process: folder, method, polish (0 or 1); the figure goes to standard output."""
     folder, method, polish = arguments
     sys.stdout.write(f"{_measure_here(folder, method, polish == '1')}\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    measure_and_print(sys.argv[1:])

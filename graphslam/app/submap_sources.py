@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.dense_ties import problem_of_folder, problem_of_run
-from graphslam.app.folders.generations import consistent
+from graphslam.app.folders.generations import read_consistently
+from graphslam.app.pose_problem_files import load_pose_problem, pose_problem_of_run
 from graphslam.app.run.files import read_options
 from graphslam.app.run.outputs import identified_submaps
 from graphslam.app.run.run import Run
@@ -87,7 +87,7 @@ def submap_source(
         return SubmapSource([], problem=source)
     if isinstance(source, Run) and are_dense(source.submaps):
         if source.holds("graph"):
-            return SubmapSource(list(source.submaps), poses_only(source.truth), problem=problem_of_run(source))
+            return SubmapSource(list(source.submaps), poses_only(source.truth), problem=pose_problem_of_run(source))
         if source.folder is not None:
             return submap_source(source.folder)
     if isinstance(source, Run):
@@ -102,10 +102,10 @@ def submap_source(
         def read(files: Path) -> tuple[float, str, MapTruth | None, list[Submap], PoseProblem | None]:
             submaps = identified_submaps(root if (files / "association.npz").is_file() else path)
             tied = are_dense(submaps) and (files / "graph.g2o").is_file()
-            problem = problem_of_folder(root, files, submaps) if tied else None
+            problem = load_pose_problem(root, files, submaps) if tied else None
             return *_run_facts(root), read_truth(files), submaps, problem
 
-        scale, identities, truth, submaps, problem = consistent(root, read)
+        scale, identities, truth, submaps, problem = read_consistently(root, read)
         known = truth if identities != "run" and problem is None else poses_only(truth)
         return SubmapSource(submaps, known, scale if problem is None else 1.0, problem)
     loaded: Any = path if path.is_file() else load_recording(source)

@@ -16,11 +16,11 @@ from graphslam.app.run.calibration import calibrate_log as calibrate_log
 from graphslam.app.run.front_ends import front_end_names, recommended
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
-from graphslam.app.run.outputs import open_run as read_run
+from graphslam.app.run.outputs import read_run_folder as read_run
+from graphslam.app.run.pipeline import resolve_from_folder
 from graphslam.app.run.pipeline import run as run
-from graphslam.app.run.pipeline import solve_again
 from graphslam.app.run.remake_map import map_of_folder
-from graphslam.app.run.run import Later, Run
+from graphslam.app.run.run import DeferredPart, Run
 from graphslam.app.run.source import load_log_source
 from graphslam.app.studies import find_study as find_study
 from graphslam.app.studies import open_study as open_study
@@ -136,7 +136,7 @@ def open_run(path: str | Path) -> Run:
 
     @cache
     def solved() -> tuple[Any, Any]:
-        return solve_again(path) if (run.folder / "taken.npz").is_file() else (None, None)  # type: ignore[operator]
+        return resolve_from_folder(path) if (run.folder / "taken.npz").is_file() else (None, None)  # type: ignore[operator]
 
     def fused() -> Any:
         try:
@@ -144,8 +144,8 @@ def open_run(path: str | Path) -> Run:
         except MissingDataError:  # a front end without dense maps
             return None
 
-    parts: dict[str, Any] = {"graph": Later(lambda: solved()[0]), "solution": Later(lambda: solved()[1])}
-    parts["fused"] = Later(fused)
+    parts: dict[str, Any] = {"graph": DeferredPart(lambda: solved()[0]), "solution": DeferredPart(lambda: solved()[1])}
+    parts["fused"] = DeferredPart(fused)
     return replace(run, **parts)
 
 
@@ -249,7 +249,7 @@ def compare(
     submap_poses : int, optional
         A pose-graph file is cut into submaps of so many poses.
     **options
-        See :func:`graphslam.app.compare.compare`.
+        See :func:`graphslam.app.compare.compare_methods`.
 
     Returns
     -------
@@ -273,7 +273,7 @@ def compare(
     options.setdefault("covariance_scale", s.covariance_scale)
     methods = comparing.default_methods(s.material) if methods is None else methods
     with one_blas_thread():
-        return comparing.compare(s.material, methods=methods, truth=truth or s.truth, **options)
+        return comparing.compare_methods(s.material, methods=methods, truth=truth or s.truth, **options)
 
 
 def join_submaps(
@@ -335,7 +335,7 @@ def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[
     solver : str
         One of :func:`solvers`.
     **options
-        See :func:`graphslam.app.solve_file.solve_file`.
+        See :func:`graphslam.app.solve_file.solve_network_file`.
 
     Returns
     -------
@@ -360,4 +360,4 @@ def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[
     """
     from graphslam.app import solve_file as solving
 
-    return solving.solve_file(path, solver, **options)
+    return solving.solve_network_file(path, solver, **options)

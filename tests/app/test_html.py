@@ -21,8 +21,8 @@ import pytest
 import graphslam
 import graphslam_studies
 from graphslam.app.report.report import Report
+from graphslam.app.run.residual_consistency import ResidualConsistency
 from graphslam.app.run.run import Run
-from graphslam.app.run.without_truth import WithoutTruth
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import VelocityControls
@@ -182,7 +182,7 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
     ),
     "graphslam.solve.solution.Solution": a_solution,
     "graphslam.evidence.grid.EvidenceGrid": lambda _: EvidenceGrid(0.1),
-    "graphslam.app.run.without_truth.WithoutTruth": lambda _: WithoutTruth(
+    "graphslam.app.run.residual_consistency.ResidualConsistency": lambda _: ResidualConsistency(
         {"c": ClassConsistency(**CLASS)}, None, None
     ),
     "graphslam_studies.montecarlo.study.Study": a_study,

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import graphslam as gs
 from graphslam.app.cli import app
-from graphslam.app.live import LiveView, in_space, shown_points
+from graphslam.app.live import LiveView, pose_in_space, shown_points
 from graphslam.backend.back_end import Observer
 from graphslam.core import se3
 from graphslam.core.errors import MissingDataError
@@ -110,7 +110,7 @@ def test_clouds_and_loops_are_where_the_graph_has_them(tmp_path: Path) -> None:
 
 def test_a_pose_in_the_plane_is_the_same_in_space() -> None:
     pose, points = np.array([1.0, -2.0, 2.5]), np.random.default_rng(0).normal(size=(5, 2))
-    x, q = in_space(pose)
+    x, q = pose_in_space(pose)
     there = se3.se3_transform(np.concatenate([x, q]), np.column_stack([points, np.zeros(5)]))
     np.testing.assert_allclose(there[:, :2], se2_transform(pose, points), atol=1e-12)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.hypotheses import Clearest, write_clearest
+from graphslam.app.hypotheses import MinimumEntropyMap, write_minimum_entropy
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, solve_choice
@@ -109,7 +109,7 @@ def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Rob
 
     (tmp_path / "alternatives").mkdir()
     (tmp_path / "alternatives" / "99.tum").write_text("of an earlier choice")
-    files = write_clearest(tmp_path, Clearest(choice, 3))
+    files = write_minimum_entropy(tmp_path, MinimumEntropyMap(choice, 3))
     assert all(p.is_file() for p in files)
     assert not (tmp_path / "alternatives" / "99.tum").exists()
     kept = json.loads((tmp_path / "clearest.json").read_text())

@@ -38,7 +38,7 @@ from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 STAGES: list[tuple[Any, str, str]] = [
     (pipeline, "load_log_source", "log opened"),
-    (front_to_back.FrontToBack, "step", "front end, back end"),
+    (front_to_back.SubmapPipeline, "step", "front end, back end"),
     (pipeline, "at_rest", "scans for the refinement"),
     (BackEnd, "finish", "loops, solved"),
     (refining, "refine", "refinement"),

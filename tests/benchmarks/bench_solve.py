@@ -35,11 +35,11 @@ QUICK = ("smallGrid3D", "kitti_07", "intel")
 
 def ours(path: str) -> dict[str, Any]:
     """Default options, from the file to the report."""
-    from graphslam.app.solve_file import solve_file
+    from graphslam.app.solve_file import solve_network_file
 
     importlib.import_module("graphslam.solve.network.batch")  # GTSAM, which is loaded when it is needed
     begin = time.process_time()
-    report = solve_file(path)
+    report = solve_network_file(path)
     return {
         "work": time.process_time() - begin,
         "objective": report["objective"],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.report.curves import _Axis, extremes
+from graphslam.app.report.curves import _Axis, extreme_rows
 from graphslam.core import se3
 from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import ConfigError, DataError
@@ -101,7 +101,7 @@ def test_a_long_curve_keeps_its_ends_and_every_peak(n: int) -> None:
     if n > 100:
         at = RNG.choice(np.arange(1, n - 1), 9, replace=False)
         values[at] = [50.0, -50.0, 60.0, -60.0, 70.0, -70.0, 80.0, -80.0, 90.0]
-    keep = extremes(values, 2000)
+    keep = extreme_rows(values, 2000)
     assert len(keep) <= 2000
     assert np.all(np.diff(keep) > 0)
     if n <= 2000:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from graphslam.app.run.verdict import Figures, stated
+from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
 from graphslam.core.records import Gps
 from graphslam.evaluate.bias_test import sum_bias_windows
 from graphslam.evaluate.covariance_assessment import (
@@ -188,11 +188,13 @@ def test_the_line_says_what_it_rests_on_and_survives_the_file():
     rows = json.loads(json.dumps(tests_as_json(HONEST)))
     assert tests_of_json(rows) == HONEST
     assert tests_of_json([{"name": "x"}, 3, None]) == tests_of_json(None) == []
-    lines = {f.code: f for f in stated(Figures({"converged": True, "evidence": rows}, {}))}
+    lines = {f.code: f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": rows}, {}))}
     assert lines["trust"].level == "good"
     assert "without ground truth" in lines["trust"].text
     assert "errors match" not in " ".join(f.text for f in lines.values())
     alone = tests_as_json(chi2_ratio_test("map", "map", 1.0, 8.0))
-    (line,) = [f for f in stated(Figures({"converged": True, "evidence": alone}, {})) if f.code == "trust"]
+    (line,) = [
+        f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": alone}, {})) if f.code == "trust"
+    ]
     assert "covariances: not tested" in line.text
     assert line.level == ""

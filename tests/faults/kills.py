@@ -373,7 +373,7 @@ class Bench:
                 StudyFolder(self.out).collect()
             return ""
         try:
-            outputs.open_run(self.out)
+            outputs.read_run_folder(self.out)
             return "an unfinished run is opened as a finished one"
         except RunFolderError:
             pass
@@ -395,7 +395,7 @@ class Bench:
         page = make_report(self.out)
         lost = {k: v for k, v in page.problems.items() if k != "clearest.json"}
         if self.name != "merge":
-            outputs.open_run(self.out)
+            outputs.read_run_folder(self.out)
             loops_of_run(self.out)
         return f"the report misses {lost}" if lost else ""
 

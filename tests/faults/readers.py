@@ -21,12 +21,12 @@ import numpy as np
 import scipy.io
 import scipy.sparse as sp
 
-from graphslam.app.folders.generations import outputs
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.report.folder import read_folder
 from graphslam.app.report.report import make_report
 from graphslam.app.run.files import loops_of_run, read_merged_dense
-from graphslam.app.run.outputs import open_run, refined_submaps_of
+from graphslam.app.run.outputs import read_run_folder, refined_submaps_of
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.atomic import write_json, write_npz
 from graphslam.core.config import read_toml
@@ -278,7 +278,7 @@ def run_folder(root: Path) -> None:
 
 
 def read_run(root: Path) -> Any:
-    run = open_run(root)
+    run = read_run_folder(root)
     run._repr_html_()
     source = submap_source(run)
     return run, loops_of_run(root).decisions, source
@@ -287,8 +287,8 @@ def read_run(root: Path) -> Any:
 def refined_run(root: Path) -> None:
     """The same run as if its path had been refined by scans."""
     run_folder(root)
-    at = outputs(root)
-    run = open_run(root)
+    at = current_outputs(root)
+    run = read_run_folder(root)
     frames = base_frames(run.map)
     store = SubmapStore(at / "refined")
     for s, a, b in zip(run.submaps, frames, frames[1:]):
@@ -347,8 +347,8 @@ def read_scans(root: Path) -> Any:
 
 
 def read_refined(root: Path) -> Any:
-    run = open_run(root)
-    return run, run.verdict, refined_submaps_of(run), Scans.load(outputs(root) / "scans.npz")
+    run = read_run_folder(root)
+    return run, run.verdict, refined_submaps_of(run), Scans.load(current_outputs(root) / "scans.npz")
 
 
 def report_of_run(root: Path) -> Any:

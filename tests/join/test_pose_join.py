@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.compare import compare, default_methods
+from graphslam.app.compare import compare_methods, default_methods
 from graphslam.app.join_verdict import compare_verdict
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
@@ -42,7 +42,7 @@ def truth_of(problem: PoseProblem, poses: Array) -> MapTruth:
 @pytest.mark.parametrize("case", CASES)
 def test_five_methods_one_optimum_and_the_price_of_filtering_before_it(case: dict) -> None:
     problem, truth = pose_ramp(2, submaps=7, radians=0.03, **case)  # an odd one goes up the tree by itself
-    table = compare(problem, truth=truth_of(problem, truth), memory=False).set_index("method")
+    table = compare_methods(problem, truth=truth_of(problem, truth), memory=False).set_index("method")
     assert list(table.index) == list(METHODS)
     best = table["objective_polished"]["batch"]
     np.testing.assert_allclose(table["objective_polished"], best, rtol=1e-9)
@@ -211,7 +211,7 @@ def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
     refused = [
         (lambda: join_by_method(mixed, "eif-tree"), DataError, "not joined by matches"),
         (lambda: join_by_method(problem, "eif-online"), UnknownNameError, "eif-online"),
-        (lambda: compare(problem, ["magic"], memory=False), UnknownNameError, "magic"),
+        (lambda: compare_methods(problem, ["magic"], memory=False), UnknownNameError, "magic"),
         (lambda: join_by_method(problem, "eif-tree", associate="joint"), ConfigError, "no landmarks to be associated"),
         (lambda: join_by_method(problem, "eif-tree", workers=2), ConfigError, "one process"),
         (lambda: join_by_method(problem, "eif-tree", covariance_scale=2.0), ConfigError, "scale 1"),
@@ -269,7 +269,7 @@ def test_published_graphs_cut_into_submaps(
 def test_a_pose_graph_file_is_cut_where_it_is_named(data_dir: Path) -> None:
     found = submap_source(data_dir / "posegraphs/intel.g2o.xz", submap_poses=100)
     assert len(found.material.keys) == 18
-    table = compare(found.material, ["eif-tree", "batch"], memory=False)
+    table = compare_methods(found.material, ["eif-tree", "batch"], memory=False)
     np.testing.assert_allclose(table["objective_polished"], BEST_KNOWN["posegraphs/intel.g2o.xz"], rtol=1e-6)
     assert found.times == list(range(1728))
     with pytest.raises(MissingDataError, match="cut into some by --submap-poses"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.run.verdict import Figures, stated
+from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.beams import BeamModel
 from graphslam.maps.contradictions import FEW, Contradictions, find_contradictions
@@ -41,7 +41,7 @@ def test_a_room_that_stands_beside_itself_is_denied(dim: int) -> None:
 def test_verdict_says_which_passes_contradict() -> None:
     def line(share: float, doubted: list[list[int]]) -> tuple[str, str]:
         facts = {"pairs": 9, "points": 900, "share": share, "doubted": doubted}
-        found = [f for f in stated(Figures({"map_passes": facts}, {})) if f.code == "passes"]
+        found = [f for f in findings_from_metrics(RunMetrics({"map_passes": facts}, {})) if f.code == "passes"]
         return found[0].level, found[0].text
 
     assert line(0.001, [])[0] == "good"
@@ -49,12 +49,14 @@ def test_verdict_says_which_passes_contradict() -> None:
     level, text = line(0.2, [[2, 7]])
     assert level == "bad"
     assert "submaps 2 and 7" in text
-    assert not [f for f in stated(Figures({}, {})) if f.code == "passes"]
+    assert not [f for f in findings_from_metrics(RunMetrics({}, {})) if f.code == "passes"]
 
 
 def test_of_a_few_points_nothing_is_said() -> None:
     few = Contradictions(np.array([[0, 3], [3, 0]]), np.array([FEW - 2, 0]), np.array([0, 1]))
     assert few.share is None
-    assert not [f for f in stated(Figures({"map_passes": few.facts()}, {})) if f.code == "passes"]
+    assert not [f for f in findings_from_metrics(RunMetrics({"map_passes": few.facts()}, {})) if f.code == "passes"]
     enough = Contradictions(few.pairs, np.array([FEW, 0]), np.array([0, 0]))
-    assert [f.level for f in stated(Figures({"map_passes": enough.facts()}, {})) if f.code == "passes"] == ["good"]
+    assert [
+        f.level for f in findings_from_metrics(RunMetrics({"map_passes": enough.facts()}, {})) if f.code == "passes"
+    ] == ["good"]

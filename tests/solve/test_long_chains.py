@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import graphslam.solve.network.multistart as multistart
-from graphslam.app.solve_file import report_of
+from graphslam.app.solve_file import solution_json
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.graph.pose_graph import PoseGraph
@@ -117,7 +117,7 @@ def test_no_gap_is_told_where_no_optimum_is_known(monkeypatch: pytest.MonkeyPatc
     assert not solution.converged
     assert np.isnan(solution.gap)
     assert solution.decrement > 0
-    assert report_of(solution)["gap"] is None
+    assert solution_json(solution)["gap"] is None
     assert "above a minimum" in repr(solution)
 
 

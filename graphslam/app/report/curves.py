@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.packed import base64_floats, packed_points
-from graphslam.app.report.sections import figures_of
+from graphslam.app.report.sections import metrics_of_folder
 from graphslam.app.run.files import read_gps_residuals
 from graphslam.app.run.verdict import CONFIDENCE, class_rows
 from graphslam.core.errors import GraphSlamError
@@ -33,7 +33,7 @@ _ROW = ("low", "high")
 Rows = npt.NDArray[np.intp]
 
 
-def curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
+def report_curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     """Panels of a finished run, the most telling first; none where there is nothing to show.
 
     With truth: NEES by degree of freedom of every pose with the two-sided bounds of a single one, and its errors with
@@ -90,7 +90,7 @@ class _Axis:
         sigmas: Array | None = None,
         log: bool = False,
     ) -> dict[str, Any]:
-        keep = extremes(values, MOST)
+        keep = extreme_rows(values, MOST)
         piece = self.piece[keep]
         out: dict[str, Any] = {
             **{"name": name, "said": said, "unit": unit, "kind": kind, "colour": style.ESTIMATE, "log": log},
@@ -107,7 +107,7 @@ class _Axis:
         return out
 
 
-def extremes(values: Array, most: int) -> Rows:
+def extreme_rows(values: Array, most: int) -> Rows:
     """Rows of at most ``most`` of the values ``(n,)``: the ends, and of every so many the least and the largest."""
     n = len(values)
     if n <= most:
@@ -209,7 +209,7 @@ def _kinds(folder: ReportFolder) -> list[dict[str, Any]]:
     """χ²/dof by kind of factor with its bounds."""
     rows = [
         {"name": str(r.get("class")), **{k: round(float(r[k]), 6) for k in _ROW}, "value": _six(r["chi2_per_dof"])}
-        for r in class_rows(figures_of(folder))
+        for r in class_rows(metrics_of_folder(folder))
         if all(isinstance(r.get(k), (int, float)) and np.isfinite(r[k]) for k in (*_ROW, "chi2_per_dof"))
     ]
     if not rows:

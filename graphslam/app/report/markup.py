@@ -17,38 +17,38 @@ SCRIPTS = ("viewer.js", "curves.js")
 """Joined, the one script of a page."""
 
 
-def folded(summary: str, body: Markup) -> Markup:
+def folded_section(summary: str, body: Markup) -> Markup:
     """What is opened by hand."""
     return html_element("details", html_element("summary", summary), body)
 
 
-def note(*text: Any) -> Markup:
+def remark(*text: Any) -> Markup:
     """A remark."""
     return html_element("p", *text, class_="note")
 
 
-def missing(*text: Any) -> Markup:
+def missing_note(*text: Any) -> Markup:
     """That something is not there, and why."""
     return html_element("p", "Missing: ", *text, class_="missing")
 
 
-def section(name: str, title: str, *parts: Any) -> Markup:
+def page_section(name: str, title: str, *parts: Any) -> Markup:
     """A part of the page, under a name that links lead to."""
     return html_element("section", html_element("h2", title), join_parts(parts, "\n"), id=name)
 
 
-def picture(png: bytes, caption: str) -> Markup:
+def inline_picture(png: bytes, caption: str) -> Markup:
     """A PNG inside the page."""
     src = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
     return html_element("figure", html_element("img", src=src, alt=caption), html_element("figcaption", caption))
 
 
-def compact(value: Any) -> str:
+def compact_json(value: Any) -> str:
     """A value as one line of JSON."""
     return json.dumps(value, ensure_ascii=False, default=str)
 
 
-def page(**values: Any) -> str:
+def whole_page(**values: Any) -> str:
     """A whole page: ``title``, ``headline``, ``findings``, ``parts`` and ``scene`` in the template ``page.html``."""
     pages = template_environment("graphslam.app.report")
     templates = files("graphslam.app.report") / "templates"

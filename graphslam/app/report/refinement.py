@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
-from graphslam.app.report.markup import missing, note, picture, section
+from graphslam.app.report.markup import inline_picture, missing_note, page_section, remark
 from graphslam.core.markup import Markup, html_table, is_numeric, pair_list
 
 MEANING = {
@@ -28,14 +28,16 @@ BEFORE_AFTER = (
 )
 
 
-def refinement(folder: ReportFolder) -> Markup:
+def refinement_section(folder: ReportFolder) -> Markup:
     """The path of the graph and the refined one in figures, and what else the scans determined."""
     title = "Refinement by scans"
     found = folder.part("refine")
     if folder.kind != "run":
-        return section("refinement", title, note("Only for finished single runs."))
+        return page_section("refinement", title, remark("Only for finished single runs."))
     if not found:
-        return section("refinement", title, note("No refinement; the path is that of the graph. See the verdict."))
+        return page_section(
+            "refinement", title, remark("No refinement; the path is that of the graph. See the verdict.")
+        )
     m = folder.values()
     rows = [{"what": w, "graph": m[a], "refined": m[b]} for w, a, b in BEFORE_AFTER if a in m and b in m]
     parts: list[Any] = [html_table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
@@ -46,13 +48,13 @@ def refinement(folder: ReportFolder) -> Markup:
         **{"surface_sigma": "σ of a surface [m]", "pairs": "pairs", "passes": "of other traversals"},
         **{"spread": "residual spread [m]", "moved": "path moved by [m]"},
     }
-    parts.append(html_table(rounds, columns) if rounds else missing("rounds of the refinement."))
+    parts.append(html_table(rounds, columns) if rounds else missing_note("rounds of the refinement."))
     apart = found.get("left_apart") or []
     if apart:
         listed = {f"{k + 1}": f"{a:.1f} s and {b:.1f} s" for k, (a, b) in enumerate(apart[:20])}
-        parts += [note(f"Pairs of places in the graph that contradict the scans ({len(apart)}):"), pair_list(listed)]
-    parts.append(note("The measurements of the refined path are listed under evidence."))
-    return section("refinement", title, *parts)
+        parts += [remark(f"Pairs of places in the graph that contradict the scans ({len(apart)}):"), pair_list(listed)]
+    parts.append(remark("The measurements of the refined path are listed under evidence."))
+    return page_section("refinement", title, *parts)
 
 
 def _constants(found: Mapping[str, Any]) -> Markup:
@@ -70,4 +72,4 @@ def _bias(found: Mapping[str, Any]) -> list[Markup]:
     from graphslam.plots.refined import plot_yaw_bias
     from graphslam.plots.save import figure_png
 
-    return [picture(figure_png(plot_yaw_bias(None, knots)), "Yaw rate bias at its knots")]
+    return [inline_picture(figure_png(plot_yaw_bias(None, knots)), "Yaw rate bias at its knots")]

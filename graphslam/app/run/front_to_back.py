@@ -46,7 +46,7 @@ class ProgressBar(Observer):
 
 
 @dataclass(frozen=True, slots=True)
-class FrontEndWork:
+class FrontEndTiming:
     """What the front end did in this session.
 
     Parameters
@@ -62,7 +62,7 @@ class FrontEndWork:
     per_scan: Array
 
 
-class FrontToBack:
+class SubmapPipeline:
     """Feeds every submap to the back end as soon as the front end has made it of the records that have come.
 
     Parameters
@@ -125,15 +125,15 @@ class FrontToBack:
             self._cost.append(self._since / max(int(submap.report.get("scans", 1)), 1))
             self._since = 0.0
 
-    def drawn_anew(self, back: BackEnd) -> FrontToBack:
+    def with_next_seed(self, back: BackEnd) -> SubmapPipeline:
         """The same log with the next draw of random numbers, for another back end."""
         feed = RecordSource(self.feed.log)
-        return FrontToBack(feed, self.front, back, self._seed, self.folder, self._with_grids, self.draw + 1)
+        return SubmapPipeline(feed, self.front, back, self._seed, self.folder, self._with_grids, self.draw + 1)
 
     @property
-    def work(self) -> FrontEndWork:
+    def work(self) -> FrontEndTiming:
         """What the front end did so far."""
-        return FrontEndWork(self._seconds, self._resumed, np.array(self._cost[1:]))
+        return FrontEndTiming(self._seconds, self._resumed, np.array(self._cost[1:]))
 
     def _watch(self, at: Any) -> None:
         for o in self.back.observers:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from graphslam.app.folders.lock import locked
-from graphslam.app.run.files import loops_of_run, undone_of_run
-from graphslam.app.run.pipeline import again
+from graphslam.app.folders.lock import lock_folder
+from graphslam.app.run.files import loops_of_run, removed_loops_of_run
+from graphslam.app.run.pipeline import rerun_without_loops
 from graphslam.core.errors import DataError
 from graphslam.loops.candidates import FRONT_END
 from graphslam.loops.ledger import LoopDecision, LoopLedger
@@ -60,7 +60,7 @@ def _again(
 ) -> LoopLedger:
     """Make a run again without the loops that are chosen from its ledger and from those that are undone."""
     without(loops_of_run(folder), [])  # a folder that is no run is not locked, nor made
-    with locked(folder):  # from the look at the ledger on
-        undone = without(loops_of_run(folder), undone_of_run(folder))
-        again(folder, sorted(undone, key=lambda x: x.loop), progress=progress)
+    with lock_folder(folder):  # from the look at the ledger on
+        undone = without(loops_of_run(folder), removed_loops_of_run(folder))
+        rerun_without_loops(folder, sorted(undone, key=lambda x: x.loop), progress=progress)
     return loops_of_run(folder)

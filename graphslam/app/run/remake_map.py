@@ -5,13 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from graphslam.app.folders.generations import new_generation, outputs
-from graphslam.app.folders.lock import locked
-from graphslam.app.hypotheses import Clearest, clearest_of_choices, clearest_of_topologies, write_clearest
+from graphslam.app.folders.generations import current_outputs, new_generation
+from graphslam.app.folders.lock import lock_folder
+from graphslam.app.hypotheses import (
+    MinimumEntropyMap,
+    minimum_entropy_loops,
+    minimum_entropy_topology,
+    write_minimum_entropy,
+)
 from graphslam.app.report.report import report_beside
 from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
-from graphslam.app.run.outputs import open_run, refined_submaps_of
+from graphslam.app.run.outputs import read_run_folder, refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.app.run.surface import COLOURS, RunSurface, draw_surface, surface_of_run, write_surface
 from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain_file, terrain_of_run, write_terrain
@@ -32,14 +37,14 @@ class RemadeMap:
 
     Parameters
     ----------
-    clearest : Clearest or None
+    clearest : MinimumEntropyMap or None
         Choices of matches and loops, where they were asked for.
     files, figures : list of Path
         Written.
     """
 
     map: RunMap
-    clearest: Clearest | None
+    clearest: MinimumEntropyMap | None
     files: list[Path]
     figures: list[Path]
 
@@ -73,13 +78,13 @@ def remake_map(
     if minimum_entropy and hypotheses:
         raise ConfigError("minimum_entropy and hypotheses exclude each other; give one of them")
     home = Path(folder)
-    if not (outputs(home) / "run.json").is_file():
-        open_run(home)  # says what is wrong
-    with locked(home):
+    if not (current_outputs(home) / "run.json").is_file():
+        read_run_folder(home)  # says what is wrong
+    with lock_folder(home):
         run, made = map_of_folder(home, low=low, high=high)
-        found = clearest_of_choices(run, made, progress=progress) if minimum_entropy else None
+        found = minimum_entropy_loops(run, made, progress=progress) if minimum_entropy else None
         if hypotheses:
-            found = clearest_of_topologies(run, hypotheses, log=log, progress=progress)
+            found = minimum_entropy_topology(run, hypotheses, log=log, progress=progress)
         with new_generation(home) as new:
             files = write_run_map(new, made, run.report.get("generation"))
             if grid:
@@ -88,7 +93,7 @@ def remake_map(
             figures = draw_run_map(made, run.map.trajectory, new.figures, name=run.name, truth=run.truth_path)
             old = ["map.ply", "map.bt", "cloud.ply", "map*.pgm", "map*.yaml", "map.grid.npz", "figures/fused*.png"]
             if found is not None:
-                files += write_clearest(new.path, found, bands=made.bands)
+                files += write_minimum_entropy(new.path, found, bands=made.bands)
                 old += ["clearest*", "alternatives/*"]
             new.adopt(drop=old)
             report_beside(new)  # the page of the run shows the pictures and the choices
@@ -118,10 +123,10 @@ def remake_terrain(
     RunTerrain, files, figures
     """
     home = Path(folder)
-    if not (outputs(home) / "run.json").is_file():
-        open_run(home)  # says what is wrong
-    with locked(home):
-        run = open_run(home)
+    if not (current_outputs(home) / "run.json").is_file():
+        read_run_folder(home)  # says what is wrong
+    with lock_folder(home):
+        run = read_run_folder(home)
         made = terrain_of_run(run, log=log, vehicle=vehicle, sensor_height=sensor_height, progress=progress)
         with new_generation(home) as new:
             files = write_terrain(new, made, generation=run.report.get("generation"))
@@ -158,11 +163,11 @@ def remake_surface(
     home = Path(folder)
     if colour not in COLOURS:
         raise UnknownNameError("colour of a surface", colour, COLOURS)
-    if not (outputs(home) / "run.json").is_file():
-        open_run(home)  # says what is wrong
-    with locked(home):
-        run = open_run(home)
-        terrain = read_terrain_file(outputs(home)) if colour == "terrain" else None
+    if not (current_outputs(home) / "run.json").is_file():
+        read_run_folder(home)  # says what is wrong
+    with lock_folder(home):
+        run = read_run_folder(home)
+        terrain = read_terrain_file(current_outputs(home)) if colour == "terrain" else None
         made = surface_of_run(run, log=log, config=config, progress=progress)
         with new_generation(home) as new:
             files = write_surface(new, made, colour=colour, terrain=terrain, generation=run.report.get("generation"))
@@ -181,7 +186,7 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     low, high : float, optional
         Heights of the floor plans above the path [m]; default the run's.
     """
-    run = open_run(path)
+    run = read_run_folder(path)
     root = Path(path)
     refined = refined_submaps_of(run)
     submaps = refined or read_submaps(root, load_grid=load_spilled)

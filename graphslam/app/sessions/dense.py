@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.folders.generations import consistent
+from graphslam.app.folders.generations import read_consistently
 from graphslam.app.run.files import read_options, read_report
 from graphslam.app.run.outputs import refined_submaps_of
 from graphslam.app.run.run import Run
@@ -30,12 +30,12 @@ SPACING = 3.0
 """Of the nodes of a run that has none inside its submaps [m]: places to be tied are needed."""
 
 
-def is_dense(run: Run) -> bool:
+def run_is_dense(run: Run) -> bool:
     """Whether the submaps of a run are without landmarks."""
     return bool(run.submaps) and all(s.landmarks is None for s in run.submaps)
 
 
-def with_maps(run: Run) -> list[Submap]:
+def submaps_with_maps(run: Run) -> list[Submap]:
     """The submaps of a run with their dense maps, along its refined path where it has one."""
     submaps = refined_submaps_of(run) or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
@@ -73,7 +73,7 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
     begin = run.submaps[0].interval[0]
     shift = 0.0 if begin > after else float(np.ceil(after - begin) + 1000.0)
     keys = {s.key: first_key + k for k, s in enumerate(run.submaps)}
-    found = with_maps(run)
+    found = submaps_with_maps(run)
     refined = all(s.report.get("refined") is True for s in found)
     submaps = [_in_common(s, keys, name, shift) for s in found]
     inner = [] if refined else _inner(run, config)
@@ -102,7 +102,7 @@ def _inner(run: Run, config: BackEndConfig) -> list[IntraSessionLoop]:
         )
     if run.holds("graph") and run.graph is not None:
         return loops_of_graph(run.graph)
-    net = None if run.folder is None else consistent(run.folder, lambda root: _graph_of(run, root))
+    net = None if run.folder is None else read_consistently(run.folder, lambda root: _graph_of(run, root))
     if net is None:
         raise DataError("a run does not say how its submaps hang together", where=run.name, wanted="its graph.g2o")
     kernel = NO_KERNEL if config.match_robust == "none" else RobustKernel(config.match_robust, config.match_width)

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.folders.generations import outputs
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import RENAMED, make_front_end
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import load_log_source
-from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_maps
+from graphslam.app.sessions.dense import back_end_config, run_is_dense, session_of, submaps_with_maps
 from graphslam.backend.sessions import DenseSession, add_session, connect_session
 from graphslam.core.errors import DataError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
@@ -31,7 +31,7 @@ from graphslam.solve.registry import make_solver
 
 
 @dataclass(frozen=True, slots=True)
-class Localisation:
+class LocalisationResult:
     """Where something lies in a saved map, or why that is not known.
 
     Parameters
@@ -81,7 +81,7 @@ def localise(
     config: InterSessionConfig | None = None,
     solver: str = "batch",
     progress: bool = False,
-) -> Localisation:
+) -> LocalisationResult:
     """Find a submap, a chain of them, or a stretch of a log in the map of a finished run.
 
     Nothing is assumed of where it may lie. Places of the map that look like places of it are registered; the pose is
@@ -100,7 +100,7 @@ def localise(
 
     Returns
     -------
-    Localisation
+    LocalisationResult
         ``T_map_base`` ``(3,)`` or ``(7,)`` in the frame of the run's map, its covariance (right tangent), and ``why``
         nothing was found.
 
@@ -117,12 +117,12 @@ def localise(
     >>> found.T_map_base is None or found.T_map_base.shape == (7,)  # found.why says what was missing
     True
     """
-    opened = run if isinstance(run, Run) else open_run(run)
-    if not is_dense(opened):
+    opened = run if isinstance(run, Run) else read_run_folder(run)
+    if not run_is_dense(opened):
         raise DataError("only maps of dense submaps are localised in", where=opened.name, wanted="dense submaps")
     with one_blas_thread():
         if isinstance(source, SensorLog):
-            submaps = window_submaps(opened, source)
+            submaps = submaps_of_stretch(opened, source)
         else:
             submaps = [source] if isinstance(source, Submap) else list(source)
         return _localise(opened, submaps, config or InterSessionConfig(), solver, progress)
@@ -148,15 +148,15 @@ def source_of(
         Of a log [s].
     """
     path = Path(source)
-    if (outputs(path) / "run.json").is_file():
-        run = open_run(path)
+    if (current_outputs(path) / "run.json").is_file():
+        run = read_run_folder(path)
         known = [s.key for s in run.submaps]
         rows = [known.index(k) for k in keys if k in known]
         if len(rows) != len(keys) or any(b != a + 1 for a, b in pairwise(rows)):
             raise DataError(
                 "submaps do not follow one another in this run", where=str(path), got=list(keys), wanted=known
             )
-        submaps = with_maps(run)
+        submaps = submaps_with_maps(run)
         return submaps if not rows else [submaps[k] for k in rows]
     log = load_log_source(source, reader=reader, **(reader_options or {}))
     a, b = log.interval
@@ -166,7 +166,7 @@ def source_of(
     return part
 
 
-def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
+def submaps_of_stretch(run: Run, log: SensorLog) -> list[Submap]:
     """Submaps that the front end of a run makes of a log, with the options of the run."""
     folder = None if run.folder is None else Path(run.folder) / "config.toml"
     if folder is None or not folder.is_file():
@@ -183,13 +183,13 @@ def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
 
 def _localise(
     run: Run, submaps: list[Submap], config: InterSessionConfig, solver_name: str, progress: bool
-) -> Localisation:
+) -> LocalisationResult:
     known = session_of(run, "map")
     new = _query(run, known, submaps)
     two = TwoSessions(known.map, new.map)
     ties = two.find(config, progress=progress)
     if ties.why:
-        return Localisation(ties.why, ties, [])
+        return LocalisationResult(ties.why, ties, [])
     graph = PoseGraph(known.submaps[0].dim)
     solver = make_solver(solver_name, graph)
     add_session(graph, known)
@@ -197,11 +197,11 @@ def _localise(
     try:
         at = connect_session(graph, solver, known, 0, new, config=config, found=(two, ties), progress=progress)
     except SolverError as error:
-        return Localisation(str(error), ties, [])
+        return LocalisationResult(str(error), ties, [])
     end = graph.submaps[-1].exit_node
     P = graph.covariance()
     poses = graph.values.poses
-    return Localisation(
+    return LocalisationResult(
         "", ties, at.used, poses[at.first_node].copy(), P.marginal(f"x{at.first_node}"),
         poses[end].copy(), P.marginal(f"x{end}"),
     )  # fmt: skip

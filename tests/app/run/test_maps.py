@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.hypotheses import clearest_of_choices, clearest_of_topologies
+from graphslam.app.hypotheses import minimum_entropy_loops, minimum_entropy_topology
 from graphslam.app.run import config as cfg
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.pipeline import run
@@ -151,7 +151,7 @@ def test_every_choice_of_matches_is_solved_before_it_is_ranked(finished: Run) ->
     choices = choices_of_matches(submaps, 0.5)
     assert choices["as the run"] == choices_of_matches(again.submaps, 0.5)["as the run"]
     assert len(set(choices.values())) == len(choices)
-    found = clearest_of_choices(replace(again, submaps=submaps), made, progress=False)
+    found = minimum_entropy_loops(replace(again, submaps=submaps), made, progress=False)
     table = found.choice.rows()
     assert len(table) == len(choices)
     rows = {r["choice"]: r for r in table}
@@ -202,7 +202,7 @@ def test_topologies_of_the_particles_become_graphs(finished: Run, tmp_path: Path
     config = tmp_path / "foreign" / "config.toml"
     config.write_text(config.read_text().replace('frontend = "segslam"', 'frontend = "rbpf-grid"'))
     with pytest.raises(ConfigError, match="'rbpf-grid' tells one topology"):
-        clearest_of_topologies(foreign, 2, log=finished.log)
+        minimum_entropy_topology(foreign, 2, log=finished.log)
 
 
 def test_runs_without_grids_are_as_before_and_say_so(tmp_path: Path) -> None:

@@ -77,8 +77,8 @@ def test_a_match_is_undone_with_its_ties(
     # and comes back with them
     asked: list[LoopDecision] = []
     monkeypatch.setattr(app_loops, "loops_of_run", lambda folder: ledger_of_events(back.graph.events))
-    monkeypatch.setattr(app_loops, "undone_of_run", lambda folder: undone)
-    monkeypatch.setattr(app_loops, "again", lambda folder, gone, progress: asked.extend(gone))
+    monkeypatch.setattr(app_loops, "removed_loops_of_run", lambda folder: undone)
+    monkeypatch.setattr(app_loops, "rerun_without_loops", lambda folder, gone, progress: asked.extend(gone))
     app_loops.redo_loop(tmp_path, match)
     assert asked == []
     tie = next(d.loop for d in undone if d.source == "tie")

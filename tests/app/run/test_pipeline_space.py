@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.run import pipeline
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import se2_between, se2_log
@@ -106,7 +106,7 @@ def test_folder_is_complete_and_comes_back(dim, tmp_path, monkeypatch):
     events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     assert [e["support"] for e in events if e["event"] == "match-not-used"] == [0.1]
     assert sum(e.get("group") == "match" for e in events if e["event"] == "between") == 3
-    back = open_run(tmp_path / "run")
+    back = read_run_folder(tmp_path / "run")
     np.testing.assert_array_equal(back.map.base_poses, r.map.base_poses)
     np.testing.assert_array_equal(back.map.trajectory.covariances, r.map.trajectory.covariances)
     assert back.truth_path.dim == dim

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from graphslam.app.report.folder import read_folder
-from graphslam.app.report.scene import scene
-from graphslam.app.run.outputs import SAME_BYTES, TWO_MAPS, open_run
+from graphslam.app.report.scene import report_scene
+from graphslam.app.run.outputs import SAME_BYTES, TWO_MAPS, read_run_folder
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
 from graphslam.core.log import SensorLog
@@ -75,7 +75,7 @@ def test_both_maps_are_in_the_folder_with_their_loops(finished: Run) -> None:
     assert first
     assert second
     assert not set(first) & set(second)
-    opened = open_run(folder)
+    opened = read_run_folder(folder)
     assert opened.two_maps is not None
     assert finished.two_maps is not None
     for name, path, stored, own, other in zip(
@@ -98,7 +98,7 @@ def test_the_verdict_says_so_in_one_line_and_the_report_shows_both(finished: Run
     assert "To do: check which of the two is right" in line.text
     assert finished.headline.level == "bad"
     assert finished.folder is not None
-    drawn = scene(read_folder(finished.folder, finished.folder))
+    drawn = report_scene(read_folder(finished.folder, finished.folder))
     assert drawn is not None
     layers = {x["name"]: x for x in drawn["layers"]}
     a, b = layers["two maps, the first"], layers["two maps, the second"]

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 import graphslam
 from graphslam.app.cli import app
-from graphslam.app.folders.generations import outputs
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.run import pipeline
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.surface import scanned_path
 from graphslam.app.sessions.dense import session_of
 from graphslam.app.sessions.localise import localise
@@ -175,10 +175,10 @@ def test_drives_of_clouds_become_one_map(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("graphslam.app.sessions.merge_surface.scanned_path", scanned_from(list(zip(runs, logs))))
         graphslam.merge(runs, out=tmp_path / "both", surface=SurfaceConfig(voxel=0.3))
-    facts = json.loads((outputs(tmp_path / "both") / "surface.json").read_text())
+    facts = json.loads((current_outputs(tmp_path / "both") / "surface.json").read_text())
     assert facts["sessions"] == 2
     assert facts["colour"] == "session"
-    assert (outputs(tmp_path / "both") / "figures" / "surface_sessions.png").is_file()
+    assert (current_outputs(tmp_path / "both") / "figures" / "surface_sessions.png").is_file()
     with pytest.raises(ConfigError, match="taste"):
         graphslam.merge(runs, out=tmp_path / "third", surface=SurfaceConfig(), colour="taste")
 
@@ -310,7 +310,7 @@ def test_a_run_goes_on_in_a_saved_map(drives: list[HallDrive], runs: list[Any], 
         out = tmp_path / "again"
         done = CliRunner().invoke(app, [*arguments, "--out", str(out)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    assert open_run(out).name == "again"
+    assert read_run_folder(out).name == "again"
     a = read_npz(out / "continued" / "merged.npz", fmt="graphslam.merged-submaps/1")
     assert a["sessions"].tolist() == ["there", "again"]
     assert json.loads(done.stdout)["continued"]["sessions"][1]["hangs_on"] == "there"

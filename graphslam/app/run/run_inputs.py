@@ -41,7 +41,7 @@ KEPT = (Compass, Gps, Imu, LandmarkObservations, Odometry, SteeringControls, Vel
 
 
 @dataclass(frozen=True, slots=True)
-class Stamps:
+class TimestampsOnly:
     """A stream of which the stamps alone are kept.
 
     Parameters
@@ -54,13 +54,13 @@ class Stamps:
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", check_times(self.times))
 
-    def take(self, index: Any) -> Stamps:
+    def take(self, index: Any) -> TimestampsOnly:
         """See :class:`graphslam.core.records.Stream`."""
         return replace(self, times=self.times[index])
 
 
 @dataclass(frozen=True)
-class Taken:
+class RunInputs:
     """What the back end and the figures of a run are made of, beside its submaps.
 
     Parameters
@@ -81,22 +81,22 @@ class Taken:
     scans: Scans | None = None
 
 
-def take(
+def collect_inputs(
     log: SensorLog,
     dropped: Mapping[str, int],
     identities: npt.NDArray[np.int64] | None,
     noticed: Sequence[StreamFinding] = (),
     scans: Scans | None = None,
-) -> Taken:
+) -> RunInputs:
     """What is kept of a log; ``dropped`` counts what its front end dropped."""
-    streams: dict[str, Any] = {n: s if isinstance(s, KEPT) else Stamps(s.times) for n, s in log.streams.items()}
+    streams: dict[str, Any] = {n: s if isinstance(s, KEPT) else TimestampsOnly(s.times) for n, s in log.streams.items()}
     read = dict(log.read) or {k: len(s.times) for k, s in log.streams.items()}
-    return Taken(
+    return RunInputs(
         replace(log, streams=streams, read=read, dropped={**log.dropped, **dropped}), identities, tuple(noticed), scans
     )
 
 
-def write_taken(folder: Path, taken: Taken, generation: str) -> None:
+def write_inputs(folder: Path, taken: RunInputs, generation: str) -> None:
     """Write it into the folder of a run's files."""
     log = taken.log
     save_log(replace(log, streams={n: s for n, s in log.streams.items() if isinstance(s, KEPT)}), folder / INPUTS)
@@ -113,7 +113,7 @@ def write_taken(folder: Path, taken: Taken, generation: str) -> None:
         taken.scans.save(folder / SCANS)
 
 
-def read_taken(folder: Path) -> tuple[Taken, str | None]:
+def read_inputs(folder: Path) -> tuple[RunInputs, str | None]:
     """Read it, and the generation that it is of."""
     if not (folder / "taken.npz").is_file() or not (folder / INPUTS / INDEX_NAME).is_file():
         raise MissingDataError(
@@ -124,7 +124,7 @@ def read_taken(folder: Path) -> tuple[Taken, str | None]:
     log, a = load_log(folder / INPUTS), read_npz(folder / "taken.npz", fmt=TAKEN_FORMAT)
     try:
         streams: dict[str, Any] = {
-            str(n): Stamps(a[f"times_{k}"]) if f"times_{k}" in a else log.streams[str(n)]
+            str(n): TimestampsOnly(a[f"times_{k}"]) if f"times_{k}" in a else log.streams[str(n)]
             for k, n in enumerate(a["names"])
         }
         rows = [(str(s), Finding.from_row(dict(zip(("level", "code", "text"), map(str, r))))) for s, *r in a["noticed"]]
@@ -132,4 +132,4 @@ def read_taken(folder: Path) -> tuple[Taken, str | None]:
         raise FormatError(f"stream or array {error} is missing", where=str(folder / "taken.npz")) from None
     noticed = tuple(StreamFinding(stream, finding) for stream, finding in rows if finding is not None)
     scans = Scans.load(folder / SCANS, log.name) if (folder / SCANS).is_file() else None
-    return Taken(replace(log, streams=streams), a.get("identities"), noticed, scans), generation_of(a)
+    return RunInputs(replace(log, streams=streams), a.get("identities"), noticed, scans), generation_of(a)

@@ -20,13 +20,13 @@ from graphslam.loops.graph_loops import GROUP
 from graphslam.loops.rules import LoopConfig
 
 
-def problem_of_run(run: Run) -> PoseProblem:
+def pose_problem_of_run(run: Run) -> PoseProblem:
     """The submaps and ties of a run that has its graph in memory."""
     assert run.graph is not None
     return PoseProblem.of_graph(run.graph)
 
 
-def problem_of_folder(root: Path, files: Path, submaps: list[Submap]) -> PoseProblem:
+def load_pose_problem(root: Path, files: Path, submaps: list[Submap]) -> PoseProblem:
     """The same of a run folder: chains from its submaps, ties from ``graph.g2o``, kernels from its options.
 
     Parameters

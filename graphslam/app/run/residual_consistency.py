@@ -39,7 +39,7 @@ MOST_FORETOLD = {2: 1000, 3: 300}
 
 
 @dataclass(frozen=True)
-class WithoutTruth:
+class ResidualConsistency:
     """Consistency checks of a run without ground truth.
 
     Parameters
@@ -117,7 +117,7 @@ class WithoutTruth:
         return html_frame(self.table())
 
 
-def check_without_truth(
+def check_residual_consistency(
     out: Metrics,
     graph: PoseGraph,
     submaps: Sequence[Submap],
@@ -125,7 +125,7 @@ def check_without_truth(
     poses: Array,
     gps: Gps | None,
     settings: RunConfig,
-) -> WithoutTruth:
+) -> ResidualConsistency:
     """Run the checks and add their values to the metrics.
 
     Parameters
@@ -167,17 +167,17 @@ def check_without_truth(
         out.add("gps_distance_chance", fixes.chance)
     loops = None
     if graph.dim == 3:  # no landmarks to compare loops by
-        return WithoutTruth(classes, innovations, None, fixes)
+        return ResidualConsistency(classes, innovations, None, fixes)
     try:
         known = [graph.as_known(s) for s in submaps]
         found = find_landmark_loops(known, poses, covariance_scale=settings.backend.covariance_scale)
         loops = loop_consistency(found)
     except DataError:  # a chain without a loop has nothing to compare, and the metrics then hold none of it
-        return WithoutTruth(classes, innovations, None, fixes)
+        return ResidualConsistency(classes, innovations, None, fixes)
     test = loops.test()
     for key in ("value", "low", "high", "dof", "loops", "inside", "shape"):
         out.add(f"loops_{key}", test[key], "", "one" if key in ("value", "shape") else "none")
-    return WithoutTruth(classes, innovations, loops, fixes)
+    return ResidualConsistency(classes, innovations, loops, fixes)
 
 
 def _innovations(graph: PoseGraph, gps: Gps | None, settings: RunConfig) -> GpsInnovations | None:
