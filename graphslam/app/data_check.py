@@ -35,7 +35,7 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
     except GraphSlamError as error:
         return [StreamFinding("", Finding("bad", "unreadable", str(error)))]
     if not isinstance(log, SensorLog):
-        text = f"{type(log).__name__}: not a sensor log — not checked. `graphslam solve` checks pose-graph files."
+        text = f"{source}: not a sensor log — not checked. `graphslam solve` checks pose-graph files."
         return [StreamFinding("", Finding("", "read", text))]
     said = [StreamFinding("", Finding("", "read", f"{reading_line(log) or log.name}."))]
     said += [

@@ -115,7 +115,9 @@ def submap_source(
         return SubmapSource([], problem=PoseProblem.of_network(read_network(loaded), submap_poses))
     if not (isinstance(loaded, list) and loaded and isinstance(loaded[0], Submap)):
         raise MissingDataError(
-            f"{source} holds no submaps", got=type(loaded).__name__, wanted="a store, a run or a card of them"
+            f"{source} holds no submaps",
+            got=type(loaded).__name__,
+            wanted="a submap store, a run folder or a data set of submaps",
         )
     return SubmapSource(loaded)
 

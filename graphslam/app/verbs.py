@@ -13,7 +13,7 @@ import pandas as pd
 from graphslam.app import compare as comparing
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.calibration import calibrate_log as calibrate_log
-from graphslam.app.run.front_ends import front_end_names, recommended
+from graphslam.app.run.front_ends import front_end_names, recommended_options
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
 from graphslam.app.run.outputs import read_run_folder as read_run
@@ -150,12 +150,12 @@ def open_run(path: str | Path) -> Run:
 
 
 def load(source: str | Path, **options: Any) -> SensorLog:
-    """A sensor log by card name, or from a folder.
+    """Load a sensor log by data set name, or from a folder.
 
     Parameters
     ----------
     source : str or path
-        Name of a card (``graphslam data list``), or a folder in a layout that is known.
+        Name of a data set (``graphslam data list``), or a folder in a layout that is known.
     **options
         For its reader.
 
@@ -215,7 +215,7 @@ def refine_path(
     """
     log = source if isinstance(source, SensorLog) else load(source)
     if steps is None:
-        steps = recommended(log, "segslam").get("frontend", {}).get("steps", {})
+        steps = recommended_options(log, "segslam").get("frontend", {}).get("steps", {})
     cut = make_steps(log, steps if isinstance(steps, StepConfig) else build_config(StepConfig, dict(steps), "steps"))
     start = chain_odometry(cut.odometry) if path is None else path
     if start.times[0] > cut.times[0] or start.times[-1] < cut.times[-1]:

@@ -107,7 +107,9 @@ def _inverse(information: Array) -> Array:
     try:
         P = np.linalg.inv(information)
     except np.linalg.LinAlgError:
-        raise CovarianceError("a tie says nothing of a direction", wanted="information of full rank") from None
+        raise CovarianceError(
+            "a loop closure does not constrain one direction", wanted="information of full rank"
+        ) from None
     return 0.5 * (P + P.T)
 
 
@@ -233,7 +235,7 @@ def connect_session(
         factors[_add(graph, x, known, new)] = x
     solver.solve_to_optimum()
     dropped += _winnow(graph, solver, factors)
-    logger.info("%s hangs on %s by %d ties", new.name, known.name, len(factors))
+    logger.info("%s is attached to %s by %d loop closures", new.name, known.name, len(factors))
     return ConnectedSession(node, known, ties, list(factors.values()), dropped)
 
 
@@ -270,7 +272,7 @@ def connect_by_gps(
         factors = {_add(graph, x, known, new): x for x in _near(graph, two, known_node, node, [], progress)[0]}
         solver.solve_to_optimum()
         dropped = _winnow(graph, solver, factors)
-    logger.info("%s hangs on %s by GPS and %d ties", new.name, known.name, len(factors))
+    logger.info("%s is attached to %s by GPS and %d loop closures", new.name, known.name, len(factors))
     return ConnectedSession(node, known, None, list(factors.values()), dropped)
 
 

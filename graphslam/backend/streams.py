@@ -106,7 +106,7 @@ def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObser
     found = {name: s for name, s in log.streams.items() if isinstance(s, LandmarkObservations)}
     if config.use not in found:
         raise MissingDataError(
-            "beacons.use names no stream of sightings of the log",
+            "beacons.use names no stream of landmark observations of the log",
             got=config.use,
             wanted=f"none, {', '.join(found) or '(it has none)'}",
         )

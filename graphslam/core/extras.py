@@ -23,11 +23,13 @@ class Extra:
 
 
 EXTRAS = {
-    "surface": Extra("surfaces as triangles (map --surface), ways planned over terrain", ("skimage", "trimesh"), 60),
-    "open3d": Extra("gs.to_open3d(run), Poisson surfaces to compare with", ("open3d",), 1020),
+    "surface": Extra(
+        "triangle meshes of surfaces (map --surface), path planning on terrain", ("skimage", "trimesh"), 60
+    ),
+    "open3d": Extra("gs.to_open3d(run), Poisson surfaces", ("open3d",), 1020),
     "ros": Extra("bags of ROS 1 and ROS 2, MCAP; no ROS needed", ("rosbags", "mcap"), 45),
     "las": Extra("LAS and LAZ clouds", ("laspy", "lazrs"), 2),
-    "live": Extra("run --live: the Rerun viewer while a run goes on", ("rerun",), 670),
+    "live": Extra("run --live: the Rerun viewer during a run", ("rerun",), 670),
     "cluster": Extra("studies, joins and networks on a Dask cluster", ("distributed",), 40),
     "notebooks": Extra("the notebooks, in JupyterLab", ("jupyterlab", "ipywidgets", "nbclient"), 165),
 }
@@ -41,7 +43,7 @@ def import_extra(module: str, need: str, *, where: str | None = None) -> ModuleT
     module : str
         Such as ``"rosbags.rosbag1"``.
     need : str
-        What cannot be done without it: the beginning of the sentence that a user reads.
+        What needs the package: the beginning of the message.
     where : str, optional
         File that asks for it.
     """

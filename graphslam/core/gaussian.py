@@ -32,7 +32,7 @@ def information_matrices(covariances: Array, where: str) -> Array:
             f"{int(bad.sum())} covariances are not positive definite, first: number {int(np.argmax(bad))}",
             where=where,
             got=f"smallest eigenvalue {low[bad][0]:.3g}",
-            wanted="> 0",
+            wanted="> 0; check units and time stamps",
         )
     try:
         inverse = np.linalg.inv(covariances)
@@ -74,7 +74,10 @@ def check_covariance(
     except np.linalg.LinAlgError:
         low = float(np.linalg.eigvalsh(P)[0])
         raise CovarianceError(
-            f"{what} is not positive definite", where=where, got=f"smallest eigenvalue {low:.3g}", wanted="> 0"
+            f"{what} is not positive definite",
+            where=where,
+            got=f"smallest eigenvalue {low:.3g}",
+            wanted="> 0; check units and time stamps",
         ) from None
     return P
 

@@ -101,7 +101,7 @@ def check_informations(information: ArrayLike, labels: Sequence[str], *, what: s
         raise CovarianceError(
             f"{len(bad)} of {len(info)} {what} are indefinite: {_names(labels, bad, values)}",
             where=where,
-            wanted="positive semi-definite matrices, or repair=True to project them",
+            wanted="positive semi-definite matrices; --repair (repair=True) replaces them by the nearest valid ones",
         )
     return info
 

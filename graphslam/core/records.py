@@ -40,7 +40,9 @@ def check_times(times: Any, n: int | None = None, *, where: str | None = None) -
         raise DataError("stamps have the wrong shape", where=where, got=t.shape, wanted=f"({n},)" if n else "(n,)")
     if not np.all(finite_mask(t)):
         k = int(np.flatnonzero(~finite_mask(t))[0])
-        raise DataError(f"stamp of record {k} is not finite", where=where, got=t[k], wanted="seconds")
+        raise DataError(
+            f"stamp of record {k} is not finite", where=where, got=t[k], wanted="seconds, with a decimal point"
+        )
     bad = np.flatnonzero(np.diff(t) <= 0)
     if len(bad):
         k = int(bad[0]) + 1
@@ -558,7 +560,7 @@ class PointObservations:
             raise DataError("ids of points are missing or negative", got=ids.shape, wanted=f"({q},), each ≥ 0")
         scan = np.repeat(np.arange(len(self.times)), np.diff(offsets))
         if len(np.unique(np.column_stack([scan, ids]), axis=0)) < q:
-            raise DataError("an id stands twice in one scan", wanted="each once")
+            raise DataError("an id is repeated in one scan", wanted="each once")
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "T_base_sensor", _array(self.T_base_sensor, (7,), "T_base_sensor"))
 

@@ -56,17 +56,17 @@ class SensorBiases:
         c = len(CONSTANTS)
         shapes = (self.sigmas.shape, self.score.shape, self.information.shape)
         if len(self.names) != c or shapes != ((c,), (c,), (c, c)) or self.response.shape[1:] != (c,):
-            raise GeometryError("lasting errors do not fit each other", got=shapes, wanted=((c,), (c,), (c, c)))
+            raise GeometryError("systematic errors do not fit each other", got=shapes, wanted=((c,), (c,), (c, c)))
         if self.path.shape[1:] != (3, c) or self.points.shape[1:] != (c,):
-            raise GeometryError("lasting errors do not fit the path", got=self.path.shape, wanted=f"(T, 3, {c})")
+            raise GeometryError("systematic errors do not fit the path", got=self.path.shape, wanted=f"(T, 3, {c})")
         for part in (self.sigmas, self.response, self.score, self.information, self.path, self.points):
             if not np.all(finite_mask(part)):
-                raise GeometryError("lasting errors are not finite", wanted="finite numbers")
+                raise GeometryError("systematic errors are not finite", wanted="finite numbers")
         if not np.all(self.sigmas > 0):
-            raise CovarianceError("lasting errors need a positive σ beforehand", got=self.sigmas)
+            raise CovarianceError("systematic errors need a positive prior σ", got=self.sigmas)
         L = self.information
         if np.abs(L - L.T).max() > 1e-6 * np.abs(L).max(initial=1e-300):
-            raise CovarianceError("information of lasting errors is not symmetric")
+            raise CovarianceError("information of systematic errors is not symmetric")
 
     def of_landmarks(self, keep: npt.NDArray[np.intp]) -> SensorBiases:
         """The same beside fewer landmarks: ``keep`` are rows of the landmark map's vector."""

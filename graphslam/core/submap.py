@@ -110,12 +110,12 @@ class LandmarkMap:
             raise GeometryError("points of the path do not fit the map", got=self.path.cross.shape, wanted=f"(…, {n})")
         if self.lasting is not None and len(self.lasting.response) != n:
             raise GeometryError(
-                "lasting errors do not fit the map", got=self.lasting.response.shape, wanted=f"({n}, 6)"
+                "systematic errors do not fit the map", got=self.lasting.response.shape, wanted=f"({n}, 6)"
             )
         if self.sightings is not None:
             rows = np.ascontiguousarray(self.sightings, dtype=np.int64).reshape(-1, 2)
             if len(rows) and (rows[:, 1].min() < 0 or rows[:, 1].max() >= len(ids)):
-                raise GeometryError("sightings name a landmark that is not in the map", got=rows[:, 1].max())
+                raise GeometryError("observations of a landmark that is not in the map", got=rows[:, 1].max())
             object.__setattr__(self, "sightings", rows)
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "exit_pose", pose)

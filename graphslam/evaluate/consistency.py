@@ -148,7 +148,7 @@ class Consistency:
 
     @property
     def mean_normalised(self) -> float:
-        """Mean of ``D²/n``: 1 for an honest estimator, above it over-confident, below it pessimistic."""
+        """Mean of ``D²/n``: 1 for a consistent estimator, above it over-confident, below it pessimistic."""
         if self.unit == "value":
             known = np.isfinite(self.nees)
             return float(np.sum(self.nees[known]) / np.sum(self.dof[known]))
@@ -156,9 +156,9 @@ class Consistency:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Two-sided bounds of :attr:`mean_normalised` for an honest estimator.
+        """Two-sided bounds of :attr:`mean_normalised` for a consistent estimator.
 
-        Values inside a run are taken as fully correlated with ``unit="run"``: then the mean over a run is
+        Values inside a run are assumed fully correlated with ``unit="run"``: then the mean over a run is
         distributed as one ``χ²_n/n``. With any weaker correlation the bounds are wide, never narrow.
         """
         known = np.isfinite(self.nees)
@@ -190,7 +190,7 @@ class Consistency:
 
     @property
     def coverage_bounds(self) -> tuple[float, float]:
-        """Two-sided binomial bounds of :attr:`coverage` for an honest estimator, by number of independent units."""
+        """Two-sided binomial bounds of :attr:`coverage` for a consistent estimator, by number of independent units."""
         n = self.runs if self.unit == "run" else self.count
         a = (1.0 - self.confidence) / 2.0
         binom = stats.binom(n, self.confidence)
@@ -199,7 +199,7 @@ class Consistency:
     def curve(self) -> tuple[Array, Array, Array]:
         """Mean over the runs of ``D²/n`` per column, with its lower and upper bounds, each ``(k,)``.
 
-        Columns are usually submaps: is the estimator still honest there? Only runs that have a value count.
+        Columns are usually submaps: is the estimator still consistent there? Only runs that have a value count.
         """
         runs = np.sum(np.isfinite(self.nees), axis=0)
         if np.any(runs == 0):

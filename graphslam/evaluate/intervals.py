@@ -30,8 +30,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
 
 
 def share_interval(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Bounds of a probability of which ``count`` of ``total`` independent trials came true (Clopper and Pearson
-    1934)."""
+    """Bounds of a probability: ``count`` of ``total`` independent trials were successes (Clopper and Pearson 1934)."""
     if total < 1 or not 0 <= count <= total:
         raise DataError("no interval of a share", got=f"{count} of {total}", wanted="0 … total, total ≥ 1")
     a = 0.5 * (1.0 - confidence)

@@ -70,7 +70,7 @@ def match_ids(ids: ArrayLike, truth_ids: ArrayLike) -> tuple[Index, Index]:
     order = np.argsort(b, kind="stable")
     s = b[order]
     if len(s) and np.any(np.diff(s) == 0):
-        raise DataError("a true landmark stands twice", got=int(s[1:][np.diff(s) == 0][0]), wanted="unique ids")
+        raise DataError("a true landmark is repeated", got=int(s[1:][np.diff(s) == 0][0]), wanted="unique ids")
     if not len(s):
         return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
     at = np.minimum(np.searchsorted(s, a), len(s) - 1)

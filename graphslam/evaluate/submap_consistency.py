@@ -108,7 +108,7 @@ def submap_nees(submap: Submap, truth: Truth) -> SubmapNees:
 
 
 def submaps_consistency(submaps: Iterable[Submap], truth: Truth, *, confidence: float = 0.95) -> dict[str, Consistency]:
-    """Honesty of a chain of local maps: ``joint`` and ``exit`` over all of them.
+    """Consistency of a chain of local maps: ``joint`` and ``exit`` over all of them.
 
     Local maps of one run use different data, so each is an independent unit and even one run judges them well.
     """

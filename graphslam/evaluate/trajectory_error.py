@@ -142,7 +142,9 @@ def _pair(
 ) -> tuple[Array, Array, Array, Array, float]:
     """Stamps, reference poses, aligned estimated poses, alignment and scale."""
     if reference.dim != estimate.dim:
-        raise DataError("trajectories differ in dimension", got=estimate.dim, wanted=reference.dim)
+        raise DataError(
+            "estimate and reference differ in dimension", got=f"a {estimate.dim}-D path", wanted=f"{reference.dim}-D"
+        )
     i, j = match_stamps(reference.times, estimate.times, max_diff=max_diff)
     if not len(i):
         raise DataError(

@@ -89,7 +89,7 @@ def update_grids(
         if g.model is not first.model and g.model != first.model:
             raise GridError(f"grid {k} has another beam model than the first", got=g.model, wanted=first.model)
     if len({id(g) for g in grids}) != len(grids):
-        raise GridError("a grid stands twice in one update", wanted="each grid once")
+        raise GridError("a grid is repeated in one update", wanted="each grid once")
     scan = scan_rows(points, origin, returns, max_range, first.dim, first.voxel_size)
     T = pose_rows(poses, first.dim)
     check_number("poses", T, len(grids))

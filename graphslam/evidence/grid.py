@@ -141,7 +141,7 @@ class EvidenceGrid(GridTree):
         u = c + half
         keys = (u[:, 2] << 40) | (u[:, 1] << 20) | u[:, 0]
         if len(np.unique(keys)) != len(keys):
-            raise GridError("a brick stands twice in one write", wanted="each brick once")
+            raise GridError("a brick is repeated in one write", wanted="each brick once")
         write_packed(self, keys, v)
 
     def merge(self, other: EvidenceGrid, pose: Any = None) -> int:
@@ -257,7 +257,7 @@ class EvidenceGrid(GridTree):
         counts, box, m = self.voxel_counts(), self.bounding_box(), self.memory()
         extent = "empty" if box is None else " × ".join(f"{d:.1f}" for d in box[1] - box[0]) + " m"
         facts = {
-            "extent of what is known": extent,
+            "extent of known space": extent,
             "voxels occupied / free": f"{counts.occupied:,} / {counts.free:,}",
             "memory, own / shared": f"{m.private / 1e6:.2f} / {m.shared / 1e6:.2f} MB",
         }

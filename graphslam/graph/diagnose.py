@@ -124,10 +124,10 @@ def _remedies(lost: Sequence[str], flat: FactorArrays, waiting: int) -> list[str
     if nodes:
         first = min(int(n[1:]) for n in nodes)
         out.append(
-            f"x{first} is not tied to x{first - 1}: add a submap or a between-factor from x{first - 1} to it, "
+            f"x{first} is not connected to x{first - 1}: add a submap or a between-factor from x{first - 1} to it, "
             "or two landmarks that both sides saw."
             if flat.layout.dim == 2
-            else f"x{first} is not tied to x{first - 1}: add a submap or a between-factor from x{first - 1} to it."
+            else f"x{first} is not connected to x{first - 1}: add a submap or a between-factor from x{first - 1} to it."
         )
     landmarks = [n for n in lost if n[0] == "l"]
     if landmarks and not nodes:

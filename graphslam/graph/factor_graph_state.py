@@ -298,12 +298,14 @@ class FactorGraphState:
         """
         record = self.records.get(factor_id)
         if not isinstance(record, SubmapRecord) or not 0 <= entry < len(record.landmark_ids):
-            raise DataError("no such sighting to split off", got=(factor_id, entry), wanted="a submap factor's entry")
+            raise DataError(
+                "no such observation to split off", got=(factor_id, entry), wanted="a submap factor's entry"
+            )
         old, new = int(record.landmark_ids[entry]), self._next_landmark
         ids = record.landmark_ids.copy()
         ids[entry] = new
         if old not in ids and len(self._seen_in[old]) < 2:
-            raise DataError(f"landmark {old} is seen nowhere else", got=(factor_id, entry), wanted="two sightings")
+            raise DataError(f"landmark {old} is seen nowhere else", got=(factor_id, entry), wanted="two observations")
         self._next_landmark += 1
         seen = se2_transform(self.values.poses[record.start], record.z[3 + 2 * entry : 5 + 2 * entry])
         self._start_landmarks(ids[entry : entry + 1], seen[None])

@@ -70,7 +70,7 @@ class GpsConfig:
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"gps.{name} must be positive, got {value}")
         if self.bias_time is not None and self.bias_sigma is None:
-            raise ConfigError("gps.bias_time needs gps.bias_sigma: the size of the errors that last so long")
+            raise ConfigError("gps.bias_time needs gps.bias_sigma, the σ of these errors")
 
     @property
     def bias_every(self) -> float:
@@ -254,7 +254,12 @@ class GpsFixes:
         """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_gps`."""
         g = self.graph
         if gps.positions.shape[1] != g.dim:
-            raise GeometryError("GPS fixes have the wrong dimension", got=gps.positions.shape, wanted=f"(n, {g.dim})")
+            raise GeometryError(
+                "GPS positions and map differ in dimension",
+                where=stream,
+                got=f"{gps.positions.shape[1]}-D positions",
+                wanted=f"{g.dim}-D, or leave GPS out (--set gps.use=none)",
+            )
         self.config = config or self.config
         for t in gps.times:
             g.ledger.check(f"GPS fix at {t:.3f} s", [stream], (float(t), float(t)))

@@ -25,10 +25,10 @@ EXCLUSIVE = "measurement"
 DECLARED = {
     "shared-scan": "a scan that made a submap also registers it to another one",
     "prior": "an assumption, not a measurement",
-    "lasting": "what a submap says of constant errors is the part of its likelihood that its own Gaussian leaves out",
-    "levelled": "each base was levelled by the same gravity that the submap's exit holds",
-    "aid": "where matches began and how scans are bent: nothing that it tells is in a covariance of the path",
-    "start": "where the refinement by scans began: it enters no sum of the refined path",
+    "lasting": "the factor of constant errors is the part of the likelihood that the submap Gaussian does not contain",
+    "levelled": "each base was levelled by the same gravity measurement as the exit of the submap",
+    "aid": "used for initial guesses of matches and for deskewing only; in no covariance of the path",
+    "start": "initial guess of the refinement; in no factor of the refined path",
 }
 
 
@@ -55,7 +55,7 @@ class Ledger:
     >>> ledger.spend(1, "between x0 x1", ["odometry"], (9.0, 11.0))
     Traceback (most recent call last):
     ...
-    graphslam.core.errors.EvidenceReusedError: between x0 x1 would spend stream 'odometry' over [9.000, 11.000) s a \
+    graphslam.core.errors.EvidenceReusedError: between x0 x1 would use stream 'odometry' over [9.000, 11.000) s a \
 second time: submap 0 spent it over [0.000, 10.000) s
     """
 
@@ -99,7 +99,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
             e = self.conflict(stream, interval)
             if e is not None:
                 raise EvidenceReusedError(
-                    f"{factor} would spend stream {stream!r} over [{t0:.3f}, {t1:.3f}) s a second time: "
+                    f"{factor} would use stream {stream!r} over [{t0:.3f}, {t1:.3f}) s a second time: "
                     f"{e.factor} spent it over [{e.t_start:.3f}, {e.t_end:.3f}) s"
                 )
 

@@ -234,7 +234,7 @@ class PendingMeasurements:
                 continue
             (self._tie_range if r.beacon >= 0 else self._tie_heading)(r, s.nodes[int(at[0])], T, P)
         self._drop(outside, "outside the submap's trajectory")
-        self._drop(spent, "its submap has spent the stream already")
+        self._drop(spent, "its submap uses the stream already")
 
     def finish(self) -> None:
         """No more submaps will come: what still waits is dropped, and counted."""

@@ -226,7 +226,9 @@ class PoseGraph(FactorGraphState):
             The graph has none.
         """
         if not 0 <= robot < self.values.count("wheels"):
-            raise DataError(f"the graph has no constant errors of robot {robot}", wanted="submaps with lasting errors")
+            raise DataError(
+                f"the graph has no constant errors of robot {robot}", wanted="submaps with systematic errors"
+            )
         return sensor_biases_at(self.values, robot), self.covariance().joint(bias_variable_names(robot))
 
     def _add_dense(
@@ -507,7 +509,7 @@ class PoseGraph(FactorGraphState):
             raise ConfigError(f"attitude of x{node} needs a positive sigma, got {sigma}")
         names = list(streams)
         if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"attitude of x{node} must name the streams and the interval that it spends")
+            raise ConfigError(f"attitude of x{node} must name the streams and the interval that it uses")
         record = AttitudeRecord(self.next_factor(), node, d / length, np.eye(2) / sigma, robust, group)
         self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
         self.start_tilt()
@@ -543,7 +545,7 @@ class PoseGraph(FactorGraphState):
             raise DataError(f"distance x{i} – x{j} is not usable", got=(distance, sigma), wanted="≥ 0 m, sigma > 0 m")
         names = list(streams)
         if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"distance x{i} – x{j} must name the streams and the interval that it spends")
+            raise ConfigError(f"distance x{i} – x{j} must name the streams and the interval that it uses")
         arms = [np.zeros(self.dim) if a is None else np.asarray(a, dtype=np.float64) for a in (arm_i, arm_j)]
         record = RangeRecord(self.next_factor(), i, j, arms[0], arms[1], float(distance), float(sigma), robust)
         self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
@@ -606,7 +608,7 @@ class PoseGraph(FactorGraphState):
         T = self._pose(T_ij, f"relative pose x{i} → x{j}")
         names = list(streams)
         if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"between-factor x{i} → x{j} must name the streams and the interval that it spends")
+            raise ConfigError(f"between-factor x{i} → x{j} must name the streams and the interval that it uses")
         W = whitener(covariance, what=f"covariance of x{i} → x{j}", dim=self.structure.group.dof)
         record = BetweenRecord(self._next_factor, i, j, T, W, robust, group)
         self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
@@ -664,7 +666,7 @@ class PoseGraph(FactorGraphState):
         if len(T) != len(e):
             raise DataError("relative poses do not fit their ends", got=len(T), wanted=len(e))
         if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"{len(e)} between-factors must name the streams and the interval that they spend")
+            raise ConfigError(f"{len(e)} between-factors must name the streams and the interval that they use")
         W = covariance_whiteners(covariance, len(e), self.structure.group.dof, what="between-factor")
         first, label = self._next_factor, f"{len(e)} × {group}"
         self.ledger.spend(first, label, names or ["-"], interval or (0.0, 0.0), evidence)

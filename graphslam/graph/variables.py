@@ -94,21 +94,21 @@ for _kind in (
     VariableKind("l", "l", {2: "mm", 3: "mmm"}, classes=("submap", "dense-submap", "*")),
     VariableKind(
         "point", "y", {2: "mm"}, classes=("path",),
-        remedy="a point of a submap's path hangs on no submap: remove the fixes that hang on it.",
+        remedy="a point of a submap's path has no submap: remove the GPS fixes of this point.",
     ),
     # Constant errors of a robot (graphslam.core.sensor_biases): turn and log distance of its wheels; ranges and
     # bearings of # its sensor, and where that stands.
     VariableKind(
         "wheels", "w", {2: "rr"}, classes=("lasting",),
-        remedy="constant errors of the wheels need what is known of them beforehand.",
+        remedy="constant errors of the wheels need a prior.",
     ),
     VariableKind(
         "sensor", "e", {2: "mr"}, classes=("lasting",),
-        remedy="constant errors of the sensor need what is known of them beforehand.",
+        remedy="constant errors of the sensor need a prior.",
     ),
     VariableKind(
         "mount", "m", {2: "mm"}, classes=("lasting",),
-        remedy="where the sensor stands needs what is known of it beforehand.",
+        remedy="the sensor position needs a prior.",
     ),
     # In space the datum's heading stands last and it moves by addition.
     VariableKind("datum", "g", {2: "mmr", 3: "mmmr"}, group=True, single=True, classes=("gps",)),
@@ -118,15 +118,15 @@ for _kind in (
     ),
     VariableKind(
         "tilt", "t", {3: "rr"}, single=True, classes=("attitude", "levelled", "imu", "imu-gravity"),
-        remedy="nothing says where up is: add the attitude of a node that is tied to x0.",
+        remedy="the vertical is unconstrained: add the attitude of a node that is connected to x0.",
     ),
     VariableKind(
         "velocity", "v", {3: "mmm"}, classes=("imu",),
-        remedy="the velocity or the bias of an IMU hangs on nothing: add readings, or remove its factors.",
+        remedy="the velocity or the bias of an IMU is unconstrained: add readings, or remove its factors.",
     ),
     VariableKind(
         "imubias", "i", {3: "rrrmmm"}, classes=("imu-bias", "imu"),
-        remedy="the velocity or the bias of an IMU hangs on nothing: add readings, or remove its factors.",
+        remedy="the velocity or the bias of an IMU is unconstrained: add readings, or remove its factors.",
     ),
 ):  # fmt: skip
     register_variable(_kind)

@@ -225,7 +225,7 @@ class _Bag:
                     f"bag cannot be opened: {_said(error)}",
                     where=str(f),
                     got=f"{_size(f):,} bytes" if f.is_file() else None,
-                    wanted="a bag that is whole: `rosbag reindex`, `ros2 bag reindex` or `mcap recover` may mend it",
+                    wanted="a bag that is whole: `rosbag reindex`, `ros2 bag reindex` or `mcap recover` may repair it",
                 ) from None
             stack.callback(_quietly, reader.close)
             self.readers.append(reader)
@@ -267,7 +267,8 @@ class _Bag:
 
 
 def _said(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    text = " ".join(str(error).split())[:200]
+    return text or f"damaged or cut off ({type(error).__name__})"
 
 
 def _size(path: Path) -> int:

@@ -138,7 +138,7 @@ def cards_folder() -> Path:
     for folder in (package / "cards", package.parent / "datasets"):
         if any(folder.glob("*.toml")):
             return folder
-    raise MissingDataError("this installation holds no data-set cards", where=str(package / "cards"))
+    raise MissingDataError("this installation has no data set descriptions", where=str(package / "cards"))
 
 
 @cache
@@ -169,16 +169,18 @@ def read_card(path: Path) -> Card:
     except (ValueError, RecursionError) as error:  # tomllib's own errors are ValueErrors
         raise FormatError(f"not TOML ({error})", where=where) from None
     if content.pop("format", None) != CARD_FORMAT:
-        raise FormatError("unknown format of card", where=where, wanted=repr(CARD_FORMAT))
+        raise FormatError("unknown format of a data set description", where=where, wanted=repr(CARD_FORMAT))
     files = tuple(_build(CardFile, f, where) for f in _list(content, "files", where))
     archives = tuple(_build(CardArchive, a, where) for a in _list(content, "archives", where))
     made: Card = _build(Card, {**content, "files": files, "archives": archives}, where)
     if not _NAME.fullmatch(made.name) or made.name != path.stem:
-        raise FormatError("name of the card is not that of its file", where=where, got=made.name, wanted=path.stem)
+        raise FormatError(
+            "name of the data set description differs from its file name", where=where, got=made.name, wanted=path.stem
+        )
     if made.kind not in KINDS:
         raise FormatError("unknown kind", where=where, got=made.kind, wanted=", ".join(KINDS))
     if not files:
-        raise FormatError("card without files", where=where)
+        raise FormatError("data set description without files", where=where)
     for p in (made.folder, *(f.path for f in files)):
         _check_path(p, where)
     for f in files:
@@ -230,4 +232,4 @@ def _build(kind: Any, values: Mapping[str, Any], where: str) -> Any:
     try:
         return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
     except TypeError as error:
-        raise FormatError(f"card is incomplete ({error})", where=where) from None
+        raise FormatError(f"data set description is incomplete ({error})", where=where) from None

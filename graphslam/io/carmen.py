@@ -103,7 +103,7 @@ def read_carmen(
     reach = max_range or scans.max_range or MAX_RANGE
     ranges, poses = scans.ranges, scans.poses
     times, mended = mend_stamps(scans.stamps, most_mended, where=where)
-    counter.drop("laser", "stamp mended (kept)", mended)
+    counter.drop("laser", "stamp corrected (kept)", mended)
     if poses is None or _still(poses):
         found = _between(scans.odom, times, most_mended, where)
         if found is not None:

@@ -341,7 +341,7 @@ def _pcd_layout(head: bytes, where: str) -> _Layout:
         for i, (f, k, s, c) in enumerate(zip(fields, kinds, sizes, counts))
     ]
     if len({c[0] for c in columns}) != len(columns):
-        raise FormatError("a field stands twice", where=where, got=fields)
+        raise FormatError("a field is repeated", where=where, got=fields)
     dtype = np.dtype([(f, d) if c == 1 else (f, d, (c,)) for f, d, c in columns])
     form = end[1].decode().lower()
     if form == "ascii":

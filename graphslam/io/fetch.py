@@ -108,13 +108,13 @@ def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, mo
         )
     except requests.exceptions.RequestException as error:
         raise MissingDataError(
-            f"download failed ({type(error).__name__}: {error})", where=url, wanted=f"or a copy from {c.source}"
+            f"download failed ({type(error).__name__}: {error}); get the files by hand from {c.source}", where=url
         ) from None
     except ValueError as error:
         if "hash" not in str(error):
             raise DataError(f"download failed ({error})", where=url) from None
         raise DataError(
-            "what was downloaded is not the file of the card: the checksum differs; it was thrown away",
+            "checksum of the downloaded file differs from the description of the data set; the file was deleted",
             where=url,
             wanted=f"sha256 {digest}",
         ) from None
@@ -142,7 +142,9 @@ def _stream(url: str, file: str, most: int, progress: bool) -> None:
                         size += len(part)
                         if size > most:
                             raise DataError(
-                                "more data than the card says; it was thrown away", where=at, wanted=f"{most} bytes"
+                                "download is larger than the description of the data set says; the file was deleted",
+                                where=at,
+                                wanted=f"{most} bytes",
                             )
                         out.write(part)
                         bar.update(len(part))
@@ -175,7 +177,9 @@ def _unpack(packed: Path, wanted: list[CardFile], target: Path) -> None:
                     content = stream.read(size + 1)  # never more than the card says: a bomb stays folded
                 if len(content) != size or hashlib.sha256(content).hexdigest() != digest:
                     raise DataError(
-                        f"{member.filename} is not the file of the card", where=where, wanted=f"sha256 {digest}"
+                        f"{member.filename} differs from the description of the data set",
+                        where=where,
+                        wanted=f"sha256 {digest}",
                     )
                 (target / name).parent.mkdir(parents=True, exist_ok=True)
                 with atomic_open(target / name) as out:

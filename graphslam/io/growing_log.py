@@ -158,7 +158,7 @@ class _Held:
 
     def part(self, first: int, last: int) -> Stream:
         if first < self.ends[0]:
-            raise DataError("records that were let go of", where=self.where, got=first, wanted=f"≥ {self.ends[0]}")
+            raise DataError("records that were already freed", where=self.where, got=first, wanted=f"≥ {self.ends[0]}")
         if first == self.ends[0] and last == self.ends[-1] and len(self.parts) > 1:
             self.parts, self.ends = [join_portions(self.kind, self.parts)], [first, last]  # next time it is one portion
         a = int(np.searchsorted(self.ends, first, side="right")) - 1

@@ -102,9 +102,9 @@ def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
             return name
     odd = np.flatnonzero((nonzero != np.isin(np.arange(6), [0, 3, 5])).any(axis=1))
     raise FormatError(
-        "the meaning of the noise columns cannot be told from the numbers",
+        "the meaning of the noise columns is not clear from the numbers",
         where=records.where(int(lines[odd[0]])),
-        wanted='noise="covariance", "information", "sqrt-information" or "toro"',
+        wanted='in Python, noise="covariance", "information", "sqrt-information" or "toro"',
     )
 
 

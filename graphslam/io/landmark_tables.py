@@ -137,7 +137,7 @@ def claim_tables(look: SourceProbe) -> ReaderMatch | None:
     guess = [p for p in guess if p.suffix.lower() in TABLE_ENDINGS and look.lines(p, 1)]
     if motion and seen:
         return ReaderMatch(
-            f"odometry ({look.relative(motion[0])}) and sightings of landmarks ({look.relative(seen[0])})"
+            f"odometry ({look.relative(motion[0])}) and landmark observations ({look.relative(seen[0])})"
         )
     if motion or seen:
         have, lack = (motion[0], "sightings") if motion else (seen[0], "odometry")
@@ -207,7 +207,7 @@ def read_landmark_tables(
     if not (motion and seen):
         claim = claim_tables(look)
         raise MissingDataError(
-            "no table of odometry beside one of sightings",
+            "no odometry table in addition to the observation table",
             where=str(root),
             got=claim.found if claim else str(look),
             wanted=f"odometry.csv with the header {ODOMETRY_HEADER}, sightings.csv with {SIGHTINGS_HEADER}",
@@ -325,7 +325,7 @@ def _sightings(
     a, header = _read(path, "landmarks", counter)
     n = len(a["t"])
     if n == 0:
-        raise DataError("holds no sighting", where=str(path), wanted="at least one row below the header")
+        raise DataError("no observations", where=str(path), wanted="at least one row below the header")
     t, r, b = a["t"], a["range"], a.get("bearing", np.zeros(n))
     ids = a.get("id")
     good = np.ones(n, dtype=np.bool_)
@@ -339,7 +339,7 @@ def _sightings(
     if good.sum() < 0.5 * n:
         usual = t[np.isfinite(t)]
         raise DataError(
-            f"{int((~good).sum())} of {n} sightings are unusable",
+            f"{int((~good).sum())} of {n} observations are unusable",
             where=str(path),
             got=f"{dict(counter.counts)}; stamps {usual.min() if len(usual) else np.nan:.3f} to "
             f"{usual.max() if len(usual) else np.nan:.3f} s, odometry {span[0]:.3f} to {span[1]:.3f} s",

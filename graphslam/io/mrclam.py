@@ -97,7 +97,7 @@ def read_mrclam(
     if robot is None or robot not in range(1, ROBOTS + 1):
         raise ConfigError(
             f"{name} holds one log a robot, here of {', '.join(map(str, there)) or 'none'}: choose one, "
-            f"--reader-option robot={there[0] if there else 1}, or of a card {name}/robot1; got robot={robot}"
+            f"--reader-option robot={there[0] if there else 1}, or of a data set {name}/robot1; got robot={robot}"
         )
     if not (range_sigma > 0 and bearing_sigma > 0 and idle > 0 and np.isfinite(range_bias + control_delay)):
         raise ConfigError(
@@ -119,7 +119,7 @@ def read_mrclam(
     if robots:
         streams["robots"] = _observations(others, stamps, sigma)
     else:
-        counter.drop("landmarks", "sightings of other robots", len(others))
+        counter.drop("landmarks", "observations of other robots", len(others))
     if drops is not None:
         drops.counts.update(counter.counts)
     return SensorLog(
@@ -189,7 +189,7 @@ def _barcodes(root: Path) -> dict[int, int]:
         raise FormatError("subject or barcode is no whole number", where=f"{path}, line {lines[bad[0]]}")
     codes = table[:, 1].astype(np.int64).tolist()
     if len(set(codes)) != len(codes):
-        raise FormatError("a barcode stands twice", where=str(path), wanted="each once")
+        raise FormatError("a barcode is repeated", where=str(path), wanted="each once")
     return dict(zip(codes, table[:, 0].astype(np.int64).tolist()))
 
 

@@ -52,7 +52,7 @@ def read_network(
         "not a pose network",
         where=str(path),
         got="records " + ", ".join(sorted(other)[:5]) if other else "an empty file",
-        wanted="g2o, TORO or iSAM records",
+        wanted="records of g2o (VERTEX_SE2, EDGE_SE3:QUAT …), TORO (VERTEX2, EDGE2 …) or iSAM (ODOMETRY …)",
     )
 
 

@@ -88,7 +88,7 @@ def _plain(value: Any) -> Any:
     """NumPy scalars and arrays of a report as JSON values."""
     if hasattr(value, "tolist"):
         return value.tolist()
-    raise FormatError("a submap's report holds something JSON has no word for", got=type(value).__name__)
+    raise FormatError("a submap's report holds a value that JSON cannot store", got=type(value).__name__)
 
 
 def submap_from_arrays(arrays: Arrays, *, where: str) -> Submap:

@@ -99,6 +99,12 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     os.replace(temporary, p)
 
 
+def _unknown(tag: str) -> str:
+    """``unknown record``, and its cause where it is a byte order mark."""
+    mark = " (the file begins with a byte order mark; save it as UTF-8 without one)" if tag.startswith("\ufeff") else ""
+    return f"unknown record {tag[:40]!r}{mark}"
+
+
 @dataclass(frozen=True, slots=True)
 class Rows:
     """All records of one tag, in file order.
@@ -157,7 +163,7 @@ class Records:
                 if tokens[0] in ignored:
                     continue
                 raise FormatError(
-                    f"unknown record {tokens[0][:40]!r}",
+                    _unknown(tokens[0]),
                     where=self.where(number),
                     wanted="one of " + ", ".join(layouts),
                 )
@@ -207,7 +213,12 @@ class Records:
         return rows
 
     def _impossible(self, number: int, got: object) -> NoReturn:
-        raise FormatError("impossible vertex id", where=self.where(number), got=got, wanted="0 or more")
+        raise FormatError(
+            "impossible vertex id",
+            where=self.where(number),
+            got=got,
+            wanted="whole numbers from 0 to 2⁶²; GTSAM keys with a letter have to be renumbered",
+        )
 
     def where(self, number: int) -> str:
         """``file:line``."""

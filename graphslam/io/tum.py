@@ -82,7 +82,7 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
     _refuse(~np.all(finite_mask(data), axis=1), "not finite", where, lines, rows)
     norm = np.linalg.norm(data[:, 4:], axis=1)
     _refuse(np.abs(norm - 1.0) > _NORM_TOLERANCE, "rotation is no unit quaternion", where, lines, norm)
-    _refuse(np.r_[False, np.diff(data[:, 0]) <= 0][: len(data)], "time does not increase", where, lines, data[:, 0])
+    _refuse(np.r_[False, np.diff(data[:, 0]) <= 0][: len(data)], "stamps do not increase", where, lines, data[:, 0])
     off_plane = np.any(data[:, 3:6] != 0.0, axis=1)
     if dim is None:
         dim = 3 if np.any(off_plane) or not len(data) else 2

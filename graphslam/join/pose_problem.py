@@ -289,8 +289,7 @@ class PoseProblem(RelativePoseFactors):
 
     @classmethod
     def of_graph(cls, graph: PoseGraph) -> PoseProblem:
-        """The relative poses and levelled bases of a graph of dense submaps, ties at the weight of their kernels
-        there."""
+        """The relative poses and levelled bases of a graph of dense submaps, with the weights of their kernels."""
         chain = graph.submaps
         if not chain:
             raise DataError("there are no submaps", got=0, wanted="at least one")

@@ -142,7 +142,7 @@ class SpaceProblem:
             ids = m.ids.tolist()
             if len(ids) and (min(ids) < 0 or len(set(ids)) < len(ids)):
                 raise DataError(
-                    f"a landmark of submap {submaps[k].key} has no id, or its id stands twice",
+                    f"a landmark of submap {submaps[k].key} has no id, or its id is repeated",
                     got=ids, wanted="landmarks in space, each identified and once in a submap",
                 )  # fmt: skip
             for i in ids:

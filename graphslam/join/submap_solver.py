@@ -100,7 +100,7 @@ class SubmapEstimate:
         f = landmarks - self.landmarks
         if (chart or self.chart) == "group":
             if self.anchors is None:
-                raise SolverError("the map does not say what its landmarks hang on: wanted anchors")
+                raise SolverError("the map has no anchors of its landmarks")
             e[:, :2] = apply_inverse_left_jacobian(e[:, :2], e[:, 2])
             f = apply_inverse_left_jacobian(f, e[self.anchors, 2])
         return np.concatenate([e.ravel(), f.ravel()])

@@ -161,7 +161,7 @@ class Piece:
         size = tuple(shape[::-1].tolist())
         bricks = _Bricks(c, lookup, extents, first, size)
         if np.count_nonzero(bricks.table) != len(c):
-            raise GridError("a brick stands twice in a piece", wanted="each brick once")
+            raise GridError("a brick is repeated in a piece", wanted="each brick once")
         if dim == 2 and len(c) and (np.any(c[:, 2]) or np.any(v[:, 64:] != UNKNOWN)):
             raise GridError("a 2-D piece leaves its layer", got=f"bricks {np.unique(c[:, 2]).tolist()}", wanted="k = 0")
         group = SE3 if dim == 3 else SE2
@@ -358,5 +358,5 @@ def pieces_of_submap(
         pieces = divide_grid(grid, submap.trajectory, node_times, T_base_nodes=T_base_nodes, config=config)
     called: Sequence[PieceId] = [(submap.key, k) for k in range(len(pieces))] if names is None else names
     if len(called) != len(pieces) or len(set(called)) != len(called):
-        raise DataError("names of pieces differ in number, or stand twice", got=called, wanted=f"{len(pieces)} names")
+        raise DataError("names of pieces differ in number, or are repeated", got=called, wanted=f"{len(pieces)} names")
     return {name: piece for name, piece in zip(called, pieces) if piece.known}

@@ -24,7 +24,7 @@ def plot_consistency(
     log: bool | None = None,
     title: str | None = None,
 ) -> Axes:
-    """Mean normalised NEES (or CI) over the runs against the submap, with the two-sided bounds of an honest one.
+    """Mean normalised NEES (or CI) over the runs against the submap, with the two-sided bounds of a consistent one.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def plot_consistency(
     submaps : (k,), optional
         Numbers of the columns; default 1, 2, …
     figure : {"nees", "ci"}
-        ``nees``: mean D²/n, honest = 1. ``ci``: mean D²/χ²_{n,1-α} (Combined SLAM eq. 20) with its limit 1.
+        ``nees``: mean D²/n, consistent = 1. ``ci``: mean D²/χ²_{n,1-α} (Combined SLAM eq. 20) with its limit 1.
     log : bool, optional
         Logarithmic axis; default where the curves leave the decade around the bounds.
     """
@@ -48,7 +48,7 @@ def plot_consistency(
         if k == 0:
             name = f"{c.confidence:.0%} bounds, {c.runs} run{'s' if c.runs != 1 else ''}"
             ax.fill_between(x, low * factor, high * factor, color=style.BOUNDS, alpha=0.8, lw=0, label=name, zorder=0)
-            ax.plot(x, factor, color=style.GREY, lw=0.9, ls=":", label="expected if honest", zorder=1)
+            ax.plot(x, factor, color=style.GREY, lw=0.9, ls=":", label="expected if consistent", zorder=1)
         every = max(1, len(x) // 12)
         ax.plot(x, mean * factor, lw=1.5, ms=4, markevery=(k * every // 4, every), label=label, **style.line(k))
         top = max(top, float(np.nanmax(mean / high)))

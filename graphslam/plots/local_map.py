@@ -1,4 +1,4 @@
-"""One submap in its own frame: where it went, what it saw, how sure it is, and how its errors hang together."""
+"""One submap in its own frame: where it went, what it saw, how sure it is, and correlation of its errors."""
 
 from __future__ import annotations
 
@@ -78,7 +78,5 @@ def plot_correlation(ax: Axes | None, submap: Submap, *, title: str | None = Non
     ax.set_yticks(ticks, ["exit", "landmarks"], rotation=90, va="center")
     ax.tick_params(length=0)
     ax.figure.colorbar(image, ax=ax, label="correlation", shrink=0.85)
-    ax.set_title(
-        title if title is not None else f"submap {submap.key}: how its errors hang together", fontsize="medium"
-    )
+    ax.set_title(title if title is not None else f"submap {submap.key}: correlation of its errors", fontsize="medium")
     return ax

@@ -52,8 +52,8 @@ def plot_before_after(
         ax.plot(refined.times[keep] - begin, sigma[keep], color=style.GREY, lw=1.0, ls="--", label=label)
     ax.set_yscale("log")
     ax.set_xlabel("time [s]")
-    ax.set_ylabel("distance from the truth [m]" if truth is not None else "distance [m]")
-    ax.set_title(title or "path before and after its refinement by scans", fontsize="medium")
+    ax.set_ylabel("distance from ground truth [m]" if truth is not None else "distance [m]")
+    ax.set_title(title or "path before and after refinement", fontsize="medium")
     style.legend(ax)
     return ax
 
@@ -72,5 +72,5 @@ def plot_yaw_bias(ax: Axes | None, knots: npt.ArrayLike, *, title: str | None = 
     ax.axhline(0.0, color=style.GREY, lw=0.8)
     ax.set_xlabel("time [s]")
     ax.set_ylabel("yaw bias [mrad/s]")
-    ax.set_title(title or "bias of the yaw rate, as the refinement found it", fontsize="medium")
+    ax.set_title(title or "yaw rate bias estimated by the refinement", fontsize="medium")
     return ax

@@ -16,15 +16,15 @@ from graphslam.plots import style
 def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency, *, title: str | None = None) -> Axes:
     """``D²/3`` of every pair of loops (off the diagonal) and of every loop against the chain (on it).
 
-    White is what an honest map has. A false loop is a dark cross, an over-confident front end a dark page, and a pale
-    blue page is a pessimistic one.
+    White is expected of a consistent map. A false loop is a dark cross, an over-confident front end a dark page, a
+    pessimistic one a pale blue page.
     """
     ax = style.new_axes(ax, (6.5, 5.5))
     ax.grid(False)
     ratio = np.clip(loops.d2 / 3.0, 1e-2, 1e2)
     image = ax.imshow(ratio, cmap="RdBu_r", norm=LogNorm(1e-2, 1e2), interpolation="nearest", origin="upper")
     bar = ax.figure.colorbar(image, ax=ax, shrink=0.85)
-    bar.set_label("D² / 3   (honest: 1)")
+    bar.set_label("D² / 3   (consistent: 1)")
     bar.ax.axhline(stats.chi2.ppf(loops.confidence, 3) / 3.0, color=style.BLACK, lw=1.0)
     names = [f"{a}–{b}" for a, b in zip(loops.loops.a, loops.loops.b)]
     every = max(1, len(names) // 15)
@@ -50,7 +50,7 @@ def plot_innovations(ax: Axes | None, gps: GpsInnovations, *, title: str | None 
     ax.plot(t, gps.nis, ".", color=style.GPS, ms=4, label="withheld fix", zorder=3)
     ax.axhline(d * each["value"], color=style.ESTIMATE, lw=1.2, label=f"mean {d * each['value']:.2f} (honest: {d})")
     limit = float(stats.chi2.ppf(gps.confidence, d))
-    ax.axhline(limit, color=style.BLACK, lw=0.8, ls="--", label=f"{gps.confidence:.0%} of honest fixes below")
+    ax.axhline(limit, color=style.BLACK, lw=0.8, ls="--", label=f"{gps.confidence:.0%} of consistent fixes below")
     ax.set_yscale("log")
     ax.set_ylim(bottom=1e-2)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -71,7 +71,7 @@ def plot_exit_nees(
 ) -> Axes:
     """Squared error of every segment's exit in units of its covariance, for several covariances (log scale).
 
-    Honest ones scatter about 1 and leave the grey band, between the quantiles of a single χ², once in twenty times.
+    Consistent ones scatter around 1 and leave the grey band (quantiles of a single χ²) once in twenty times.
 
     Parameters
     ----------

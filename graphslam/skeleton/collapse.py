@@ -76,7 +76,7 @@ class Collapse:
         self.pairs += len(left)
 
     def landmarks(self) -> tuple[Labels, int]:
-        """Landmark of every measurement ``(M,)``, and how many there are; numbered by first sighting.
+        """Landmark of every measurement ``(M,)``, and how many there are; numbered by first observation.
 
         The numbers are written over the sets, so nothing can be added afterwards.
         """

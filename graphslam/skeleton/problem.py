@@ -18,7 +18,7 @@ from graphslam.skeleton.tile_store import Tiles
 
 @dataclass(frozen=True, eq=False)
 class SkeletonProblem:
-    """Measurements in pose order, and what ties a pose alone or to the next one.
+    """Measurements sorted by pose, with priors and odometry factors.
 
     World frame: z up. A pose is the body in the world. Covariances are given once for all, or one each.
 
@@ -27,7 +27,7 @@ class SkeletonProblem:
     points : (M, 3) float32
         Measured points in the body frame [m].
     landmark : (M,) int32
-        Landmark of each, numbered by first sighting (:class:`~graphslam.skeleton.collapse.Collapse`).
+        Landmark of each, numbered by first observation (:class:`~graphslam.skeleton.collapse.Collapse`).
     first : (N + 1,)
         Where the measurements of each pose begin; the last entry is M.
     odometry_rotation, odometry_translation : (N - 1, 3, 3), (N - 1, 3)
@@ -142,7 +142,7 @@ class SkeletonProblem:
             label = self.landmark[k : k + block]
             peak = np.maximum.accumulate(np.concatenate([[high], label]))
             if label.min() < 0 or (label > peak[:-1] + 1).any():
-                raise DataError("landmarks are not numbered by first sighting", wanted="number_by_first_sighting")
+                raise DataError("landmarks are not numbered by first observation", wanted="number_by_first_sighting")
             high = int(peak[-1])
         object.__setattr__(self, "_landmarks", high + 1)
 
@@ -238,7 +238,7 @@ class SkeletonProblem:
         return Poses(R, p)
 
     def relabelled(self, landmark: npt.NDArray[np.int32]) -> SkeletonProblem:
-        """The same measurements with other landmarks ``(M,)``, numbered by first sighting."""
+        """The same measurements with other landmarks ``(M,)``, numbered by first observation."""
         return replace(self, landmark=landmark)
 
 

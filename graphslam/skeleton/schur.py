@@ -46,7 +46,7 @@ class Workers:
 class WorkRanges:
     """Ranges of poses and of landmarks, and the arrays into which each range of poses sums.
 
-    Landmarks are numbered by first sighting, so the first range of poses sees the first landmarks only.
+    Landmarks are numbered by first observation, so the first range of poses sees the first landmarks only.
     """
 
     def __init__(self, problem: SkeletonProblem, workers: Workers, parts: int = PARTS) -> None:

@@ -144,7 +144,7 @@ def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points
     folder : path
         Made if it is not there. Tiles that it holds already are kept.
     blocks : iterable of (counts (n,), points (m, 3), landmarks (m,))
-        Measurements of each pose, in pose order; landmarks numbered by first sighting over all blocks.
+        Measurements of each pose, in pose order; landmarks numbered by first observation over all blocks.
     """
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
@@ -160,7 +160,7 @@ def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points
             raise DataError("a measured point is not finite, or lies in the sensor", where=f"block {number}")
         peak = np.maximum.accumulate(np.concatenate([[high], label]))
         if label.min(initial=0) < 0 or (label > peak[:-1] + 1).any():
-            raise DataError("landmarks are not numbered by first sighting", where=f"block {number}")
+            raise DataError("landmarks are not numbered by first observation", where=f"block {number}")
         high = int(peak[-1])
         data = n.tobytes() + z.tobytes() + label.tobytes()
         name = f"{_digest(data)}.tile"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.demo import DemoProgress, demo_log
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.core.config import merge_options
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.random import SeedTree
@@ -42,7 +42,7 @@ def test_quick_demo_from_the_command_line(tmp_path: Path) -> None:
 
 def test_watching_changes_nothing_and_sees_the_chain() -> None:
     log = demo_log("quick", 3)
-    options = recommended(log, "segslam")["frontend"]
+    options = recommended_options(log, "segslam")["frontend"]
     options = merge_options(options, {"filter": {"particles": 2}})
     config = make_front_end("segslam", options).config
     steps = make_steps(log, config.steps)

@@ -91,6 +91,6 @@ def test_impossible_splits_are_refused(rng):
     lone = next(k for k, i in enumerate(record.landmark_ids) if len(g.sightings(int(i))) == 1)
     with pytest.raises(DataError, match="nowhere else"):
         g.split_landmark(record.factor_id, lone)
-    with pytest.raises(DataError, match="no such sighting"):
+    with pytest.raises(DataError, match="no such observation"):
         g.split_landmark(record.factor_id, 999)
     assert find_association_outliers(g, 1e9) == []

@@ -50,7 +50,7 @@ class Watched(Ring):
 def test_submaps_steps_and_the_solution_are_told_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     log, front = ring(2)
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: Watched(front.made))
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     heard = Listener()
     r = gs.run(log, frontend="ring", progress=False, observers=[heard, Observer()], out=tmp_path / "run")
     n = len(front.made)

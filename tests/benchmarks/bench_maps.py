@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphslam.app.run.front_ends import recommended
+from graphslam.app.run.front_ends import recommended_options
 from graphslam.core.config import build_config
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
@@ -70,7 +70,7 @@ def scene(name: str, points: int = ALL_POINTS) -> Scene:
     """A scene by name, with so many beams of a step at most."""
     if name not in ("court", "garage", "garage-full"):
         log = load_recording(name)
-        config: Any = build_config(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+        config: Any = build_config(SegSlamFrontEndConfig, recommended_options(log, "segslam")["frontend"])
         config = dataclasses.replace(config, filter=dataclasses.replace(config.filter, map_beams=0))
     else:
         crawler = crawler_preset("full" if name == "garage-full" else "light")

@@ -1,7 +1,6 @@
 """Peak memory and CPU seconds of a whole run, stage by stage.
 
-    python -m tests.benchmarks.bench_memory [--quick] [--length 2400] [--source LOG] [--frontend lidar-odometry]
-        [--limit 1.5]
+    python -m tests.benchmarks.bench_memory [--quick] [--length 2400] [--source LOG] [--frontend NAME] [--limit 1.5]
 
 Without a source: a lidar of 16 lines is driven through the streets of a simulated campus at 3 m/s, five scans a second,
 and what a user would have is written to a folder, ``velodyne/*.bin`` and ``times.txt``. This process then runs a front

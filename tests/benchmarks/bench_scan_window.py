@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import graphslam as gs
-from graphslam.app.run.front_ends import recommended
+from graphslam.app.run.front_ends import recommended_options
 from graphslam.core.config import build_config
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
@@ -96,7 +96,7 @@ def main() -> None:
         runs: dict[str, list[list[float]]] = {}
         for seed in seeds:
             log = gs.simulate("garage", seed=seed, layout=layout)
-            options = recommended(log, "scan-window").get("frontend", {})
+            options = recommended_options(log, "scan-window").get("frontend", {})
             config: ScanWindowFrontEndConfig = build_config(ScanWindowFrontEndConfig, options, "frontend")
             rows.append(odometry(make_steps(log, config.steps), config))
             print(f"  {layout} {seed}: {rows[-1][0]:.3f} m, {1e3 * rows[-1][1]:.1f} mrad", flush=True)

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.run.front_ends import recommended
+from graphslam.app.run.front_ends import recommended_options
 from graphslam.core.config import build_config
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
@@ -50,7 +50,7 @@ RANDOM_PAIRS = 5000
 
 def settings(log: SensorLog, particles: int | None = None) -> SegSlamFrontEndConfig:
     """The preset of a log for the front end ``segslam``."""
-    c: SegSlamFrontEndConfig = build_config(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    c: SegSlamFrontEndConfig = build_config(SegSlamFrontEndConfig, recommended_options(log, "segslam")["frontend"])
     return c if particles is None else dataclasses.replace(c, filter=dataclasses.replace(c.filter, particles=particles))
 
 

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import reference_labels
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.backend.back_end import BackEnd
 from graphslam.core.config import build_config, merge_options
 from graphslam.core.geometry import Array, se2_compose
@@ -120,7 +120,7 @@ class Clock:
 
 def front_end_options(log: SensorLog, name: str, **options: Any) -> dict[str, Any]:
     """The preset of a front end with some options changed."""
-    return merge_options(recommended(log, name)["frontend"], options)
+    return merge_options(recommended_options(log, name)["frontend"], options)
 
 
 def one_map(log: SensorLog, **options: Any) -> tuple[Submap, Array]:
@@ -187,7 +187,7 @@ def judge_of(log: SensorLog, front: Any) -> Judge:
 def _all_methods(log: SensorLog, judge: Judge, out: Results, seed: int, *, progress: bool) -> None:
     """One run of everything; single maps draw nothing at random and run once."""
     bar = tqdm(desc=f"seed {seed}", unit="method", disable=not progress, leave=False)
-    settings: cfg.RunConfig = build_config(cfg.RunConfig, recommended(log, "rbpf-ekf"))
+    settings: cfg.RunConfig = build_config(cfg.RunConfig, recommended_options(log, "rbpf-ekf"))
     scale = settings.backend.covariance_scale
     moments, spent = local_maps(log, seed, handover="moments")
     ends = np.array([s.interval[1] for s in moments])
@@ -315,7 +315,7 @@ def print_table(table: pd.DataFrame) -> None:
 
 def levels(log: SensorLog, judge: Judge) -> None:
     """Where a tree of the paper's maps goes wrong: landmarks that mix trees after every level, by rule."""
-    scale = float(recommended(log, "rbpf-ekf")["backend"]["covariance_scale"])
+    scale = float(recommended_options(log, "rbpf-ekf")["backend"]["covariance_scale"])
     submaps = scale_covariances(local_maps(log, 0, handover="moments")[0], scale)
     print(f"\npaper × {scale:g}, tree, by level: submaps in a map | maps | landmarks that mix trees, nearest | joint")
     size = 2

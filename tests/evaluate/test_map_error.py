@@ -28,7 +28,7 @@ def test_match_ids_with_strangers_and_duplicates() -> None:
     i, j = match_ids([7, -1, 3, 7, 50], [3, 9, 7])
     assert i.tolist() == [0, 2, 3]
     assert j.tolist() == [2, 0, 2]
-    with pytest.raises(DataError, match="stands twice"):
+    with pytest.raises(DataError, match="is repeated"):
         match_ids([1], [2, 2])
 
 

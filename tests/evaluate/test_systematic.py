@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -15,7 +15,7 @@ from tests.faults import inject_landmarks as inject
 
 
 def reports(log: SensorLog, frontend: str) -> list[dict]:
-    options = recommended(log, frontend)["frontend"]
+    options = recommended_options(log, frontend)["frontend"]
     return [s.report for s in make_front_end(frontend, options).submaps(log, seed=SeedTree(1))]
 
 
@@ -75,7 +75,7 @@ def test_honest_robots_have_no_error(seed: int) -> None:
 def test_noise_that_is_larger_than_stated_is_said() -> None:
     for scale, level in ((1.12, "look"), (2.0, "bad")):
         log = simulate("landmark-field", seed=5, preset="quick", noise_scale=scale)
-        options = recommended(log, "rbpf-ekf")["frontend"]
+        options = recommended_options(log, "rbpf-ekf")["frontend"]
         options["motion"] = {k: v / scale for k, v in options["motion"].items()}
         made = [s.report for s in make_front_end("rbpf-ekf", options).submaps(log, seed=SeedTree(1))]
         lines = bias_test_findings(made)

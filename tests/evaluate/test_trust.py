@@ -125,8 +125,7 @@ SMALL = chi2_ratio_test("fixes", "fixes", 0.13, 400.0)
         # small residuals, and alike from one to the next: never pessimistic
         ([*HONEST[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "over-confident"),
         ([*HONEST[:1], *SMALL], True, "pessimistic"),
-        ([*chi2_ratio_test("map", "map", 0.5, 2000.0), largest_score_test("calibration", "map", 6.0, tests=16)], False,
-        "over-confident"),
+        ([*chi2_ratio_test("map", "map", 0.5, 2000.0), largest_score_test("calibration", "map", 6.0, tests=16)], False, "over-confident"),
     ],
 )  # fmt: skip
 def test_the_word(rows: list[ConsistencyTest], fixes: bool, word: str) -> None:
@@ -177,7 +176,7 @@ def test_errors_that_last_for_a_window_are_found(rng):
         found = 0
         for _ in range(40):
             rows = short_window_tests(sum_bias_windows([windows(rng, 6, lasts), windows(rng, 6, lasts)]))
-            found += next(r for r in rows if r.name.startswith("errors that last")).too_large < 0.01
+            found += next(r for r in rows if r.name.startswith("time-correlated errors")).too_large < 0.01
         return found
 
     assert named(0.0) <= 3

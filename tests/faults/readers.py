@@ -244,7 +244,7 @@ def finished_run() -> Path:
 
     with pytest.MonkeyPatch.context() as patch:  # pictures take longer than the run
         patch.setattr(outputs, "save_figures", lambda *_: None)
-        patch.setattr(report, "report_beside", lambda *_: None)
+        patch.setattr(report, "add_report", lambda *_: None)
         run(log, frontend="rbpf-ekf", out=out, progress=False, config={"frontend": {"particles": 5}})
     arrays = {"times": gps.times, "positions": gps.positions, "sigma": gps.sigma, "lever": gps.lever}
     write_npz(out / "fixes.npz", {"format": "graphslam.fixes/1", **arrays})

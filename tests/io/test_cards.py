@@ -94,7 +94,7 @@ def test_good_card(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ('format = "graphslam.card/1"', 'format = "graphslam.card/9"', "unknown format"),
-        ('name = "toy"', 'name = "other"', "not that of its file"),
+        ('name = "toy"', 'name = "other"', "differs from its file name"),
         ('kind = "sensor-log"', 'kind = "film"', "unknown kind"),
         ('title = "t"', "title = 3", "title is not of type str"),
         ('title = "t"', 'titel = "t"', "unknown key 'titel'"),

@@ -108,7 +108,7 @@ def test_wrong_content_is_refused_and_leaves_nothing(server: tuple[str, Path], t
     url, root = server
     serve(root)
     (root / "b.bin").write_bytes(b"abd")
-    with pytest.raises(DataError, match=r"b\.bin: what was downloaded is not the file of the card"):
+    with pytest.raises(DataError, match=r"b\.bin: checksum of the downloaded file differs"):
         fetch_dataset(linked(url))
     assert not (tmp_path / "cache/toy/sub/b.bin").exists()
     left = {p.name for p in (tmp_path / "cache").rglob("*") if p.is_file()}
@@ -171,8 +171,8 @@ def test_archive_members_are_found_checked_and_put_in_place(server: tuple[str, P
         ({"../../a.txt": CONTENT, "b.bin": b"abc"}, FormatError, "outside itself; got ../../a.txt"),
         ({"/etc/a.txt": CONTENT, "b.bin": b"abc"}, FormatError, "outside itself"),
         ({"..\\a.txt": CONTENT, "b.bin": b"abc"}, FormatError, "outside itself"),
-        ({"a.txt": CONTENT + b"x", "b.bin": b"abc"}, DataError, "not the file of the card"),
-        ({"a.txt": CONTENT[:-1] + b"x", "b.bin": b"abc"}, DataError, "not the file of the card"),
+        ({"a.txt": CONTENT + b"x", "b.bin": b"abc"}, DataError, "differs from the description of the data set"),
+        ({"a.txt": CONTENT[:-1] + b"x", "b.bin": b"abc"}, DataError, "differs from the description of the data set"),
         ({"b.bin": b"abc"}, MissingDataError, "does not hold a.txt"),
     ],
 )
@@ -197,7 +197,7 @@ def test_truncated_archive(server: tuple[str, Path]) -> None:
         with pytest.raises(FormatError, match="truncated or corrupt"):
             fetch_dataset(archived(url))
     (root / "set.zip").write_bytes(data)
-    with pytest.raises(DataError, match="checksum differs"):
+    with pytest.raises(DataError, match="checksum of the downloaded file differs"):
         fetch_dataset(archived(url, sha256="0" * 64))
 
 
@@ -206,7 +206,7 @@ def test_a_bomb_stays_folded(server: tuple[str, Path]) -> None:
     url, root = server
     (root / "set.zip").write_bytes(zipped(**{"a.txt": b"\0" * 200_000_000, "b.bin": b"abc"}))
     tracemalloc.start()
-    with pytest.raises(DataError, match="not the file of the card"):
+    with pytest.raises(DataError, match="differs from the description of the data set"):
         fetch_dataset(archived(url))
     held = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -284,6 +284,6 @@ def test_a_download_that_does_not_end_is_cut(server: tuple[str, Path], tmp_path:
     url, root = server
     serve(root)
     (root / "b.bin").write_bytes(b"abc" + bytes(1_000_000))
-    with pytest.raises(DataError, match="more data than the card says"):
+    with pytest.raises(DataError, match="download is larger than the description"):
         fetch_dataset(linked(url))
     assert not list((tmp_path / "cache").rglob("*b.bin*"))

@@ -180,7 +180,7 @@ def test_noise_columns_of_toro_and_isam_lines(tmp_path: Path) -> None:
     assert np.diag(root.information[0]).tolist() == [4, 16, 25]
     assert "square-root" in root.noise
     full = put(tmp_path, E2.format(*["2 0.1 0.2 4 0.3 5"] * 2), "b.txt")
-    with pytest.raises(FormatError, match="cannot be told from the numbers"):
+    with pytest.raises(FormatError, match="is not clear from the numbers"):
         read_network(full)
     R = np.array([[2, 0.1, 0.2], [0, 4, 0.3], [0, 0, 5]])
     assert np.allclose(read_network(full, noise="sqrt-information").information[0], R.T @ R)

@@ -52,7 +52,7 @@ def test_lines_become_controls_scans_and_truth(folder):
     assert log.truth is not None
     np.testing.assert_array_equal(log.truth.landmark_ids, [6, 7])
     np.testing.assert_allclose(log.truth.landmarks, [[1, 2], [3, -1]])
-    assert dict(log.dropped) == {"landmarks: sightings of other robots": 1}
+    assert dict(log.dropped) == {"landmarks: observations of other robots": 1}
     assert dict(log.read) == {"controls": 41, "landmarks": 4}
 
 
@@ -99,7 +99,7 @@ def test_isolated_bad_records_are_dropped_and_counted(folder):
         "controls: speed or turn rate is not finite": 1,
         "landmarks: barcode that the table does not know": 1,
         "landmarks: range is not positive": 1,
-        "landmarks: sightings of other robots": 1,
+        "landmarks: observations of other robots": 1,
     }
     np.testing.assert_array_equal(log["landmarks"].ids, [6])
 
@@ -118,7 +118,7 @@ def test_isolated_bad_records_are_dropped_and_counted(folder):
         ("Robot2_Measurement.dat", "101.200 63", "101.200 63.5", r"line 4: barcode is no whole number"),
         ("Robot2_Measurement.dat", "101.200", "90.0", "out of order"),
         ("Robot2_Measurement.dat", "103.000", "1e24", "nothing was read for .* a stamp is wrong"),
-        ("Barcodes.dat", "7 81", "7 63", "barcode stands twice"),
+        ("Barcodes.dat", "7 81", "7 63", "barcode is repeated"),
         ("Barcodes.dat", "7 81", "7 8.1", "no whole number"),
         ("Landmark_Groundtruth.dat", "3.0", "nan", r"Landmark_Groundtruth.dat, line 3"),
     ],
@@ -153,7 +153,7 @@ def test_the_recording(data_dir):
     log = load_recording("mrclam-dataset7/robot3")
     assert dict(log.read) == {"controls": 55085, "landmarks": 5399}
     assert log.dropped["landmarks: barcode that the table does not know"] == 9
-    assert log.dropped["landmarks: sightings of other robots"] == 965
+    assert log.dropped["landmarks: observations of other robots"] == 965
     assert log.dropped["controls: repeated stamp"] == 7
     o, truth = log["landmarks"], log.truth
     assert len(o.ranges) == 5399 - 9 - 965

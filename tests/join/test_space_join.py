@@ -110,7 +110,7 @@ def test_what_cannot_be_joined_is_refused(drifting) -> None:
     with pytest.raises(ConfigError, match="one process"):
         join_by_method(submaps, workers=2)
     nobody = [submaps[0].with_ids(np.full(len(submaps[0].landmarks), -1)), *submaps[1:]]
-    with pytest.raises(DataError, match="has no id, or its id stands twice"):
+    with pytest.raises(DataError, match="has no id, or its id is repeated"):
         join_by_method(nobody)
     flat = gs.local_maps(gs.simulate("landmark-field", preset="quick", seed=1))[0]
     with pytest.raises(DataError, match="two dimensions"):

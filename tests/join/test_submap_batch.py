@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import wrap_angle
@@ -86,7 +86,7 @@ def test_poor_starts_reach_the_optimum_downhill(
 def test_a_kilometre_loop_joined_in_sequence_is_polished_in_a_few_steps() -> None:
     """Where headings are corrected by degrees, straight steps leave the valley and damped ones crawl along it."""
     log = simulate("landmark-field", preset="A", seed=3, layout_seed=1, laps=1.08, lap_length=2500.0, landmarks=260)
-    options = {**recommended(log, "rbpf-ekf")["frontend"], "particles": 20}
+    options = {**recommended_options(log, "rbpf-ekf")["frontend"], "particles": 20}
     submaps = list(make_front_end("rbpf-ekf", options).submaps(log, seed=SeedTree(0)))
     joined, tree = join_sequential(submaps), solve_submaps(submaps)
     polished = optimise_from_join(submaps, joined)

@@ -200,7 +200,7 @@ def test_consistency_curves_show_mean_and_bounds(rng: np.random.Generator, tmp_p
     ax = rendered(plot_consistency(None, curves), tmp_path)
     assert ax.get_yscale() == "log"
     assert np.allclose(line(ax, "honest")[:, 1], d2.mean(0) / 3)
-    assert np.allclose(line(ax, "expected if honest")[:, 1], 1.0)
+    assert np.allclose(line(ax, "expected if consistent")[:, 1], 1.0)
     assert np.allclose(line(ax, "bold")[:, 1], 3 * d2.mean(0))
     assert "95% bounds, 10 runs" in legend_of(ax)
     assert "first base fixed" in ax.get_title()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import graphslam as gs
-from graphslam.app.run.front_ends import recommended
+from graphslam.app.run.front_ends import recommended_options
 from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
@@ -53,7 +53,9 @@ def refined(building: SensorLog) -> Refinement:
 def test_relations_of_a_planar_log_are_better_than_those_of_its_odometry(
     building: SensorLog, refined: Refinement
 ) -> None:
-    steps = make_steps(building, build_config(StepConfig, recommended(building, "segslam")["frontend"]["steps"]))
+    steps = make_steps(
+        building, build_config(StepConfig, recommended_options(building, "segslam")["frontend"]["steps"])
+    )
     before = relations(chain_odometry(steps.odometry), building["reference"])
     after = relations(path_of(refined), building["reference"])
     assert after["translation_mean"] < before["translation_mean"]

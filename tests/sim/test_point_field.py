@@ -46,7 +46,7 @@ def test_figures_that_make_no_world_are_refused() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"ids": np.array([1, 1])}, "stands twice"),
+        ({"ids": np.array([1, 1])}, "is repeated"),
         ({"ids": np.array([1, -1])}, "negative"),
         ({"covariances": np.zeros((2, 3, 3))}, "positive definite"),
         ({"points": np.array([[1.0, np.nan, 0], [1, 2, 3]])}, "point"),

@@ -185,7 +185,7 @@ def test_impossible_networks_are_refused(problem: SkeletonProblem) -> None:
         ({"points": bad}, DataError, "measurement 7"),
         ({"points": nan}, DataError, "not finite"),
         ({"odometry_covariance": skewed}, CovarianceError, "odometry_covariance"),
-        ({"landmark": shuffled}, DataError, "first sighting"),
+        ({"landmark": shuffled}, DataError, "first observation"),
         ({"first": problem.first + 1}, DataError, "rising"),
         ({"odometry_rotation": problem.odometry_rotation[1:]}, DataError, "odometry_rotation"),
         ({"gps_pose": np.array([N]), "gps_position": np.zeros((1, 3))}, DataError, "not there"),

@@ -158,5 +158,5 @@ def test_damaged_folders_are_refused(problem: SkeletonProblem, tmp_path: Path) -
     other = write_tiles(tmp_path / "other", [([1, 1], np.ones((2, 3), np.float32), np.array([0, 0], np.int32))])
     with pytest.raises(DataError):
         load_tiled_problem(problem, other)
-    with pytest.raises(DataError, match="first sighting"):
+    with pytest.raises(DataError, match="first observation"):
         write_tiles(tmp_path / "more", [([1], np.ones((1, 3), np.float32), np.array([4], np.int32))])

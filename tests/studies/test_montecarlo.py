@@ -117,7 +117,7 @@ def test_missing_figures_are_nan_and_doubles_are_refused() -> None:
     t = table([(0, "a", 0, "q", 1.0), (1, "a", 0, "q", 2.0), (1, "a", 1, "q", 3.0)])
     _, v = values_of(t, "a", "q")
     assert np.array_equal(v, [[1.0, np.nan], [2.0, 3.0]], equal_nan=True)
-    with pytest.raises(DataError, match="stands twice"):
+    with pytest.raises(DataError, match="is repeated"):
         values_of(pd.concat([t, t]), "a", "q")
     with pytest.raises(DataError, match="no 'x' of 'a'"):
         values_of(t, "a", "x")
@@ -213,7 +213,7 @@ def test_what_cannot_be_sent_to_a_worker_is_refused_at_once() -> None:
 def test_nonsense_and_double_figures_are_failures() -> None:
     m = Measurement("a", "q", 1.0)
     assert check_measurements([m, Measurement("a", "q", 1.0, 0), Measurement("a", "q", 1.0, timing=True)]) is None
-    assert "stands twice" in (check_measurements([m, m]) or "")
+    assert "is repeated" in (check_measurements([m, m]) or "")
     assert "gave a float" in (check_measurements([1.0]) or "")
 
 

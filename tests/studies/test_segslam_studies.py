@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.run.front_ends import recommended
+from graphslam.app.run.front_ends import recommended_options
 from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.log import SensorLog
@@ -359,9 +359,9 @@ def test_presets_are_the_settings_of_the_studies(world: str) -> None:
     """Who simulates a world and runs a front end on it gets what the study has figures of."""
     study = {**GARAGE.full, **MINE.full, **BUILDING.full}[world]
     log = SensorLog(name=world, streams={})
-    segslam = build_config(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    segslam = build_config(SegSlamFrontEndConfig, recommended_options(log, "segslam")["frontend"])
     assert (segslam.steps, segslam.filter, segslam.segslam, segslam.drift) == (
         study.steps, study.segslam_filter, study.segslam, study.drift,
     )  # fmt: skip
-    rbpf = build_config(RbpfGridConfig, recommended(log, "rbpf-grid")["frontend"])
+    rbpf = build_config(RbpfGridConfig, recommended_options(log, "rbpf-grid")["frontend"])
     assert (rbpf.steps, rbpf.filter) == (study.steps, study.filter)

@@ -193,7 +193,9 @@ class SensorBiasConfig:
                 raise ConfigError(f"lasting.{name} = {getattr(self, name)}; wanted a finite σ ≥ 0")
         for one, other in (("yaw_bias", "turn_per_metre"), ("sensor_yaw", "range_scale")):
             if getattr(self, one) and getattr(self, other):
-                raise ConfigError(f"lasting.{one} and lasting.{other} cannot be told apart; wanted 0 for one of them")
+                raise ConfigError(
+                    f"lasting.{one} and lasting.{other} cannot be estimated together; wanted 0 for one of them"
+                )
 
     def chosen(self) -> tuple[tuple[str, ...], Array]:
         """Name and σ of each of :data:`~graphslam.core.sensor_biases.CONSTANTS`; what is none has no name, and a σ of

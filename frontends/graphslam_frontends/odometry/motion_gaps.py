@@ -105,7 +105,7 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
     if len(stamps) < 2:
         if len(stamps) and end - begin > SHORTEST:
             raise DataError(
-                "the motion stream holds a single record, which tells of no motion",
+                "the motion stream holds a single record, so there is no motion",
                 where=where,
                 got=f"one record for {end - begin:.1f} s",
                 wanted=f"records at least every {limit:g} s (frontend.longest_gap)",

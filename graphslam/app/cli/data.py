@@ -105,8 +105,9 @@ def check_command(
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Look for faults before a run: checksums of a card's files; stamps, units, signs, mountings and stuck sensors of a
-    log. Exit with 1 if there is one.
+    """Check a log for errors before a long run: checksums, stamps, units, signs, mountings, stuck sensors.
+
+    Exit with 1 if there is an error.
     """
     from graphslam.app.data_check import check_source, check_summary
     from graphslam.io.cards import list_cards

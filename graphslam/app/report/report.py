@@ -129,7 +129,7 @@ def _save(report: Report, file: Path) -> Path:
     return file
 
 
-def report_beside(new: FolderTransaction) -> None:
+def add_report(new: FolderTransaction) -> None:
     """Write the page of a state that is being written; its failure is said, and undoes nothing."""
     try:
         _save(_page(new.home, new.path), new.path / PAGE)

@@ -48,8 +48,7 @@ def reference_labels(log: SensorLog, observations: LandmarkObservations) -> Ints
 
 
 def reference_identities(log: SensorLog, front: FrontEnd) -> Ints | None:
-    """Identity of every observation that a front end read ``(q,)``, by a reference that it never saw; None =
-    nowhere."""
+    """Identity of every observation of a front end ``(q,)``, by a reference that it never saw; None = nowhere."""
     seen = front.observations(log)
     return None if seen is None else reference_labels(log, seen[1])
 

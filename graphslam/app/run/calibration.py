@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.source import load_log_source
 from graphslam.calibrate.calibrate import calibrate_streams
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections
@@ -115,7 +115,7 @@ def calibrate_log(
     """
     log = load_log_source(source, reader=reader, **(reader_options or {}))
     name = frontend or (LANDMARKS if log.of_type(LandmarkObservations) else SCANS)
-    options = merge_options(recommended(log, name, preset), config or {})
+    options = merge_options(recommended_options(log, name, preset), config or {})
     front = make_front_end(name, options.get("frontend", {}))
     with one_blas_thread():
         return calibrate_for_front_end(log, front, QUICK if quick else FULL, seed=seed)

@@ -85,7 +85,7 @@ def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str,
     return made
 
 
-def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dict[str, Any]:
+def recommended_options(log: SensorLog, frontend: str, preset: str | None = None) -> dict[str, Any]:
     """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise.
 
     Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set, layouts of a simulated world
@@ -120,7 +120,8 @@ def named_preset(frontend: str, preset: str | None) -> dict[str, Any]:
 
 
 def preset_of(log: SensorLog, frontend: str) -> tuple[str, bool]:
-    """Name of the preset that :func:`recommended` takes, empty where there is none; and is it made for this very set?
+    """Name of the preset that :func:`recommended_options` takes, empty where there is none; and is it made for this
+    very set?
 
     That of a reader or of a kind of log says how it is read; its noise is that of other robots.
     """

@@ -10,7 +10,7 @@ from tqdm.auto import tqdm
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run import config as cfg
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.source import load_log_source
 from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError
@@ -24,7 +24,7 @@ from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 
 def _front_end(log: SensorLog, frontend: str, options: Mapping[str, Any] | None) -> Any:
     settings: cfg.RunConfig = build_config(
-        cfg.RunConfig, merge_options(recommended(log, frontend), {"frontend": options or {}})
+        cfg.RunConfig, merge_options(recommended_options(log, frontend), {"frontend": options or {}})
     )
     return make_front_end(frontend, settings.frontend)
 

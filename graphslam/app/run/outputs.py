@@ -15,7 +15,7 @@ import pandas as pd
 
 from graphslam.app.folders.generations import FolderTransaction, new_generation, read_consistently
 from graphslam.app.folders.output_files import json_lines
-from graphslam.app.report.report import report_beside
+from graphslam.app.report.report import add_report
 from graphslam.app.run.figures import save_figures
 from graphslam.app.run.files import (
     ASSOCIATION_FORMAT,
@@ -119,7 +119,7 @@ def write_outputs(folder: Path, run: Run) -> Run:
         if before is not None and _same_file(before / "map.npz", new.path / "map.npz"):
             for pattern in _MADE_OF_MAP:
                 new.adopt(only=pattern)
-        report_beside(new)  # made from the files, so they come first
+        add_report(new)  # made from the files, so they come first
     return run
 
 
@@ -315,8 +315,7 @@ def _open(home: Path, root: Path) -> Run:
 
 
 def refined_submaps_of(run: Run) -> list[Submap]:
-    """Submaps of a run along its refined path, with their dense maps; none where the path of the graph is the
-    result."""
+    """Submaps of a run along its refined path, with their dense maps; none without refinement."""
     if run.refined is not None:
         return run.refined.submaps
     if run.folder is None:

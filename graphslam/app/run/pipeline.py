@@ -29,7 +29,7 @@ from graphslam.app.run.calibration import (
 from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, removed_loops_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
-from graphslam.app.run.front_ends import check_name, make_front_end, name_of, preset_of, recommended
+from graphslam.app.run.front_ends import check_name, make_front_end, name_of, preset_of, recommended_options
 from graphslam.app.run.front_to_back import FrontEndTiming, ProgressBar, SubmapPipeline
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_metrics, write_outputs
@@ -192,7 +192,7 @@ def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[s
     if frontend is None:
         choice = choose_front_end(log)
         frontend, why = choice.frontend, choice.why
-    options = recommended(log, frontend, preset)
+    options = recommended_options(log, frontend, preset)
     if read:
         taken = preset or preset_of(log, frontend)[0] or "none"
         logger.warning("front end: %s (%s); preset: %s", frontend, why, taken)

@@ -13,7 +13,7 @@ from graphslam.app.hypotheses import (
     minimum_entropy_topology,
     write_minimum_entropy,
 )
-from graphslam.app.report.report import report_beside
+from graphslam.app.report.report import add_report
 from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
 from graphslam.app.run.outputs import read_run_folder, refined_submaps_of
@@ -96,7 +96,7 @@ def remake_map(
                 files += write_minimum_entropy(new.path, found, bands=made.bands)
                 old += ["clearest*", "alternatives/*"]
             new.adopt(drop=old)
-            report_beside(new)  # the page of the run shows the pictures and the choices
+            add_report(new)  # the page of the run shows the pictures and the choices
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return RemadeMap(made, found, files, figures)
 
@@ -132,7 +132,7 @@ def remake_terrain(
             files = write_terrain(new, made, generation=run.report.get("generation"))
             figures = draw_terrain(made, new.figures, name=run.name)
             new.adopt(drop=["terrain*", "figures/terrain*.png"])
-            report_beside(new)
+            add_report(new)
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return made, files, figures
 
@@ -173,7 +173,7 @@ def remake_surface(
             files = write_surface(new, made, colour=colour, terrain=terrain, generation=run.report.get("generation"))
             figures = draw_surface(made, new.figures, name=run.name)
             new.adopt(drop=["surface*", "figures/surface*.png"])
-            report_beside(new)
+            add_report(new)
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return made, files, figures
 

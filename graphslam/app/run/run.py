@@ -82,7 +82,7 @@ class Run:
         ``run.json``: versions, seed, counts of records read, used and dropped; and the seconds of ``timings.json``.
     events : list of dict
     ledger : DataFrame or None
-        Which factor spent which stream when.
+        Which factor used which stream when.
     gps : mapping of str to GpsResiduals
         ``all`` and, where GPS was in the graph, ``withheld``; empty for a run read back from disk.
     fixes : Gps or None
@@ -90,7 +90,7 @@ class Run:
     folder : Path or None
     log : SensorLog or None
     taken : RunInputs or None
-        What of the log the graph and the figures were made of; None for a run read back from disk.
+        Subset of the log used for the graph and the metrics; None for a run read back from disk.
     truth : MapTruth or None
         Ends of the submaps and landmarks.
     truth_path, dead_reckoning : Trajectory or None
@@ -99,7 +99,7 @@ class Run:
         The solver's own view. Of a run that :func:`graphslam.open_run` read they are solved again, once, when they are
         first asked for; None where its folder does not hold what that needs.
     checks : ResidualConsistency or None
-        What the run says of its own honesty; None for a run read back from disk, whose metrics hold the figures.
+        Consistency checks without ground truth; None for a run read back from disk, whose metrics hold the figures.
     fused : RunMap or None
         Fused evidence grid of submaps that have grids. Of a run that :func:`graphslam.open_run` read it is made again,
         once, when it is first asked for.
@@ -158,12 +158,12 @@ class Run:
 
     @property
     def verdict(self) -> list[Finding]:
-        """What the run says of itself: is it solved, honest, whole, and was everything used that was asked for."""
+        """Findings on the run: solved, consistent, complete, all requested data used."""
         return findings_of_json(self.report.get("verdict"))
 
     @property
     def headline(self) -> Finding:
-        """The first line of the verdict: what was made, how far it is to be trusted, what to do."""
+        """First line of the verdict: overall result, main values, next step."""
         return headline_of_json(self.report.get("verdict")) or Finding("", "headline", "No verdict.")
 
     def to_pandas(self) -> pd.DataFrame:

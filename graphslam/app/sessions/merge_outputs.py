@@ -10,7 +10,7 @@ import numpy as np
 
 from graphslam.app.folders.generations import FolderTransaction, current_outputs, is_empty, new_generation
 from graphslam.app.folders.lock import lock_folder, make_folder
-from graphslam.app.report.report import report_beside
+from graphslam.app.report.report import add_report
 from graphslam.app.run.files import MERGED_DENSE_FORMAT, MERGED_FORMAT
 from graphslam.app.run.outputs import graph_metrics, landmarks_csv
 from graphslam.app.run.surface import RunSurface, draw_surface, write_surface
@@ -126,4 +126,4 @@ def _finish(folder: FolderTransaction, merged: MergedMap | MergedSubmaps) -> Non
     seconds = float(report.pop("seconds"))
     folder.write_json("timings.json", [{"key": "seconds_merge", "value": seconds, "unit": "s", "direction": "lower"}])
     folder.write_json("merge.json", {**report, "graph": graph_metrics(merged.graph, classes)})
-    report_beside(folder)
+    add_report(folder)

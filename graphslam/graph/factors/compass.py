@@ -29,7 +29,7 @@ from graphslam.graph.variables import VariableKind, register_variable
 register_variable(
     VariableKind(
         "compass", "c", {2: "r", 3: "r"}, classes=("compass",),
-        remedy="the zero of a compass hangs on nothing: add readings at nodes that are tied to x0.",
+        remedy="the zero of a compass is unconstrained: add readings at nodes that are connected to x0.",
     )
 )  # fmt: skip
 register_variable(VariableKind("deviation", "d", {2: "rr", 3: "rr"}, classes=("deviation",)))

@@ -28,7 +28,7 @@ from graphslam.graph.variables import VariableKind, register_variable
 register_variable(
     VariableKind(
         "clock", "k", {3: "mm"}, classes=("pseudorange",),
-        remedy="the clock of a receiver is not held: it needs pseudoranges of its epoch, or a clock before it.",
+        remedy="the clock of a receiver is unconstrained: it needs pseudoranges of its epoch, or a clock before it.",
     )
 )  # fmt: skip
 register_variable(

@@ -22,7 +22,7 @@ from graphslam.graph.variables import VariableKind, register_variable
 register_variable(
     VariableKind(
         "beacon", "p", {2: "mm", 3: "mmm"}, classes=("beacon",),
-        remedy="a beacon is not held by its distances: it needs them from places that do not lie on one line.",
+        remedy="the distances do not determine a beacon: measure them from places that do not lie on one line.",
     )
 )  # fmt: skip
 

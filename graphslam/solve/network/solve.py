@@ -344,7 +344,7 @@ def _gnc(task: _Task) -> _Answer:
     if kept < enough * np.count_nonzero(loops) and np.count_nonzero(loops) >= FEWEST_LOOPS:
         doubt = (
             f"not solved: only {kept} of {np.count_nonzero(loops)} loops agree with each other and with the odometry "
-            "as its noise is stated; either most loops are wrong, or the odometry is worse than stated"
+            "with its assumed noise; either most loops are wrong, or the odometry is worse than stated"
         )
     details: dict[str, Any] = {
         "doubt": doubt,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.config import merge_options
 from graphslam.core.errors import GraphSlamError
@@ -116,7 +116,7 @@ class _Trial:
         """The preset's options with those of the study on top: noise as the log states it, equal cuts."""
         own = {"association": "known", "stopping": {"scans": self.config.scans}}
         merged: dict[str, Any] = merge_options(
-            recommended(self.log, front_end), {"frontend": merge_options(own, options)}
+            recommended_options(self.log, front_end), {"frontend": merge_options(own, options)}
         )
         return dict(merged["frontend"])
 

@@ -36,7 +36,7 @@ QUICK_WORLDS = {
     "stability-120": ScaleTrialConfig("stability", LapsConfig(poses=120, laps=3, begin=5), turns=(5e-4, 2e-2)),
 }
 QUANTITIES = ["chi2", "gap", "residual", "to_optimum", "to_truth", "iterations", "products", "landmarks", "split"]
-DRAWN = {"to_optimum": "rms distance to the optimum [m]", "to_truth": "rms distance to the truth [m]"}
+DRAWN = {"to_optimum": "rms distance to the optimum [m]", "to_truth": "rms distance to ground truth [m]"}
 
 
 class ScaleStudy(WorldsStudy[ScaleTrialConfig]):

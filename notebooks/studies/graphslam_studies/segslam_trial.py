@@ -108,7 +108,7 @@ class GridTrialConfig:
         for name in self.algorithms:
             family_of(name)
         if len(set(self.algorithms)) != len(self.algorithms) or min(self.samples, self.placements) < 1:
-            raise ConfigError("trial of grids: an algorithm stands twice, or no sample or placement is wanted")
+            raise ConfigError("trial of grids: an algorithm is repeated, or no sample or placement is wanted")
 
     def make_world(self, seed: int) -> World:
         """The world of a seed, which moves what can be moved in it."""

@@ -27,7 +27,7 @@ def run_ring(dim: int, out: Path) -> Path:
     log, front = ring(dim)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "make_front_end", lambda *_: front)
-        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
         config = {"gps": {"use": "every-second", "robust": "none"}}
         pipeline.run(log, frontend="ring", out=out, config=config, progress=False, solver="batch")
     return out
@@ -170,7 +170,7 @@ def test_nees_of_the_ends_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(report_figures, "Consistency", keep)
     log, front = ring(3)
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: front)
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     r = pipeline.run(log, frontend="ring", out=tmp_path / "run", progress=False, solver="batch")
     assert r.solution is not None
     assert r.truth is not None

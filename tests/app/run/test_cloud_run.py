@@ -44,7 +44,7 @@ def log() -> SensorLog:
 def go(log: SensorLog) -> Any:
     """Runs the log with the front end of clouds through the public verb."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
         patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build_config(CloudConfig, o, "frontend")))
 
         def run(out: Path | None = None, *, every: int = 2, loops: bool = True, **how: Any) -> Run:

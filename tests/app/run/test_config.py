@@ -9,7 +9,7 @@ import tomllib
 import pytest
 
 from graphslam.app.run import config as cfg
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.backend.config import GpsOptions, ImuOptions
 from graphslam.core.config import build_config, dump_toml, merge_options, options_dict, parse_setting, read_toml
@@ -105,7 +105,7 @@ def test_effective_configuration_round_trips_through_toml():
 
 def test_simulated_log_brings_its_own_noise():
     log = simulate("landmark-field", preset="quick", seed=0, sigma_speed=0.11)
-    options = recommended(log, "rbpf-ekf")
+    options = recommended_options(log, "rbpf-ekf")
     assert options["frontend"]["motion"]["speed"] == 0.11
     assert options["frontend"]["association"] == "known"
 

@@ -44,7 +44,7 @@ def made(uses: frozenset[str] = frozenset({"laser"})) -> tuple[SensorLog, list[S
 
 def solved(log: SensorLog, submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, out: Any = None, **options: Any):
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: HandedOver(tuple(submaps)))
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     return pipeline.run(log, frontend="ring", out=out, progress=False, **options)
 
 

@@ -101,7 +101,7 @@ def scanned_from(logs: list[tuple[Any, SensorLog]]) -> Any:
 def solved(d: HallDrive, name: str, out: Path, *, gps: str = "none", seed: int = 0) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "make_front_end", lambda *_: Ready(tuple(d.submaps)))
-        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
         config = {"gps": {"use": gps, "robust": "none"}}
         return pipeline.run(log_of(d, name, seed), frontend="ready", out=out, config=config, progress=False)
 
@@ -303,7 +303,7 @@ def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path)
 def test_a_run_goes_on_in_a_saved_map(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "make_front_end", lambda *_: Ready(tuple(drives[1].submaps)))
-        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
         patch.setattr(pipeline, "load_log_source", lambda *_, **__: log_of(drives[1], "again", 1))
         patch.setattr(pipeline, "check_name", lambda *_: None)
         arguments = ["run", "again", "--frontend", "ready", "--continue", str(runs[0].folder), "--json"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import Gaussian
@@ -94,7 +94,7 @@ def test_the_alarm_rings_for_moments_that_are_handed_over_and_not_for_the_rest(m
 )
 def test_degenerate_filters_and_wrong_noise_are_flagged(options, reason):
     log = simulate("landmark-field", seed=3, preset="quick")
-    merged = recommended(log, "rbpf-ekf")["frontend"] | options
+    merged = recommended_options(log, "rbpf-ekf")["frontend"] | options
     submaps = list(make_front_end("rbpf-ekf", merged).submaps(log, seed=SeedTree(1)))
     assert np.mean([reason in s.report["flag"] for s in submaps]) > 0.7
 
@@ -111,7 +111,7 @@ def test_honest_filters_are_flagged_in_one_submap_of_twenty_at_most():
             sigma_bearing=np.deg2rad(rng.uniform(1.0, 5.0)),
         )
         association = ("known", "likelihood")[seed % 2]
-        options = recommended(log, "rbpf-ekf")["frontend"] | {"association": association}
+        options = recommended_options(log, "rbpf-ekf")["frontend"] | {"association": association}
         flags += [bool(s.report["flag"]) for s in make_front_end("rbpf-ekf", options).submaps(log, seed=SeedTree(seed))]
     assert len(flags) > 35
     assert np.mean(flags) <= 0.05

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_exp, wrap_angle
@@ -100,7 +100,7 @@ def test_a_record_of_odometry_over_a_gap_is_believed_only_if_it_tells_the_way() 
 @pytest.mark.parametrize("frontend", ["rbpf-ekf", "ekf"])
 def test_a_map_is_split_where_nothing_was_seen(frontend: str) -> None:
     log = simulate("landmark-field", seed=2, preset="quick")
-    front = make_front_end(frontend, recommended(log, frontend)["frontend"])
+    front = make_front_end(frontend, recommended_options(log, frontend)["frontend"])
     submaps = list(front.submaps(inject.gap_of_all(10.0)(log), seed=SeedTree(1)))
     bridge = [s for s in submaps if s.report["gaps"]]
     assert len(bridge) == 1
@@ -119,4 +119,4 @@ def test_impossible_limits_are_refused() -> None:
     log = simulate("landmark-field", seed=2, preset="quick")
     for frontend in ("rbpf-ekf", "ekf", "ekf-slam"):
         with pytest.raises(ConfigError, match="longest_gap"):
-            make_front_end(frontend, recommended(log, frontend)["frontend"] | {"longest_gap": -1.0})
+            make_front_end(frontend, recommended_options(log, frontend)["frontend"] | {"longest_gap": -1.0})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.run import config as cfg
-from graphslam.app.run.front_ends import recommended
+from graphslam.app.run.front_ends import recommended_options
 from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -29,7 +29,7 @@ PRESETS = (
 
 
 def settings(log: SensorLog) -> SegSlamFrontEndConfig:
-    built: SegSlamFrontEndConfig = build_config(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    built: SegSlamFrontEndConfig = build_config(SegSlamFrontEndConfig, recommended_options(log, "segslam")["frontend"])
     return built
 
 

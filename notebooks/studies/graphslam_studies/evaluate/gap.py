@@ -144,7 +144,9 @@ def pose_consistency_along(
     at = {int(key): i for i, key in enumerate(truth.keys)}
     unknown = [s.key for s in submaps if s.key not in at]
     if unknown:
-        raise DataError("the end of a submap is not in the truth", got=unknown[0], wanted="the ends of all of them")
+        raise DataError(
+            "the end of a submap is not in the ground truth", got=unknown[0], wanted="the ends of all of them"
+        )
     ends = truth.exit_poses[[at[s.key] for s in submaps]]
     found = {}
     for method in methods:

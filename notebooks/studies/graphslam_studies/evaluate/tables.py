@@ -34,7 +34,7 @@ def values_of(table: pd.DataFrame, algorithm: str, quantity: str) -> tuple[Array
     if rows.empty:
         raise DataError(f"table has no {quantity!r} of {algorithm!r}", wanted=sorted(set(table["quantity"])))
     if rows.duplicated(["run", "submap"]).any():
-        raise DataError(f"{quantity!r} of {algorithm!r} stands twice in a run")
+        raise DataError(f"{quantity!r} of {algorithm!r} is repeated in a run")
     wide = rows.pivot(index="run", columns="submap", values="value")
     return np.asarray(wide.columns, dtype=np.float64), wide.to_numpy(dtype=np.float64)
 

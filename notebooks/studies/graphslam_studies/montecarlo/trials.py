@@ -61,7 +61,7 @@ def check_measurements(values: Iterable[object]) -> str | None:
             return f"the trial gave a {type(m).__name__}; wanted Measurement"
         key = (m.algorithm, m.quantity, m.submap, m.timing)
         if key in seen:
-            return f"{m.quantity!r} of {m.algorithm!r} at submap {m.submap} stands twice"
+            return f"{m.quantity!r} of {m.algorithm!r} at submap {m.submap} is repeated"
         seen.add(key)
     return None
 

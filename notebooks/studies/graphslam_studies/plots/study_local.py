@@ -24,7 +24,7 @@ def plot_local_consistency(
     confidence: float = 0.95,
     title: str | None = None,
 ) -> Axes:
-    """Histogram of the joint NEES/n of local maps against what honest maps of the same sizes would show.
+    """Histogram of the joint NEES/n of local maps and that of consistent maps of the same sizes.
 
     Densities are over ln(NEES/n), so every area is one. The expected curve is the mean of the χ²_n/n densities of the
     maps' own dimensions n. Maps of one run use different data: each is a unit.
@@ -52,7 +52,9 @@ def plot_local_consistency(
     x = np.geomspace(left, right, 400)
     sizes, counts = np.unique(found[names[0]][1], return_counts=True)
     f = stats.chi2.pdf(x[:, None] * sizes, sizes) * sizes * x[:, None]
-    ax.fill_between(x, f @ counts / counts.sum(), color=style.BOUNDS, alpha=0.8, lw=0, label="honest (χ²)", zorder=0)
+    ax.fill_between(
+        x, f @ counts / counts.sum(), color=style.BOUNDS, alpha=0.8, lw=0, label="consistent (χ²)", zorder=0
+    )
     for k, (name, (d2, dof)) in enumerate(found.items()):
         r, look = d2 / dof, algorithm_line(name, k)
         beyond = int(np.sum(r > right))
