@@ -125,7 +125,11 @@ SMALL = chi2_ratio_test("fixes", "fixes", 0.13, 400.0)
         # small residuals, and alike from one to the next: never pessimistic
         ([*HONEST[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "over-confident"),
         ([*HONEST[:1], *SMALL], True, "pessimistic"),
-        ([*chi2_ratio_test("map", "map", 0.5, 2000.0), largest_score_test("calibration", "map", 6.0, tests=16)], False, "over-confident"),
+        (
+            [*chi2_ratio_test("map", "map", 0.5, 2000.0), largest_score_test("calibration", "map", 6.0, tests=16)],
+            False,
+            "over-confident",
+        ),
     ],
 )  # fmt: skip
 def test_the_word(rows: list[ConsistencyTest], fixes: bool, word: str) -> None:
