@@ -77,7 +77,7 @@ class ConsistencyTest:
         return self.value * self.dof / max(float(stats.chi2.ppf(1.0 - SURE, self.dof)), 1e-12)
 
 
-def chi2_ratio_test(name: str, of: Of, value: float, dof: float) -> list[ConsistencyTest]:
+def chi_square_ratio_test(name: str, of: Of, value: float, dof: float) -> list[ConsistencyTest]:
     """A statistic χ²/dof; none where it has hardly any degrees of freedom."""
     if not (np.isfinite(value) and np.isfinite(dof) and dof >= LEAST_DOF):
         return []
@@ -96,11 +96,11 @@ def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
     """What the short windows of landmark front ends say: of the size of all noise, of lasting errors and of drifts."""
     if found is None:
         return []
-    out = chi2_ratio_test("χ² of odometry and observations in short windows", "map", found.ratio, found.dof)
+    out = chi_square_ratio_test("χ² of odometry and observations in short windows", "map", found.ratio, found.dof)
     p = len(found.taken)
     out.append(largest_score_test("calibration errors", "map", float(np.sqrt(found.taken.max())), tests=2 * p))
     drifts = [
-        chi2_ratio_test("time-correlated errors within windows", "map", v, d)
+        chi_square_ratio_test("time-correlated errors within windows", "map", v, d)
         for v, d in zip(found.drift, found.drift_dof)
     ]
     worst = min((e[0] for e in drifts if e), key=lambda e: e.too_large, default=None)

@@ -15,7 +15,7 @@ from graphslam.evaluate.covariance_assessment import (
     MAX_NONLINEARITY,
     ConsistencyTest,
     assess_covariances,
-    chi2_ratio_test,
+    chi_square_ratio_test,
     largest_score_test,
     pooled_nonlinearity,
     short_window_tests,
@@ -106,9 +106,9 @@ def test_fixes_whose_errors_last_are_over_confident_however_small_their_residual
     assert all(c.independent < 0.4 * c.dof for c in lasting)
 
 
-HONEST = chi2_ratio_test("map", "map", 1.0, 2000.0) + chi2_ratio_test("fixes", "fixes", 1.0, 400.0)
+HONEST = chi_square_ratio_test("map", "map", 1.0, 2000.0) + chi_square_ratio_test("fixes", "fixes", 1.0, 400.0)
 
-SMALL = chi2_ratio_test("fixes", "fixes", 0.13, 400.0)
+SMALL = chi_square_ratio_test("fixes", "fixes", 0.13, 400.0)
 
 
 @pytest.mark.parametrize(
@@ -117,16 +117,19 @@ SMALL = chi2_ratio_test("fixes", "fixes", 0.13, 400.0)
         (HONEST, True, "consistent"),
         (HONEST[:1], False, "consistent"),
         (HONEST[:1], True, "undecided"),  # nothing says how good the fixes are
-        (chi2_ratio_test("map", "map", 1.0, 8.0), False, "undecided"),  # half as large again is possible
+        (chi_square_ratio_test("map", "map", 1.0, 8.0), False, "undecided"),  # half as large again is possible
         ([], False, "undecided"),
-        (chi2_ratio_test("map", "map", 1.3, 2000.0), False, "over-confident"),
-        (chi2_ratio_test("map", "map", 0.6, 2000.0), False, "pessimistic"),
-        (chi2_ratio_test("map", "map", 0.97, 20000.0), False, "consistent"),  # significant, and of no matter
+        (chi_square_ratio_test("map", "map", 1.3, 2000.0), False, "over-confident"),
+        (chi_square_ratio_test("map", "map", 0.6, 2000.0), False, "pessimistic"),
+        (chi_square_ratio_test("map", "map", 0.97, 20000.0), False, "consistent"),  # significant, and of no matter
         # small residuals, and alike from one to the next: never pessimistic
         ([*HONEST[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "over-confident"),
         ([*HONEST[:1], *SMALL], True, "pessimistic"),
         (
-            [*chi2_ratio_test("map", "map", 0.5, 2000.0), largest_score_test("calibration", "map", 6.0, tests=16)],
+            [
+                *chi_square_ratio_test("map", "map", 0.5, 2000.0),
+                largest_score_test("calibration", "map", 6.0, tests=16),
+            ],
             False,
             "over-confident",
         ),
@@ -146,7 +149,7 @@ def test_maps_that_bend_are_promised_nothing() -> None:
         assess_covariances([*HONEST[:1], *SMALL], fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY).word == "undecided"
     )
     # what the log itself contradicts comes first
-    wrong = chi2_ratio_test("map", "map", 1.3, 2000.0)
+    wrong = chi_square_ratio_test("map", "map", 1.3, 2000.0)
     assert assess_covariances(wrong, fixes=False, nonlinearity=1.1 * MAX_NONLINEARITY).word == "over-confident"
     # a mean over unknowns, of the submaps that say it
     reports = [{"nonlinearity": 0.01, "unknowns": 30}, {"nonlinearity": 0.04, "unknowns": 10}, {}]
@@ -157,7 +160,9 @@ def test_maps_that_bend_are_promised_nothing() -> None:
 def test_honest_runs_are_seldom_called_wrong(rng):
     wrong = 0
     for _ in range(400):
-        rows = [chi2_ratio_test(f"{k}", "map", rng.chisquare(200 * k) / (200 * k), 200.0 * k)[0] for k in range(1, 8)]
+        rows = [
+            chi_square_ratio_test(f"{k}", "map", rng.chisquare(200 * k) / (200 * k), 200.0 * k)[0] for k in range(1, 8)
+        ]
         rows += [largest_score_test(f"s{k}", "map", rng.standard_normal()) for k in range(5)]
         wrong += assess_covariances(rows, fixes=False).word in ("over-confident", "pessimistic")
     assert wrong <= stats.binom.ppf(0.999, 400, 0.05)
@@ -195,7 +200,7 @@ def test_the_line_says_what_it_rests_on_and_survives_the_file():
     assert lines["trust"].level == "good"
     assert "without ground truth" in lines["trust"].text
     assert "errors match" not in " ".join(f.text for f in lines.values())
-    alone = tests_as_json(chi2_ratio_test("map", "map", 1.0, 8.0))
+    alone = tests_as_json(chi_square_ratio_test("map", "map", 1.0, 8.0))
     (line,) = [
         f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": alone}, {})) if f.code == "trust"
     ]

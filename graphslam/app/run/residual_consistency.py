@@ -20,7 +20,7 @@ from graphslam.evaluate.bias_test import sum_bias_windows
 from graphslam.evaluate.covariance_assessment import (
     ConsistencyTest,
     Of,
-    chi2_ratio_test,
+    chi_square_ratio_test,
     largest_score_test,
     short_window_tests,
 )
@@ -95,13 +95,13 @@ class ResidualConsistency:
                 b = self.classes["gps-bias"]
                 chi2, dof = chi2 + b.chi2, dof + b.dof
             if name != "gps-bias" and dof > 0:
-                out += chi2_ratio_test(f"χ² of {name}", of, chi2 / dof, dof * c.independent / max(c.dof, 1e-9))
+                out += chi_square_ratio_test(f"χ² of {name}", of, chi2 / dof, dof * c.independent / max(c.dof, 1e-9))
             if c.whiteness is not None and np.isfinite(c.ratio):
                 score = c.whiteness.score if c.whiteness.lasting() else min(c.whiteness.score, 0.0)
                 out.append(largest_score_test(f"autocorrelation of {name} residuals", of, score))
         if self.gps is not None:
             for r in self.gps.tests().to_dict("records"):
-                out += chi2_ratio_test(f"withheld GPS, {r['test']}", "fixes", r["value"], r["dof"])
+                out += chi_square_ratio_test(f"withheld GPS, {r['test']}", "fixes", r["value"], r["dof"])
                 if r["test"] == "joint" and np.isfinite(r["autocorrelation"]):
                     score = two_sided_width(0.95) * r["autocorrelation"] / r["white"]
                     out.append(largest_score_test("autocorrelation of withheld GPS errors", "fixes", score))
@@ -110,7 +110,7 @@ class ResidualConsistency:
             out.append(ConsistencyTest("squared distances from GPS fixes", "fixes", f.ratio, 1.0, f.chance, 1.0))
         if self.loops is not None:
             r = self.loops.test()
-            out += chi2_ratio_test("loop closures against each other", "map", r["value"], r["dof"])
+            out += chi_square_ratio_test("loop closures against each other", "map", r["value"], r["dof"])
         return out
 
     def _repr_html_(self) -> str:

@@ -9,7 +9,7 @@ from graphslam.app.run.verdict import (
     TWO_MAPS_DO,
     ChiSquareTest,
     RunMetrics,
-    chi2_test,
+    chi_square_test,
     covariance_assessment,
     is_finite_number,
     nees_tests,
@@ -151,7 +151,7 @@ def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
     """First line of the verdict of a run or of a merge."""
     known = _error(figures)
     nees = nees_tests(figures)
-    chi2, worst_nees = chi2_test(figures), max(nees, key=lambda j: LEVELS.index(j.level), default=None)
+    chi2, worst_nees = chi_square_test(figures), max(nees, key=lambda j: LEVELS.index(j.level), default=None)
     open_chain = "" if chi2 else "no redundant measurements, so consistency is not testable"
     facts = [_made(figures), known or "true error unknown", open_chain]
     trusted = covariance_assessment(figures)

@@ -294,7 +294,7 @@ class ChiSquareTest:
         return f"{self.ratio:.3g} per degree of freedom [{low:.3g}, {high:.3g}; {self.dof:.4g} dof] — {meaning}"
 
 
-def chi2_test(figures: RunMetrics) -> ChiSquareTest | None:
+def chi_square_test(figures: RunMetrics) -> ChiSquareTest | None:
     """χ² of the whole graph; None where nothing is redundant that could contradict, or that is not known."""
     found = whole_chi2(figures)
     if found is None or found[0] < EXACT * found[1]:
@@ -348,7 +348,7 @@ def _state(figures: RunMetrics) -> Finding:
 
 
 def _chi2(figures: RunMetrics) -> Finding:
-    if j := chi2_test(figures):
+    if j := chi_square_test(figures):
         if of_the_start(figures, j):
             text = f"chi-square of the initial graph: {j.text}. The refined path does not depend on it."
             return Finding("", "chi2", text)
