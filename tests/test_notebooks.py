@@ -97,7 +97,7 @@ def test_internal_imports_are_found() -> None:
 def test_a_lecture_has_a_knob_to_turn_and_exercises(path: Path) -> None:
     cells = nbformat.read(path, as_version=4).cells
     assert sum("gs.plots.knob(" in c.source for c in cells if c.cell_type == "code") == 1
-    assert sum("**Turn the knob.**" in c.source for c in cells if c.cell_type == "markdown") == 1
+    assert sum("**Change a parameter.**" in c.source for c in cells if c.cell_type == "markdown") == 1
     assert sum("## Exercises" in c.source for c in cells if c.cell_type == "markdown") == 1
 
 

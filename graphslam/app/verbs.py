@@ -187,7 +187,7 @@ def refine_path(
 
     Parameters
     ----------
-    source : SensorLog, card or folder
+    source : SensorLog, data set name or folder
         With scans or clouds, and motion.
     path : Trajectory, optional
         Of the base, where the refinement begins; gravity-aligned in space. By default the odometry of the log.
@@ -237,11 +237,11 @@ def compare(
     submap_poses: int | None = None,
     **options: Any,
 ) -> pd.DataFrame:
-    """Join the same submaps by several methods: objective, time, memory, non-zeros, and NEES where truth is known.
+    """Join the same submaps by several methods: objective, time, memory, non-zeros, and NEES with ground truth.
 
     Parameters
     ----------
-    source : Run, run folder, submap store, card of submaps, pose-graph file, or sequence of Submap
+    source : Run, run folder, submap store, data set of submaps, pose-graph file, or sequence of Submap
     methods : sequence of str
         By default ``isam2``, ``batch``, ``eif-tree``, ``eif-sequential``, ``ekf``.
     truth : MapTruth, optional
@@ -288,7 +288,7 @@ def join_submaps(
 
     Parameters
     ----------
-    source : Run, run folder, submap store, card of submaps, pose-graph file, or sequence of Submap
+    source : Run, run folder, submap store, data set of submaps, pose-graph file, or sequence of Submap
     method : str
         One of :func:`joiners`.
     polish : bool

@@ -222,14 +222,14 @@ def connect_session(
     dropped = _winnow(graph, solver, factors)
     if 2 * len(factors) < len(here):
         raise SolverError(
-            f"{new.name}: of {len(here)} ties to {known.name} that agree with each other the graph bears "
+            f"{new.name}: of {len(here)} loop closures with {known.name} that agree with each other the graph accepts "
             f"{len(factors)}, wanted half of them"
         )
     near, tried = _near(graph, two, known_node, node, here, progress)
     if tried >= c.heard and len(near) < c.borne * tried:
         raise SolverError(
-            f"{new.name}: {len(here)} ties to {known.name} agree with each other, but of {tried} more places that "
-            f"they bring together {len(near)} match, wanted {c.borne:.0%}: another place looks alike"
+            f"{new.name}: {len(here)} loop closures with {known.name} agree with each other, but of {tried} more "
+            f"places that they bring together {len(near)} match, wanted {c.borne:.0%}: another place looks alike"
         )
     for x in near:
         factors[_add(graph, x, known, new)] = x

@@ -26,7 +26,7 @@ def finite_points(points: Any, *, what: str = "points", drops: DropCounter | Non
     if good.all():
         return p
     if drops is not None:
-        drops.drop(what, "not finite, or absurdly far", int(np.sum(~good)))
+        drops.drop(what, "not finite, or too far", int(np.sum(~good)))
     return p[good]
 
 

@@ -237,15 +237,15 @@ class Submap:
     grid : EvidenceGrid or None
         In the base frame.
     cloud : CloudMap or None
-        In the base frame; an array ``(m, dim)`` is taken as points of which nothing else is known.
+        In the base frame; an array ``(m, dim)`` is read as points without further data.
     matches : tuple of Match
     uses : frozenset of str
         Streams whose information is already inside.
     assisting_streams : frozenset of str
         Streams that helped to find what is inside, while nothing that they tell is in its covariances: where a match
-        began, how a scan is bent. A factor may still spend them.
+        began, how a scan is bent. A factor may still use them.
     report : mapping
-        What the front end says of this map: why it ended, honesty figures, counts. JSON-serialisable.
+        Report of the front end: why the map ended, consistency values, counts. JSON-serialisable.
 
     Examples
     --------

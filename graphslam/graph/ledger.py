@@ -100,7 +100,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
             if e is not None:
                 raise EvidenceReusedError(
                     f"{factor} would use stream {stream!r} over [{t0:.3f}, {t1:.3f}) s a second time: "
-                    f"{e.factor} spent it over [{e.t_start:.3f}, {e.t_end:.3f}) s"
+                    f"{e.factor} used it over [{e.t_start:.3f}, {e.t_end:.3f}) s"
                 )
 
     def spend(

@@ -60,9 +60,9 @@ __all__ = ["PoseGraph", "SubmapNode"]
 
 
 class PoseGraph(FactorGraphState):
-    """A graph of submaps, landmarks and GPS, in the plane or in space: the verbs that add factors.
+    """A graph of submaps, landmarks and GPS, in the plane or in space: the functions that add factors.
 
-    The first base is fixed at the origin. What the graph holds and what can be asked of it is in
+    The first base is fixed at the origin. Queries of the graph are in
     :class:`~graphslam.graph.factor_graph_state.FactorGraphState`.
 
     Parameters
@@ -99,7 +99,7 @@ class PoseGraph(FactorGraphState):
             Starts where the last one ended, or where :meth:`start_session` put its base. Without landmarks it becomes
             a between-factor, or a chain of them.
         landmark_ids : (n,) int, optional
-            Graph landmark of every entry, -1 = new; by default the submap's own ids. An id may stand twice.
+            Graph landmark of every entry, -1 = new; by default the submap's own ids. An id may be repeated.
         covariance_scale : float
             Factor on the covariance.
         spacing : float, optional
@@ -109,7 +109,7 @@ class PoseGraph(FactorGraphState):
             In space: base and exit of this submap were levelled, each by itself, with this standard deviation [rad].
             An exit that says so as a *relative* roll and pitch says it wrongly: errors of relative poses add up along
             a chain, those of levelling do not. So the exit gives up its relative roll and pitch, and the exit's node
-            is said to be level instead (and the first base, once). That gravity was in the exit's covariance already;
+            is levelled instead (and the first base, once). That gravity was in the exit's covariance already;
             it is no double count because the exit has given up what it knew of it (ledger kind ``levelled``).
 
         Returns
@@ -120,7 +120,7 @@ class PoseGraph(FactorGraphState):
         Raises
         ------
         EvidenceReusedError
-            Its streams were already spent over an overlapping interval (nothing is changed then).
+            Its streams were already used over an overlapping interval (nothing is changed then).
         CovarianceError, GeometryError, DataError
         """
         if submap.dim != self.dim:
@@ -218,7 +218,7 @@ class PoseGraph(FactorGraphState):
     def lasting_errors(self, robot: int = 0) -> tuple[Array, Array]:
         """Constant errors of a robot's wheels and sensor ``(4,)`` at the graph's values, and their covariance.
 
-        In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; what is known beforehand is in it.
+        In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; their prior is in it.
 
         Raises
         ------
@@ -314,7 +314,7 @@ class PoseGraph(FactorGraphState):
         Fixes wait until their submap is there, and until :attr:`GpsConfig.baseline` is spanned; then the datum starts
         by rigid alignment and all of them become factors. The map stays where it is then, however late that be: its
         first base is fixed and the datum is solved for. Fixes that no submap covers are dropped and counted
-        (:attr:`events`, kind ``gps-dropped``). Each hangs on the node nearest in time, the base or an inner one.
+        (:attr:`events`, kind ``gps-dropped``). Each is attached to the node nearest in time, the base or an inner one.
 
         Returns
         -------
@@ -335,7 +335,7 @@ class PoseGraph(FactorGraphState):
     def add_imu(
         self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False
     ) -> list[int]:
-        """Give the graph an IMU that no front end used; what it says of the nodes that are there becomes factors.
+        """Give the graph an IMU that no front end used; its readings between existing nodes become factors.
 
         Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
         preintegrated way (:mod:`graphslam.graph.factors.imu.preintegration`,
@@ -358,7 +358,7 @@ class PoseGraph(FactorGraphState):
             By default that of the call before.
         more : bool
             It will be called again with more submaps: the last node waits for the one that begins there, and axes are
-            not checked, nor what is left out counted.
+            not checked, and dropped readings are not counted.
 
         Returns
         -------
@@ -368,7 +368,7 @@ class PoseGraph(FactorGraphState):
         Raises
         ------
         EvidenceReusedError
-            A submap, or another factor, spent the stream over an overlapping interval. Nothing is changed then.
+            A submap, or another factor, used the stream over an overlapping interval. Nothing is changed then.
         DataError
             Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
         GeometryError
@@ -378,7 +378,7 @@ class PoseGraph(FactorGraphState):
         return self.imu.add(imu, stream=stream, config=config, more=more)
 
     def check_imu(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
-        """Hold the axes of an IMU against the paths of the submaps; returns what is wrong in words, or nothing.
+        """Compare the axes of an IMU with the paths of the submaps; returns what is wrong in words, or nothing.
 
         Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
 
@@ -477,7 +477,7 @@ class PoseGraph(FactorGraphState):
         sigma : float
             Standard deviation of roll and of pitch [rad].
         streams, interval
-            What it spends; an exclusive measurement must say both.
+            Streams and interval that it uses; an exclusive measurement needs both.
         evidence : str
             ``"measurement"``, or a kind declared in the ledger.
         robust : RobustKernel
@@ -536,7 +536,7 @@ class PoseGraph(FactorGraphState):
         Parameters
         ----------
         streams, interval
-            What it spends; an exclusive measurement must say both.
+            Streams and interval that it uses; an exclusive measurement needs both.
         """
         last = self.structure.count("x") - 1
         if i == j or not (0 <= i <= last and 0 <= j <= last):
@@ -595,7 +595,7 @@ class PoseGraph(FactorGraphState):
         Parameters
         ----------
         streams, interval
-            What it spends; an exclusive measurement must say both.
+            Streams and interval that it uses; an exclusive measurement needs both.
         evidence : str
             ``"measurement"``, or a kind declared in the ledger (``"shared-scan"``).
         robust : RobustKernel
@@ -692,7 +692,7 @@ class PoseGraph(FactorGraphState):
         """A front end's re-entry into an earlier submap, as declared ``shared-scan`` evidence.
 
         A scan matches what the map shows around it, and that was laid down by the nearest stretch of the target's
-        path. So where the target has inner nodes the match hangs on the one nearest to where the match puts this
+        path. So where the target has inner nodes the match is attached to the one nearest to where the match puts this
         submap's base: by the fixed pose of that node in the target, and with the covariance that the path has lost
         between the node and its nearest pose added.
 

@@ -254,7 +254,7 @@ class _Bag:
             except GraphSlamError:
                 raise
             except Exception as error:
-                drops.drop("bag", f"is damaged or cut off, and read up to there ({_said(error)})")
+                drops.drop("bag", f"is damaged or truncated; read up to there ({_said(error)})")
 
     def decode(self, raw: bytes, kind: str) -> Any:
         """A message; :class:`ValueError` where it cannot be decoded."""
@@ -452,7 +452,7 @@ def read_bag(
         place_of_imu = frames.between(base, rows["imu"].frame) if rows["imu"].frame else None
         if place_of_imu is None and rows["imu"].frame != base:
             notes.append(f"imu left out: no transform from {base!r} to {rows['imu'].frame!r}")
-            counter.drop("imu", "its place is not known", len(rows["imu"].values))
+            counter.drop("imu", "unknown mounting", len(rows["imu"].values))
         else:
             streams["imu"] = _imu(rows["imu"], place_of_imu, accelerometer_unit, counter, notes, str(p))
     if "gps" in rows:
@@ -718,7 +718,7 @@ def _laser(
         reach.append(high)
     times, keep = _kept(r, "laser", {"angles are impossible, or fewer than 2 beams": odd}, counter, notes, where)
     rows, beams, moved = unify_layout([s for s, good in zip(scans, keep) if good])
-    counter.drop("laser", f"scan of other beams put on the usual {len(beams)} (kept)", moved)
+    counter.drop("laser", f"scan of other beams mapped to the usual {len(beams)} (kept)", moved)
     stated = [v for v in reach if np.isfinite(v) and v > 0]
     far = max_range or (float(np.median(stated)) if stated else 80.0)
     yaw = 2.0 * np.arctan2(place[5], place[6])
@@ -813,7 +813,7 @@ def _gps(r: _Rows, planar: bool, place: Array | None, counter: DropCounter, note
             P[k] = S
         else:
             unknown += 1
-    counter.drop("gps", f"fix without a usable covariance: σ {FIX_SIGMA:g} m taken (kept)", unknown)
+    counter.drop("gps", f"fix without a usable covariance: σ {FIX_SIGMA:g} m assumed (kept)", unknown)
     c = 2 if flat else 3
     lever = np.zeros(3) if place is None else place[:3]
     sigma = np.sqrt(P[:, 0, 0])

@@ -148,7 +148,7 @@ def list_cards() -> tuple[Card, ...]:
 
 
 def find_card(name: str) -> Card:
-    """The card of that name.
+    """The data set description of that name.
 
     Raises
     ------

@@ -112,7 +112,7 @@ def read_carmen(
             times, ranges, robot = times[inside], ranges[inside], robot[inside]
             poses = np.column_stack([robot, robot])
     else:
-        counter.drop("log", "line ODOM not used: scans bring their odometry", len(scans.odom))
+        counter.drop("log", "line ODOM not used: scans have their own odometry", len(scans.odom))
     T_base_sensor = np.zeros(3)
     streams: dict[str, Stream] = {}
     if poses is not None:
@@ -297,7 +297,7 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
         drops.drop("laser", reason, len(numbers_of))
     directions = {x.layout: _directions(x.layout) for x in lines}
     ranges, beams, moved = unify_layout([(x.ranges, directions[x.layout]) for x in lines])
-    drops.drop("laser", f"scan of other beams put on the usual {len(beams)} (kept)", moved)
+    drops.drop("laser", f"scan of other beams mapped to the usual {len(beams)} (kept)", moved)
     poses = [x.pose for x in lines if x.pose is not None]
     reach = [x.max_range for x in lines if x.max_range is not None]
     return _Scans(

@@ -102,16 +102,16 @@ def check_files(data: Card | str) -> list[FileCheck]:
 
 
 def load_recording(source: str | os.PathLike[str], *, reader: str | None = None, **options: Any) -> Any:
-    """Load recorded data by card name, or from a path.
+    """Load recorded data by data set name, or from a path.
 
     Parameters
     ----------
     source : str or path
-        A card's name; ``card/file`` for one file of a card (the ending may be left out, as ``posegraphs/intel``);
-        ``card/part`` where a set holds several logs (``mrclam-dataset7/robot1``); or an existing file or folder.
+        Name of a data set; ``name/file`` for one file of it (the ending may be left out, as ``posegraphs/intel``);
+        ``name/part`` where a set holds several logs (``mrclam-dataset7/robot1``); or an existing file or folder.
     reader : str, optional
-        Name of the reader (:func:`graphslam.io.readers.list_readers`). By default the card's, or the first one that
-        recognises the path by what it holds.
+        Name of the reader (:func:`graphslam.io.readers.list_readers`). Default: that of the data set, or the first one
+        that recognises the content of the path.
     options
         For the reader.
 
@@ -125,9 +125,9 @@ def load_recording(source: str | os.PathLike[str], *, reader: str | None = None,
     Raises
     ------
     UnknownNameError
-        Neither a card nor a path; no such reader.
+        Neither a data set nor a path; no such reader.
     MissingDataError
-        The card's files are not on this machine; or something is missing in the folder, or a package.
+        The files of the data set are not on this machine; or something is missing in the folder, or a package.
     FormatError
         A file or folder that no reader knows.
     DataError

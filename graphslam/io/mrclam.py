@@ -174,7 +174,7 @@ def _measurements(root: Path, robot: int, counter: DropCounter) -> tuple[Array, 
         counter.drop("landmarks", reason, int((good & bad).sum()))
         good &= ~bad
     subject = np.array([subject_of.get(int(c), -1) if np.isfinite(c) else -1 for c in code], dtype=np.int64)
-    counter.drop("landmarks", "barcode that the table does not know", int((good & (subject < 0)).sum()))
+    counter.drop("landmarks", "unknown barcode", int((good & (subject < 0)).sum()))
     good &= subject >= 0
     out = np.column_stack([table[:, 0], subject, table[:, 2:]])[good]
     return out[np.argsort(out[:, 0], kind="stable")], len(table)

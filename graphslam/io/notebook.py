@@ -18,7 +18,7 @@ class NotebookStop(Exception):
 
 
 def load_or_stop(name: str) -> Any:
-    """Load a recorded data set by the name of its card; where it is missing, end the notebook and say how to get it.
+    """Load a recorded data set by its name; where it is missing, end the notebook and say how to get it.
 
     Raises
     ------

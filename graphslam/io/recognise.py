@@ -359,7 +359,7 @@ BUILT_IN: dict[str, Reader] = {
     "smartloc": Reader("smartLoc: lines odom3 and pseudorange3", f"{_IO}.smartloc:read_smartloc", _smartloc),
     "kitti-gps": Reader("KITTI positions of GTSAM: Time,X,Y,Z", f"{_IO}.kitti_gps:read_kitti_gps", _kitti_gps),
     "euroc": Reader(
-        "EuRoC (ASL) without cameras: data.csv of imu0, perhaps of leica0 or vicon0, and the truth",
+        "EuRoC (ASL) without cameras: data.csv of imu0, perhaps of leica0 or vicon0, and ground truth",
         f"{_IO}.euroc:read_euroc",
         _euroc,
     ),

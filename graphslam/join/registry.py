@@ -135,7 +135,7 @@ def join_by_method(
     ----------
     submaps : sequence of Submap, or PoseProblem
         In order; submap k+1 starts where submap k ends. Those without landmarks are joined by their poses: with the
-        matches that they carry, or with all ties of a :class:`~graphslam.join.pose_problem.PoseProblem`.
+        matches that they carry, or with all constraints of a :class:`~graphslam.join.pose_problem.PoseProblem`.
     method : str
         ``eif-tree``, ``eif-sequential``: extended information filters, in the chart of the submaps; with ``-classical``
         as the paper has them, Cartesian and linearised once. ``ekf``: once linearised. ``eif-online``: in sequence,
@@ -155,7 +155,7 @@ def join_by_method(
     Returns
     -------
     SubmapEstimate
-        A :class:`~graphslam.join.joined_map.JoinResult` for the joiners; of dense submaps a
+        A :class:`~graphslam.join.joined_map.JoinResult` for landmark submaps; of dense submaps a
         :class:`~graphslam.join.pose_estimate.PoseEstimate`.
 
     Raises

@@ -72,9 +72,9 @@ class InterSessionConfig:
         for f in fields(self):
             value = getattr(self, f.name)
             if not math.isfinite(value) or value < 0 or (f.name in ("top", "keep", "least", "heard") and value < 1):
-                raise ConfigError(f"ties of sessions: {f.name} = {value}; wanted a positive number")
+                raise ConfigError(f"loop closures of sessions: {f.name} = {value}; wanted a positive number")
         if not 0 < self.level < 1:
-            raise ConfigError(f"ties of sessions: level = {self.level}; wanted a probability in (0, 1)")
+            raise ConfigError(f"loop closures of sessions: level = {self.level}; wanted a probability in (0, 1)")
 
 
 class SessionMap:

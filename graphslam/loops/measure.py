@@ -37,7 +37,7 @@ class Loop:
     why : str
         Gates of the registration that it fails; empty for one that may be taken.
     gates : dict
-        Figures that were judged; JSON-serialisable.
+        Values that were tested; JSON-serialisable.
     submaps : (int, int)
         Keys of the submaps of i and j.
     """

@@ -47,7 +47,7 @@ class Alternative:
     graph : PoseGraph
         At its solution.
     facts : mapping of str
-        What else is to be told of it, JSON-serialisable.
+        Further facts, JSON-serialisable.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Alternative:
 
     @property
     def ties(self) -> int:
-        """Pairs of submaps that matches and loops tie: ties of one pair stand and fall together."""
+        """Pairs of submaps that matches and loops tie: constraints of one pair are accepted or rejected together."""
         submap = {n: k for k, s in enumerate(self.graph.submaps) for n in s.nodes[:-1]}
         tied = [r for r in self.graph.records.values() if r.group in TIES and isinstance(r, BetweenRecord)]
         last = len(self.graph.submaps) - 1  # whose exit is a node of its own

@@ -25,7 +25,7 @@ def knob(
     """Draw the same picture at some settings side by side, and offer all of them to turn through.
 
     The row of pictures needs nothing but matplotlib, so that a notebook says the same on paper, on a site, and where it
-    is run without anybody looking. Where ipywidgets are installed and a notebook is open, a slider stands below it.
+    is run without anybody looking. Where ipywidgets are installed and a notebook is open, a slider is below it.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ def plot_method_maps(
     Parameters
     ----------
     maps : mapping of label to SubmapEstimate or Submap
-        Joined maps, or single maps over the whole run. Features bear the identities of the truth; those without are
+        Joined maps, or single maps over the whole run. Features have the ids of the ground truth; those without are
         left out.
     start : float
         Stamp of the first base [s].

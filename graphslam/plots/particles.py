@@ -35,7 +35,7 @@ def plot_exit(
     confidence: float = 0.95,
     title: str | None = None,
 ) -> Axes:
-    """Where a submap ends: the Gaussians of several hand-overs, the particles behind one of them, the truth.
+    """Where a submap ends: the Gaussians of several outputs, the particles of one of them, ground truth.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def plot_exit_panels(
     truth: Truth | None = None,
     confidence: float = 0.95,
 ) -> list[Axes]:
-    """One :func:`plot_exit` per title, side by side on the same scales; the legend stands beside the last."""
+    """One :func:`plot_exit` per title, side by side on the same scales; the legend is next to the last."""
     if not panels:
         raise DataError("no submap to draw")
     n = len(panels)

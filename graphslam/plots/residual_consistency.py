@@ -48,7 +48,7 @@ def plot_innovations(ax: Axes | None, gps: GpsInnovations, *, title: str | None 
     d = gps.dim
     ax.axhspan(d * each["low"], d * each["high"], color=style.BOUNDS, alpha=0.8, lw=0, label=band, zorder=0)
     ax.plot(t, gps.nis, ".", color=style.GPS, ms=4, label="withheld fix", zorder=3)
-    ax.axhline(d * each["value"], color=style.ESTIMATE, lw=1.2, label=f"mean {d * each['value']:.2f} (honest: {d})")
+    ax.axhline(d * each["value"], color=style.ESTIMATE, lw=1.2, label=f"mean {d * each['value']:.2f} (consistent: {d})")
     limit = float(stats.chi2.ppf(gps.confidence, d))
     ax.axhline(limit, color=style.BLACK, lw=0.8, ls="--", label=f"{gps.confidence:.0%} of consistent fixes below")
     ax.set_yscale("log")

@@ -54,7 +54,7 @@ def plot_scan(
     scans : LaserScans, optional
         Raw returns.
     landmarks : LandmarkObservations, or mapping of label to LandmarkObservations, optional
-        Several lists are told apart by their markers; only the first gets ellipses.
+        Several lists have different markers; only the first gets ellipses.
     confidence : float
         Of the ellipses.
     max_gap : float

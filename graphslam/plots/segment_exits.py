@@ -93,7 +93,7 @@ def plot_exit_nees(
     dof = next(iter(scores.values())).dof
     tail = 0.5 * (1.0 - confidence)
     low, high = chi2_quantile(tail, dof) / dof, chi2_quantile(1.0 - tail, dof) / dof
-    ax.axhspan(low, high, color=style.BOUNDS, alpha=0.6, lw=0, zorder=0, label=f"honest, {confidence:.0%}")
+    ax.axhspan(low, high, color=style.BOUNDS, alpha=0.6, lw=0, zorder=0, label=f"consistent, {confidence:.0%}")
     ax.axhline(1.0, color=style.GREY, lw=0.7, zorder=1)
     x = np.arange(n)
     for k, (label, s) in enumerate(scores.items()):

@@ -79,7 +79,7 @@ class CampusConfig:
     range_sigma: Range = (0.01, 0.03)
     """σ of a range, independent per beam [m]."""
     drop_out: float = 0.005
-    """Probability of a beam without a reading."""
+    """Probability of a beams without a reading."""
     encoder_offset: float = 0.0
     """What the pan encoder reads too much [rad]."""
     clock_offset: float = 0.0

@@ -50,7 +50,7 @@ class CrawlerConfig:
     range_sigma: float = 0.025
     """σ of a range, independent per beam [m]."""
     drop_out: float = 0.005
-    """Probability of a beam without a reading, independent per beam."""
+    """Probability of a beams without a reading, independent per beam."""
     mount: Pose = (0.3, 0.0, 0.7, 0.0, 0.0, 0.0, 1.0)
     """T_base_mount of the forward scanner: x y z qx qy qz qw."""
     rear_mount: Pose = (-0.3, 0.0, 0.7, 0.0, 0.0, 1.0, 0.0)

@@ -53,7 +53,7 @@ class SkeletonProblem:
     ------
     DataError
         Shapes do not fit, numbers are not finite, a point lies in the sensor, landmarks are not numbered by first
-        sighting.
+        observation.
     CovarianceError
         A covariance is not positive definite.
 

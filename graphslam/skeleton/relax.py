@@ -63,11 +63,11 @@ class RelaxConfig:
     limit : float
         Memory that the written-out network may take [bytes].
     halve : bool
-        Halve a step that raises the objective; if not, it is taken as it is.
+        Halve a step that raises the objective; if not, it is accepted.
     split : bool
         Look for wrong unions and split them.
     soft : int
-        How many of the softest modes are told; 0 for none.
+        How many of the softest modes are reported; 0 for none.
     threads : int
         The result does not depend on it.
     """

@@ -55,7 +55,7 @@ ROWS = (
     Row("scanner", "all ranges 3 m exactly", put.every(3.0), "reported", "scans-constant"),
     Row("scanner", "all ranges 3 m with noise", put.bubble, "reported", "distance-disagrees"),
     Row("scanner", "the same scan always", put.stuck, "reported", "scans-repeated"),
-    Row("scanner", "every scan twice", put.twice, "dropped", "scan is the one before, number for number"),
+    Row("scanner", "every scan twice", put.twice, "dropped", "scan equal to the one before"),
     Row("scanner", "ranges × 2", put.ranges(lambda r: 2.0 * r), "reported", "distance-disagrees|scans-unlike"),
     Row("scanner", "ranges 1 m too long", put.ranges(lambda r: r + 1.0), "reported", f"{MOUNT}|scans-unlike", (3,)),
     Row("scanner", "ranges 1 m too long", put.ranges(lambda r: r + 1.0), "handled", "", (2,)),

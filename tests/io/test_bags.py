@@ -236,7 +236,7 @@ def test_fixes_without_covariance_or_place(tmp_path: Path) -> None:
     assert len(log["gps"].times) == N - 2
     assert log.dropped["gps: latitude and longitude are 0"] == 1
     assert log.dropped["gps: no place on Earth"] == 1
-    assert log.dropped["gps: fix without a usable covariance: σ 5 m taken (kept)"] == 1
+    assert log.dropped["gps: fix without a usable covariance: σ 5 m assumed (kept)"] == 1
     none = [(a, b, t, m.fix(t, (50.0, 8.0, 1.0), status=-1)) for a, b, t, _ in fixes]
     (tmp_path / "none").mkdir()
     with pytest.raises(DataError, match="no fix"):

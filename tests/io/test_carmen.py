@@ -59,7 +59,7 @@ def test_a_log(tmp_path: Path, beams: int) -> None:
     driven, turned = np.linalg.norm(odometry.increments[5, :2]), odometry.increments[5, 2]
     assert odometry.covariances[5, 0, 0] == pytest.approx(0.01**2 + (0.1 * driven) ** 2)
     assert odometry.covariances[5, 2, 2] == pytest.approx(0.005**2 + (0.15 * driven) ** 2 + (0.2 * turned) ** 2)
-    assert log.dropped == {"log: line ODOM not used: scans bring their odometry": 40}
+    assert log.dropped == {"log: line ODOM not used: scans have their own odometry": 40}
 
 
 def test_bearings_are_those_of_the_scanner() -> None:

@@ -97,7 +97,7 @@ def test_isolated_bad_records_are_dropped_and_counted(folder):
     assert dict(log.dropped) == {
         "controls: repeated stamp": 1,
         "controls: speed or turn rate is not finite": 1,
-        "landmarks: barcode that the table does not know": 1,
+        "landmarks: unknown barcode": 1,
         "landmarks: range is not positive": 1,
         "landmarks: observations of other robots": 1,
     }
@@ -152,7 +152,7 @@ def test_the_recording(data_dir):
     """Facts counted by hand from the files, and every identity checked against the Vicon truth."""
     log = load_recording("mrclam-dataset7/robot3")
     assert dict(log.read) == {"controls": 55085, "landmarks": 5399}
-    assert log.dropped["landmarks: barcode that the table does not know"] == 9
+    assert log.dropped["landmarks: unknown barcode"] == 9
     assert log.dropped["landmarks: observations of other robots"] == 965
     assert log.dropped["controls: repeated stamp"] == 7
     o, truth = log["landmarks"], log.truth

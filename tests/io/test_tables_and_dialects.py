@@ -104,7 +104,7 @@ def test_scans_of_other_beams_are_put_on_those_of_most(tmp_path: Path) -> None:
     off = np.abs(seen - want)  # a beam is taken from up to a degree beside
     assert np.nanmedian(off) < 0.02
     assert np.nanmax(off) < 0.5
-    assert any("put on the" in k or "other beams" in k for k in log.dropped)
+    assert any("mapped to the" in k or "other beams" in k for k in log.dropped)
 
 
 def test_a_tum_table_is_odometry_and_a_file_of_any_name_will_do(tmp_path: Path) -> None:

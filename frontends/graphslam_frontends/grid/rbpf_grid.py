@@ -307,6 +307,6 @@ class RbpfGrid(StepwiseFrontEnd):
                 result, drift, drift_scale=self.config.drift_scale, steps=steps, passed=self.config.passed
             )
             if len(result.particles) == 1:
-                text = "A single particle corrects nothing: the path is dead reckoning, and its covariance says so."
+                text = "particles: 1 — no correction by scans; path and covariance are dead reckoning."
                 steps = replace(steps, findings=(*steps.findings, Finding("look", "one-particle", text)))
             yield with_findings(submap, steps)

@@ -97,7 +97,7 @@ class Points(FrontEnd):
             last, reason = self._end(steps, points, first)
             submap = _Smoothing(self.config, steps, points, first, last, own_scan=first == 0).submap(key, reason)
             if drops is not None and submap.report["outliers"]:
-                drops.drop(seen, "points that no landmark explains", submap.report["outliers"])
+                drops.drop(seen, "points without a landmark", submap.report["outliers"])
             yield replace(submap, uses=frozenset({motion, seen}))
             first, key = last, key + 1
 

@@ -263,7 +263,7 @@ class LogPreparation:
             if scans.ids is None:
                 raise MissingDataError("known association needs identities", where=where, wanted="ids")
             unknown = usable & (scans.ids < 0)
-            drops.drop(stream, "observations without identity", int(unknown.sum()))
+            drops.drop(stream, "observations without an id", int(unknown.sum()))
             usable &= ~unknown
         scans, kept = _only(scans, usable)
         if len(scans.times):

@@ -471,10 +471,9 @@ def _uneven(key: int, kept: list[FollowedScan]) -> list[Finding]:
     if not off or np.median(off) <= UNEVEN:
         return []
     text = (
-        "Without readings of an IMU scans are straightened as if the motion was even. In submap "
-        f"{key} it changes from scan to scan by so much that points in the middle of a scan are off by "
-        f"{np.median(off):.2f} m. Neither path nor covariance knows of it: the path is less exact than its covariance "
-        "says, above all where it is refined. To do: log the lidar's IMU, or move it more steadily."
+        f"deskewing without IMU in submap {key}: error of about {np.median(off):.2f} m in the middle of a scan — the "
+        "velocity changes within scans, and the covariance does not include this. To do: log the lidar's IMU, or move "
+        "it more steadily."
     )
     return [Finding("bad", "uneven-motion", text)]
 
@@ -564,28 +563,25 @@ def _findings(
     imu, wheels = names
     if imu is not None and report["scans_aided"] < 0.5 * n:
         text = (
-            f"Submap {key}: {imu} was left aside in {n - report['scans_aided']} of {n} scans. There its readings have "
-            "a pause, or an even motion tells the turns between scans better: look at its axes, units and stamps."
+            f"{imu} in submap {key}: not used in {n - report['scans_aided']} of {n} scans — its readings have gaps, or "
+            "constant velocity predicts the rotation better. Check its axes, units and stamps."
         )
         out.append(Finding("look", "imu-left-aside", text))
     own = kept[int(key > 0) :]
     alone = sum(f.seen.unheld == 6 and not f.seen.bridged for f in own)
     if report["scans_lost"] > MANY * n + (BEGUN if key == 0 else 0):
-        text = (
-            f"Submap {key}: {report['scans_lost']} of {n} scans found no place in the map of the scans before them and "
-            "are not in it. "
-        )
+        text = f"unmatched scans in submap {key}: {report['scans_lost']} of {n} — not in the map. "
         if alone < report["scans_lost"]:
-            text += f"The path there is that of {wheels}, as sure as scans elsewhere found it to be."
-            text += f" For {alone} of them it is that of an even motion, since {wheels} tells nothing." if alone else ""
+            text += f"The path there is that of {wheels}, with the noise estimated from the other scans."
+            text += f" For {alone} of them constant velocity is assumed, because {wheels} has no data." if alone else ""
         else:
-            text += "The path there is that of an even motion, and the covariance as wide as that may be off."
+            text += "Constant velocity is assumed there, with a matching covariance."
         out.append(Finding("bad" if alone > 0.5 * n else "look", "scans-lost", text))
     if report["scans_unheld"] > 0.5 * n:
-        by = "an even motion" if not any(f.seen.bridged for f in own) else wheels
+        by = "constant velocity" if not any(f.seen.bridged for f in own) else wheels
         text = (
-            f"Submap {key}: nothing holds {report['scans_unheld']} of {n} scans along some direction, as in a corridor "
-            f"or on a plain. The path along it is that of {by}."
+            f"unobservable directions in submap {key}: {report['scans_unheld']} of {n} scans, as in a corridor or on a "
+            f"plain — the path along them is that of {by}."
         )
         out.append(Finding("look", "scans-unheld", text))
     return out

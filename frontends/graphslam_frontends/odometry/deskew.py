@@ -162,11 +162,11 @@ def beam_source(
         good = nothing | (ranges >= min_range)
     unread = np.isnan(ranges)
     again = repeated_scans(ranges, stream.max_range)
-    drops.drop(name, "scan is the one before, number for number", int(again.sum()))
-    drops.drop(name, "beam without a reading", int(unread.sum()))
+    drops.drop(name, "scan equal to the one before", int(again.sum()))
+    drops.drop(name, "beams without a reading", int(unread.sum()))
     drops.drop(name, f"nearer than {min_range:g} m", int(np.sum(~good & ~unread)))
     drops.drop(name, "scan without a reading", int(np.sum(~good.any(axis=1))))
-    drops.drop(name, "scan that met nothing (kept)", int(np.sum((nothing | ~good).all(axis=1) & good.any(axis=1))))
+    drops.drop(name, "scan without a hit (kept)", int(np.sum((nothing | ~good).all(axis=1) & good.any(axis=1))))
     record, beam = (a.astype(np.int64) for a in np.nonzero(good & ~again[:, None]))
     if isinstance(stream, RangeScans):
         times = stream.times[record] + stream.beam_times[beam]
@@ -191,7 +191,7 @@ def _list_clouds(
             good = good[:0]
         before = cloud
         rows.append(good)
-    drops.drop(name, "scan is the one before, number for number", len(again))
+    drops.drop(name, "scan equal to the one before", len(again))
     drops.drop(name, f"nearer than {min_range:g} m", near)
     drops.drop(name, "scan without a reading", empty)
     record = np.repeat(np.arange(len(rows)), [len(r) for r in rows])

@@ -80,7 +80,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
             got=f"{beam_times.min():.3f} to {beam_times.max():.3f} s",
             wanted=f"{source.begin:.3f} to {source.end:.3f} s, as {', '.join(source.names)}",
         )
-    count.drop(", ".join(names), "beam outside the motion", outside)
+    count.drop(", ".join(names), "beams without odometry at their time", outside)
     skipped = np.concatenate([s.skipped for s in sources])
     skipped = skipped[(skipped >= source.begin) & (skipped <= source.end)]
     times, begin = _stamps(log[names[0]], np.append(beam_times[inside], skipped), source, config)
@@ -91,9 +91,9 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
     if config.silent == "unknown":
         silent = np.concatenate([~s.beams(np.arange(len(s.times)))[2] for s in sources]) & inside
         step[silent] = -1
-        count.drop(", ".join(names), "beam without a range", int(silent.sum()))
+        count.drop(", ".join(names), "beams without a range", int(silent.sum()))
     chosen, offsets, thinned = _choose(step, len(times), config.most_points)
-    count.drop(", ".join(names), f"beam left out, {config.most_points} a step are kept", thinned)
+    count.drop(", ".join(names), f"beams thinned out ({config.most_points} per step kept)", thinned)
     count.drop("steps", "step without a beam (kept)", int(np.sum(np.diff(offsets) == 0)))
     origins, ends, met = _beams(sources, chosen, config)
     origins, ends = deskew_beams(motion.path, motion.poses, step[chosen], beam_times[chosen], origins, ends)

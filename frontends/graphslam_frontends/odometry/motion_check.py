@@ -342,27 +342,24 @@ def motion_findings(found: MotionCheck) -> list[Finding]:
     out: list[Finding] = []
     if found.tried >= LEAST_PAIRS and found.matched < found.least_share * found.tried:
         text = (
-            f"Only {found.matched} of {found.tried} pairs of neighbouring scans could be matched: scans that do not "
-            "look alike from one moment to the next make no map. Look at the ranges, the order of the beams and the "
-            "mounting."
+            f"matched pairs of neighbouring scans: {found.matched} of {found.tried} — consecutive scans differ too "
+            "much for a map. Check the ranges, the order of the beams and the mounting."
         )
         out.append(Finding("look", "scans-unlike", text))
     f = found.fits
     for key, what, (odometry, scans), causes in (
-        ("distance", "Distances", found.moved, _distance_cause),
-        ("turn", "Turns", found.turned, _turn_cause),
+        ("distance", "distances", found.moved, _distance_cause),
+        ("turn", "turns", found.turned, _turn_cause),
     ):
         unit = "m" if key == "distance" else "rad"
         if key in f:
             level = _level(f[key].value - 1.0, f[key].sigma, SCALE)
             if level:
-                said = f"{what} by the scans are {f[key].value:.3g} ± {f[key].sigma:.2g} times those of the odometry"
-                out.append(Finding(level, f"{key}-disagrees", f"{said}: {causes(f[key].value)}."))
+                said = f"{what} by scan matching: {f[key].value:.3g} ± {f[key].sigma:.2g} times those of the odometry"
+                out.append(Finding(level, f"{key}-disagrees", f"{said} — {causes(f[key].value)}."))
         elif found.matched >= LEAST_PAIRS and scans > 0.1 and scans > 5.0 * odometry:
-            said = (
-                f"By the scans a motion of {scans:.2g} {unit} lies between two of them, by the odometry {odometry:.2g}"
-            )
-            out.append(Finding("bad", f"{key}-disagrees", f"{said}: the odometry seems to stand still."))
+            said = f"motion between two scans: {scans:.2g} {unit} by scan matching, {odometry:.2g} by the odometry"
+            out.append(Finding("bad", f"{key}-disagrees", f"{said} — the odometry seems to stand still."))
     if ("distance" in f and abs(f["distance"].value - 1.0) > 0.5) or ("turn" in f and abs(f["turn"].value - 1.0) > 0.5):
         return out  # angles and levers mean nothing beside such errors
     mounted: list[str] = []
@@ -379,16 +376,16 @@ def motion_findings(found: MotionCheck) -> list[Finding]:
             worst = "bad" if "bad" in (worst, level) else "look"
     if mounted:
         text = (
-            f"Scans and motion agree best with a scanner that sits {', '.join(mounted)} of where its mounting says. "
-            "Measure the mounting (T_base_sensor, T_base_mount); mirrored bearings or turns of the wrong sign may look "
-            "like it, too."
+            f"scanner mounting: {', '.join(mounted)} of the configured pose fits scans and odometry best — the "
+            "mounting is wrong, bearings are mirrored, or turns have the wrong sign. Measure the mounting "
+            "(T_base_sensor, T_base_mount)."
         )
         out.append(Finding(worst, "mounting-disagrees", text))
     if "lag" in f and (level := _level(f["lag"].value, f["lag"].sigma, LAG)):
         late = "later" if f["lag"].value > 0 else "earlier"
         text = (
-            f"Turns seen by the scans come {abs(f['lag'].value):.2f} ± {f['lag'].sigma:.2g} s {late} than those of the "
-            "odometry: the clocks of the two differ."
+            f"turns by scan matching: {abs(f['lag'].value):.2f} ± {f['lag'].sigma:.2g} s {late} than those of the "
+            "odometry — their clocks differ."
         )
         out.append(Finding(level, "clocks-disagree", text))
     return out
@@ -403,7 +400,7 @@ def _distance_cause(ratio: float) -> str:
     if ratio < -SCALE:
         return "the speed has the wrong sign, or the scanner looks backwards"
     if ratio < 0.15:
-        return "the scans hardly change: the scanner is stuck, or sees nothing but what moves along"
+        return "the scans hardly change: the scanner is stuck, or sees only the robot itself"
     for factor, why in ((3.6, "the odometry is m/s read as km/h, or"), (1.0 / 3.6, "the odometry is in km/h, or")):
         if abs(np.log(ratio / factor)) < 0.1:
             return f"{why} ranges or distances are in another unit"

@@ -136,9 +136,8 @@ def scan_findings(steps: Steps) -> list[Finding]:
     if gaps:
         a, b = max(gaps, key=lambda g: g[1] - g[0])
         text = (
-            f"Gaps of {LONG:g} s or more in the records of the motion were bridged: {len(gaps)}, the longest "
-            f"{b - a:.1f} s from {a:.2f} s. The motion there is a guess, and the covariances are widened by what this "
-            "robot does in such a time."
+            f"gaps in the odometry: {len(gaps)} of {LONG:g} s or more, the longest {b - a:.1f} s from {a:.2f} s — "
+            "bridged with the usual motion of the robot; the covariances are increased accordingly."
         )
         out.append(Finding("look", "motion-gap", text))
     stretches = unobserved_stretches(steps)
@@ -148,9 +147,9 @@ def scan_findings(steps: Steps) -> list[Finding]:
         metres = sum(float(steps.path_length[b] - steps.path_length[a - 1]) for a, b in blind)
         share = seconds / max(float(steps.times[-1] - steps.times[0]), 1e-9)
         text = (
-            f"No scan corrects the motion for {seconds:.1f} s ({metres:.1f} m, {100 * share:.0f} % of the time; "
-            f"stretches: {len(blind)}): there are fewer than {FEW} returns in a step. The path "
-            "there is dead reckoning, and the covariances are widened by its own."
+            f"path without scan correction: {seconds:.1f} s ({metres:.1f} m, {100 * share:.0f} % of the time; "
+            f"stretches: {len(blind)}) — fewer than {FEW} returns in a step; path and covariance there are dead "
+            "reckoning."
         )
         out.append(Finding("bad" if share > 0.5 else "look", "motion-uncorrected", text))
     return out

@@ -122,8 +122,8 @@ def encoder_findings(
         return []
     degrees = np.rad2deg(abs(e.offset))
     text = (
-        f"Scans of {e.stream} say that the robot moves askew all along: its encoder reads {degrees:.1f}° too "
-        f"{'much' if e.offset > 0 else 'little'} (± {np.rad2deg(e.sigma):.1f}°), or its mount is turned as much. Take "
-        "it off the angles of the head, and run again."
+        f"encoder of {e.stream}: {degrees:.1f} ± {np.rad2deg(e.sigma):.1f}° too {'much' if e.offset > 0 else 'little'} "
+        "— the scans show a constant sideways motion; the encoder has an offset, or the mount is rotated. Subtract the "
+        "offset from the encoder angles, and run again."
     )
     return [Finding("bad", "scan-encoder", text)]

@@ -220,8 +220,8 @@ def _lost(key: int, steps: int, report: dict[str, Any]) -> list[Finding]:
         return []
     why = ", ".join(f"{n} for {WHY[code]}" for code, n in report["scans_lost_why"].items())
     text = (
-        f"Submap {key}: {lost} of {steps} scans found no place on the surfaces before them ({why}). The path there is "
-        "that of the motion, and the covariances are as wide as its."
+        f"unmatched scans in submap {key}: {lost} of {steps} ({why}) — the path and its covariance there are those of "
+        "the odometry."
     )
     return [Finding("bad" if lost > 0.5 * steps else "look", "scans-lost", text)]
 
@@ -229,6 +229,6 @@ def _lost(key: int, steps: int, report: dict[str, Any]) -> list[Finding]:
 WHY = {
     "points": "too few returns",
     "overlap": "too few points on surfaces",
-    "spread": "the spread of the distances",
-    "surprise": "a correction that the motion rules out",
+    "spread": "a large spread of the distances",
+    "surprise": "a correction that contradicts the odometry",
 }

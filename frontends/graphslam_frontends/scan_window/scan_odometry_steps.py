@@ -93,5 +93,5 @@ def refuse_fused_steps(config: StepConfig) -> None:
     if config.match_scans:
         raise ConfigError(
             "frontend.steps.match_scans = true fuses the motion with the scans, which scan-to-window odometry would "
-            "spend a second time; wanted false"
+            "use a second time; wanted false"
         )

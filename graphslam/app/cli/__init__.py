@@ -40,7 +40,7 @@ COMMANDS = "graphslam.commands"
 
 
 class Verbs(TyperGroup):
-    """The verbs, and those of plug-ins; Ctrl-C in one of them reaches :func:`main`."""
+    """The commands, and those of plug-ins; Ctrl-C in one of them reaches :func:`main`."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), *plugins(COMMANDS)]

@@ -46,7 +46,7 @@ class Slam:
     fused, and the verdict is given. The result is that of ``gs.run`` over the same records, to the last byte, with the
     same options.
 
-    Beams that were used are let go of; they are on disk until the end, where the verdict and a refinement ask for them
+    Beams that were used are freed; they are on disk until the end, where the verdict and a refinement ask for them
     once more. Work is done inside :meth:`add`, in the caller's thread, on one BLAS thread: where sensors cannot wait,
     put a queue between them and it.
 

@@ -68,7 +68,7 @@ def merge(
     solver : str
         Registered solver.
     identity_gate : float
-        At the end, sightings that contradict the map by this χ² (2 dof) are split off; 0 = never.
+        At the end, observations that contradict the map by this χ² (2 dof) are split off; 0 = never.
     tolerance : float
         Landmarks of two maps within this distance after alignment agree [m].
     out : path, optional

@@ -90,7 +90,7 @@ class MergedSubmaps:
         if self.graph.dim == 3:
             paths = {k: plan_path(v) for k, v in paths.items()}
         ties = sum(len(s.attached.used) for s in self.sessions if s.attached is not None)
-        return plot_paths(ax, paths, title=f"{len(paths)} sessions, {ties} ties between them")
+        return plot_paths(ax, paths, title=f"{len(paths)} sessions, {ties} loop closures between them")
 
     def __repr__(self) -> str:
         return f"MergedSubmaps({len(self.sessions)} sessions, {len(self.graph.submaps)} submaps)"

@@ -98,7 +98,7 @@ class SurfaceLayer:
     def update(self) -> Ints:
         """Evolve what changed; coordinates ``(n, 3)`` of the bricks whose distances were made anew.
 
-        Bricks in which nobody says anything any more are let go.
+        Bricks without any value are freed.
         """
         c = self.config
         changed = np.array(sorted(self._changed), np.int64)

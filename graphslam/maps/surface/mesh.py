@@ -203,7 +203,7 @@ def _weight_at(piece: SurfacePiece, points: Array, T: Array, voxel: float) -> Ar
 
 
 def position_sigma(mesh: Mesh, layer: SurfaceLayer, covariances: Mapping[PieceId, Array]) -> Array:
-    """Standard deviation of the place of every vertex ``(v,)`` [m] that comes of the pose of the node it hangs on.
+    """Standard deviation of the place of every vertex ``(v,)`` [m] that comes of the pose of its node.
 
     Of a vertex ``p = R q + t``, with the node's covariance in its right tangent (rotation, translation):
     ``J = R [−[q]×, I]``, ``σ² = trace(J Σ Jᵀ)``. NaN where no piece speaks or no covariance is given.

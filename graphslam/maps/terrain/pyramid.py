@@ -231,7 +231,7 @@ class Pyramid:
 
         Of steps and of support the finest band that knows the cell speaks. Something hanging is believed of any band,
         because a near band that saw the ground may not have looked at the space above it; where a finer band saw
-        something hang in the cell of a coarser one, the finer one says where. What pieces saw hang (see
+        something hang in the cell of a coarser one, the finer one gives the height. What pieces saw hang (see
         :mod:`graphslam.maps.terrain.layer`) has moved away where more than twice as many, of all bands,
         saw ground alone.
 

@@ -117,7 +117,7 @@ class LineSensor:
     def speed_bound(self, vehicle: Vehicle, depth: float | None = None) -> float:
         """Highest speed [m/s] from which the vehicle stops before a fall.
 
-        The last look at a place may be a sweep ago, and then the place was just out of reach. So the way of a sweep,
+        The last look at a place may be a sweep ago, and then the place was just out of reach. So the path of one sweep,
         the braking distance and half the width of the vehicle, by which its front is ahead of the sensor, lie within
         `hole_reach`.
 

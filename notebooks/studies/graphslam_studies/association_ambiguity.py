@@ -66,7 +66,7 @@ PAIRS = (
     ("ekf-slam-jcbb", "ekf-jcbb-smoothed"),
 )
 DRAWN = {
-    "wrong_share": "wrong sightings inside submaps",
+    "wrong_share": "wrong associations inside submaps",
     "used_share": "true observations rightly used",
     "missed_merge_share": "merges missed between submaps",
     "map_rmse": "map RMSE [m]",

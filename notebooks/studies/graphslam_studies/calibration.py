@@ -98,7 +98,7 @@ def found_table(table: pd.DataFrame) -> pd.DataFrame:
 
 STUDY = CalibrationStudy(
     "calibration",
-    "noise, biases and scales told from the log itself: drawn robots, and recorded logs as if they were unknown",
+    "noise, biases and scales estimated from the log: random robots, and recorded logs without their presets",
     WORLDS,
     QUICK_WORLDS,
     trials=10,

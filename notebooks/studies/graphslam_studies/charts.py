@@ -1,4 +1,4 @@
-"""The study ``charts``: in which coordinates local maps are honest, and what that does to the maps joined of them.
+"""The study ``charts``: in which coordinates local maps are consistent, and what that does to the maps joined of them.
 
 A robot drives at random (the slow one in rows, like a lawn mower) through features whose identities are known; every
 run draws its own route, features and noise. Odometry is white, and stated as it is. Worlds differ in how much the
@@ -309,7 +309,7 @@ def joined_table(table: pd.DataFrame) -> pd.DataFrame:
 
 STUDY = ChartStudy(
     "charts",
-    "in which coordinates local maps are honest, and the filters and optima that are made of them",
+    "in which coordinates local maps are consistent, and the filters and optima that are made of them",
     WORLDS,
     QUICK_WORLDS,
     trials=10,

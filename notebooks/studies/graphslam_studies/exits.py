@@ -120,7 +120,7 @@ def inside_table(table: pd.DataFrame, probability: float = 0.95) -> pd.DataFrame
 
 STUDY = ExitsStudy(
     "exits",
-    "honesty of exits: drawn robots that nothing was fitted on, told what a data sheet says, in drawn garages",
+    "consistency of exits: random robots with data sheet noise in random garages, nothing tuned on them",
     WORLDS,
     QUICK_WORLDS,
     trials=10,

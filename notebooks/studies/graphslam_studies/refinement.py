@@ -86,7 +86,7 @@ def gain_table(table: pd.DataFrame) -> pd.DataFrame:
 
 STUDY = RefinementStudy(
     "refinement",
-    "the solved path refined by its scans: errors, honesty, wrong loops in the start, robots never tuned on",
+    "the solved path refined by its scans: errors, consistency, wrong loops in the start, robots never tuned on",
     WORLDS,
     QUICK_WORLDS,
     trials=10,

@@ -160,7 +160,7 @@ def decision_table(table: pd.DataFrame) -> pd.DataFrame:
 
 STUDY = SegMapGraph(
     "segmap-graph",
-    "from the SegMap to one graph: paths, entropies, honesty of nodes and decisions on loops, beside the filters",
+    "from the SegMap to one graph: paths, entropies, consistency of nodes and decisions on loops, beside the filters",
     WORLDS,
     QUICK_WORLDS,
 )

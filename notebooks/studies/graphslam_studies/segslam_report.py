@@ -143,7 +143,7 @@ def time_table(table: pd.DataFrame, timings: pd.DataFrame) -> pd.DataFrame:
 
 
 def nees_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Honesty of the segments' exits by covariance: mean NEES per degree of freedom, 1 if honest.
+    """Honesty of the segments' exits by covariance: mean NEES per degree of freedom, 1 if consistent.
 
     ``low … high``: bounds of the mean over the runs, whose segments hang together. ``honest_low … honest_high``: where
     the mean of as many independent honest ones lies. ``inside``: share in the 95 % region, over all segments.

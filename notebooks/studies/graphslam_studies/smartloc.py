@@ -227,7 +227,8 @@ class SmartLocStudy(WorldsStudy[SmartLocTrialConfig]):
 _RECORDED = SmartLocTrialConfig(grids=GRIDS)
 STUDY = SmartLocStudy(
     "smartloc",
-    "raw pseudoranges among high buildings: error and honesty, hyper-parameters chosen on the other half of the log",
+    "raw pseudoranges among high buildings: error and consistency, hyper-parameters chosen on the other half of the "
+    "log",
     {"first-to-second": _RECORDED, "second-to-first": replace(_RECORDED, scored=0)},
     {"street": SmartLocTrialConfig(street=SatelliteConfig(), grids=QUICK_GRIDS, windows=2, every=3)},
     trials=1,

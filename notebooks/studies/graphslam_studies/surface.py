@@ -67,7 +67,7 @@ class SurfaceStudy(WorldsStudy[SurfaceTrialConfig]):
 
 STUDY = SurfaceStudy(
     "surface",
-    "Surfaces of a simulated world: level set, truncated distance, log-odds and Poisson beside the truth.",
+    "Surfaces of a simulated world: level set, truncated distance, log-odds and Poisson beside ground truth.",
     WORLDS,
     QUICK_WORLDS,
     trials=3,

@@ -68,7 +68,7 @@ class TerrainStudy(WorldsStudy[TerrainTrialConfig]):
                 out[f"{world}: false alarms by ring [m], coverage of 0.8–8 m ahead"] = alarms
             calibrated = calibration(rows)
             if len(calibrated):
-                out[f"{world}: probabilities against the truth"] = calibrated
+                out[f"{world}: probabilities against ground truth"] = calibrated
         out["what the figures hold for"] = conditions(
             {**self.full, **self.quick}, [str(w) for w in table["world"].unique()]
         )

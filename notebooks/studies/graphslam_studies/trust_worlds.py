@@ -72,9 +72,9 @@ class TrustWorld:
         if self.scale != 1.0:
             out.append(f"wheels {100 * (self.scale - 1):+.1f} %")
         if self.tails:
-            out.append(f"{100 * self.tails:.0f} % wild sightings")
+            out.append(f"{100 * self.tails:.0f} % outlier observations")
         if self.lasting_odometry[0]:
-            out.append(f"lasting odometry ×{self.lasting_odometry[0]:.1f}, {self.lasting_odometry[1]:.0f} s")
+            out.append(f"time-correlated odometry ×{self.lasting_odometry[0]:.1f}, {self.lasting_odometry[1]:.0f} s")
         if self.gps in ("lasting", "lasting-white", "multipath"):
             out.append(f"GPS {self.gps}" + (f", {self.gps_time:.0f} s" if self.gps != "multipath" else ""))
         return "; ".join(out) or "nothing"

@@ -249,7 +249,7 @@ _FLIGHT = WithheldConfig(source="euroc-mh01-imu-leica", every=1.0)
 _DRIVE = WithheldConfig(source="gtsam-kitti-gps", every=2.0)
 STUDY = WithheldStudy(
     "withheld-fixes",
-    "positions that nobody was told, foretold by an IMU or by steady motion: error and honesty on recorded logs",
+    "predicting withheld GPS fixes with an IMU or constant-velocity model: error and consistency on recorded logs",
     {
         "euroc-1s": _FLIGHT,
         "euroc-2s": replace(_FLIGHT, every=2.0),

@@ -194,7 +194,7 @@ def test_clouds_with_their_poses_pass_and_poses_the_wrong_way_round_do_not(tmp_p
 
 def test_one_time_for_all_points_of_a_scan(tmp_path: Path) -> None:
     folder = small.cloud_folder(tmp_path / "a", "ply", table="tum", n=16)
-    assert "have no times" in faults(checked(folder)[1])["points-without-times"]
+    assert "point times of clouds: none" in faults(checked(folder)[1])["points-without-times"]
     ply_with_one_time(folder)
     code, lines = checked(folder)
     assert code == 1

@@ -96,7 +96,7 @@ def test_ctrl_c_in_a_run_is_one_line_that_says_how_to_go_on(tmp_path: Path) -> N
         said = run.communicate()[1]
     assert run.returncode == 130, said
     last = said.splitlines()[-1]
-    assert last.startswith("graphslam: interrupted; finished submaps are kept; go on with:")
+    assert last.startswith("graphslam: interrupted; finished submaps are saved; resume with:")
     assert last.endswith(f"{' '.join(typed[2:])} --resume")
     assert "Traceback" not in said
     more = subprocess.run([*command, *typed, "--resume", "--json"], capture_output=True, text=True, check=True)

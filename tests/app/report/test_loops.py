@@ -127,7 +127,7 @@ def test_every_decision_with_its_reason(copy: Path) -> None:
     assert first["gates"] == "fitness 0.9, fitness_known 0.93, margin 0.2"
     history = next(t for t in page.tables if t.section == "loops" and len(t.rows[0]) == 6).records()
     assert [(r["loop"], r["verdict"]) for r in history] == [("1", "accepted"), ("1", "undone")]
-    assert "1 refused by their registration" in page.sections["loops"]
+    assert "1 rejected by registration" in page.sections["loops"]
 
 
 def test_hypotheses_and_runners_up(copy: Path) -> None:

@@ -80,7 +80,7 @@ def test_thinning_is_spread_and_always_the_same(room: SensorLog) -> None:
     drops = DropCounter()
     full, thin = make_steps(room), make_steps(room, StepConfig(most_points=20), drops=drops)
     assert np.all(np.diff(thin.offsets) == 20)
-    assert drops.counts["scanner: beam left out, 20 a step are kept"] == len(full.points) - len(thin.points)
+    assert drops.counts["scanner: beams thinned out (20 per step kept)"] == len(full.points) - len(thin.points)
     for k in range(len(full)):
         chosen = stratified_indices(int(full.offsets[k + 1] - full.offsets[k]), 20)
         for a, b in zip(thin.scan(k), full.scan(k)):

@@ -33,10 +33,10 @@ def test_readings_that_say_nothing_are_counted(room: SensorLog) -> None:
     drops = DropCounter()
     steps = make_steps(spoiled(room, scanner=replace(scans, ranges=ranges)), drops=drops)
     assert drops.counts == {
-        "scanner: beam without a reading": 16,
+        "scanner: beams without a reading": 16,
         "scanner: scan without a reading": 1,
         "scanner: nearer than 0.1 m": 2,
-        "scanner: scan that met nothing (kept)": 1,
+        "scanner: scan without a hit (kept)": 1,
     }
     assert len(steps.points) == len(clean.points) - 18
     assert np.sum(~steps.returns) >= np.sum(~clean.returns) + 10
@@ -55,7 +55,7 @@ def test_a_scanner_that_sees_nothing_gives_steps_all_the_same(room: SensorLog, v
         assert drops.counts["steps: step without a beam (kept)"] == 10
     else:
         np.testing.assert_allclose(np.linalg.norm(steps.points - steps.origins, axis=1), 8.0)
-        assert drops.counts["scanner: scan that met nothing (kept)"] == len(scans.times)
+        assert drops.counts["scanner: scan without a hit (kept)"] == len(scans.times)
 
 
 def test_a_pause_of_the_scanner_leaves_empty_steps(room: SensorLog) -> None:
@@ -99,7 +99,7 @@ def test_clocks_that_differ(room: SensorLog) -> None:
     scans = room["scanner"]
     drops = DropCounter()
     steps = make_steps(spoiled(room, scanner=replace(scans, times=scans.times + 1.0)), drops=drops)
-    assert drops.counts["scanner: beam outside the motion"] > 150
+    assert drops.counts["scanner: beams without odometry at their time"] > 150
     assert len(steps) == 8
     with pytest.raises(DataError, match="are the clocks the same"):
         make_steps(spoiled(room, scanner=replace(scans, times=scans.times + 100.0)))

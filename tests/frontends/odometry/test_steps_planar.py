@@ -21,7 +21,7 @@ def test_beams_that_came_back_with_nothing_may_say_nothing() -> None:
     free, silent = make_steps(log), make_steps(log, StepConfig(silent="unknown"), drops=drops)
     assert not free.returns.all()  # the corners are farther than the laser sees
     assert silent.returns.all()
-    assert drops.counts["laser: beam without a range"] == len(free.points) - len(silent.points) > 0
+    assert drops.counts["laser: beams without a range"] == len(free.points) - len(silent.points) > 0
     np.testing.assert_array_equal(free.points[free.returns], silent.points)
     # what is cut at a shorter range did come back: it stays, as free space
     cut = make_steps(log, StepConfig(silent="unknown", max_range=3.5))

@@ -90,7 +90,7 @@ def full_batch(
     increments, covariances : (n, 3), (n, 3, 3)
         Dead reckoning into every scan (right tangent at the later pose); the first from the base.
     observations : LandmarkObservations
-        n scans; observations without identity (-1) are not used.
+        n scans; observations without an id (-1) are not used.
     initial_poses : (n, 3)
         Bases at the scans in the frame of the first base. Dead reckoning over kilometres is too poor a start: give the
         path of a solved submap graph.

@@ -99,7 +99,7 @@ def plot_ci(
     what = f"{confidence:.0%} bounds of the {statistic}, {fewest} run{'s' if fewest != 1 else ''}"
     ax.axhspan(low, high, color=style.BOUNDS, alpha=0.8, lw=0, label=what, zorder=0)
     honest = (stats.chi2.ppf(0.5, n) if statistic == "median" else n) / q
-    ax.axhline(honest, color=style.GREY, lw=0.9, ls=":", label=f"{statistic} if honest", zorder=1)
+    ax.axhline(honest, color=style.GREY, lw=0.9, ls=":", label=f"{statistic} if consistent", zorder=1)
     ax.axhline(1.0, color=style.BLACK, lw=0.8, ls="--", label="CI = 1", zorder=1)
     if log or (log is None and top > 10.0 * max(high, 1.0)):
         ax.set_yscale("log")
