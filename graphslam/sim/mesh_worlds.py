@@ -43,7 +43,7 @@ class MeshWorld:
 
 MESH_WORLDS: dict[str, MeshWorld] = {
     "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
-    "court": MeshWorld("graphslam.sim.court", "court"),
+    "court": MeshWorld("graphslam.sim.ring_hall", "ring_hall"),
 }
 
 

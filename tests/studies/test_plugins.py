@@ -17,7 +17,7 @@ from graphslam.app.run.front_ends import check_name, make_front_end
 from graphslam.core import plugins
 from graphslam.core.errors import MissingExtraError, UnknownNameError
 from graphslam.io.cards import list_cards
-from graphslam.io.readers import reader, readers
+from graphslam.io.readers import find_reader, list_readers
 
 ROOT = Path(__file__).resolve().parents[2]
 HOW = r"is part of graphslam-studies, which is not installed; wanted pip install ./notebooks/studies"
@@ -57,16 +57,16 @@ def test_functions_say_what_to_install(call: Callable[[], Any]) -> None:
         (lambda: gs.simulate("point-field"), "world 'point-field'"),
         (lambda: make_front_end("ekf-slam", {}), "front end 'ekf-slam'"),
         (lambda: check_name("rbpf-slam"), "front end 'rbpf-slam'"),
-        (lambda: reader("mrclam"), "reader 'mrclam'"),
+        (lambda: find_reader("mrclam"), "reader 'mrclam'"),
     ],
 )
 def test_names_that_moved_say_what_to_install(call: Callable[[], Any], what: str) -> None:
-    readers.cache_clear()
+    list_readers.cache_clear()
     try:
         with pytest.raises(MissingExtraError, match=f"^{what} {HOW}"):
             call()
     finally:
-        readers.cache_clear()
+        list_readers.cache_clear()
 
 
 def test_cards_name_the_distribution_of_their_reader() -> None:
@@ -79,12 +79,12 @@ def test_cards_name_the_distribution_of_their_reader() -> None:
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("name", ["plaza1", "mrclam-dataset7/robot1", "lidar3d-hku1"])
 def test_a_card_says_what_reads_it(name: str) -> None:
-    readers.cache_clear()
+    list_readers.cache_clear()
     try:
         with pytest.raises(MissingExtraError, match=HOW):
             gs.load(name)
     finally:
-        readers.cache_clear()
+        list_readers.cache_clear()
 
 
 @pytest.mark.usefixtures("alone")

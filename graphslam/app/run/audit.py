@@ -12,7 +12,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.association import match_observations, pair_agreement
 from graphslam.evaluate.metrics import Metrics
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam_frontends.base import FrontEnd
 
 logger = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ def reference_labels(log: SensorLog, observations: LandmarkObservations) -> Ints
         return None
     card, reader = PUBLISHED[log.name]
     try:
-        published: LandmarkObservations = load(card, reader=reader)
+        published: LandmarkObservations = load_recording(card, reader=reader)
     except GraphSlamError as error:
         logger.info("association is not audited: %s", error)
         return None

@@ -15,7 +15,7 @@ from graphslam.core.submap import Submap
 from graphslam_frontends.base import FrontEnd, Watch
 from graphslam_frontends.landmarks.ekf import EkfRun, require_bearings
 from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfFilterConfig
-from graphslam_frontends.landmarks.prepare import Prepared, prepare
+from graphslam_frontends.landmarks.prepare import PreparedLog, prepare_log
 from graphslam_studies.frontends.snapshot import Snapshot
 
 OnScan = Callable[[int], None]
@@ -31,8 +31,8 @@ class EkfSlamConfig(EkfFilterConfig):
         return None
 
 
-def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCounter | None) -> Prepared:
-    data = prepare(log, config, drops if drops is not None else DropCounter())
+def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCounter | None) -> PreparedLog:
+    data = prepare_log(log, config, drops if drops is not None else DropCounter())
     require_bearings(data, log.name)
     return data
 

@@ -6,75 +6,79 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from graphslam.io.look import Claim, Look, plain_name
 from graphslam.io.reader import Reader
-from graphslam.io.recognise import rows_of
+from graphslam.io.recognise import first_rows
+from graphslam.io.source_probe import ReaderMatch, SourceProbe, plain_name
 
 
-def _slsjf_maps(look: Look) -> Claim | None:
+def _slsjf_maps(look: SourceProbe) -> ReaderMatch | None:
     found = [p for p in look.by_ending.get(".mat", []) if re.fullmatch(r"localmap_\d+\.mat", p.name)]
     if not found:
         return None
-    return Claim(f"{len(found)} local maps of 2D I-SLSJF") if look.path.is_dir() else Claim("a local map", "its folder")
+    return (
+        ReaderMatch(f"{len(found)} local maps of 2D I-SLSJF")
+        if look.path.is_dir()
+        else ReaderMatch("a local map", "its folder")
+    )
 
 
-def _slsjf_network(look: Look) -> Claim | None:
+def _slsjf_network(look: SourceProbe) -> ReaderMatch | None:
     found = [p for p in look.by_ending.get(".mat", []) if b"clean_data" in look.head(p)[128:4096]]
     found += [p for p in look.by_ending.get(".mat", []) if p.name.lower().endswith("clean_data.mat") and p not in found]
-    return Claim(f"odometry and observations of 2D I-SLSJF ({found[0].name})") if found else None
+    return ReaderMatch(f"odometry and observations of 2D I-SLSJF ({found[0].name})") if found else None
 
 
-def _ufastslam(look: Look) -> Claim | None:
+def _ufastslam(look: SourceProbe) -> ReaderMatch | None:
     found = look.named("ufastslam_observationdistance.txt")
-    return Claim("detections of trees as UFastSLAM publishes them") if found and look.path.is_dir() else None
+    return ReaderMatch("detections of trees as UFastSLAM publishes them") if found and look.path.is_dir() else None
 
 
-def _mrclam(look: Look) -> Claim | None:
+def _mrclam(look: SourceProbe) -> ReaderMatch | None:
     robots = [p for p in look.files if re.fullmatch(r"robot\d+_odometry\.dat", plain_name(p))]
     if not robots:
         return None
     said = f"UTIAS MRCLAM, {len(robots)} robots"
     if look.path.is_file() or len({p.parent for p in robots}) > 1:
-        return Claim(said, "the one folder that holds Barcodes.dat and the files of its robots")
+        return ReaderMatch(said, "the one folder that holds Barcodes.dat and the files of its robots")
     if look.named("barcodes.dat") is None:
-        return Claim(said, "Barcodes.dat beside them: which barcode is which landmark")
-    return Claim(said)
+        return ReaderMatch(said, "Barcodes.dat beside them: which barcode is which landmark")
+    return ReaderMatch(said)
 
 
-def _plaza(look: Look) -> Claim | None:
+def _plaza(look: SourceProbe) -> ReaderMatch | None:
     tables = [p for p in look.files if re.fullmatch(r".+_dr\.txt", plain_name(p))]
-    tables = [p for p in tables if (r := rows_of(look, p)) and all(len(x) == 3 for x in r)]
+    tables = [p for p in tables if (r := first_rows(look, p)) and all(len(x) == 3 for x in r)]
     if not tables:
         return None
     prefix = plain_name(tables[0])[: -len("_dr.txt")]
     said = f"Plaza (range only), {tables[0].name}"
     if look.path.is_file() or look.named(f"{prefix}_td.txt") is None:
-        return Claim(said, f"the folder with {prefix}_TD.txt, the ranges, in it")
-    return Claim(said)
+        return ReaderMatch(said, f"the folder with {prefix}_TD.txt, the ranges, in it")
+    return ReaderMatch(said)
 
 
-def _tagged(look: Look, tags: tuple[str, ...]) -> Path | None:
+def _tagged(look: SourceProbe, tags: tuple[str, ...]) -> Path | None:
     return next((p for p in look.texts if look.lines(p, 1)[0].split()[0] in tags), None)
 
 
-def _tuc(look: Look) -> Claim | None:
+def _tuc(look: SourceProbe) -> ReaderMatch | None:
     path = _tagged(look, ("odom2", "loop"))
-    return Claim(f"odometry and loop candidates of TU Chemnitz ({path.name})") if path else None
+    return ReaderMatch(f"odometry and loop candidates of TU Chemnitz ({path.name})") if path else None
 
 
-def _smartloc(look: Look) -> Claim | None:
+def _smartloc(look: SourceProbe) -> ReaderMatch | None:
     path = _tagged(look, ("odom3", "pseudorange3"))
-    return Claim(f"odometry and pseudoranges of smartLoc ({path.name})") if path else None
+    return ReaderMatch(f"odometry and pseudoranges of smartLoc ({path.name})") if path else None
 
 
-def _kitti_gps(look: Look) -> Claim | None:
+def _kitti_gps(look: SourceProbe) -> ReaderMatch | None:
     path = next((p for p in look.texts if look.lines(p, 1)[0].split() == ["Time,X,Y,Z"]), None)
-    return Claim(f"positions of KITTI as GTSAM ships them ({path.name})") if path else None
+    return ReaderMatch(f"positions of KITTI as GTSAM ships them ({path.name})") if path else None
 
 
-def _lidar_pack(look: Look) -> Claim | None:
+def _lidar_pack(look: SourceProbe) -> ReaderMatch | None:
     found = look.named("xyz_i16_planar.npy")
-    return Claim("packed clouds (int16)") if found is not None and look.path.is_dir() else None
+    return ReaderMatch("packed clouds (int16)") if found is not None and look.path.is_dir() else None
 
 
 def _parts() -> Iterator[tuple[str, dict[str, int]]]:
@@ -82,7 +86,7 @@ def _parts() -> Iterator[tuple[str, dict[str, int]]]:
         yield f"robot{k}", {"robot": k}
 
 
-def _never(look: Look) -> Claim | None:
+def _never(look: SourceProbe) -> ReaderMatch | None:
     """Recognises nothing: it is asked for by name."""
     return None
 
