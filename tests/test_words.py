@@ -20,8 +20,6 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
 RATCHET = ROOT / "tests" / "words_ratchet.toml"
 # idiom → plain words
