@@ -51,7 +51,7 @@ _TYPES = {
 }
 _NAMES = {**_VERBS, **_LISTS, **_TYPES}
 
-# rooms with a face of their own (graphslam.core.face): ``gs.plots.plot_scan``
+# rooms with a face of their own (graphslam.core.lazy_exports): ``gs.plots.plot_scan``
 _ROOMS = ("backend", "core", "evaluate", "evidence", "io", "join", "loops", "maps", "plots", "sim")
 
 __all__ = ["__version__", "plots", *_NAMES]

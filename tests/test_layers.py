@@ -195,14 +195,14 @@ MORE_ARGUMENTS = {
     "evidence/cast_kernels.py": {"cast_rays"},
     "evidence/cube_kernels.py": {
         *("fill_cube", "build_tree", "uniform_cube", "share_cubes", "add_brick", "make_path", "find_states"),
-        "settle_occupied",
+        "finalise_occupied",
     },
     "evidence/mark_kernels.py": {"mark_grids"},
     "evidence/merge_kernels.py": {"sample_bricks"},
-    "evidence/octomap_kernels.py": {"write_tree", "look_at", "write_brick", "read_tree"},
-    "evidence/query_kernels.py": {"look_up", "count_private"},
-    "evidence/tree_kernels.py": {"write_bricks", "own_parent", "own_roots"},
-    "evidence/update_kernels.py": {"resolve_grids", "apply_grids", "settle_grids"},
+    "evidence/octomap_kernels.py": {"write_tree", "tree_node_state", "write_brick", "read_tree"},
+    "evidence/query_kernels.py": {"look_up_values", "count_private"},
+    "evidence/tree_kernels.py": {"write_bricks", "unique_parent", "unique_roots"},
+    "evidence/update_kernels.py": {"resolve_writes", "apply_grids", "finalise_writes"},
 }
 """Kernels on the trees of evidence grids that have more arguments still; no others."""
 

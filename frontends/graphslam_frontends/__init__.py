@@ -1,8 +1,8 @@
 """Layer 2: front ends: sensor data in, submaps out. Imports no gtsam."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "odometry.make_steps": "make_steps",
     "detectors.trees": "TreeDetectorConfig detect_trees",
     "grid.config": "GridFilterConfig",
@@ -10,10 +10,10 @@ _FACE = {
     "grid.rbpf_grid": "run_rbpf",
     "segslam.segslam": "run_segslam",
     "segslam.config": "HandoverConfig",
-    "segslam.front_end": "settled",
-    "segslam.submaps": "exits_of_interval settled_chain",
-    "segslam.sampling": "grow root_of_segment",
+    "segslam.front_end": "submaps_of_best_particle",
+    "segslam.submaps": "exits_of_interval common_ancestor_chain",
+    "segslam.sampling": "grow_sample root_of_segment",
     "lidar_odometry.config": "LidarOdometryConfig",
     "lidar_odometry.odometry": "LidarOdometry",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

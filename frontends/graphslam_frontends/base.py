@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
-from graphslam.core.feed import Feed
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import Submap
 from graphslam_frontends.odometry.steps import Steps
 
 Watch: TypeAlias = Callable[[Any], None]
-"""Takes the progress of a front end, of its own kind (``segslam``: `graphslam_frontends.segslam.progress.Progress`)."""
+"""Takes the progress of a front end, of its own kind (``segslam``:
+`graphslam_frontends.segslam.progress.SegSlamProgress`)."""
 
 
 @runtime_checkable
@@ -53,12 +54,12 @@ class FrontEnd(Protocol):
         watch : callable or None
             Called with the front end's own progress after every step that it can show; changes nothing.
         """
-        found = self.follow(Feed(log), seed=seed, after=after, drops=drops, watch=watch)
+        found = self.follow(RecordSource(log), seed=seed, after=after, drops=drops, watch=watch)
         return (submap for submap in found if submap is not None)
 
     def follow(
         self,
-        feed: Feed,
+        feed: RecordSource,
         *,
         seed: SeedTree,
         after: Submap | None = None,

@@ -7,7 +7,7 @@ from typing import Any
 
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam_frontends.base import FrontEnd
-from graphslam_frontends.odometry.scan_use import checked_steps
+from graphslam_frontends.odometry.scan_use import check_steps
 from graphslam_frontends.odometry.steps import Steps
 
 
@@ -20,7 +20,7 @@ class StepwiseFrontEnd(FrontEnd):
     def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
         """The steps of a log; those of the last one are kept."""
         if not (self._made and self._made[0] is log):
-            self._made[:] = [log, checked_steps(log, self.config.steps, drops)]
+            self._made[:] = [log, check_steps(log, self.config.steps, drops)]
         made: Steps = self._made[1]
         return made
 

@@ -17,8 +17,8 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.poses import group_of
 from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error
 from graphslam.evaluate.map_error import match_ids
-from graphslam.join.association import Association
-from graphslam.join.registry import Material, association_of, identify, methods_for, prepared
+from graphslam.join.association import MapAssociationConfig
+from graphslam.join.registry import Material, association_of, identify_landmarks, methods_for, prepare_submaps
 from graphslam.join.submap_solver import SubmapEstimate
 
 logger = logging.getLogger(__name__)
@@ -114,13 +114,13 @@ def _judge(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth | None
     }
 
 
-def compare(
+def compare_methods(
     submaps: Material,
     methods: Sequence[str] = DEFAULT_METHODS,
     *,
     truth: MapTruth | None = None,
     polish: bool = True,
-    associate: str | Association = "given",
+    associate: str | MapAssociationConfig = "given",
     covariance_scale: float = 1.0,
     memory: bool = True,
     progress: bool = False,
@@ -156,16 +156,16 @@ def compare(
         time, polish included; ``nnz`` the stored entries of the information matrix (of the dense covariance for an
         unpolished EKF).
     """
-    submaps = prepared(submaps, associate=associate, covariance_scale=covariance_scale)
+    submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
     way = methods_for(submaps)
     for m in methods:
         way.check(m)
     association = association_of(associate)
     if association is not None and isinstance(submaps, Sequence):
-        submaps = identify(submaps, association, progress=progress)
+        submaps = identify_landmarks(submaps, association, progress=progress)
         # Recognised landmarks have names of their own; only the poses can be held against the truth.
         truth = None if truth is None else _poses_only(truth)
-    keys = keys_of(submaps)
+    keys = submap_keys(submaps)
     rows = []
     for method in tqdm(methods, desc="compare", unit="method", disable=not progress):
         own: dict[str, Any] = {}
@@ -194,12 +194,12 @@ def compare(
     return pd.DataFrame(rows)
 
 
-def keys_of(submaps: Material) -> list[int]:
+def submap_keys(submaps: Material) -> list[int]:
     """Keys of the submaps."""
     return [s.key for s in submaps] if isinstance(submaps, Sequence) else submaps.keys.tolist()
 
 
-def dof_of(submaps: Material, estimate: SubmapEstimate) -> int:
+def degrees_of_freedom(submaps: Material, estimate: SubmapEstimate) -> int:
     """Scalars that submaps and their ties measure, less the free ones."""
     if not isinstance(submaps, Sequence):
         return submaps.dof
@@ -217,7 +217,7 @@ def _describe(method: str, submaps: Material, estimate: SubmapEstimate) -> dict[
         "states": estimate.states,
         "landmarks": len(estimate.landmark_ids),
         "nnz": estimate.nnz,
-        "dof": dof_of(submaps, estimate),
+        "dof": degrees_of_freedom(submaps, estimate),
     }
 
 
@@ -301,10 +301,10 @@ def join_json(
     own : SubmapEstimate, optional
         The map before its refinement.
     """
-    before = {} if own is None else _judge(own, keys_of(submaps), truth)
+    before = {} if own is None else _judge(own, submap_keys(submaps), truth)
     row = {
         **_describe(method, submaps, estimate),
-        **_judge(estimate, keys_of(submaps), truth),
+        **_judge(estimate, submap_keys(submaps), truth),
         "nees_unpolished": before.get("nees"),
         "ci_unpolished": before.get("ci"),
     }

@@ -10,11 +10,11 @@ from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameE
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.evaluate.log_checks import check_log
-from graphslam.evaluate.stream_checks import Noticed
-from graphslam.io.catalog import load
+from graphslam.evaluate.stream_checks import StreamFinding
+from graphslam.io.catalog import load_recording
 
 
-def check_source(source: str | Path, *, reader: str | None = None, **options: Any) -> list[Noticed]:
+def check_source(source: str | Path, *, reader: str | None = None, **options: Any) -> list[StreamFinding]:
     """Check a source for errors: its files, their content, and whether a front end can use it.
 
     Parameters
@@ -25,26 +25,28 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
 
     Returns
     -------
-    list of Noticed
+    list of StreamFinding
         The first line describes the log. An unreadable source is a line of level ``bad``.
     """
     try:
-        log = load(source, reader=reader, **options)
+        log = load_recording(source, reader=reader, **options)
     except UnknownNameError:
         raise
     except GraphSlamError as error:
-        return [Noticed("", Finding("bad", "unreadable", str(error)))]
+        return [StreamFinding("", Finding("bad", "unreadable", str(error)))]
     if not isinstance(log, SensorLog):
         text = f"{source}: not a sensor log — not checked. `graphslam solve` checks pose-graph files."
-        return [Noticed("", Finding("", "read", text))]
-    said = [Noticed("", Finding("", "read", f"{reading_line(log) or log.name}."))]
-    said += [Noticed("", Finding("", "left-out", f"dropped by the reader: {n} {what}.")) for what, n in _lost(log)]
+        return [StreamFinding("", Finding("", "read", text))]
+    said = [StreamFinding("", Finding("", "read", f"{reading_line(log) or log.name}."))]
+    said += [
+        StreamFinding("", Finding("", "left-out", f"dropped by the reader: {n} {what}.")) for what, n in _lost(log)
+    ]
     said += check_log(log)
     try:
         choice = choose_front_end(log)
-        said.append(Noticed("", Finding("", "front-end", f"front end: {choice.frontend} — {choice.why}.")))
+        said.append(StreamFinding("", Finding("", "front-end", f"front end: {choice.frontend} — {choice.why}.")))
     except MissingDataError as error:
-        said.append(Noticed("", Finding("look", "no-front-end", str(error))))
+        said.append(StreamFinding("", Finding("look", "no-front-end", str(error))))
     return said
 
 
@@ -52,7 +54,7 @@ def _lost(log: SensorLog) -> list[tuple[str, int]]:
     return [(what, n) for what, n in log.dropped.items() if not what.endswith("(kept)")]
 
 
-def summary(found: list[Noticed]) -> str:
+def check_summary(found: list[StreamFinding]) -> str:
     """The last line: whether to run."""
     bad = sum(n.finding.level == "bad" for n in found)
     look = sum(n.finding.level == "look" for n in found)

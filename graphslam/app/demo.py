@@ -17,9 +17,9 @@ from graphslam.core.atomic import part_path
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam.plots.segments import plot_segments
-from graphslam_frontends.segslam.progress import Progress
+from graphslam_frontends.segslam.progress import SegSlamProgress
 
 logger = logging.getLogger(__name__)
 
@@ -33,11 +33,11 @@ def demo_log(preset: str, seed: int) -> SensorLog:
         raise UnknownNameError("size of the demo", preset, PRESETS)
     if preset == "garage":
         return simulate("garage", seed=seed)
-    from graphslam.sim.court import court
     from graphslam.sim.crawler import simulate_crawler
     from graphslam.sim.crawler_config import CrawlerConfig
+    from graphslam.sim.ring_hall import ring_hall
 
-    return simulate_crawler(court(seed=seed), seed, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=seed), seed, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool = True) -> Run:
@@ -82,7 +82,7 @@ class DemoProgress(Observer):
     def __exit__(self, *_: object) -> None:
         self.bar.close()
 
-    def front_end_at(self, at: Progress) -> None:
+    def front_end_at(self, at: SegSlamProgress) -> None:
         """After every step of the filter."""
         if self.bar.total is None:
             self.bar.total = at.steps
@@ -99,17 +99,17 @@ class DemoProgress(Observer):
             self.bar.set_description("segments → graph → fused map")
         self.bar.set_postfix_str(where, refresh=last)
 
-    def draw(self, at: Progress) -> None:
+    def draw(self, at: SegSlamProgress) -> None:
         """The picture, in place of the one before."""
         self.picture.parent.mkdir(parents=True, exist_ok=True)
         paths = at.paths()
         truth = self.truth
         if truth is not None:  # as the map is, in the frame of the first base
-            from graphslam.core.poses import group_of, level
+            from graphslam.core.poses import group_of, remove_roll_pitch
 
-            truth = truth.transformed(group_of(truth.poses).inverse(level(truth.poses[0])))
+            truth = truth.transformed(group_of(truth.poses).inverse(remove_roll_pitch(truth.poses[0])))
         title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closure yet"
         ax = plot_segments(None, paths, truth=truth, title=title)
         part = part_path(self.picture, ".png")
-        save(ax, part)
+        save_figure(ax, part)
         part.replace(self.picture)

@@ -27,7 +27,7 @@ REQUIRED = {
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class InstallCheck:
     """One line of the examination."""
 
     name: str
@@ -35,9 +35,9 @@ class Finding:
     detail: str
 
 
-def examine() -> list[Finding]:
+def examine_installation() -> list[InstallCheck]:
     """Python, packages, extras and what each buys, data roots, front ends; "absent" is an optional part."""
-    found = [Finding("python", "ok", f"{platform.python_version()}, {os.cpu_count()} cores, {platform.system()}")]
+    found = [InstallCheck("python", "ok", f"{platform.python_version()}, {os.cpu_count()} cores, {platform.system()}")]
     for name, module in REQUIRED.items():
         problem = _import_error(f"import {module}")
         found.append(_finding(name, problem))
@@ -48,26 +48,30 @@ def examine() -> list[Finding]:
         problem = _import_error(code) if there else "not installed"
         advice = f"{e.buys}: pip install 'graphslam-submaps[{extra}]' (about {e.size} MB)"
         detail = e.buys if not problem else advice if not there else f"{problem} ({e.buys})"
-        found.append(Finding(f"extra {extra}", "absent" if problem else "ok", detail))
+        found.append(InstallCheck(f"extra {extra}", "absent" if problem else "ok", detail))
     names = front_end_names()
     state: Literal["ok", "missing"] = "ok" if names else "missing"
     found.append(
-        Finding("front ends", state, ", ".join(names) or "none registered: install the package (pip install -e .)")
+        InstallCheck("front ends", state, ", ".join(names) or "none registered: install the package (pip install -e .)")
     )
     for root in data_roots()[:-1]:
-        found.append(Finding("data root", "ok" if root.is_dir() else "absent", str(root)))
+        found.append(InstallCheck("data root", "ok" if root.is_dir() else "absent", str(root)))
     cache = cache_folder()
-    found.append(Finding("data cache", "ok" if cache.is_dir() else "absent", f"{cache} (made by graphslam data fetch)"))
+    found.append(
+        InstallCheck("data cache", "ok" if cache.is_dir() else "absent", f"{cache} (made by graphslam data fetch)")
+    )
     return found
 
 
-def _finding(name: str, problem: str) -> Finding:
+def _finding(name: str, problem: str) -> InstallCheck:
     try:
         number = version(name)
     except PackageNotFoundError:
         number = "not installed"
     return (
-        Finding(name, "missing", f"{number}: {problem}; pip install {name}") if problem else Finding(name, "ok", number)
+        InstallCheck(name, "missing", f"{number}: {problem}; pip install {name}")
+        if problem
+        else InstallCheck(name, "ok", number)
     )
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.folders.generations import name_inside, new_generation
-from graphslam.app.folders.lock import locked
-from graphslam.app.run.outputs import open_run
+from graphslam.app.folders.lock import lock_folder
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
 from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
@@ -164,7 +164,7 @@ def export(
         raise ConfigError(
             f"{format} needs a datum: latitude and longitude of the GPS frame's origin, or of the first base"
         )
-    opened = run if isinstance(run, Run) else open_run(run)
+    opened = run if isinstance(run, Run) else read_run_folder(run)
     home = opened.folder
     if format in ("nav2", "autoware"):
         if out is None:
@@ -184,9 +184,9 @@ def export(
     if home is None or name is None:
         write(Path(out or ""), opened)
         return Path(out or "")
-    with locked(home):
+    with lock_folder(home):
         if not isinstance(run, Run):
-            opened = open_run(home)  # as it is now that nobody else changes it
+            opened = read_run_folder(home)  # as it is now that nobody else changes it
         with new_generation(home) as new:
             write(new.path / name, opened)
             new.adopt()

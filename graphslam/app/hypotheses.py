@@ -14,26 +14,26 @@ from typing import Any
 
 from tqdm import tqdm
 
-from graphslam.app.folders.generations import check_same, consistent
+from graphslam.app.folders.generations import check_same, read_consistently
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.run import Run
+from graphslam.app.run.run_inputs import read_inputs
 from graphslam.app.run.source import log_of_run
-from graphslam.app.run.taken import read_taken
 from graphslam.backend.back_end import find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions, ImuOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, hypotheses_of, solve_choice, solve_hypotheses
-from graphslam.backend.refining import Refined, refine_run
-from graphslam.backend.streams import ImuPart
-from graphslam.core.config import build
+from graphslam.backend.refining import RefinedRun, refine_run
+from graphslam.backend.streams import ImuSource
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, MissingDataError, RunFolderError
-from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.network import to_network
@@ -42,10 +42,10 @@ from graphslam.io.submap_store import read_submaps
 from graphslam.io.tum import write_tum
 from graphslam.loops.candidates import FRONT_END
 from graphslam.loops.ledger import ledger_of_events
-from graphslam.maps.alternatives import Alternative, Choice, choose
+from graphslam.maps.alternatives import Alternative, RankedAlternatives, rank_alternatives
 from graphslam.maps.export import save_maps
-from graphslam.maps.global_map import make_map
-from graphslam.maps.minimum_entropy import Candidate
+from graphslam.maps.global_map import make_global_map
+from graphslam.maps.minimum_entropy import MapHypothesis
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import REACH_MARGIN, MapConfig, RunMap, make_run_map, solved_poses
@@ -58,16 +58,16 @@ MOST = 16
 
 
 @dataclass(frozen=True)
-class Clearest:
+class MinimumEntropyMap:
     """Alternative graphs of a run, judged.
 
     Parameters
     ----------
-    choice : Choice
+    choice : RankedAlternatives
         The chosen one first.
     left_out : int
         Alternatives that were not solved.
-    refined : Refined or None
+    refined : RefinedRun or None
         The chosen one refined by its scans; None where the run is not, or where that was refused.
     refined_map : RunMap or None
         Its fused map.
@@ -75,14 +75,14 @@ class Clearest:
         What the refinement says of it.
     """
 
-    choice: Choice
+    choice: RankedAlternatives
     left_out: int
-    refined: Refined | None = None
+    refined: RefinedRun | None = None
     refined_map: RunMap | None = None
     findings: list[Finding] = field(default_factory=list)
 
 
-def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Clearest:
+def minimum_entropy_loops(run: Run, made: RunMap, *, progress: bool = True) -> MinimumEntropyMap:
     """Solve a finished run with every choice of its matches and loops, and judge the graphs and their maps.
 
     SegSLAM draws map samples and takes the one of least entropy. A run hands over one settled chain, whose matches
@@ -117,17 +117,17 @@ def clearest_of_choices(run: Run, made: RunMap, *, progress: bool = True) -> Cle
         solution = back.finish()
         ends = [*solution.base_nodes.tolist(), int(solution.exit_nodes[-1])]
         nodes = {s.key: (solution.node_times[a:b], solution.poses[a:b]) for s, a, b in zip(run.submaps, ends, ends[1:])}
-        candidate = Candidate(made.divided.pieces, solved_poses(made.divided, nodes), name)
+        candidate = MapHypothesis(made.divided.pieces, solved_poses(made.divided, nodes), name)
         taken = sum(key == LOOP for key, _ in chosen)
         facts = {"matches": len(chosen) - taken, "loops": taken}
         alternatives.append(Alternative(name, back.graph, solution, candidate, facts))
-    choice = choose(alternatives, model=made.fused.grid.model, progress=progress)
-    return _refined(run, Clearest(choice, len(every) - len(choices)), run.submaps)
+    choice = rank_alternatives(alternatives, model=made.fused.grid.model, progress=progress)
+    return _refined(run, MinimumEntropyMap(choice, len(every) - len(choices)), run.submaps)
 
 
-def clearest_of_topologies(
+def minimum_entropy_topology(
     run: Run, most: int, *, log: str | Path | SensorLog | None = None, progress: bool = True
-) -> Clearest:
+) -> MinimumEntropyMap:
     """Solve the topologies that the particles of a SegSLAM run told, and judge the graphs and their maps.
 
     The folder holds one chain of segments; the others are in the particles. So the front end works through the log once
@@ -171,29 +171,29 @@ def clearest_of_topologies(
         progress=progress,
     )
     model = next(iter(told[0].grids.values())).model
-    found = Clearest(choose(alternatives, model=model, progress=progress), left_out)
+    found = MinimumEntropyMap(rank_alternatives(alternatives, model=model, progress=progress), left_out)
     return _refined(run, found, told[found.choice.best.number].submaps)
 
 
-def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
+def _refined(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
     """The chosen alternative refined by the scans of the run, where the run is refined; all are judged without that."""
     if run.folder is None:
         return found
     values = read_options(run.folder)
-    config: RefineConfig = build(RefineConfig, values.get("refine", {}), "refine")
-    taken, generation = consistent(run.folder, read_taken) if config.use else (None, None)
+    config: RefineConfig = build_config(RefineConfig, values.get("refine", {}), "refine")
+    taken, generation = read_consistently(run.folder, read_inputs) if config.use else (None, None)
     if taken is None or taken.scans is None:
         return found
     check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
     solution = found.choice.best.alternative.solution
-    solved = make_map(solution, list(submaps), {}, 1)
+    solved = make_global_map(solution, list(submaps), {}, 1)
     gps = None
     if solution.T_gps_world is not None and run.fixes is not None:
-        gps = (run.fixes, build(GpsOptions, values.get("gps", {}), "gps"))
+        gps = (run.fixes, build_config(GpsOptions, values.get("gps", {}), "gps"))
     refined, said = refine_run(config, taken.scans, submaps, solved, gps=gps)
     if refined is None or not refined.submaps:
         return replace(found, refined=refined, findings=said)
-    options: MapConfig = build(MapConfig, values.get("map", {}), "map")
+    options: MapConfig = build_config(MapConfig, values.get("map", {}), "map")
     made = make_run_map(refined.submaps, map_of_frames(refined.map), reach=sensor_reach(values), config=options)
     return replace(found, refined=refined, refined_map=made, findings=said)
 
@@ -201,27 +201,27 @@ def _refined(run: Run, found: Clearest, submaps: Sequence[Submap]) -> Clearest:
 def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]]]:
     """How the graph of a run was made, and what makes the GPS and IMU of one graph more, as `built` takes them."""
     values: Mapping[str, Any] = read_options(run.folder) if run.folder is not None else {}
-    gps: GpsOptions = build(GpsOptions, values.get("gps", {}), "gps")
+    gps: GpsOptions = build_config(GpsOptions, values.get("gps", {}), "gps")
     if gps.use != "none" and run.fixes is None:
         raise MissingDataError(
             f"{run.folder}: the graph of this run has GPS factors, but its fixes are not in the folder",
             wanted="fixes.npz, or a run with gps.use = none",
         )
-    imu: ImuOptions = build(ImuOptions, values.get("imu", {}), "imu")
-    feed: Feed | None = None
+    imu: ImuOptions = build_config(ImuOptions, values.get("imu", {}), "imu")
+    feed: RecordSource | None = None
     if imu.use != "none" and run.folder is not None:
-        taken, generation = consistent(run.folder, read_taken)
+        taken, generation = read_consistently(run.folder, read_inputs)
         check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
-        feed = Feed(taken.log)
+        feed = RecordSource(taken.log)
 
     def streams() -> dict[str, Any]:
-        return {"fixes": run.fixes, "gps": gps, "imu": ImuPart(feed, imu) if feed and feed.names(Imu) else None}
+        return {"fixes": run.fixes, "gps": gps, "imu": ImuSource(feed, imu) if feed and feed.names(Imu) else None}
 
-    return build(BackEndConfig, values.get("backend", {}), "backend"), streams
+    return build_config(BackEndConfig, values.get("backend", {}), "backend"), streams
 
 
-def write_clearest(
-    folder: Path, found: Clearest, *, bands: Mapping[str, tuple[float, float]] | None = None
+def write_minimum_entropy(
+    folder: Path, found: MinimumEntropyMap, *, bands: Mapping[str, tuple[float, float]] | None = None
 ) -> list[Path]:
     """Keep the alternatives in a run folder.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from graphslam.app.run.summary import headline, in_metres
-from graphslam.app.run.verdict import Judged, number
+from graphslam.app.run.summary import headline, length_text
+from graphslam.app.run.verdict import ChiSquareTest, is_finite_number
 from graphslam.core.findings import Finding
 from graphslam.join.submap_solver import SubmapEstimate
 
@@ -27,7 +27,7 @@ def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Seq
         What the graph of the submaps holds besides.
     """
     out = [_state(row, estimate)]
-    judged = {j.code: j for j in join_judged(row)}
+    judged = {j.code: j for j in join_consistency_tests(row)}
     if chi2 := judged.get("chi2"):
         out.append(Finding(chi2.level, "chi2", f"chi-square at the optimum: {chi2.text}."))
     elif row.get("dof") is not None and row["objective_polished"] is not None:
@@ -35,7 +35,7 @@ def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Seq
         out.append(Finding("", "chi2", text))
     if nees := judged.get("nees"):
         before: Any = row.get("nees_unpolished")
-        said = f"; before refinement {before / nees.dof:.3g}" if number(before) else ""
+        said = f"; before refinement {before / nees.dof:.3g}" if is_finite_number(before) else ""
         out.append(Finding(nees.level, "nees", f"NEES (ground truth): {nees.text}{said}."))
     if left_out:
         text = (
@@ -46,14 +46,14 @@ def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Seq
     return out
 
 
-def join_judged(row: Mapping[str, Any]) -> list[Judged]:
+def join_consistency_tests(row: Mapping[str, Any]) -> list[ChiSquareTest]:
     """Ratios that test the covariances of a joined map."""
     out = []
     best: Any = row["objective_polished"]
-    if (dof := row.get("dof") or 0) > 0 and number(best):
-        out.append(Judged("chi2", "χ²/dof", best / dof, dof))
-    if number(row.get("nees")) and row["nees_dof"]:
-        out.append(Judged("nees", "NEES/n", row["nees"] / row["nees_dof"], row["nees_dof"]))
+    if (dof := row.get("dof") or 0) > 0 and is_finite_number(best):
+        out.append(ChiSquareTest("chi2", "χ²/dof", best / dof, dof))
+    if is_finite_number(row.get("nees")) and row["nees_dof"]:
+        out.append(ChiSquareTest("nees", "NEES/n", row["nees"] / row["nees_dof"], row["nees_dof"]))
     return out
 
 
@@ -72,9 +72,9 @@ def join_headline(row: Mapping[str, Any], findings: Sequence[Finding], *, submap
         Of the path through the nodes [m].
     """
     marks = f", {row['landmarks']} landmarks" if row["landmarks"] else ""
-    judged = join_judged(row)
+    judged = join_consistency_tests(row)
     known = any(j.code == "nees" for j in judged)
-    facts = [f"{in_metres(length)} through {submaps} submaps{marks}", "" if known else "true error unknown"]
+    facts = [f"{length_text(length)} through {submaps} submaps{marks}", "" if known else "true error unknown"]
     return headline(findings, facts, judged, known=known)
 
 
@@ -99,7 +99,7 @@ def compare_verdict(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
     rows : sequence of mapping
         Of :func:`graphslam.app.compare.methods_json`.
     """
-    ends = {r["method"]: r["objective_polished"] for r in rows if number(r["objective_polished"])}
+    ends = {r["method"]: r["objective_polished"] for r in rows if is_finite_number(r["objective_polished"])}
     if len(ends) < 2:
         return []
     low, high = min(ends.values()), max(ends.values())

@@ -16,7 +16,7 @@ from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_node import SubmapNode
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.solve.solution import Solution
 
 POINTS = 4000
@@ -59,12 +59,12 @@ class LiveView(Observer):
             self.stream.log(f"map/submap-{submap.key}/points", self.rr.Points3D(points))
         self._places(graph.submaps, np.asarray(graph.values.poses), np.asarray(graph.values.landmarks))
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         """A line from base to base, green where it was believed; and why."""
         nodes = {s.key: s.node for s in graph.submaps}
         ends = graph.values.poses[[nodes[decision.submap_i], nodes[decision.submap_j]], : graph.dim]
         colour = BELIEVED if decision.verdict == "accepted" else DOUBTED
-        line = self.rr.LineStrips3D([raised(ends)], colors=[colour], labels=[decision.verdict])
+        line = self.rr.LineStrips3D([raise_points(ends)], colors=[colour], labels=[decision.verdict])
         self.stream.log(f"map/loops/{decision.loop}", line)
         said = f"loop {decision.loop}, submaps {decision.submap_i} and {decision.submap_j}: {decision.verdict}"
         self.stream.log("said", self.rr.TextLog(f"{said}, {decision.why}" if decision.why else said))
@@ -78,11 +78,11 @@ class LiveView(Observer):
     def _places(self, submaps: Sequence[SubmapNode], poses: Array, landmarks: Array) -> None:
         rr, dim = self.rr, group_of(poses).dim
         for s in submaps:
-            x, q = in_space(poses[s.node])
+            x, q = pose_in_space(poses[s.node])
             self.stream.log(f"map/submap-{s.key}", rr.Transform3D(translation=x, quaternion=q))
-        self.stream.log("map/path", rr.LineStrips3D([raised(poses[:, :dim])], colors=[PATH]))
+        self.stream.log("map/path", rr.LineStrips3D([raise_points(poses[:, :dim])], colors=[PATH]))
         if len(landmarks):
-            self.stream.log("map/landmarks", rr.Points3D(raised(landmarks), radii=0.3, colors=LANDMARKS))
+            self.stream.log("map/landmarks", rr.Points3D(raise_points(landmarks), radii=0.3, colors=LANDMARKS))
 
 
 def shown_points(submap: Submap) -> Array:
@@ -93,16 +93,16 @@ def shown_points(submap: Submap) -> Array:
         points = submap.grid.occupied_cloud()
     else:
         return np.zeros((0, 3))
-    return raised(points[:: max(1, -(-len(points) // POINTS))])
+    return raise_points(points[:: max(1, -(-len(points) // POINTS))])
 
 
-def raised(points: Array) -> Array:
+def raise_points(points: Array) -> Array:
     """Points in space ``(n, 3)``: those of the plane at height 0."""
     points = np.asarray(points, dtype=np.float64)
     return points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
 
 
-def in_space(pose: Array) -> tuple[Array, Array]:
+def pose_in_space(pose: Array) -> tuple[Array, Array]:
     """Place ``(3,)`` and quaternion ``(4,)`` x y z w of a pose ``(3,)`` or ``(7,)``."""
     if len(pose) == 7:
         return pose[:3], pose[3:]

@@ -21,9 +21,9 @@ from pathlib import Path
 from types import TracebackType
 
 import graphslam
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 from graphslam.io.submap_store import read_submaps, write_submaps
-from graphslam.join.registry import Material, join
+from graphslam.join.registry import Material, join_by_method
 
 logger = logging.getLogger(__name__)
 
@@ -108,25 +108,25 @@ def _measure_here(folder: str, method: str, polish: bool) -> float:
     """Load, settle, reset the high-water mark, join, read the mark [MB]."""
     submaps = _read(Path(folder))
     first = submaps[:2] if isinstance(submaps, Sequence) else submaps.part(0, min(2, len(submaps.keys)))
-    join(first, method, polish=polish)  # modules and thread pools that load on first use
+    join_by_method(first, method, polish=polish)  # modules and thread pools that load on first use
     gc.collect()
-    give_back()  # or the join would reuse it unseen
+    trim_heap()  # or the join would reuse it unseen
     before = _status("VmRSS")
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         return math.nan
-    result = join(submaps, method, polish=polish)
+    result = join_by_method(submaps, method, polish=polish)
     peak = _status("VmHWM")
     assert result.states > 0
     return max(peak - before, 0) / 1e6
 
 
-def main(arguments: Sequence[str]) -> None:
+def measure_and_print(arguments: Sequence[str]) -> None:
     """Entry of the measuring process: folder, method, polish (0 or 1); the figure goes to standard output."""
     folder, method, polish = arguments
     sys.stdout.write(f"{_measure_here(folder, method, polish == '1')}\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    measure_and_print(sys.argv[1:])

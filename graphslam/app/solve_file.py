@@ -16,7 +16,7 @@ from graphslam.solve.network.solve import NetworkSolution, solve_network
 RESIDUAL = "gtsam: Log(z^-1 x_i^-1 x_j)"
 
 
-def solve_file(
+def solve_network_file(
     path: str | os.PathLike[str],
     solver: str = "lm",
     repair: bool = False,
@@ -67,13 +67,13 @@ def solve_file(
     solution = solve_network(network, solver, starts=starts, certificate=certificate, progress=progress, **options)
     if out is not None:
         write_g2o(out, solution.to_network())
-    report = report_of(solution)
+    report = solution_json(solution)
     if out is not None:
         report["out"] = str(out)
     return report
 
 
-def report_of(solution: NetworkSolution) -> dict[str, Any]:
+def solution_json(solution: NetworkSolution) -> dict[str, Any]:
     """A solution as plain JSON values; infinities become None."""
     network: PoseNetwork = solution.network
     return {

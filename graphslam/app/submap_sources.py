@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.dense_ties import problem_of_folder, problem_of_run
-from graphslam.app.folders.generations import consistent
+from graphslam.app.folders.generations import read_consistently
+from graphslam.app.pose_problem_files import load_pose_problem, pose_problem_of_run
 from graphslam.app.run.files import read_options
 from graphslam.app.run.outputs import identified_submaps
 from graphslam.app.run.run import Run
@@ -18,11 +18,11 @@ from graphslam.core.errors import MissingDataError
 from graphslam.core.json_file import check_json
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import read_truth
 from graphslam.join.pose_problem import PoseProblem
-from graphslam.join.registry import Material, is_dense
+from graphslam.join.registry import Material, are_dense
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +85,9 @@ def submap_source(
         return source
     if isinstance(source, PoseProblem):
         return SubmapSource([], problem=source)
-    if isinstance(source, Run) and is_dense(source.submaps):
+    if isinstance(source, Run) and are_dense(source.submaps):
         if source.holds("graph"):
-            return SubmapSource(list(source.submaps), poses_only(source.truth), problem=problem_of_run(source))
+            return SubmapSource(list(source.submaps), poses_only(source.truth), problem=pose_problem_of_run(source))
         if source.folder is not None:
             return submap_source(source.folder)
     if isinstance(source, Run):
@@ -101,14 +101,14 @@ def submap_source(
 
         def read(files: Path) -> tuple[float, str, MapTruth | None, list[Submap], PoseProblem | None]:
             submaps = identified_submaps(root if (files / "association.npz").is_file() else path)
-            tied = is_dense(submaps) and (files / "graph.g2o").is_file()
-            problem = problem_of_folder(root, files, submaps) if tied else None
+            tied = are_dense(submaps) and (files / "graph.g2o").is_file()
+            problem = load_pose_problem(root, files, submaps) if tied else None
             return *_run_facts(root), read_truth(files), submaps, problem
 
-        scale, identities, truth, submaps, problem = consistent(root, read)
+        scale, identities, truth, submaps, problem = read_consistently(root, read)
         known = truth if identities != "run" and problem is None else poses_only(truth)
         return SubmapSource(submaps, known, scale if problem is None else 1.0, problem)
-    loaded: Any = path if path.is_file() else load(source)
+    loaded: Any = path if path.is_file() else load_recording(source)
     if isinstance(loaded, Path) and loaded.is_file():
         if submap_poses is None:
             raise MissingDataError(f"{source} holds no submaps; a pose-graph file is cut into some by --submap-poses")

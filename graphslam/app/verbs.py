@@ -13,14 +13,14 @@ import pandas as pd
 from graphslam.app import compare as comparing
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.calibration import calibrate_log as calibrate_log
-from graphslam.app.run.front_ends import front_end_names, recommended
+from graphslam.app.run.front_ends import front_end_names, recommended_options
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
-from graphslam.app.run.outputs import open_run as read_run
+from graphslam.app.run.outputs import read_run_folder as read_run
+from graphslam.app.run.pipeline import resolve_from_folder
 from graphslam.app.run.pipeline import run as run
-from graphslam.app.run.pipeline import solve_again
 from graphslam.app.run.remake_map import map_of_folder
-from graphslam.app.run.run import Later, Run
+from graphslam.app.run.run import DeferredPart, Run
 from graphslam.app.run.source import load_log_source
 from graphslam.app.studies import find_study as find_study
 from graphslam.app.studies import open_study as open_study
@@ -28,7 +28,7 @@ from graphslam.app.studies import study as study
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.map_truth import MapTruth
@@ -36,11 +36,11 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.join import registry as joining
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.refine import Refinement, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.solve import registry
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
 __all__ = [
@@ -136,7 +136,7 @@ def open_run(path: str | Path) -> Run:
 
     @cache
     def solved() -> tuple[Any, Any]:
-        return solve_again(path) if (run.folder / "taken.npz").is_file() else (None, None)  # type: ignore[operator]
+        return resolve_from_folder(path) if (run.folder / "taken.npz").is_file() else (None, None)  # type: ignore[operator]
 
     def fused() -> Any:
         try:
@@ -144,8 +144,8 @@ def open_run(path: str | Path) -> Run:
         except MissingDataError:  # a front end without dense maps
             return None
 
-    parts: dict[str, Any] = {"graph": Later(lambda: solved()[0]), "solution": Later(lambda: solved()[1])}
-    parts["fused"] = Later(fused)
+    parts: dict[str, Any] = {"graph": DeferredPart(lambda: solved()[0]), "solution": DeferredPart(lambda: solved()[1])}
+    parts["fused"] = DeferredPart(fused)
     return replace(run, **parts)
 
 
@@ -215,9 +215,9 @@ def refine_path(
     """
     log = source if isinstance(source, SensorLog) else load(source)
     if steps is None:
-        steps = recommended(log, "segslam").get("frontend", {}).get("steps", {})
-    cut = make_steps(log, steps if isinstance(steps, StepConfig) else build(StepConfig, dict(steps), "steps"))
-    start = chain(cut.odometry) if path is None else path
+        steps = recommended_options(log, "segslam").get("frontend", {}).get("steps", {})
+    cut = make_steps(log, steps if isinstance(steps, StepConfig) else build_config(StepConfig, dict(steps), "steps"))
+    start = chain_odometry(cut.odometry) if path is None else path
     if start.times[0] > cut.times[0] or start.times[-1] < cut.times[-1]:
         raise DataError(
             "the path does not cover the scans",
@@ -226,7 +226,7 @@ def refine_path(
             wanted=f"{cut.times[0]:.3f} to {cut.times[-1]:.3f} s",
         )
     with one_blas_thread():
-        return refine(Scans.of(cut), start.interpolate(cut.times), config)
+        return refine_by_scans(Scans.of(cut), start.interpolate(cut.times), config)
 
 
 def compare(
@@ -249,7 +249,7 @@ def compare(
     submap_poses : int, optional
         A pose-graph file is cut into submaps of so many poses.
     **options
-        See :func:`graphslam.app.compare.compare`.
+        See :func:`graphslam.app.compare.compare_methods`.
 
     Returns
     -------
@@ -273,7 +273,7 @@ def compare(
     options.setdefault("covariance_scale", s.covariance_scale)
     methods = comparing.default_methods(s.material) if methods is None else methods
     with one_blas_thread():
-        return comparing.compare(s.material, methods=methods, truth=truth or s.truth, **options)
+        return comparing.compare_methods(s.material, methods=methods, truth=truth or s.truth, **options)
 
 
 def join_submaps(
@@ -296,7 +296,7 @@ def join_submaps(
     submap_poses : int, optional
         A pose-graph file is cut into submaps of so many poses.
     **options
-        See :func:`graphslam.join.registry.join`.
+        See :func:`graphslam.join.registry.join_by_method`.
 
     Returns
     -------
@@ -322,7 +322,7 @@ def join_submaps(
     s = submap_source(source, submap_poses=submap_poses)
     options.setdefault("covariance_scale", s.covariance_scale)
     with one_blas_thread():
-        return joining.join(s.material, method, polish=polish, **options)
+        return joining.join_by_method(s.material, method, polish=polish, **options)
 
 
 def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:
@@ -335,7 +335,7 @@ def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[
     solver : str
         One of :func:`solvers`.
     **options
-        See :func:`graphslam.app.solve_file.solve_file`.
+        See :func:`graphslam.app.solve_file.solve_network_file`.
 
     Returns
     -------
@@ -360,4 +360,4 @@ def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[
     """
     from graphslam.app import solve_file as solving
 
-    return solving.solve_file(path, solver, **options)
+    return solving.solve_network_file(path, solver, **options)

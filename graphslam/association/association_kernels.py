@@ -20,7 +20,7 @@ def _mahalanobis(vx: float, vy: float, a: float, b: float, c: float) -> tuple[fl
     return (c * vx * vx - 2.0 * b * vx * vy + a * vy * vy) / det, det
 
 
-class Pairings(NamedTuple):
+class PairingArrays(NamedTuple):
     """Individually compatible pairings."""
 
     observed: Index
@@ -33,7 +33,7 @@ class Pairings(NamedTuple):
     """(2p, 2p): their joint covariance."""
 
 
-class Accepted(NamedTuple):
+class AcceptedPairings(NamedTuple):
     """Accepted pairings of every start: out."""
 
     pairs: Index
@@ -48,7 +48,7 @@ class Accepted(NamedTuple):
 
 @njit
 def joint_compatibility(
-    pairings: Pairings, seeds: Index, gate: float, joint_limit: Array, persistent: bool, accepted: Accepted
+    pairings: PairingArrays, seeds: Index, gate: float, joint_limit: Array, persistent: bool, accepted: AcceptedPairings
 ) -> None:
     """From every seed pairing, add the best compatible pairing, conditioned on those taken, until none is left.
 

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.association.association_kernels import Accepted, Pairings, joint_compatibility
+from graphslam.association.association_kernels import AcceptedPairings, PairingArrays, joint_compatibility
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 
@@ -21,7 +21,7 @@ Ints = npt.NDArray[np.int64]
 Index = npt.NDArray[np.intp]
 
 
-def distance2(nu: Array, S: Array) -> Array:
+def mahalanobis2(nu: Array, S: Array) -> Array:
     """``νᵀ S⁻¹ ν`` of ``(…, 2)`` and ``(…, 2, 2)``; infinite where ``S`` is not positive definite."""
     a, b, c = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
     x, y = nu[..., 0], nu[..., 1]
@@ -31,7 +31,7 @@ def distance2(nu: Array, S: Array) -> Array:
     return np.asarray(np.where(fit, d2, np.inf))
 
 
-def nearest(d2: Array, i: Ints, j: Ints) -> Index:
+def nearest_neighbour_pairs(d2: Array, i: Ints, j: Ints) -> Index:
     """Exclusive nearest neighbours: the smallest distance of all is taken first, then the next that is still free.
 
     Parameters
@@ -58,7 +58,7 @@ def nearest(d2: Array, i: Ints, j: Ints) -> Index:
 
 
 @dataclass(frozen=True, slots=True)
-class Searched:
+class SearchResult:
     """What a search found from each of its starts.
 
     Parameters
@@ -82,9 +82,9 @@ class Searched:
         return self.pairings[start, : self.count[start]].astype(np.intp)
 
 
-def search(
+def search_compatible_sets(
     i: Ints, j: Ints, nu: Array, C: Array, seeds: Ints, gate: float, limits: Array, *, persistent: bool
-) -> Searched:
+) -> SearchResult:
     """Grow a jointly compatible set from every seed pairing.
 
     Again and again the likeliest pairing (least ``d² + ln det S``) is added that passes its gate given those taken.
@@ -107,13 +107,13 @@ def search(
     starts, most = len(seeds), len(limits) - 1
     out = np.zeros((starts, most), dtype=np.int64)
     count, score, cost = np.zeros(starts, dtype=np.int64), np.zeros(starts), np.zeros(starts)
-    pairings = Pairings(
+    pairings = PairingArrays(
         np.ascontiguousarray(i, dtype=np.int64), np.ascontiguousarray(j, dtype=np.int64),
         np.ascontiguousarray(nu), np.ascontiguousarray(C),
     )  # fmt: skip
     starts_at = np.ascontiguousarray(seeds, dtype=np.int64)
-    joint_compatibility(pairings, starts_at, gate, limits, persistent, Accepted(out, count, score, cost))
-    return Searched(out, count, score, cost)
+    joint_compatibility(pairings, starts_at, gate, limits, persistent, AcceptedPairings(out, count, score, cost))
+    return SearchResult(out, count, score, cost)
 
 
 def most_pairings(i: Ints, j: Ints) -> int:

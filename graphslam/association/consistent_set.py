@@ -40,7 +40,7 @@ CHUNK = 20_000
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class OdometryChain:
     """A dead-reckoned chain and its covariance, summed from its start.
 
     Parameters
@@ -60,7 +60,7 @@ class Chain:
     @classmethod
     def of(
         cls, increments: npt.ArrayLike, covariances: npt.ArrayLike, known: npt.NDArray[np.bool_] | None = None
-    ) -> Chain:
+    ) -> OdometryChain:
         """Chain of ``n - 1`` increments.
 
         Parameters
@@ -116,7 +116,9 @@ class LoopArrays:
     covariance: Array
 
     @classmethod
-    def of(cls, chain: Chain, ends: npt.ArrayLike, measured: npt.ArrayLike, covariance: npt.ArrayLike) -> LoopArrays:
+    def of(
+        cls, chain: OdometryChain, ends: npt.ArrayLike, measured: npt.ArrayLike, covariance: npt.ArrayLike
+    ) -> LoopArrays:
         """Loops (i, j) in any direction, checked and turned."""
         e = np.array(ends, dtype=np.int64).reshape(-1, 2)
         d = chain.tangent_dim
@@ -142,7 +144,7 @@ class LoopArrays:
         return len(self.ends)
 
 
-def chain_chi2(chain: Chain, loops: LoopArrays) -> Array:
+def chain_chi2(chain: OdometryChain, loops: LoopArrays) -> Array:
     """``D²`` of every loop against the chain alone ``(l,)``; ``nan`` where the chain does not join its ends.
 
     ``E = T_ab B_ba``: χ² of 3 or 6 degrees of freedom for a right loop.
@@ -157,7 +159,7 @@ def chain_chi2(chain: Chain, loops: LoopArrays) -> Array:
     return np.where(chain.part[a] == chain.part[b], _mahalanobis(r, S), np.nan)
 
 
-def pair_chi2(chain: Chain, loops: LoopArrays, first: npt.ArrayLike, second: npt.ArrayLike) -> Array:
+def pair_chi2(chain: OdometryChain, loops: LoopArrays, first: npt.ArrayLike, second: npt.ArrayLike) -> Array:
     """``D²`` of the cycles through the loops ``first[k]`` and ``second[k]``, ``(k,)``.
 
     ``nan`` where the chain does not join a with c, or b with d.
@@ -170,7 +172,7 @@ def pair_chi2(chain: Chain, loops: LoopArrays, first: npt.ArrayLike, second: npt
     return out
 
 
-def _pair_chi2(chain: Chain, loops: LoopArrays, one: Ints, two: Ints) -> Array:
+def _pair_chi2(chain: OdometryChain, loops: LoopArrays, one: Ints, two: Ints) -> Array:
     X, C = chain.poses, chain.spread
     (a, b), (c, d) = loops.ends[one].T, loops.ends[two].T
     T_ab, T_cd = loops.measured[one], loops.measured[two]
@@ -271,7 +273,7 @@ def consistent_loops(
         raise ConfigError(f"level must lie between 0 and 1, got {level}")
     if not 0.0 <= readmit < 1.0:
         raise ConfigError(f"readmit must lie in [0, 1), got {readmit}")
-    chain = Chain.of(chain_increments, chain_covariances)
+    chain = OdometryChain.of(chain_increments, chain_covariances)
     edges = LoopArrays.of(chain, *loops)
     l = len(edges)
     limit = float(stats.chi2.ppf(level, chain.tangent_dim))

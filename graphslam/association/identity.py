@@ -18,14 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.geometry import Array
+from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.factors.lasting import errors_at
-from graphslam.graph.graph_record import GraphRecord
+from graphslam.graph.factors.sensor_biases import sensor_biases_at
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class AssociationOutlier:
     """A sighting whose identity contradicts the map.
 
     Parameters
@@ -42,7 +42,7 @@ class Doubt:
     statistic: float
 
 
-def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
+def identity_statistics(graph: FactorGraphState, record: SubmapRecord) -> Array:
     """``T_i`` of every landmark ``(n,)`` of one submap factor at the graph's values; nan where only it sees one.
 
     The values must be the optimum: the residuals are judged by what the optimum leaves of them.
@@ -59,7 +59,7 @@ def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
     J_start, J_end, J_point = submap_jacobians(start, end, points, z, record.chart, tangent=True)
     robot = record.robot
     if robot >= 0:
-        r = np.concatenate([r, errors_at(graph.values, robot)])
+        r = np.concatenate([r, sensor_biases_at(graph.values, robot)])
     variables = record.variables()
     column = {name: k for k, name in enumerate(variables[2:])}
     J = np.zeros((len(r), 6 + 2 * len(column)))
@@ -88,7 +88,7 @@ def identity_statistics(graph: GraphRecord, record: SubmapRecord) -> Array:
     return out
 
 
-def doubtful_identities(graph: GraphRecord, gate: float) -> list[Doubt]:
+def find_association_outliers(graph: FactorGraphState, gate: float) -> list[AssociationOutlier]:
     """Sightings beyond ``gate``, the worst first.
 
     One wrong sighting makes others look wrong, too: split off the worst alone, solve again, and ask again.
@@ -98,5 +98,7 @@ def doubtful_identities(graph: GraphRecord, gate: float) -> list[Doubt]:
         if isinstance(record, SubmapRecord):
             T = identity_statistics(graph, record)
             beyond = np.flatnonzero(np.nan_to_num(T) > gate)
-            found += [Doubt(record.factor_id, int(k), int(record.landmark_ids[k]), float(T[k])) for k in beyond]
+            found += [
+                AssociationOutlier(record.factor_id, int(k), int(record.landmark_ids[k]), float(T[k])) for k in beyond
+            ]
     return sorted(found, key=lambda d: -d.statistic)

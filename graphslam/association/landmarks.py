@@ -14,7 +14,13 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.association.compatibility import distance2, joint_limits, most_pairings, nearest, search
+from graphslam.association.compatibility import (
+    joint_limits,
+    mahalanobis2,
+    most_pairings,
+    nearest_neighbour_pairs,
+    search_compatible_sets,
+)
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import Submap
@@ -26,7 +32,7 @@ Ids = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AssociationConfig:
-    """Parameters of :func:`associate`.
+    """Parameters of :func:`associate_landmarks`.
 
     Parameters
     ----------
@@ -60,7 +66,7 @@ class AssociationConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Pairings:
+class CompatiblePairings:
     """Individually compatible pairings of one submap.
 
     Parameters
@@ -82,10 +88,10 @@ class Pairings:
 
     def distance2(self) -> Array:
         """Individual Mahalanobis distances ``(p,)``."""
-        return distance2(self.innovation, _blocks(self.covariance))
+        return mahalanobis2(self.innovation, _blocks(self.covariance))
 
 
-def associate(graph: PoseGraph, submap: Submap, config: AssociationConfig | None = None) -> Ids:
+def associate_landmarks(graph: PoseGraph, submap: Submap, config: AssociationConfig | None = None) -> Ids:
     """Graph ids of the landmarks of a submap that starts at the graph's last node.
 
     Parameters
@@ -106,24 +112,24 @@ def associate(graph: PoseGraph, submap: Submap, config: AssociationConfig | None
     ids = submap.landmarks.ids.copy()
     unknown = np.flatnonzero(ids < 0)
     taken = set(ids[ids >= 0].tolist())
-    pairs = pairings(graph, submap, unknown, cfg, exclude=taken)
+    pairs = find_pairings(graph, submap, unknown, cfg, exclude=taken)
     if len(pairs.observed) == 0:
         return ids
     if cfg.method == "nearest-neighbour":
-        chosen = nearest(pairs.distance2(), pairs.observed, pairs.target)
+        chosen = nearest_neighbour_pairs(pairs.distance2(), pairs.observed, pairs.target)
     else:
         chosen = _search(pairs, cfg)
     ids[pairs.observed[chosen]] = graph.values.landmark_ids[pairs.target[chosen]]
     return ids
 
 
-def pairings(
+def find_pairings(
     graph: PoseGraph,
     submap: Submap,
     entries: npt.NDArray[np.intp],
     config: AssociationConfig,
     exclude: set[int] | frozenset[int] = frozenset(),
-) -> Pairings:
+) -> CompatiblePairings:
     """Pairings that pass the gate one by one, with the joint covariance of their innovations.
 
     With pose ``x`` (node of the submap's base), landmark ``l`` and entry ``z``: ``ν = z - R(θ)ᵀ (l - p)``,
@@ -131,7 +137,7 @@ def pairings(
     """
     lm, v = submap.landmarks, graph.values
     assert lm is not None
-    none = Pairings(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 0)))
+    none = CompatiblePairings(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 0)))
     if len(entries) == 0 or len(v.landmarks) == 0:
         return none
     z = lm.positions[entries]
@@ -154,7 +160,7 @@ def pairings(
     i = np.arange(len(entries))
     own = P_z.reshape(len(entries), 2, len(entries), 2)[i, :, i, :]
     nu = z[:, None, :] - q[near][None, :, :]
-    d2 = distance2(nu, S_pred[None] + own[:, None])
+    d2 = mahalanobis2(nu, S_pred[None] + own[:, None])
     obs, tar = np.nonzero((d2 <= config.gate) & (np.sum(nu**2, axis=2) <= config.max_distance**2))
     if len(obs) == 0:
         return none
@@ -175,7 +181,7 @@ def pairings(
     pick = (2 * slot[:, None] + np.arange(2)).ravel()
     mine = (2 * obs[:, None] + np.arange(2)).ravel()
     C = H[np.ix_(pick, pick)] + P_z[np.ix_(mine, mine)]
-    return Pairings(entries[obs].astype(np.int64), near[tar].astype(np.int64), nu[obs, tar], C)
+    return CompatiblePairings(entries[obs].astype(np.int64), near[tar].astype(np.int64), nu[obs, tar], C)
 
 
 def _jacobians(q: Array, R: Array, *, fixed: bool) -> tuple[Array, Array]:
@@ -202,18 +208,18 @@ def _blocks(C: Array) -> Array:
     return C.reshape(p, 2, p, 2)[i, :, i, :]
 
 
-def _search(pairs: Pairings, cfg: AssociationConfig) -> npt.NDArray[np.intp]:
+def _search(pairs: CompatiblePairings, cfg: AssociationConfig) -> npt.NDArray[np.intp]:
     """Best of the beam search: the start with the greatest ``Σ (gate - d²)``."""
     seeds = _seeds(pairs, cfg.starts)
     limits = joint_limits(cfg.joint_probability, most_pairings(pairs.observed, pairs.target))
     limits[1] = max(limits[1], cfg.gate)  # a single pairing is judged by its own gate
-    found = search(
+    found = search_compatible_sets(
         pairs.observed, pairs.target, pairs.innovation, pairs.covariance, seeds, cfg.gate, limits, persistent=False
     )
     return found.of(int(np.argmax(found.score)))
 
 
-def _seeds(pairs: Pairings, starts: int) -> npt.NDArray[np.int64]:
+def _seeds(pairs: CompatiblePairings, starts: int) -> npt.NDArray[np.int64]:
     """First pairings: all candidates of the least ambiguous entries, the closest first.
 
     Taking every candidate of an entry before the next entry makes sure that, if the entry is in the map at all, one

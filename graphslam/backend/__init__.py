@@ -1,9 +1,9 @@
 """Layer 8: submaps and sensor streams in, a solved graph out. Reads and writes no files."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "config": "BackEndConfig",
     "hypotheses": "choices_of_matches solve_choice",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -11,24 +11,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.association.identity import doubtful_identities
-from graphslam.association.landmarks import AssociationConfig, associate
+from graphslam.association.identity import find_association_outliers
+from graphslam.association.landmarks import AssociationConfig, associate_landmarks
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
+from graphslam.backend.ambiguous_maps import AmbiguousMaps, ambiguous_maps
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
-from graphslam.backend.rivals import TwoMaps, two_maps
-from graphslam.backend.streams import FixPart, ImuPart, recentred
+from graphslam.backend.streams import GpsSource, ImuSource, repreintegrate_until_converged
 from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, LoopSearch
-from graphslam.loops.ledger import DECIDED, Decision, LoopLedger, ledger_of_events, same_loop
-from graphslam.loops.ties import TieConfig, ties_entries
+from graphslam.loops.ledger import DECIDED, LoopDecision, LoopLedger, ledger_of_events, same_loop
+from graphslam.loops.overlap_constraints import OverlapConfig, overlap_entries
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
@@ -42,7 +42,7 @@ def find_config(c: BackEndConfig) -> FindConfig:
         candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height, least_support=c.match_support),
         appearance=AppearanceConfig() if c.loop_appearance else None,
         front_end=True,
-        ties=TieConfig() if c.loop_ties else None,
+        ties=OverlapConfig() if c.loop_ties else None,
         rounds=FindConfig().rounds if c.looks else 0,
     )
 
@@ -59,7 +59,7 @@ class Observer:
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         """A submap is in the graph, and the graph is solved with it."""
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         """A loop was believed or not, and why."""
 
     def solved(self, solution: Solution) -> None:
@@ -84,12 +84,12 @@ class BackEnd:
     per_submap_s: list[float] = field(default_factory=list)
     submaps: list[Submap] = field(default_factory=list)
     """With their maps; kept only where loops are looked for."""
-    imu: ImuPart | None = None
+    imu: ImuSource | None = None
     """IMUs of the log; None where there is no log."""
-    fixes: FixPart | None = None
+    fixes: GpsSource | None = None
     """Fixes of the log, where they are to be used as they come."""
     observers: Sequence[Observer] = ()
-    two_maps: TwoMaps | None = None
+    two_maps: AmbiguousMaps | None = None
     """Once it is finished: the graph with either of two groups of loops that cannot both be right, if nothing told."""
 
     def __post_init__(self) -> None:
@@ -99,7 +99,7 @@ class BackEnd:
         self._loops: LoopSearch | None = None
         self._noted = 0  # decisions on loops that are among the events
         kind = self.config.match_robust
-        self._match_kernel = NO_KERNEL if kind == "none" else Robust(kind, self.config.match_width)
+        self._match_kernel = NO_KERNEL if kind == "none" else RobustKernel(kind, self.config.match_width)
         self._association = AssociationConfig(
             method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
         )
@@ -144,7 +144,7 @@ class BackEnd:
 
     def _look(self) -> None:
         """While the run goes on: what IMUs say of the submaps so far, and loops."""
-        if self.imu is not None and self.imu.tie(self.graph, more=True):
+        if self.imu is not None and self.imu.attach(self.graph, more=True):
             self.solver.update()
         if self.config.looks:
             self.find_loops(last=False)
@@ -157,7 +157,7 @@ class BackEnd:
         c = self.config
         ids = None
         if c.associate and submap.landmarks is not None:
-            ids = associate(self.graph, self.graph.as_known(submap), self._association)
+            ids = associate_landmarks(self.graph, self.graph.as_known(submap), self._association)
         associated = time.perf_counter()
         dense = submap.landmarks is None
         self.graph.add_submap(
@@ -192,7 +192,7 @@ class BackEnd:
             if m.support >= self.config.match_support:
                 self.graph.add_match(submap.key, m, robust=self._match_kernel)
             else:
-                self.graph.note(
+                self.graph.log_event(
                     "match-not-used", submap=submap.key, target=m.target, fitness=m.fitness, support=m.support
                 )
 
@@ -214,12 +214,12 @@ class BackEnd:
         self.seconds["merge"] += time.perf_counter() - start
         return merged
 
-    def finish(self, undo: Sequence[int | Decision] = ()) -> Solution:
+    def finish(self, undo: Sequence[int | LoopDecision] = ()) -> Solution:
         """Merge until nothing merges any more, go to the optimum, and return the solution.
 
         Parameters
         ----------
-        undo : sequence of int or Decision
+        undo : sequence of int or LoopDecision
             Loops that are taken out again: by their numbers in the ledger of loops; or as an earlier ledger of the same
             submaps has them, and then one that is not in this graph is noted and stays undone.
         """
@@ -227,8 +227,8 @@ class BackEnd:
         self.graph.finish_gps()
         self.graph.finish_readings()
         if self.imu is not None:
-            self.imu.tie(self.graph)
-        recentred(self.graph, self.solver)
+            self.imu.attach(self.graph)
+        repreintegrate_until_converged(self.graph, self.solver)
         if self.graph.gps.config.errors == "fitted" and fit_fix_errors(self.graph) is not None:
             self.solver.solve_to_optimum()
         for _ in range(10):
@@ -238,14 +238,14 @@ class BackEnd:
         if self.config.looks:
             self.find_loops()
         for loop in undo:
-            if isinstance(loop, Decision):
+            if isinstance(loop, LoopDecision):
                 self._stay_undone(loop)
             else:
                 self.undo_loop(loop)
         start = time.perf_counter()
         if self._loops is not None and self._loops.closer is not None:
-            self.two_maps = two_maps(self.graph, self.solver, self._loops.closer)
-        recentred(self.graph, self.solver)
+            self.two_maps = ambiguous_maps(self.graph, self.solver, self._loops.closer)
+        repreintegrate_until_converged(self.graph, self.solver)
         self.split_wrong_identities()
         solution = self.solver.solution()
         self.seconds["solve"] += time.perf_counter() - start
@@ -273,7 +273,7 @@ class BackEnd:
         self._noted = len(ledger.decisions)
         for decision in new:
             event = decision.event()
-            self.graph.note(event.pop("event"), **event)
+            self.graph.log_event(event.pop("event"), **event)
         for n in dict.fromkeys(d.loop for d in new):
             for o in self.observers:
                 o.loop_decided(ledger.of(n), self.graph)
@@ -289,7 +289,7 @@ class BackEnd:
         why = {d.loop: "asked for"}
         if d.source == FRONT_END:
             entry = (d.submap_i, d.submap_j)
-            ties = (x for x in ledger.current() if x.verdict == "accepted" and entry in ties_entries(x.gates))
+            ties = (x for x in ledger.current() if x.verdict == "accepted" and entry in overlap_entries(x.gates))
             why |= {x.loop: f"by loop {loop}, which was undone" for x in ties}
         for number, reason in why.items():
             x = ledger.of(number)
@@ -297,10 +297,10 @@ class BackEnd:
             self.graph.remove(x.factor_id, reason="undone")
             if isinstance(matched, BetweenRecord) and matched.group != "match":  # of a match the removal says it
                 event = replace(x, verdict="undone", why=reason, weight=0.0, factor_id=-1).event()
-                self.graph.note(event.pop("event"), **event)
+                self.graph.log_event(event.pop("event"), **event)
         self.solver.solve_to_optimum()
 
-    def _stay_undone(self, before: Decision) -> None:
+    def _stay_undone(self, before: LoopDecision) -> None:
         """Take out a loop that was undone in an earlier run of the same submaps."""
         ledger = ledger_of_events(self.graph.events)
         d = same_loop(before, ledger)
@@ -311,13 +311,13 @@ class BackEnd:
         logger.warning("%s was undone before and was not found this time", what)
         number = 1 + max((x.loop for x in ledger.decisions), default=-1)
         event = replace(before, loop=number, why="undone before; not found this time").event()  # for the next time
-        self.graph.note(event.pop("event"), **event)
+        self.graph.log_event(event.pop("event"), **event)
 
     def split_wrong_identities(self) -> int:
         """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""
         split = 0
         while self.config.identity_gate > 0 and split < 10 * len(self.graph.submaps):
-            doubts = doubtful_identities(self.graph, self.config.identity_gate)
+            doubts = find_association_outliers(self.graph, self.config.identity_gate)
             if not doubts:
                 break
             self.graph.split_landmark(doubts[0].factor_id, doubts[0].entry)

@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
-from graphslam.graph.readings import BeaconConfig, CompassConfig
+from graphslam.graph.noise import RobustKernel
+from graphslam.graph.pending_measurements import BeaconConfig, CompassConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +23,7 @@ class GpsOptions(GpsConfig):
     """Fixes that become factors; the rest is withheld and scored. Segments are runs of fixes without a gap."""
     every: float = 0.0
     """Of these at most one in so many seconds becomes a factor; the rest is withheld, too [s]."""
-    robust: Robust = spelled(Robust("cauchy", 2.385), robust="kind", robust_width="k")
+    robust: RobustKernel = flattened_field(RobustKernel("cauchy", 2.385), robust="kind", robust_width="k")
     """Robust kernel on every GPS factor, and its width in standard deviations; less costs accuracy where fixes are good
     (docs/notes/segmap-graph.md)."""
 

@@ -74,11 +74,11 @@ def fit_fix_errors(graph: PoseGraph) -> FixErrors | None:
     errors = replace(found or FixErrors(0.0, np.inf, 1.0, 0.0), wild=len(wild), fixes=len(fixes))
     for r in wild:
         del graph.records[r.factor_id]
-        graph.ledger.refund(r.factor_id)
+        graph.ledger.release(r.factor_id)
     graph.revision += 1
     _put(graph, kept, errors)
     gps.fitted = errors
-    graph.note(
+    graph.log_event(
         "gps-errors", fixes=len(fixes), wild=len(wild), bias_sigma=errors.bias_sigma, white=errors.white,
         bias_time=errors.bias_time if np.isfinite(errors.bias_time) else None, gain=errors.gain,
     )  # fmt: skip
@@ -126,7 +126,7 @@ class _Innovations:
         at_datum = flat.layout.columns("datum")
         A[at_datum, at_datum] += LOOSE**-2 if isinstance(A, np.ndarray) else np.full(len(at_datum), LOOSE**-2)
         covariance = JointCovariance(flat.layout, A)
-        chosen = [fixes[k] for k in spread_out(len(fixes), MOST[d])]
+        chosen = [fixes[k] for k in spread_fixes(len(fixes), MOST[d])]
         batch = _batch(graph, chosen)
         r, J = batch.terms(*batch.gather(values))
         turn = batch.turns(values)
@@ -210,7 +210,7 @@ def plane_variance(stated: Array) -> Array:
     return np.asarray(0.5 * np.trace(stated[:, :2, :2], axis1=1, axis2=2))
 
 
-def spread_out(n: int, most: int) -> npt.NDArray[np.intp]:
+def spread_fixes(n: int, most: int) -> npt.NDArray[np.intp]:
     """Numbers of at most so many of n fixes: at even steps, or in stretches that are evenly spread."""
     step = -(-n // most)
     if step <= EVERY:

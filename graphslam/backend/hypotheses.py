@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from graphslam.backend.back_end import BackEnd, find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions
-from graphslam.backend.streams import ImuPart
+from graphslam.backend.streams import ImuSource
 from graphslam.core.errors import ConfigError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
@@ -26,30 +26,30 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.loops.candidates import TIE
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.graph_loops import GraphLoops
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.loops.measure import Loop
+from graphslam.loops.overlap_constraints import overlap_entries
 from graphslam.loops.rules import LoopConfig
-from graphslam.loops.ties import ties_entries
 from graphslam.maps.alternatives import Alternative
-from graphslam.maps.minimum_entropy import Candidate
+from graphslam.maps.minimum_entropy import MapHypothesis
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.config import HandoverConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segmap import SegMap
 from graphslam_frontends.segslam.segment import KINDS, MATCH
-from graphslam_frontends.segslam.submaps import drift_by_path, sampled_chain, settle, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, sampled_chain, submaps_of_segments
 
 
-def built(
+def build_back_end(
     submaps: Sequence[Submap],
     config: BackEndConfig,
     *,
     fixes: Gps | None = None,
     gps: GpsOptions | None = None,
-    imu: ImuPart | None = None,
+    imu: ImuSource | None = None,
 ) -> BackEnd:
     """A back end with a graph of submaps, not yet at its optimum.
 
@@ -57,7 +57,7 @@ def built(
     ----------
     fixes : Gps, optional
         Those that count.
-    imu : ImuPart, optional
+    imu : ImuSource, optional
         Of this graph alone.
     """
     back = BackEnd(config, "batch", imu=imu)
@@ -89,7 +89,7 @@ def choices_of_matches(
     submaps: Sequence[Submap],
     support: float,
     *,
-    loops: Sequence[Decision] = (),
+    loops: Sequence[LoopDecision] = (),
     undone: frozenset[tuple[int, int]] = frozenset(),
 ) -> dict[str, Chosen]:
     """Choices by name: the run's own, every threshold of support, and the run's own less each match and loop.
@@ -98,7 +98,7 @@ def choices_of_matches(
     ----------
     support : float
         The run's own threshold (``backend.match_support``).
-    loops : sequence of Decision
+    loops : sequence of LoopDecision
         Loops of the run's ledger that are in its graph and no matches of the front end.
     undone : frozenset of (int, int)
         Matches that are not in the run's graph, refused or taken out by hand: keys of the submap and of the one it
@@ -118,7 +118,7 @@ def choices_of_matches(
     alone = [d for d in loops if d.source != TIE]
     for d in sorted(alone, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # the most doubtful first
         found[f"without loop {d.loop} ({d.submap_j} → {d.submap_i})"] = own - {(LOOP, d.loop)}
-    needs = {(LOOP, d.loop): ties_entries(d.gates) for d in loops}
+    needs = {(LOOP, d.loop): overlap_entries(d.gates) for d in loops}
     out: dict[str, Chosen] = {}
     for name, chosen in found.items():
         entries = {(every[k].target, k[0]) for k in chosen if k in every}
@@ -133,11 +133,11 @@ def solve_choice(
     chosen: Chosen,
     config: BackEndConfig,
     *,
-    loops: Sequence[Decision] = (),
-    decided: Sequence[Decision] = (),
+    loops: Sequence[LoopDecision] = (),
+    decided: Sequence[LoopDecision] = (),
     fixes: Gps | None = None,
     gps: GpsOptions | None = None,
-    imu: ImuPart | None = None,
+    imu: ImuSource | None = None,
 ) -> BackEnd:
     """The graph of submaps with some of their matches and loops, solved to its optimum.
 
@@ -145,12 +145,12 @@ def solve_choice(
     ----------
     config : BackEndConfig
         The run's.
-    loops : sequence of Decision
+    loops : sequence of LoopDecision
         With their measurements; those that are chosen become factors as they were in the run.
-    decided : sequence of Decision
+    decided : sequence of LoopDecision
         Matches that the run decided on with its loops: in the graph as loops are, where they are chosen.
     fixes, gps, imu
-        See :func:`built`.
+        See :func:`build_back_end`.
     """
     bare = []
     # two matches of one pair of submaps are told apart by their support
@@ -165,7 +165,7 @@ def solve_choice(
             else:
                 taken.append(loop)
         bare.append(replace(s, matches=tuple(kept), grid=None))
-    back = built(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps, imu=imu)
+    back = build_back_end(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps, imu=imu)
     back.solver.solve_to_optimum()
     if taken:
         graph = GraphLoops(back.graph, back.solver)
@@ -203,7 +203,7 @@ def topologies(result: SegSlamResult) -> list[tuple[int, float, Ints]]:
     """Different topologies that particles tell: the heaviest particle of each, its support, its chain; by support."""
     groups: dict[Topology, list[tuple[float, int, Ints]]] = {}
     for p in np.argsort(-result.weights, kind="stable").tolist():
-        chain = settled_chain(result.segmap, int(result.closed[p]))
+        chain = common_ancestor_chain(result.segmap, int(result.closed[p]))
         groups.setdefault(topology(result.segmap, chain), []).append((float(result.weights[p]), p, chain))
     found = [(members[0][1], sum(w for w, *_ in members), members[0][2]) for members in groups.values()]
     return sorted(found, key=lambda x: (-x[1], x[0]))
@@ -222,7 +222,7 @@ def _sampled(result: SegSlamResult, count: int, known: Sequence[Ints]) -> list[I
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class TopologyHypothesis:
     """A topology that particles tell, as submaps.
 
     Parameters
@@ -263,7 +263,7 @@ class Hypothesis:
         }
 
 
-def _withdrawn(told: Hypothesis) -> list[Hypothesis]:
+def _withdrawn(told: TopologyHypothesis) -> list[TopologyHypothesis]:
     """A topology without each of its entries in turn, the least supported entry first."""
     out = []
     for k, s in enumerate(told.submaps):
@@ -271,7 +271,7 @@ def _withdrawn(told: Hypothesis) -> list[Hypothesis]:
             rest = replace(s, matches=tuple(x for x in s.matches if x is not m))
             submaps = [*told.submaps[:k], rest, *told.submaps[k + 1 :]]
             support = told.support * max(1.0 - m.support, 0.0)
-            out.append(Hypothesis(told.particle, support, (m.target, s.key), told.chain, submaps, told.grids))
+            out.append(TopologyHypothesis(told.particle, support, (m.target, s.key), told.chain, submaps, told.grids))
     return sorted(out, key=lambda x: -x.support)
 
 
@@ -283,7 +283,7 @@ def hypotheses_of(
     handover: HandoverConfig | None = None,
     samples: int = 0,
     least_support: float = LEAST_SUPPORT,
-) -> tuple[list[Hypothesis], int]:
+) -> tuple[list[TopologyHypothesis], int]:
     """Topologies of a SegMap: those that particles tell, by weight, then the first of them less each of its entries.
 
     Particles that entered different older maps, or none, tell different topologies; and of each entry it may be asked
@@ -316,15 +316,17 @@ def hypotheses_of(
         chains.append((-1, sum(w for _, w, c in found if topology(segmap, c) == topology(segmap, chain)), chain))
     told = []
     for particle, support, chain in chains:
-        submaps = settle(
+        submaps = submaps_of_segments(
             segmap, chain, drift_by_path(segmap, chain, drift, result.steps), handover, uses=result.steps.uses
         )
-        told.append(Hypothesis(particle, support, None, chain, submaps, own_evidence_of(segmap, chain, submaps)))
+        told.append(
+            TopologyHypothesis(particle, support, None, chain, submaps, own_evidence_of(segmap, chain, submaps))
+        )
     return [*told, *_withdrawn(told[0])[: most - len(kept)]], len(found) - len(kept)
 
 
 def solve_hypotheses(
-    told: Sequence[Hypothesis],
+    told: Sequence[TopologyHypothesis],
     config: BackEndConfig,
     *,
     find: FindConfig | None = None,
@@ -343,7 +345,7 @@ def solve_hypotheses(
     division : DivisionConfig, optional
         How maps are cut into pieces; give the sensor's reach.
     streams : callable
-        Makes ``fixes``, ``gps`` and ``imu`` of one graph more; see :func:`built`.
+        Makes ``fixes``, ``gps`` and ``imu`` of one graph more; see :func:`build_back_end`.
     progress : bool
         Show a bar.
     """
@@ -353,7 +355,7 @@ def solve_hypotheses(
     pieces: dict[int, DividedSubmaps] = {}
     out = []
     for number, h in enumerate(tqdm(told, "hypotheses", disable=not progress, leave=False)):
-        back = built(h.submaps, options, **streams())
+        back = build_back_end(h.submaps, options, **streams())
         back.solver.solve_to_optimum()
         # what is withdrawn must not come back by registration: that is the other hypothesis
         looked = find if h.withdrawn is None else replace(find, rounds=0, appearance=None)
@@ -363,7 +365,7 @@ def solve_hypotheses(
             nodes = {s.key: np.asarray(s.times[:-1]) for s in back.graph.submaps}
             pieces[id(h.grids)] = divide_submaps(h.submaps, config=division, grids=h.grids, nodes=nodes)
         divided = pieces[id(h.grids)]
-        candidate = Candidate(divided.pieces, divided.along(solution.trajectory()), f"hypothesis {number}")
+        candidate = MapHypothesis(divided.pieces, divided.along(solution.trajectory()), f"hypothesis {number}")
         facts = h.facts(ledger.counts().get("accepted", 0))
         out.append(Alternative(candidate.name, back.graph, solution, candidate, facts))
     return out

@@ -25,8 +25,8 @@ from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.moving import moving_points, without_moving
 from graphslam.maps.refined import base_frames, refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.guides import FAR, apart
-from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.refine import Refinement, refine_by_scans
+from graphslam.refine.revisit_constraints import FAR, tangent_lengths
 from graphslam.refine.scans import Scans
 
 logger = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ NAMED = {
 
 
 @dataclass(frozen=True)
-class Refined:
+class RefinedRun:
     """Result of a refinement.
 
     Parameters
@@ -88,7 +88,7 @@ def refine_run(
     gps: tuple[Gps, GpsConfig] | None = None,
     graph: PoseGraph | None = None,
     progress: Callable[[str], Any] | None = None,
-) -> tuple[Refined | None, list[Finding]]:
+) -> tuple[RefinedRun | None, list[Finding]]:
     """Refine the solved map of a run, and say what was found.
 
     Parameters
@@ -104,7 +104,7 @@ def refine_run(
 
     Returns
     -------
-    refined : Refined or None
+    refined : RefinedRun or None
         None where the path of the graph stays the result.
     findings : list of Finding
         Lines of the verdict.
@@ -114,7 +114,7 @@ def refine_run(
     path = m.trajectory
     try:
         start = path.interpolate(np.clip(scans.times, path.times[0], path.times[-1]))
-        found = refine(scans, start, config, gps=gps, progress=progress)
+        found = refine_by_scans(scans, start, config, gps=gps, progress=progress)
         if not found.better:
             text = (
                 f"refinement: not used — scans agree in {found.agreement[1]:.0%} of the points along the refined "
@@ -124,14 +124,14 @@ def refine_run(
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
-        drawn, moved = _standing(drawn, base_frames(refined))
+        drawn, moved = _static_submaps(drawn, base_frames(refined))
     except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
         logger.warning("refinement failed: %s", error)
         return None, [
             Finding("look", "refine-failed", f"refinement: failed — {error}. The graph's path is the result.")
         ]
     wrong = None if graph is None else wrong_loops(graph, refined)
-    return Refined(found, refined, drawn, path), [*findings_of(found, wrong), *moved]
+    return RefinedRun(found, refined, drawn, path), [*refinement_findings(found, wrong), *moved]
 
 
 def _input(r: Refinement) -> list[Finding]:
@@ -151,7 +151,7 @@ def _input(r: Refinement) -> list[Finding]:
     return [Finding("bad", "input-better", text)]
 
 
-def _standing(submaps: list[Submap], bases: Array) -> tuple[list[Submap], list[Finding]]:
+def _static_submaps(submaps: list[Submap], bases: Array) -> tuple[list[Submap], list[Finding]]:
     """Submaps without what moved, where they carry clouds, and how much that was."""
     if not submaps or bases.shape[1] != 7 or any(s.cloud is None for s in submaps):
         return submaps, []
@@ -174,7 +174,7 @@ def wrong_loops(graph: PoseGraph, m: GlobalMap) -> list[tuple[int, int, float, f
         return []
     g, T = group_of(m.node_poses), np.array([r.T_ij for r in ends])
     i, j = np.array([(r.i, r.j) for r in ends]).T
-    off, turned = apart(g.log(g.between(T, g.between(m.node_poses[i], m.node_poses[j]))), g)
+    off, turned = tangent_lengths(g.log(g.between(T, g.between(m.node_poses[i], m.node_poses[j]))), g)
     wrong = np.flatnonzero((off > FAR[0]) | (turned > FAR[1]))
     wrong = wrong[np.argsort(-off[wrong], kind="stable")]
     return [(int(i[k]), int(j[k]), float(off[k]), float(turned[k])) for k in wrong]
@@ -198,7 +198,7 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
     out, entries = ledger.as_start(), ledger.entries()
     streams = frozenset().union(*(s.uses for s in submaps))
     # gravity that the front end had of a stream which it used for nothing else that weighs
-    gravity = frozenset().union(*(s.aids for s in submaps)) if "gravity" in r.parts else frozenset()
+    gravity = frozenset().union(*(s.assisting_streams for s in submaps)) if "gravity" in r.parts else frozenset()
     out.spend(SCAN_PAIRS, "scan-pairs", streams | gravity, (float(r.times[0]), float(r.times[-1])))
     held = {e.stream for e in entries if e.kind == EXCLUSIVE and e.factor.startswith("GPS fix")} if r.fixes else set()
     for stream in sorted(held):
@@ -224,7 +224,7 @@ SCAN_PAIRS = -1
 """Number of the refinement in a ledger of factors, which are counted from 0."""
 
 
-def findings_of(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None) -> list[Finding]:
+def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None) -> list[Finding]:
     """Findings of a refinement, as lines of the verdict.
 
     Parameters

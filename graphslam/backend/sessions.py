@@ -17,25 +17,31 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
-from graphslam.loops.graph_loops import GraphRelative
+from graphslam.loops.graph_loops import GraphRelativePoses
+from graphslam.loops.inter_session_loops import (
+    InterSessionConfig,
+    InterSessionLoops,
+    SessionMap,
+    TwoSessions,
+    session_start,
+)
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
-from graphslam.loops.session_ties import SessionMap, TieConfig, Ties, TwoSessions, start_of
 from graphslam.solve.registry import Solver
 
 
 @dataclass(frozen=True)
-class InnerTie:
+class IntraSessionLoop:
     """A factor between two nodes of one run that are no neighbours: a re-entry or a loop."""
 
     i: int
     j: int
     T_ij: Array
     covariance: Array
-    robust: Robust
+    robust: RobustKernel
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class DenseSession:
     ----------
     submaps : list of Submap
         Keys and clock of the common graph.
-    inner : list of InnerTie
+    inner : list of IntraSessionLoop
         Nodes counted from the session's first base.
     shift : float
         Seconds that were added to its clock.
@@ -62,7 +68,7 @@ class DenseSession:
     submaps: list[Submap]
     config: BackEndConfig
     map: SessionMap
-    inner: list[InnerTie]
+    inner: list[IntraSessionLoop]
     shift: float = 0.0
     fixes: Gps | None = None
     gps: GpsOptions = field(default_factory=GpsOptions)
@@ -80,20 +86,20 @@ class DenseSession:
         return np.stack(out)
 
 
-def ties_of_graph(graph: PoseGraph) -> list[InnerTie]:
+def loops_of_graph(graph: PoseGraph) -> list[IntraSessionLoop]:
     """Factors of the graph of a run beside its chain."""
     rows = [r for r in graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
-    return [InnerTie(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
+    return [IntraSessionLoop(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
 
 
-def ties_of_network(net: PoseNetwork, kernel: Robust) -> list[InnerTie]:
+def loops_of_network(net: PoseNetwork, kernel: RobustKernel) -> list[IntraSessionLoop]:
     """The same of the file of a graph, which holds no kernels."""
     out, chained = [], set()
     for (i, j), T, info in zip(net.edges.tolist(), net.measurements, net.information):
         if j == i + 1 and i not in chained:  # the chain itself is made again from the submaps
             chained.add(i)
             continue
-        out.append(InnerTie(i, j, T, _inverse(info), kernel))
+        out.append(IntraSessionLoop(i, j, T, _inverse(info), kernel))
     return out
 
 
@@ -107,7 +113,7 @@ def _inverse(information: Array) -> Array:
     return 0.5 * (P + P.T)
 
 
-def put(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
+def add_session(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
     """Add the chain of a session and its own ties to a graph; where it hangs is another matter.
 
     Parameters
@@ -148,14 +154,14 @@ SESSION = "session"
 
 
 @dataclass(frozen=True)
-class Attached:
+class ConnectedSession:
     """A session that was tied to another one in a graph.
 
     Parameters
     ----------
     known : DenseSession
         What it was tied to.
-    ties : Ties or None
+    ties : InterSessionLoops or None
         By appearance; None where GPS said where the session lies.
     used : list of Loop
         Ties in the graph at the end, those by proximity included; nodes of the graph.
@@ -165,23 +171,23 @@ class Attached:
 
     first_node: int
     known: DenseSession
-    ties: Ties | None
+    ties: InterSessionLoops | None
     used: list[Loop]
     dropped: int
 
 
-def attach(
+def connect_session(
     graph: PoseGraph,
     solver: Solver,
     known: DenseSession,
     known_node: int,
     new: DenseSession,
     *,
-    config: TieConfig | None = None,
-    found: tuple[TwoSessions, Ties] | None = None,
+    config: InterSessionConfig | None = None,
+    found: tuple[TwoSessions, InterSessionLoops] | None = None,
     use_gps: bool = True,
     progress: bool = False,
-) -> Attached:
+) -> ConnectedSession:
     """Tie a session to one that is in the graph, and solve.
 
     First by places that look alike and agree; then, when it is known where it lies, by places that are near each other,
@@ -200,15 +206,15 @@ def attach(
     use_gps : bool
         With the new session's fixes, if it has any.
     """
-    c = TieConfig() if config is None else config
+    c = InterSessionConfig() if config is None else config
     if found is None:
         two = TwoSessions(known.map, new.map)
         found = two, two.find(c, progress=progress)
     two, ties = found
     if ties.why:
         raise DataError(f"no tie to {known.name}: {ties.why}", where=new.name)
-    start = start_of(ties.chosen, graph.values.poses[known_node:], new.chain)
-    node = put(graph, new, start, use_gps=use_gps)
+    start = session_start(ties.chosen, graph.values.poses[known_node:], new.chain)
+    node = add_session(graph, new, start, use_gps=use_gps)
     apart = two.thinned(ties.chosen, CandidateConfig().stretch)
     here = [replace(x, i=known_node + x.i, j=node + x.j) for x in apart]
     factors = {_add(graph, x, known, new): x for x in here}
@@ -230,10 +236,10 @@ def attach(
     solver.solve_to_optimum()
     dropped += _winnow(graph, solver, factors)
     logger.info("%s is attached to %s by %d loop closures", new.name, known.name, len(factors))
-    return Attached(node, known, ties, list(factors.values()), dropped)
+    return ConnectedSession(node, known, ties, list(factors.values()), dropped)
 
 
-def attach_by_gps(
+def connect_by_gps(
     graph: PoseGraph,
     solver: Solver,
     known: DenseSession,
@@ -242,7 +248,7 @@ def attach_by_gps(
     *,
     places: bool = True,
     progress: bool = False,
-) -> Attached:
+) -> ConnectedSession:
     """Tie a session to one that is in the graph by the fixes that both have, and solve.
 
     Parameters
@@ -257,7 +263,7 @@ def attach_by_gps(
         ends.append(s.T_gps_base)
     g = group_of(known.map.increments)
     T_known_new = g.between(ends[0], ends[1])
-    node = put(graph, new, g.compose(graph.values.poses[known_node], T_known_new))
+    node = add_session(graph, new, g.compose(graph.values.poses[known_node], T_known_new))
     solver.solve_to_optimum()
     factors: dict[int, Loop] = {}
     dropped = 0
@@ -267,13 +273,13 @@ def attach_by_gps(
         solver.solve_to_optimum()
         dropped = _winnow(graph, solver, factors)
     logger.info("%s is attached to %s by GPS and %d loop closures", new.name, known.name, len(factors))
-    return Attached(node, known, None, list(factors.values()), dropped)
+    return ConnectedSession(node, known, None, list(factors.values()), dropped)
 
 
 def _add(graph: PoseGraph, x: Loop, known: DenseSession, new: DenseSession) -> int:
     return graph.add_between(
         x.i, x.j, x.T_ij, x.covariance, streams=[f"{known.name}/scan", f"{new.name}/scan"], evidence="shared-scan",
-        robust=Robust("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
+        robust=RobustKernel("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
     )  # fmt: skip
 
 
@@ -310,7 +316,7 @@ def _near(
     row: dict[int, int] = {int(n): k for k, n in enumerate(places.node)}
     before = [(row[x.i], row[x.j]) for x in tied if x.i in row and x.j in row]
     config = CandidateConfig(least_gain=0.0, keep=40)
-    found = proximity_candidates(places, GraphRelative(graph), config, exclude=two.within, tried=before)
+    found = proximity_candidates(places, GraphRelativePoses(graph), config, exclude=two.within, tried=before)
     measured = [x for x in two.measurer.measure(found, progress=progress) if not x.why]
     nodes: Ints = places.node
     return [replace(x, i=int(nodes[x.i]), j=int(nodes[x.j])) for x in measured], len(found)

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from graphslam.backend.config import BeaconOptions, CompassOptions, GpsOptions, ImuOptions
 from graphslam.core.errors import MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Compass, Gps, LandmarkObservations
-from graphslam.evaluate.gps_floor import fix_segments
+from graphslam.evaluate.gps_repeatability import fix_segments
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import Solver
@@ -48,17 +48,17 @@ def used_fixes(gps: Gps, config: GpsOptions) -> Mask:
     return mask
 
 
-def split(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
+def split_fixes(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
     """(fixes that become factors, fixes withheld)."""
     mask = used_fixes(gps, config)
     used, withheld = gps.take(mask), gps.take(~mask)
     return used.with_sigma(config.sigma), withheld
 
 
-class FixPart:
+class GpsSource:
     """The fixes of a run: the graph is given them submap by submap, as they come."""
 
-    def __init__(self, feed: Feed, config: GpsOptions) -> None:
+    def __init__(self, feed: RecordSource, config: GpsOptions) -> None:
         self.feed, self.config = feed, config
         self._given = 0
         self._all: Gps | None = None
@@ -71,14 +71,14 @@ class FixPart:
         used = self._all
         if used is None:
             whole: Gps = self.feed.part(name)  # type: ignore[assignment]
-            used = split(whole, self.config)[0]
+            used = split_fixes(whole, self.config)[0]
             self._all = used if self.feed.ended else None
         last = int(np.searchsorted(used.times, until, side="right"))
         first, self._given = self._given, max(self._given, last)
         return used.take(slice(first, last)) if last > first else None
 
 
-def imus_of(feed: Feed) -> dict[str, Imu]:
+def imus_of(feed: RecordSource) -> dict[str, Imu]:
     """The IMUs of a log by name, as far as they have come."""
     return {name: feed.part(name) for name in feed.names(Imu)}  # type: ignore[misc]
 
@@ -113,10 +113,10 @@ def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObser
     return {config.use: found[config.use]}
 
 
-class ImuPart:
+class ImuSource:
     """The IMUs of a run: axes are looked at, and factors are made, while it goes on."""
 
-    def __init__(self, feed: Feed, config: ImuOptions) -> None:
+    def __init__(self, feed: RecordSource, config: ImuOptions) -> None:
         self.feed, self.config = feed, config
         self._looked: set[str] = set()
         self._given: set[str] = set()
@@ -147,7 +147,7 @@ class ImuPart:
                 self._looked.add(name)
                 graph.check_imu(imu, stream=name, axes=self.config.axes)
 
-    def tie(self, graph: PoseGraph, *, more: bool = False) -> int:
+    def attach(self, graph: PoseGraph, *, more: bool = False) -> int:
         """Give the graph the IMUs that are to be used; returns the number of new factors.
 
         Parameters
@@ -160,7 +160,7 @@ class ImuPart:
             if graph.dim != 3:
                 if more:
                     continue
-                graph.note("imu-not-used", stream=name, why="the graph is in the plane")
+                graph.log_event("imu-not-used", stream=name, why="the graph is in the plane")
                 logger.warning("%s is not used: the graph is in the plane", name)
                 continue
             imu = self.imus[name]
@@ -179,7 +179,7 @@ class ImuPart:
         return [name for name in self.imus if name in self._given or name not in spent]
 
 
-def recentred(graph: PoseGraph, solver: Solver) -> None:
+def repreintegrate_until_converged(graph: PoseGraph, solver: Solver) -> None:
     """Solve, preintegrate anew about the biases found, and solve again, until nothing moves."""
     solver.solve_to_optimum()
     for _ in range(RECENTRED):

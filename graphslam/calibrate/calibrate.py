@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 from graphslam.calibrate.estimate import Calibration
+from graphslam.calibrate.landmark_calibration import QUICK, CalibrationBudget, calibrate_sightings
 from graphslam.calibrate.scans import POINTS, calibrate_scans
-from graphslam.calibrate.sighted import QUICK, Effort, calibrate_sightings
-from graphslam.calibrate.windows import Seen
+from graphslam.calibrate.windows import SightingLog
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LaserScans
@@ -18,7 +18,7 @@ from graphslam_frontends.odometry.recorded import RecordedErrors
 
 
 def calibrate_streams(
-    log: SensorLog, kind: str, effort: Effort = QUICK, config: Any = None, *, seed: int = 0
+    log: SensorLog, kind: str, effort: CalibrationBudget = QUICK, config: Any = None, *, seed: int = 0
 ) -> Calibration:
     """What a log says of its own noise and lasting errors, without truth.
 
@@ -30,7 +30,7 @@ def calibrate_streams(
         Of a front end that reads them: how landmarks are detected, how scans become steps.
     """
     if kind == "sightings":
-        seen = Seen.of(log, *landmark_stream(log, config.detector))
+        seen = SightingLog.of(log, *landmark_stream(log, config.detector))
         return calibrate_sightings(seen, effort, seed=seed, noise=getattr(config, "motion", None))
     wanted = replace(config.steps, match_scans=False, yaw_per_metre=0.0)
     if log.of_type(LaserScans) is None:

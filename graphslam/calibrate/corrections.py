@@ -129,7 +129,7 @@ class CalibrateConfig:
             raise ConfigError(f"calibrate.budget = {self.budget}; wanted above 0, at most 100")
 
 
-def calibrated(log: SensorLog, c: Corrections) -> SensorLog:
+def apply_corrections(log: SensorLog, c: Corrections) -> SensorLog:
     """The log with the corrections applied: motion, sightings and their stated noise; its truth is left alone."""
     if c.neutral:
         return log
@@ -217,14 +217,14 @@ def _odometry(odometry: Odometry, c: Corrections) -> Odometry:
         increments[0] = odometry.increments[0]
     if c.along_metre is None:
         return replace(odometry, increments=increments)
-    P = walks(c, metres, turned, seconds, g.dof)
+    P = increment_covariances(c, metres, turned, seconds, g.dof)
     if c.widen_only:
         k = np.arange(g.dof)
         P[:, k, k] = np.maximum(P[:, k, k], odometry.covariances[:, k, k])
     return replace(odometry, increments=increments, covariances=P)
 
 
-def walks(c: Corrections, metres: Array, turned: Array, seconds: Array, dof: int) -> Array:
+def increment_covariances(c: Corrections, metres: Array, turned: Array, seconds: Array, dof: int) -> Array:
     """Covariances ``(n, dof, dof)`` of increments, right tangent."""
     along = (c.along_metre or 0.0) ** 2 * metres + c.along_second**2 * seconds + _LEAST[0]
     side = c.lateral_metre**2 * metres + _LEAST[0]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.calibrate.corrections import Corrections
-from graphslam.core.config import as_dict
+from graphslam.core.config import options_dict
 from graphslam.core.findings import Finding
 
 SURE = 3.0
@@ -79,7 +79,7 @@ class Estimate:
         elif not self.gain > GAIN:
             why = f"log-likelihood +{max(self.gain, 0.0):.1f} nats, more than {GAIN:g} needed"
         elif abs(self.value - self.other) > AGREE * math.hypot(self.sigma, self.other_sigma):
-            why = f"windows of another length give {in_words(self.name, self.other, self.other_sigma)}"
+            why = f"windows of another length give {estimate_text(self.name, self.other, self.other_sigma)}"
         return replace(self, why_not=why)
 
 
@@ -179,7 +179,7 @@ class Calibration:
                 Finding("", "calibrated", text) if taken == "all" else Finding("look", "calibration-refused", text)
             )
         for e in self.estimates:
-            said = in_words(e.name, e.value, e.sigma)
+            said = estimate_text(e.name, e.value, e.sigma)
             if e.applied:
                 text = f"calibration from {self.data}: {said} — {MENDED[e.name]} (log-likelihood +{e.gain:.0f} nats)."
                 out.append(Finding("", "calibrated", text))
@@ -190,7 +190,7 @@ class Calibration:
         if chance:
             out.append(Finding("", "calibrated", f"systematic errors of {' and '.join(chance)}: none found."))
         if self.noise:
-            text = f"noise from {self.data}: {noise_in_words(self.noise)}{', not used' * (taken == 'nothing')}."
+            text = f"noise from {self.data}: {noise_text(self.noise)}{', not used' * (taken == 'nothing')}."
             if self.corrections.widen_only:
                 text += " A larger σ in the log is kept."
             out.append(Finding("", "calibrated", text))
@@ -198,20 +198,20 @@ class Calibration:
 
     def contradictions(self) -> list[str]:
         """Implausibly large estimates, in words; with any of them nothing of the calibration is used."""
-        out = [in_words(e.name, e.value, e.sigma) for e in self.estimates if e.contradiction]
+        out = [estimate_text(e.name, e.value, e.sigma) for e in self.estimates if e.contradiction]
         large = {k: v for k, v in self.noise.items() if v > LARGEST_NOISE.get(k, math.inf)}
-        return out + ([f"noise {noise_in_words(large)}"] if large else [])
+        return out + ([f"noise {noise_text(large)}"] if large else [])
 
     def config(self) -> dict[str, Any]:
         """Options ``calibrate.…`` of a run that uses it, and estimates nothing anew."""
-        return {"use": "none", "given": as_dict(self.corrections)}
+        return {"use": "none", "given": options_dict(self.corrections)}
 
     def as_dict(self) -> dict[str, Any]:
         """JSON object."""
         return {
             "kind": self.kind,
             "data": self.data,
-            "given": as_dict(self.corrections),
+            "given": options_dict(self.corrections),
             "estimates": [
                 {k: _number(getattr(e, k)) for k in e.__dataclass_fields__} | {"applied": e.applied}
                 for e in self.estimates
@@ -219,7 +219,7 @@ class Calibration:
             "noise": {k: float(v) for k, v in self.noise.items()},
             "prediction": None
             if self.prediction is None
-            else as_dict(self.prediction) | {"taken": self.prediction.taken},
+            else options_dict(self.prediction) | {"taken": self.prediction.taken},
             "lines": [f.as_row() for f in self.findings()],
         }
 
@@ -248,7 +248,7 @@ MENDED = {
 }
 
 
-def in_words(name: str, value: float, sigma: float) -> str:
+def estimate_text(name: str, value: float, sigma: float) -> str:
     """A constant with its σ as a sentence without an end."""
     deg = np.rad2deg
     if name == "yaw_bias":
@@ -276,7 +276,7 @@ def in_words(name: str, value: float, sigma: float) -> str:
     return f"{name} {value:.4g} ± {sigma:.2g}"
 
 
-def noise_in_words(noise: dict[str, float]) -> str:
+def noise_text(noise: dict[str, float]) -> str:
     """Standard deviations as a list."""
     units = {
         "along_metre": ("along the path", "m/√m"),
@@ -294,7 +294,7 @@ def noise_in_words(noise: dict[str, float]) -> str:
     return ", ".join(found)
 
 
-def rounded(x: float) -> float:
+def round_digits(x: float) -> float:
     """Five digits: what is written is what is used, on every machine."""
     return float(f"{x:.5g}")
 

@@ -42,7 +42,7 @@ _FAR = 1e-8  # information of where a landmark is before it is seen [1/m²]
 
 
 @njit(error_model="numpy", nogil=True)
-def wrap(a):
+def wrap_residual(a):
     """Angle in (-π, π]."""
     return math.pi - (math.pi - a) % (2.0 * math.pi)
 
@@ -101,7 +101,7 @@ def _leave(at, active, A, C, S, gone):
 
 
 @njit(error_model="numpy", nogil=True)
-def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
+def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     """Linearise a window, and eliminate its poses and nuisances onto the constants.
 
     A nuisance goes with the last pose that sights it, and leaves its place in the border to another: so the border is
@@ -122,7 +122,7 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
     damping : share added to every diagonal, Levenberg-Marquardt.
     work : Work
         L (n, D, D), X (n, D, D), C (n, D, m), S (m, m), chi2 (6,), gone (2 M, m + D), pivots (2 M,), order (M,),
-        when (M,), at (M,) out, m = HEAD + 2 times the most nuisances at a time: what :func:`substitute` needs.
+        when (M,), at (M,) out, m = HEAD + 2 times the most nuisances at a time: what :func:`substitute_window` needs.
         ``order`` has the nuisances in the order in which they went, ``when`` the poses with which, ``at`` their places
         in the border. S[:HEAD, :HEAD] holds the information of the constants, with the right side and χ² in row RHS;
         chi2 is that at the linearisation point: along, lateral, heading, range, bearing, priors.
@@ -223,7 +223,7 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
                 e = math.atan2(dy, dx) - th - sensor[2] - g[SENSOR_YAW] - sightings[q, 1]
                 if v >= 0:
                     e += nuisance[v, 1]
-                e = wrap(e)
+                e = wrap_residual(e)
                 jp[:] = 0.0
                 jp[0], jp[1] = w * dy / r2, -w * dx / r2
                 jp[2] = w * (-(dx * ox + dy * oy) / r2 - 1.0)
@@ -251,7 +251,7 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
             qx, qy = cp * mx + sp * my, -sp * mx + cp * my
             qx, qy = longer * qx, longer * qy
             ex, ey = qx - cx + speed * dt, qy - cyy
-            et = wrap(poses[k + 1, 2] - th - turn + less)
+            et = wrap_residual(poses[k + 1, 2] - th - turn + less)
             var_x = p[ALONG_METRE] ** 2 * d + p[ALONG_SECOND] ** 2 * dt + p[FLOOR_POSITION] ** 2
             var_y = p[LATERAL_METRE] ** 2 * d + p[FLOOR_POSITION] ** 2
             var_t = p[HEADING_METRE] ** 2 * d + p[HEADING_RADIAN] ** 2 * abs(turn) + p[HEADING_SECOND] ** 2 * dt
@@ -367,7 +367,7 @@ def eliminate(poses, nuisance, g, data, sensor, p, damping, work):
 
 
 @njit(error_model="numpy", nogil=True)
-def substitute(work, dg, d_poses, d_nuisance):
+def substitute_window(work, dg, d_poses, d_nuisance):
     """Steps of poses (n, D) and nuisances (M, 2) that belong to a step ``dg`` of the constants."""
     L, X, C, _, _, gone, pivots, order, when, at = work
     n, D = d_poses.shape
@@ -411,4 +411,4 @@ def compose_steps(increments, start, poses):
         x, y = increments[k, 0], increments[k, 1]
         poses[k, 0] = poses[k - 1, 0] + c * x - s * y
         poses[k, 1] = poses[k - 1, 1] + s * x + c * y
-        poses[k, 2] = wrap(poses[k - 1, 2] + increments[k, 2])
+        poses[k, 2] = wrap_residual(poses[k - 1, 2] + increments[k, 2])

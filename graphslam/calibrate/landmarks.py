@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.smoothing import CONSTANTS, START, Smoothing, Window, keep_sightings, numbered
-from graphslam.calibrate.windows import Seen, cut
+from graphslam.calibrate.smoothing import CONSTANTS, START, Smoothing, SmoothingWindow, keep_sightings, renumber_slots
+from graphslam.calibrate.windows import SightingLog, cut_windows
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 
@@ -18,7 +18,9 @@ TRIMS = (5.0, 4.0)
 """Sightings with a whitened residual above are left out, with a new fit after each."""
 
 
-def smoothing_of(windows: Sequence[Window], sensor: Array, free: Sequence[str], *, visits: bool = False) -> Smoothing:
+def smoothing_of(
+    windows: Sequence[SmoothingWindow], sensor: Array, free: Sequence[str], *, visits: bool = False
+) -> Smoothing:
     """Windows with the noise that is to be found in them."""
     bearings = any(np.isfinite(w.sightings[:, 1]).any() for w in windows)
     fitted = [*WHEELS, "range"] + ["bearing"] * bearings
@@ -26,26 +28,28 @@ def smoothing_of(windows: Sequence[Window], sensor: Array, free: Sequence[str], 
     return Smoothing(list(windows), np.asarray(sensor, dtype=np.float64), tuple(free), tuple(fitted))
 
 
-def sighted(seen: Seen, seconds: float, count: int | None, free: Sequence[str], *, visits: bool = False) -> Smoothing:
+def smooth_sightings(
+    seen: SightingLog, seconds: float, count: int | None, free: Sequence[str], *, visits: bool = False
+) -> Smoothing:
     """Smoothing of windows of range and bearing, where the odometry starts it."""
-    windows = cut(seen, seconds, count, visits=visits)
+    windows = cut_windows(seen, seconds, count, visits=visits)
     return smoothing_of(windows, seen.sightings.T_base_sensor, free, visits=visits)
 
 
-def trimmed(s: Smoothing, limit: float) -> Smoothing:
+def trim_outliers(s: Smoothing, limit: float) -> Smoothing:
     """The smoothing without sightings whose residual is above ``limit`` standard deviations."""
     seen, _ = s.residuals()
     good = [np.nan_to_num(np.abs(r), nan=0.0).max(axis=1, initial=0.0) < limit for r in seen]
     return s if all(g.all() for g in good) else keep_sightings(s, good)
 
 
-def fitted(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
+def fit_noise(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
     """Fit, trim and fit again; the smoothing and its objective."""
     s.settle(8)
-    s = trimmed(s, 12.0)  # a wrong identity by metres would make its noise that of all
+    s = trim_outliers(s, 12.0)  # a wrong identity by metres would make its noise that of all
     value = s.fit(budget=budget, rounds=2 if trims else 4)
     for limit in trims:
-        less = trimmed(s, limit)
+        less = trim_outliers(s, limit)
         if less is s:
             continue
         s = less
@@ -53,15 +57,15 @@ def fitted(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS) -
     return s, value
 
 
-def without(s: Smoothing, constant: str, *, budget: int = 150) -> tuple[Smoothing, float]:
+def fit_without(s: Smoothing, constant: str, *, budget: int = 150) -> tuple[Smoothing, float]:
     """The smoothing with a constant left out, its noise fitted anew, and its objective."""
     alone = s.copy(free=tuple(c for c in s.free if c != constant))
     alone.constants[CONSTANTS.index(constant)] = 0.0
     return alone, alone.fit(budget=budget, rounds=3)
 
 
-def ranged(
-    seen: Seen, until: float, *, seed: int = 0, starts: int = 16, first: float = 150.0
+def smooth_ranges(
+    seen: SightingLog, until: float, *, seed: int = 0, starts: int = 16, first: float = 150.0
 ) -> tuple[Smoothing, Smoothing] | None:
     """One window of ranges alone, from a dead start: layouts of beacons over its beginning, then ever more of it.
 
@@ -82,7 +86,7 @@ def ranged(
     free = ("yaw_bias", "range_scale", "range_offset")
     rng = SeedTree(seed).child("calibrate", "ranges").generator()
     s, (begin, _) = seen.sightings, seen.span
-    (whole,) = cut(seen, 1e9)[:1] or (None,)
+    (whole,) = cut_windows(seen, 1e9)[:1] or (None,)
     if whole is None:
         return None
     ends = [until]
@@ -108,7 +112,7 @@ def ranged(
             tries.append((one.settle(60), one))
         best = min(tries, key=lambda x: x[0])[1]
         best.fit(budget=120, rounds=2)
-        best = trimmed(best, 5.0)
+        best = trim_outliers(best, 5.0)
         best.fit(budget=120, rounds=2)
         constants, sigmas, poses = best.constants, best.sigmas, best.windows[0].poses
         names = _names(whole, best.windows[0])
@@ -117,7 +121,7 @@ def ranged(
     return (made[-1], made[-2] if len(made) > 1 else made[-1]) if made else None
 
 
-def _names(whole: Window, w: Window) -> Array:
+def _names(whole: SmoothingWindow, w: SmoothingWindow) -> Array:
     """Landmark of the whole window that each of a part's is."""
     of_row = dict(zip(whole.rows.tolist(), whole.slots[:, 0].tolist()))
     out = np.full(len(w.nuisance), -1)
@@ -126,7 +130,7 @@ def _names(whole: Window, w: Window) -> Array:
     return out
 
 
-def _extended(whole: Window, poses: Array, n: int, g: Array) -> Array:
+def _extended(whole: SmoothingWindow, poses: Array, n: int, g: Array) -> Array:
     """Path of ``n`` poses that goes on from those known by steps without what the constants take away."""
     u = whole.steps[:n].copy()
     u[:, 2] -= g[K.YAW_BIAS] * u[:, 3]
@@ -138,11 +142,11 @@ def _extended(whole: Window, poses: Array, n: int, g: Array) -> Array:
     return out
 
 
-def _part(whole: Window, path: Array, places: dict[int, Array], rng: np.random.Generator) -> Window:
+def _part(whole: SmoothingWindow, path: Array, places: dict[int, Array], rng: np.random.Generator) -> SmoothingWindow:
     """The first poses of a window, beacons without a place put anywhere on their first circle that fits."""
     n = len(path)
     q = int(whole.first[n])
-    slots, order = numbered(whole.slots[:q])
+    slots, order = renumber_slots(whole.slots[:q])
     k = np.repeat(np.arange(n), np.diff(whole.first[: n + 1]))
     nuisance = np.zeros((len(order), 2))
     for j, l in enumerate(order.tolist()):
@@ -152,7 +156,7 @@ def _part(whole: Window, path: Array, places: dict[int, Array], rng: np.random.G
         mine = np.flatnonzero(slots[:, 0] == j)
         at, r = path[k[mine], :2], whole.sightings[mine, 0]
         nuisance[j] = _anywhere(at, r, rng)
-    return Window(
+    return SmoothingWindow(
         times=whole.times[:n],
         steps=whole.steps[:n],
         first=whole.first[: n + 1],
@@ -184,7 +188,7 @@ def _anywhere(at: Array, r: Array, rng: np.random.Generator) -> Array:
     return best if rng.random() < 0.7 else other
 
 
-def at_shift(s: Smoothing, seen: Seen, shift: float) -> Smoothing:
+def shift_motion(s: Smoothing, seen: SightingLog, shift: float) -> Smoothing:
     """The smoothing with its motion cut at stamps that are later by ``shift``."""
     windows = [replace(w, steps=seen.steps(w.times, shift)) for w in s.windows]
     return s.copy(windows=windows)

@@ -15,7 +15,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.special import gammaln
 
 from graphslam.calibrate.estimate import AGREE, NAMES, SURE, Calibration, Estimate, Prediction
-from graphslam.calibrate.sighted import Effort, calibration_of
+from graphslam.calibrate.landmark_calibration import CalibrationBudget, calibration_of
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
@@ -50,7 +50,7 @@ POINTS = 20000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pairs:
+class ScanPairs:
     """Matched pairs of scans.
 
     Parameters
@@ -79,15 +79,15 @@ class Pairs:
     along: Array
     side: Array
 
-    def take(self, keep: Array) -> Pairs:
+    def take(self, keep: Array) -> ScanPairs:
         """Some of them."""
-        return Pairs(**{k: getattr(self, k)[keep] for k in self.__dataclass_fields__})
+        return ScanPairs(**{k: getattr(self, k)[keep] for k in self.__dataclass_fields__})
 
     def __len__(self) -> int:
         return len(self.apart)
 
 
-def matched_pairs(steps: Steps, most: int) -> Pairs:
+def matched_pairs(steps: Steps, most: int) -> ScanPairs:
     """Pairs of key scans spread over the log, at most ``most`` of each distance."""
     o = steps.odometry
     g = group_of(o.increments)
@@ -141,7 +141,7 @@ def matched_pairs(steps: Steps, most: int) -> Pairs:
             rows.append([apart, *gone, chord, float(e[g.heading]), along, side])
     if len(rows) < LEAST:
         raise DataError("too few scans match to calibrate the odometry", where=steps.name, got=len(rows), wanted=LEAST)
-    return Pairs(**dict(zip(Pairs.__dataclass_fields__, np.array(rows).T)))
+    return ScanPairs(**dict(zip(ScanPairs.__dataclass_fields__, np.array(rows).T)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +167,7 @@ class Regression:
     keep: npt.NDArray[np.bool_]
 
 
-def regress(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Regression:
+def regress_errors(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Regression:
     """Greatest Student likelihood of errors ``(n,)`` with design ``(n, p)`` and variances ``c² + grows · s²``.
 
     Parameters
@@ -195,7 +195,7 @@ def regress(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Regressio
                 c = np.linalg.lstsq(H, (A[keep] * w[:, None]).T @ e[keep], rcond=None)[0]
             r2 = (e[keep] - A[keep] @ c) ** 2 / v
             w = (FREEDOM + 1.0) / (FREEDOM + r2) / v
-        return student(e[keep] - A[keep] @ c, v * FREEDOM / (FREEDOM - 2.0)), c, H
+        return student_likelihood(e[keep] - A[keep] @ c, v * FREEDOM / (FREEDOM - 2.0)), c, H
 
     for _ in range(2 if trim else 1):
         found = minimize(
@@ -221,7 +221,7 @@ def regress(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Regressio
 HEADING = ("yaw_bias", "turn_per_metre", "turn_scale")
 
 
-def calibrate_scans(steps: Steps, effort: Effort) -> Calibration:
+def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
     """What the scans of a log say of its odometry.
 
     Parameters
@@ -245,10 +245,10 @@ def calibrate_scans(steps: Steps, effort: Effort) -> Calibration:
         text += f"{math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m — limited by scan matching."
         notes.append(Finding("", "calibrated", text))
     found = calibration_of(kind, estimates, noise, notes, data)
-    return found if found.contradictions() else found.judged(predicted(p, found, widen=kind == "scans"))
+    return found if found.contradictions() else found.judged(cross_validate(p, found, widen=kind == "scans"))
 
 
-def predicted(p: Pairs, found: Calibration, *, widen: bool) -> Prediction:
+def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Prediction:
     """Two-fold cross-validation: matches of one half of the log under the estimate of the other half.
 
     Blocks of the log take turns: each is predicted from those of the other kind.
@@ -278,16 +278,16 @@ def predicted(p: Pairs, found: Calibration, *, widen: bool) -> Prediction:
         ):
             test = ~train
             match = _match_noise(e[train], stated[train])
-            before = student(e[test], match**2 + stated[test])
+            before = student_likelihood(e[test], match**2 + stated[test])
             for name, columns in (("all", A), ("noise", A[:, :0])):
-                r = regress(e[train], columns[train], g[train])
+                r = regress_errors(e[train], columns[train], g[train])
                 v = g[test] @ r.sigmas[1:] ** 2
                 v = r.sigmas[0] ** 2 + (np.maximum(v, stated[test]) if widen else v)
-                gains[name] += before - student(e[test] - columns[test] @ r.value, v)
+                gains[name] += before - student_likelihood(e[test] - columns[test] @ r.value, v)
     return Prediction(what="scan matches", count=len(p), gains=gains)
 
 
-def student(e: Array, variances: Array) -> float:
+def student_likelihood(e: Array, variances: Array) -> float:
     """Negative log likelihood of errors ``(n,)`` under Student's distribution with these variances [nats]."""
     v = variances * (FREEDOM - 2.0) / FREEDOM
     constant = gammaln(0.5 * FREEDOM) - gammaln(0.5 * (FREEDOM + 1.0)) + 0.5 * math.log(FREEDOM * math.pi)
@@ -297,21 +297,23 @@ def student(e: Array, variances: Array) -> float:
 
 def _match_noise(e: Array, stated: Array) -> float:
     """σ of a match that makes errors likeliest whose other noise is as stated."""
-    found = minimize_scalar(lambda x: student(e, math.exp(2.0 * x) + stated), bounds=_MATCHES, method="bounded")
+    found = minimize_scalar(
+        lambda x: student_likelihood(e, math.exp(2.0 * x) + stated), bounds=_MATCHES, method="bounded"
+    )
     return math.exp(found.x)
 
 
-def _turning(p: Pairs, noise: dict[str, float]) -> float:
+def _turning(p: ScanPairs, noise: dict[str, float]) -> float:
     """Noise of the heading after one metre of this log [rad/√m]."""
     grows = np.array([x.sum() for x in (p.metres, p.turned, p.seconds)]) / max(float(p.metres.sum()), 1e-9)
     return float(np.sqrt(grows @ np.square([noise[f"heading_{k}"] for k in ("metre", "radian", "second")])))
 
 
-def _heading(p: Pairs) -> tuple[list[Estimate], list[Finding], dict[str, float]]:
+def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, float]]:
     columns = {"yaw_bias": p.seconds, "turn_per_metre": p.metres, "turn_scale": p.turn}
     names, notes = list(HEADING), list[Finding]()
     grows = np.column_stack([p.metres, p.turned, p.seconds])
-    full = regress(p.heading, np.column_stack([columns[n] for n in names]), grows)
+    full = regress_errors(p.heading, np.column_stack([columns[n] for n in names]), grows)
     for pair in (("yaw_bias", "turn_per_metre"), ("turn_scale", "turn_per_metre"), ("yaw_bias", "turn_scale")):
         if not set(pair) <= set(names):
             continue
@@ -320,9 +322,9 @@ def _heading(p: Pairs) -> tuple[list[Estimate], list[Finding], dict[str, float]]
         rho = float(C[i, j] / math.sqrt(C[i, i] * C[j, j]))
         if abs(rho) > ALIKE:
             rest = [[n for n in names if n != drop] for drop in pair]
-            tried = [regress(p.heading, np.column_stack([columns[n] for n in r]), grows, trim=0) for r in rest]
+            tried = [regress_errors(p.heading, np.column_stack([columns[n] for n in r]), grows, trim=0) for r in rest]
             names = rest[int(tried[1].score < tried[0].score)]
-            full = regress(p.heading, np.column_stack([columns[n] for n in names]), grows)
+            full = regress_errors(p.heading, np.column_stack([columns[n] for n in names]), grows)
             kept = next(n for n in pair if n in names)
             text = (
                 f"errors of {NAMES[pair[0]]} and {NAMES[pair[1]]}: correlation {rho:.2f} in this log — only an error "
@@ -335,13 +337,13 @@ def _heading(p: Pairs) -> tuple[list[Estimate], list[Finding], dict[str, float]]
     parts = []
     for mine in (groups[0], groups[-1]):
         A = np.column_stack([columns[n][mine] for n in names])
-        parts.append(regress(p.heading[mine], A, grows[mine][:, :1]))
+        parts.append(regress_errors(p.heading[mine], A, grows[mine][:, :1]))
     for k, name in enumerate(names):
         sd = math.sqrt(full.covariance[k, k])
         gain = math.nan
         if abs(full.value[k]) > SURE * sd:
             others = np.column_stack([columns[n] for n in names if n != name] or [p.metres[:, None][:, :0]])
-            gain = regress(p.heading[full.keep], others[full.keep], grows[full.keep], trim=0).score - full.score
+            gain = regress_errors(p.heading[full.keep], others[full.keep], grows[full.keep], trim=0).score - full.score
         out.append(_gated(name, full, parts, k, gain))
     s = full.sigmas
     return out, notes, {"heading_metre": float(s[1]), "heading_radian": float(s[2]), "heading_second": float(s[3])}
@@ -356,16 +358,16 @@ def _gated(name: str, full: Regression, parts: list[Regression], k: int, gain: f
     return Estimate(name=name, value=value, sigma=sd, gain=gain, other=other[0], other_sigma=other[1]).gated()
 
 
-def _distance(p: Pairs) -> tuple[Estimate, dict[str, float]]:
+def _distance(p: ScanPairs) -> tuple[Estimate, dict[str, float]]:
     """Scale of the distances, and the noise along and to the side."""
     grows = p.metres[:, None]
     A = p.chord[:, None]
-    full = regress(p.along, A, grows)
-    parts = [regress(p.along[m], A[m], grows[m]) for m in (p.apart == p.apart.min(), p.apart == p.apart.max())]
+    full = regress_errors(p.along, A, grows)
+    parts = [regress_errors(p.along[m], A[m], grows[m]) for m in (p.apart == p.apart.min(), p.apart == p.apart.max())]
     gain = math.nan
     if abs(full.value[0]) > SURE * math.sqrt(full.covariance[0, 0]):
         keep = full.keep
-        gain = regress(p.along[keep], A[keep][:, :0], grows[keep], trim=0).score - full.score
+        gain = regress_errors(p.along[keep], A[keep][:, :0], grows[keep], trim=0).score - full.score
     raw = _gated("distance_scale", full, parts, 0, gain)
     # odometry less match over match is the factor less 1
     value = math.log1p(max(raw.value, -0.9))
@@ -374,5 +376,5 @@ def _distance(p: Pairs) -> tuple[Estimate, dict[str, float]]:
         value=value,
         other=math.log1p(max(raw.other, -0.9)),
     )
-    side = regress(p.side, p.metres[:, None] * 0.0 + 1.0, grows)
+    side = regress_errors(p.side, p.metres[:, None] * 0.0 + 1.0, grows)
     return scale, {"along_metre": float(full.sigmas[1]), "lateral_metre": float(side.sigmas[1])}

@@ -63,7 +63,7 @@ WIDTH = 2.0
 
 
 @dataclass(slots=True)
-class Window:
+class SmoothingWindow:
     """A stretch of the log with a frame and landmarks of its own.
 
     Parameters
@@ -115,7 +115,7 @@ class Smoothing:
         Those that are estimated.
     """
 
-    windows: list[Window]
+    windows: list[SmoothingWindow]
     sensor: Array
     free: tuple[str, ...]
     fitted: tuple[str, ...]
@@ -145,7 +145,7 @@ class Smoothing:
         if len(self._memory) != len(self.windows):
             self._memory = []
             for w in self.windows:
-                (n, D), M, m = w.poses.shape, len(w.nuisance), K.HEAD + 2 * at_a_time(w)
+                (n, D), M, m = w.poses.shape, len(w.nuisance), K.HEAD + 2 * most_open_nuisances(w)
                 shapes = ((n, D, D), (n, D, D), (n, D, m), (m, m), (6,), (2 * M, m + D), (2 * M,))
                 self._memory.append(K.Work(*(np.zeros(s) for s in shapes), *np.zeros((3, M), dtype=np.int64)))
         return self._memory
@@ -155,7 +155,7 @@ class Smoothing:
         logdet, volume, S, chi2 = 0.0, 0.0, np.zeros((K.HEAD, K.HEAD)), np.zeros(6)
         for w, work in zip(self.windows, self._buffers()):
             data = K.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
-            a, b = K.eliminate(w.poses, w.nuisance, self.constants, data, self.sensor, p, damping, work)
+            a, b = K.eliminate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, damping, work)
             logdet, volume = logdet + a, volume + b
             S += work.S[: K.HEAD, : K.HEAD]
             chi2 += work.chi2
@@ -212,7 +212,7 @@ class Smoothing:
             kept = [(w.poses, w.nuisance) for w in self.windows], self.constants
             for w, work in zip(self.windows, self._buffers()):
                 dp, dn = np.zeros_like(w.poses), np.zeros_like(w.nuisance)
-                K.substitute(work, step, dp, dn)
+                K.substitute_window(work, step, dp, dn)
                 w.poses, w.nuisance = w.poses + dp, w.nuisance + dn
             self.constants = self.constants + step
             value = self.total()
@@ -297,7 +297,7 @@ class Smoothing:
         return seen, moved
 
 
-def at_a_time(w: Window) -> int:
+def most_open_nuisances(w: SmoothingWindow) -> int:
     """The most nuisances of a window that were sighted already and will be sighted again."""
     k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))
     change = np.zeros(len(w.poses) + 1, dtype=np.int64)
@@ -313,11 +313,11 @@ def keep_sightings(smoothing: Smoothing, keep: Sequence[npt.NDArray[np.bool_]]) 
     """The smoothing without some of its sightings; what is seen less than twice then is no landmark."""
     windows = []
     for w, good in zip(smoothing.windows, keep):
-        windows.append(rebuilt(w, good))
+        windows.append(rebuild_window(w, good))
     return smoothing.copy(windows=[w for w in windows if len(w.sightings) > 3])
 
 
-def rebuilt(w: Window, good: npt.NDArray[np.bool_]) -> Window:
+def rebuild_window(w: SmoothingWindow, good: npt.NDArray[np.bool_]) -> SmoothingWindow:
     """A window with some of its sightings, nuisances renumbered in the order in which they are seen first."""
     good = good.copy()
     landmark = w.slots[:, 0]
@@ -325,8 +325,8 @@ def rebuilt(w: Window, good: npt.NDArray[np.bool_]) -> Window:
     counts = np.bincount(landmark[good], minlength=len(w.nuisance))
     good &= counts[landmark] >= least
     k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))[good]
-    slots, order = numbered(w.slots[good])
-    return Window(
+    slots, order = renumber_slots(w.slots[good])
+    return SmoothingWindow(
         times=w.times,
         steps=w.steps,
         first=np.searchsorted(k, np.arange(len(w.poses) + 1)).astype(np.int64),
@@ -339,7 +339,7 @@ def rebuilt(w: Window, good: npt.NDArray[np.bool_]) -> Window:
     )
 
 
-def numbered(slots: Ints) -> tuple[Ints, Ints]:
+def renumber_slots(slots: Ints) -> tuple[Ints, Ints]:
     """Slots ``(q, 2)`` numbered in the order of their first sighting, and the old number of each new one."""
     flat = slots.ravel()
     names, first, inverse = np.unique(flat, return_index=True, return_inverse=True)

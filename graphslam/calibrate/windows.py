@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.corrections import Corrections, calibrated, corrected_sightings, visits_of
-from graphslam.calibrate.smoothing import Ints, Window, numbered, rebuilt
+from graphslam.calibrate.corrections import Corrections, apply_corrections, corrected_sightings, visits_of
+from graphslam.calibrate.smoothing import Ints, SmoothingWindow, rebuild_window, renumber_slots
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_compose, se2_transform
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
-from graphslam_frontends.odometry.motion import Motion, MotionNoise, dead_reckoning, motion_stream
+from graphslam_frontends.odometry.motion import Motion, MotionNoise, dead_reckoned_increments, motion_stream
 
 LONGEST = 1.0
 """A pause of the motion records that is thrice the usual one, and longer than this, ends a window [s]."""
@@ -25,7 +25,7 @@ shorter than what ends a visit."""
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SightingLog:
     """The motion and the sightings of a log, ready to be cut into windows.
 
     Parameters
@@ -48,17 +48,17 @@ class Seen:
     stated: MotionNoise | None = None
 
     @classmethod
-    def of(cls, log: SensorLog, name: str, sightings: LandmarkObservations) -> Seen:
+    def of(cls, log: SensorLog, name: str, sightings: LandmarkObservations) -> SightingLog:
         """Of a log whose sightings are in the stream ``name``, or were detected in it."""
         _, motion = motion_stream(log)
-        return cls(log, name, sightings, driven(motion))
+        return cls(log, name, sightings, cumulative_motion(motion))
 
-    def mended(self, c: Corrections) -> Seen:
+    def mended(self, c: Corrections) -> SightingLog:
         """The same with corrections applied, and what is withheld."""
-        made = Seen.of(calibrated(self.log, c), self.name, corrected_sightings(self.sightings, c))
+        made = SightingLog.of(apply_corrections(self.log, c), self.name, corrected_sightings(self.sightings, c))
         return replace(made, withheld=self.withheld, stated=self.stated)
 
-    def holding(self) -> Seen:
+    def holding(self) -> SightingLog:
         """The same without the sightings of some seconds now and then."""
         s = self.sightings
         times = np.repeat(s.times, np.diff(s.offsets))
@@ -85,7 +85,7 @@ class Seen:
             The motion's clock is ahead of that of the sightings by it [s].
         """
         t = np.asarray(stamps) + shift
-        odometry, _ = dead_reckoning(self.log, t, self.stated or MotionNoise(), hold=_HOLD + abs(shift))
+        odometry, _ = dead_reckoned_increments(self.log, t, self.stated or MotionNoise(), hold=_HOLD + abs(shift))
         out = np.zeros((len(t), 8))
         if self.stated is not None:
             out[1:, 5:] = np.diagonal(odometry.covariances[1:], axis1=1, axis2=2)
@@ -101,7 +101,7 @@ class Seen:
         return np.column_stack([self.clock[0, k], self.clock[0, k + 1]])
 
 
-def driven(motion: Motion) -> Array:
+def cumulative_motion(motion: Motion) -> Array:
     """Stamps of the motion's records, seconds in motion and metres driven until each ``(3, r)``."""
     t = motion.times
     dt = np.diff(t)
@@ -119,7 +119,9 @@ def driven(motion: Motion) -> Array:
     return np.stack([t, *total])
 
 
-def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = False) -> list[Window]:
+def cut_windows(
+    seen: SightingLog, seconds: float, count: int | None = None, *, visits: bool = False
+) -> list[SmoothingWindow]:
     """Windows of a length.
 
     Parameters
@@ -129,12 +131,12 @@ def cut(seen: Seen, seconds: float, count: int | None = None, *, visits: bool = 
     visits : bool
         With a constant for each visit of a landmark.
     """
-    made = (make_window(seen, scans, visits=visits) for scans in stretches(seen, seconds, count))
+    made = (make_window(seen, scans, visits=visits) for scans in window_scans(seen, seconds, count))
     return [w for w in made if w is not None]
 
 
-def stretches(seen: Seen, seconds: float, count: int | None = None) -> list[Ints]:
-    """Scans of each window that :func:`cut` makes."""
+def window_scans(seen: SightingLog, seconds: float, count: int | None = None) -> list[Ints]:
+    """Scans of each window that :func:`cut_windows` makes."""
     s, (begin, end) = seen.sightings, seen.span
     used = np.flatnonzero((np.diff(s.offsets) > 0) & (s.times >= begin - _HOLD) & (s.times <= end + _HOLD))
     if len(used) < 5:
@@ -159,7 +161,7 @@ def stretches(seen: Seen, seconds: float, count: int | None = None) -> list[Ints
     return [used[a:b] for a, b in starts]
 
 
-def make_window(seen: Seen, scans: Ints, *, visits: bool) -> Window | None:
+def make_window(seen: SightingLog, scans: Ints, *, visits: bool) -> SmoothingWindow | None:
     """Window of these scans, landmarks where the odometry puts them; None where nothing is seen twice."""
     s = seen.sightings
     steps = seen.steps(s.times[scans])
@@ -169,24 +171,24 @@ def make_window(seen: Seen, scans: Ints, *, visits: bool) -> Window | None:
     k = np.repeat(np.arange(len(scans)), np.diff(s.offsets)[scans])
     bearing = s.has_bearing[rows]
     z = np.column_stack([s.ranges[rows], np.where(bearing, s.bearings[rows], np.nan)])
-    points = points_of(z, se2_compose(poses, np.broadcast_to(s.T_base_sensor, poses.shape))[k])
+    points = sighting_points(z, se2_compose(poses, np.broadcast_to(s.T_base_sensor, poses.shape))[k])
     if s.ids is not None and np.any(s.ids[rows] >= 0):
         track = s.ids[rows].astype(np.int64)
     else:
-        track = follow(points, k)
+        track = track_points(points, k)
     good = track >= 0 if seen.withheld is None else (track >= 0) & ~seen.withheld[rows]
     names, landmark = np.unique(track[good], return_inverse=True)
     rows, k, z, points = rows[good], k[good], z[good], points[good]
     if not len(rows):
         return None
     visit = visits_of(landmark, s.times[scans][k]) + len(names) if visits else np.full(len(rows), -1)
-    slots, order = numbered(np.column_stack([landmark, visit]).astype(np.int64))
+    slots, order = renumber_slots(np.column_stack([landmark, visit]).astype(np.int64))
     kinds = (order >= len(names)).astype(np.int64)
     nuisance = np.zeros((len(order), 2))
     for j in np.flatnonzero(kinds == 0):
         mine = points[landmark == order[j]]
         nuisance[j] = np.median(mine[np.isfinite(mine[:, 0])], axis=0) if np.isfinite(mine[:, 0]).any() else np.nan
-    w = Window(
+    w = SmoothingWindow(
         times=s.times[scans],
         steps=steps,
         first=np.searchsorted(k, np.arange(len(scans) + 1)).astype(np.int64),
@@ -197,17 +199,17 @@ def make_window(seen: Seen, scans: Ints, *, visits: bool) -> Window | None:
         poses=poses,
         nuisance=nuisance,
     )
-    w = rebuilt(w, np.ones(len(rows), dtype=np.bool_))
+    w = rebuild_window(w, np.ones(len(rows), dtype=np.bool_))
     return w if len(w.sightings) > 3 else None
 
 
-def points_of(z: Array, sensor: Array) -> Array:
+def sighting_points(z: Array, sensor: Array) -> Array:
     """Where sightings ``(q, 2)`` put their landmarks, from sensors ``(q, 3)``; NaN without a bearing."""
     local = np.column_stack([z[:, 0] * np.cos(z[:, 1]), z[:, 0] * np.sin(z[:, 1])])
     return np.asarray(se2_transform(sensor, local))
 
 
-def follow(points: Array, k: Ints, *, gate: float = 1.0, ratio: float = 1.5, lost: int = 10) -> Ints:
+def track_points(points: Array, k: Ints, *, gate: float = 1.0, ratio: float = 1.5, lost: int = 10) -> Ints:
     """Tracks ``(q,)`` of points seen from poses ``k``: nearest, mutual, and clearly nearer than the second; -1: none.
 
     A landmark stands where it was seen last by the odometry, so that a track does not need the odometry to be right for

@@ -1,12 +1,12 @@
 """Layer 0: geometry, Gaussians, sensor records, the submap, configuration and errors. Imports no other layer."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "random": "SeedTree",
-    "poses": "SE3 group_of heading_of level",
+    "poses": "SE3 group_of heading_of remove_roll_pitch",
     "geometry": "wrap_angle",
     "se3": "align_se3 se3_transform",
     "gaussian": "chi2_mean_bounds chi2_quantile",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import FormatError
-from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.interrupt import defer_interrupts
 from graphslam.core.json_file import check_json, parse_json
 from graphslam.core.npz import Field, check_arrays, read_arrays
 from graphslam.core.reading import read_text
@@ -44,7 +44,7 @@ def sweep_parts(folder: str | os.PathLike[str]) -> None:
                 path.unlink(missing_ok=True)
 
 
-def sync(path: str | os.PathLike[str]) -> None:
+def sync_to_disk(path: str | os.PathLike[str]) -> None:
     """Ask the system to bring a file, or the names in a folder, to the disk."""
     try:
         handle = os.open(path, os.O_RDONLY)
@@ -82,7 +82,7 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
         if np.asarray(value).dtype.hasobject:
             raise FormatError(f"array {name!r} holds Python objects", where=str(path), wanted="numbers or strings")
     # a Ctrl-C inside would surface as an error of the half-written archive, and not as what it is
-    with deferred_interrupts(), atomic_open(path) as stream:
+    with defer_interrupts(), atomic_open(path) as stream:
         np.savez_compressed(stream, **{k: np.asarray(v) for k, v in arrays.items()})  # type: ignore[arg-type]
 
 

@@ -39,7 +39,7 @@ CHARTS: tuple[str, ...] = get_args(Chart)
 
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 _SMALL_TURN = 0.1
-"""Below this angle [rad] the series of :func:`arc_slopes` are as exact as the closed forms."""
+"""Below this angle [rad] the series of :func:`inverse_left_jacobian_slopes` are as exact as the closed forms."""
 _SMALL = 1e-3
 """Below this half angle [rad] series are exact to rounding, and differences of cotangents are not."""
 
@@ -51,7 +51,7 @@ def check_chart(chart: str) -> str:
     return chart
 
 
-def arc_terms(d: ArrayLike) -> tuple[Array, Array, Array]:
+def inverse_left_jacobian_terms(d: ArrayLike) -> tuple[Array, Array, Array]:
     """``a``, ``b`` and ``da/dd`` of ``V(d)⁻¹ = a I - b S`` for headings ``d`` in [-π, π]."""
     h = 0.5 * np.asarray(d, dtype=np.float64)
     small = np.abs(h) < _SMALL
@@ -62,19 +62,19 @@ def arc_terms(d: ArrayLike) -> tuple[Array, Array, Array]:
     return a, h, slope
 
 
-def along_arc(difference: Array, d: ArrayLike) -> Array:
+def apply_inverse_left_jacobian(difference: Array, d: ArrayLike) -> Array:
     """``V(d)⁻¹ e`` for differences e ``(..., 2)`` of points that hang on a pose whose heading differs by ``d``."""
-    a, b, _ = arc_terms(d)
+    a, b, _ = inverse_left_jacobian_terms(d)
     x, y = difference[..., 0], difference[..., 1]
     return np.stack([a * x + b * y, a * y - b * x], -1)
 
 
-def arc_matrices(w: Array) -> Array:
+def inverse_left_jacobians(w: Array) -> Array:
     """``V(w)⁻¹`` ``(..., 3, 3)`` for rotation vectors ``(..., 3)``."""
     return so3_left_jacobian_inverse(w)
 
 
-def arc_slopes(w: Array, e: Array) -> Array:
+def inverse_left_jacobian_slopes(w: Array, e: Array) -> Array:
     """Derivatives ``(..., 3, 3)`` of ``V(w)⁻¹ e`` by w, for rotation vectors and differences ``(..., 3)``.
 
     ``V(w)⁻¹ = I - ½ W + c W²`` with ``W = [w]×`` and ``c = (1 - (φ/2) cot(φ/2)) / φ²``.
@@ -107,12 +107,12 @@ def pose_differences(poses: Array, means: Array, chart: str) -> tuple[Array, Arr
     """
     w = so3_log(quat_multiply(poses[:, 3:], means[:, 3:] * _CONJUGATE))
     e = poses[:, :3] - means[:, :3]
-    return np.hstack([w, bent(e, w, chart)]), w
+    return np.hstack([w, chart_difference(e, w, chart)]), w
 
 
-def bent(e: Array, w: Array, chart: str) -> Array:
+def chart_difference(e: Array, w: Array, chart: str) -> Array:
     """Differences ``(n, 3)`` of points that hang on poses turned by ``w`` ``(n, 3)``, in a chart."""
-    return np.einsum("kij,kj->ki", arc_matrices(w), e) if chart == "group" else e
+    return np.einsum("kij,kj->ki", inverse_left_jacobians(w), e) if chart == "group" else e
 
 
 def map_difference(x: ArrayLike, mean: ArrayLike, chart: str, *, space: bool = False) -> Array:
@@ -131,10 +131,10 @@ def map_difference(x: ArrayLike, mean: ArrayLike, chart: str, *, space: bool = F
     if space:
         first, w = pose_differences(x[None, :7], mean[None, :7], chart)
         e = (x[7:] - mean[7:]).reshape(-1, 3)
-        return np.concatenate([first[0], bent(e, np.broadcast_to(w, e.shape), chart).ravel()])
+        return np.concatenate([first[0], chart_difference(e, np.broadcast_to(w, e.shape), chart).ravel()])
     r = x - mean
     r[2] = wrap_angle(r[2])
     if chart == "group":
-        points = along_arc(np.concatenate([r[:2], r[3:]]).reshape(-1, 2), r[2])
+        points = apply_inverse_left_jacobian(np.concatenate([r[:2], r[3:]]).reshape(-1, 2), r[2])
         r[:2], r[3:] = points[0], points[1:].ravel()
     return r

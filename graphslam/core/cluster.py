@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-def connect(address: str, *, timeout: float = 10.0) -> Client:
+def connect_cluster(address: str, *, timeout: float = 10.0) -> Client:
     """Connect to a running scheduler.
 
     Parameters
@@ -37,7 +37,7 @@ def connect(address: str, *, timeout: float = 10.0) -> Client:
 
 
 @contextmanager
-def hands(workers: int | None = None, address: str | None = None) -> Iterator[Callable[..., list[Any]]]:
+def task_runner(workers: int | None = None, address: str | None = None) -> Iterator[Callable[..., list[Any]]]:
     """Something that runs tasks: ``run(work, [arguments, …])`` gives what each call of ``work`` returned, in order.
 
     Parameters
@@ -68,7 +68,7 @@ def hands(workers: int | None = None, address: str | None = None) -> Iterator[Ca
         return run
 
     if address is not None:
-        with connect(address) as client:
+        with connect_cluster(address) as client:
             yield on(client)
         return
     with (

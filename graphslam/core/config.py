@@ -22,16 +22,16 @@ from graphslam.core.reading import LARGEST, read_text
 KEYS = "keys"
 
 
-def spelled(default: Any, **keys: str) -> Any:
+def flattened_field(default: Any, **keys: str) -> Any:
     """A field that holds a small dataclass and is spelled as several keys beside the others, one a field of it.
 
-    ``robust: Robust = spelled(NO_KERNEL, robust="kind", robust_width="k")`` is ``robust = "cauchy"`` and
+    ``robust: Robust = flattened_field(NO_KERNEL, robust="kind", robust_width="k")`` is ``robust = "cauchy"`` and
     ``robust_width = 2.385`` in TOML; a key that is left out keeps the default's value.
     """
     return dataclasses.field(default=default, metadata={KEYS: keys})
 
 
-def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
+def build_config(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
     """Build dataclass ``kind`` from nested mappings."""
     hints = typing.get_type_hints(kind)
     fields = {f.name: f for f in dataclasses.fields(kind)}
@@ -44,23 +44,23 @@ def build(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
             raise ConfigError(f"unknown configuration key {name!r}; known: {', '.join(sorted(known))}")
         if key in parts:
             f, part = parts[key]
-            converted = convert(typing.get_type_hints(hints[f.name])[part], value, name)
+            converted = convert_option(typing.get_type_hints(hints[f.name])[part], value, name)
             out[f.name] = dataclasses.replace(out.get(f.name, f.default), **{part: converted})
         else:
-            out[key] = convert(hints[key], value, name)
+            out[key] = convert_option(hints[key], value, name)
     try:
         return kind(**out)
     except TypeError as error:
         raise ConfigError(f"{where or kind.__name__}: {error}") from None
 
 
-def convert(hint: Any, value: Any, name: str) -> Any:
+def convert_option(hint: Any, value: Any, name: str) -> Any:
     """``value`` as the type that ``hint`` asks for; ``name`` is that of the option, for messages."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None or (value == "none" and str not in args):
             return None
-        return convert(next(a for a in args if a is not type(None)), value, name)
+        return convert_option(next(a for a in args if a is not type(None)), value, name)
     if origin is Literal:
         if value not in args:
             raise ConfigError(f"{name} = {value!r}; known: {', '.join(map(str, args))}")
@@ -68,15 +68,15 @@ def convert(hint: Any, value: Any, name: str) -> Any:
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, Mapping):
             raise ConfigError(f"{name} = {value!r}; wanted a table of options")
-        return build(hint, value, name)
+        return build_config(hint, value, name)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
             raise ConfigError(f"{name} = {value!r}; wanted a list")
         if args[1:] == (...,):
-            return tuple(convert(args[0], v, name) for v in value)
+            return tuple(convert_option(args[0], v, name) for v in value)
         if len(value) != len(args):
             raise ConfigError(f"{name} = {value!r}; wanted {len(args)} values")
-        return tuple(convert(a, v, name) for a, v in zip(args, value, strict=True))
+        return tuple(convert_option(a, v, name) for a, v in zip(args, value, strict=True))
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         if not (abs(value) <= LARGEST or abs(value) == math.inf):
             raise ConfigError(f"{name} = {value}; wanted a number, at most {LARGEST:g}")
@@ -90,12 +90,12 @@ def convert(hint: Any, value: Any, name: str) -> Any:
     raise ConfigError(f"{name} = {value!r}; wanted {getattr(hint, '__name__', hint)}")
 
 
-def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merge_options(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Deep merge of nested mappings, ``over`` wins."""
     out = dict(base)
     for key, value in over.items():
         old = out.get(key)
-        out[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+        out[key] = merge_options(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return out
 
 
@@ -126,7 +126,7 @@ def parse_setting(text: str) -> dict[str, Any]:
     return dict(value)
 
 
-def as_dict(config: Any) -> dict[str, Any]:
+def options_dict(config: Any) -> dict[str, Any]:
     """Nested plain dict of a configuration; None becomes absent (TOML has no null)."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
         items: dict[str, Any] = {}
@@ -141,7 +141,7 @@ def as_dict(config: Any) -> dict[str, Any]:
         if value is None:
             continue
         if dataclasses.is_dataclass(value) or isinstance(value, Mapping):
-            out[key] = as_dict(value)
+            out[key] = options_dict(value)
         else:
             out[key] = list(value) if isinstance(value, tuple) else value
     return out

@@ -1,7 +1,7 @@
 """What a submap knows densely: an evidence grid, a cloud, or both, and the one view that everybody asks.
 
-Registration, loops and fused maps ask a :class:`MapView` and nothing else; `graphslam.evidence.views.view_of` makes
-that of a submap.
+Registration, loops and fused maps ask a :class:`DenseMapView` and nothing else; `graphslam.evidence.views.dense_view`
+makes that of a submap.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.points import FARTHEST
-from graphslam.core.shelf import SHELF, Slot, as_it_is, the_only
+from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry, pack_array, unpack_array
 
 Ints = npt.NDArray[np.int64]
 
@@ -27,7 +27,7 @@ class DensePayload(Protocol):
 
 class CloudMap:
     """Points on the surfaces around a submap, in the frame of its base. A value that does not change; its points lie on
-    the shelf of the process (:mod:`graphslam.core.shelf`), so that those of a long run do not fill the memory.
+    the shelf of the process (:mod:`graphslam.core.spill_cache`), so that those of a long run do not fill the memory.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class CloudMap:
             raise GeometryError("origins and scans of a cloud go together", wanted="both, or neither")
         self.cell = cell
         self.origins: Array | None = None
-        self._scan: Slot[Ints] | None = None
+        self._scan: CacheEntry[Ints] | None = None
         if origins is not None:
             origins, scan = _rows(origins, "origins of a cloud"), np.ascontiguousarray(scan, dtype=np.int64)
             if origins.shape[1] != points.shape[1] or scan.shape != (len(points),):
@@ -67,9 +67,9 @@ class CloudMap:
                     got=int(scan.max()),
                     wanted=f"0 … {len(origins)}",
                 )
-            self.origins, self._scan = origins, SHELF.put(scan, scan.nbytes, as_it_is, the_only)
+            self.origins, self._scan = origins, SPILL_CACHE.put(scan, scan.nbytes, pack_array, unpack_array)
         self._shape = points.shape
-        self._points: Slot[Array] = SHELF.put(points, points.nbytes, as_it_is, the_only)
+        self._points: CacheEntry[Array] = SPILL_CACHE.put(points, points.nbytes, pack_array, unpack_array)
 
     @property
     def points(self) -> Array:
@@ -104,7 +104,7 @@ def _rows(values: Any, what: str) -> Array:
     return a
 
 
-class MapView(Protocol):
+class DenseMapView(Protocol):
     """What a submap knows of its surroundings, in the frame of its base."""
 
     @property

@@ -43,7 +43,7 @@ class Finding:
         return cls(cast(Level, row["level"]), row["code"], row["text"])
 
 
-def worst(findings: Iterable[Finding]) -> Level:
+def worst_level(findings: Iterable[Finding]) -> Level:
     """The level that weighs most among the findings."""
     return max((f.level for f in findings), key=LEVELS.index, default="")
 

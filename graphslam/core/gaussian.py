@@ -17,10 +17,10 @@ from scipy import special
 
 from graphslam.core.errors import CovarianceError, FormatError
 from graphslam.core.geometry import Array, ArrayLike, circular_mean, wrap_angle
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 
-def inverses(covariances: Array, where: str) -> Array:
+def information_matrices(covariances: Array, where: str) -> Array:
     """Information matrices of covariances ``(n, d, d)`` from a file."""
     finite = np.isfinite(covariances).all(axis=(1, 2))
     low = np.where(finite, 0.0, np.nan)
@@ -53,8 +53,8 @@ def check_covariance(
     if P.ndim != 2 or P.shape[0] != P.shape[1] or dim not in (None, len(P)):
         wanted = f"({dim}, {dim})" if dim is not None else "a square matrix"
         raise CovarianceError(f"{what} has the wrong shape", where=where, got=P.shape, wanted=wanted)
-    if not np.all(usable(P)):
-        i, j = np.argwhere(~usable(P))[0]
+    if not np.all(finite_mask(P)):
+        i, j = np.argwhere(~finite_mask(P))[0]
         raise CovarianceError(
             f"{what} is not finite", where=where, got=f"{P[i, j]} at ({i}, {j})", wanted="finite numbers"
         )

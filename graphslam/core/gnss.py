@@ -11,7 +11,7 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geodesy import geodetic_to_ecef, tangent_axes
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
 
 SPEED_OF_LIGHT = 299_792_458.0
@@ -71,8 +71,8 @@ class Pseudoranges:
             a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
             if a.shape != shapes.get(name, (q,)):
                 raise GeometryError(f"{name} has the wrong shape", got=a.shape, wanted=shapes.get(name, (q,)))
-            if not np.all(usable(a)):
-                k = int(np.argwhere(~usable(a))[0][0])
+            if not np.all(finite_mask(a)):
+                k = int(np.argwhere(~finite_mask(a))[0][0])
                 raise DataError(f"{name} of pseudorange {k} is not finite", got=a[k], wanted="finite numbers")
             object.__setattr__(self, name, a)
         for name in ("ids", "systems"):

@@ -16,7 +16,7 @@ def _trim() -> Callable[[int], int] | None:
     return found
 
 
-def give_back() -> None:
+def trim_heap() -> None:
     """Hand freed heap back to the system, where the C library can.
 
     glibc keeps arrays of up to 32 MB after they are freed. Between the stages of a long run that is as much as the

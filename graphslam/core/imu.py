@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
 
 GRAVITY = 9.80665
@@ -40,7 +40,7 @@ class ImuNoise:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if not (usable(value) and value >= 0):
+            if not (finite_mask(value) and value >= 0):
                 raise DataError(f"IMU noise {name} is impossible", got=value, wanted="≥ 0")
 
 
@@ -94,8 +94,8 @@ class Imu:
             a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
             if a.shape != shape:
                 raise GeometryError(f"IMU {name} has the wrong shape", got=a.shape, wanted=shape)
-            if not np.all(usable(a)):
-                k = int(np.argwhere(~usable(a))[0][0])
+            if not np.all(finite_mask(a)):
+                k = int(np.argwhere(~finite_mask(a))[0][0])
                 raise DataError(f"IMU {name} of record {k} is not finite", got=a[k], wanted="finite numbers")
             object.__setattr__(self, name, a)
 
@@ -137,7 +137,7 @@ def usable_readings(
     t, w, f = (np.asarray(a, dtype=np.float64) for a in (times, angular_rate, specific_force))
     if t.ndim != 1 or w.shape != (len(t), 3) or f.shape != (len(t), 3):
         raise GeometryError("IMU readings do not fit", got=(t.shape, w.shape, f.shape), wanted="(n,), (n, 3), (n, 3)")
-    finite = np.flatnonzero(usable(t) & np.all(usable(w) & usable(f), axis=1))
+    finite = np.flatnonzero(finite_mask(t) & np.all(finite_mask(w) & finite_mask(f), axis=1))
     latest = np.maximum.accumulate(np.concatenate([[-np.inf], t[finite]]))[:-1]
     rows = finite[t[finite] > latest]
     dropped = {"not finite": len(t) - len(finite), "time does not increase": len(finite) - len(rows)}

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["Interrupt", "deferred_interrupts", "heeded_interrupts"]
+__all__ = ["Interrupt", "defer_interrupts", "watch_interrupts"]
 
 
 class Interrupt:
-    """Whether Ctrl-C was pressed in a block of `heeded_interrupts`."""
+    """Whether Ctrl-C was pressed in a block of `watch_interrupts`."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -37,7 +37,7 @@ def _is_ours_to_handle() -> bool:
 
 
 @contextmanager
-def heeded_interrupts() -> Iterator[Interrupt]:
+def watch_interrupts() -> Iterator[Interrupt]:
     """Remember Ctrl-C in this block as well as raising it; call `Interrupt.check` between pieces of work.
 
     Does nothing outside the main thread or where the program handles the signal itself (as in a notebook's kernel
@@ -60,7 +60,7 @@ def heeded_interrupts() -> Iterator[Interrupt]:
 
 
 @contextmanager
-def deferred_interrupts() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Let this block end before Ctrl-C is heard; for short blocks that must be whole or not at all.
 
     Does nothing outside the main thread, which no signal interrupts.

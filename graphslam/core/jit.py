@@ -36,12 +36,15 @@ def without_garbage_collection() -> Iterator[None]:
 with without_garbage_collection():
     import numba
 
+_NAMES = 2
+"""Raise it when a class that kernels take is renamed: numba looks for the old name before it sees a changed source."""
+
 
 def compiled_folder() -> Path:
     """Folder of compiled code: ``NUMBA_CACHE_DIR``, or one of this numba and Python in the user's cache folder."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(chosen)
-    version = f"numba-{numba.__version__}-python-{sys.version_info.major}.{sys.version_info.minor}"
+    version = f"numba-{numba.__version__}-python-{sys.version_info.major}.{sys.version_info.minor}-{_NAMES}"
     return Path(platformdirs.user_cache_dir("graphslam", appauthor=False)) / "compiled" / version
 
 

@@ -143,14 +143,14 @@ def read_json_lines(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     return out
 
 
-def finite(value: Any) -> Any:
+def json_values(value: Any) -> Any:
     """The value with NumPy scalars as Python numbers and non-finite numbers as None (JSON has none)."""
     if isinstance(value, Mapping):
-        return {str(k): finite(v) for k, v in value.items()}
+        return {str(k): json_values(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite(v) for v in value]
+        return [json_values(v) for v in value]
     if hasattr(value, "tolist"):
-        return finite(value.tolist())
+        return json_values(value.tolist())
     if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
         return None
     return value

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import element, items, join, table
+from graphslam.core.markup import html_element, html_table, item_list, join_parts
 from graphslam.core.records import Stream, check_times
 from graphslam.core.trajectory import Trajectory
 
@@ -170,10 +170,10 @@ class SensorLog:
             rows.append({"stream": name, "kind": kind, "records": n, "from s": first, "to s": last})
         span = f"{self.duration:.1f} s" if any(len(s.times) for s in self.streams.values()) else "empty"
         parts: list[str] = [
-            element("b", f"SensorLog {self.name}"),
+            html_element("b", f"SensorLog {self.name}"),
             f", {span}, truth {'known' if self.truth else 'unknown'}",
-            table(rows, ["stream", "kind", "records", "from s", "to s"]),
+            html_table(rows, ["stream", "kind", "records", "from s", "to s"]),
         ]
         if self.dropped:
-            parts += ["dropped:", items(f"{k}: {v}" for k, v in self.dropped.items())]
-        return join(parts)
+            parts += ["dropped:", item_list(f"{k}: {v}" for k, v in self.dropped.items())]
+        return join_parts(parts)

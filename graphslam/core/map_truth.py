@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -48,7 +48,7 @@ class MapTruth:
         points = points.reshape(-1, dim) if points.size == 0 else points
         if points.shape != (len(ids), dim):
             raise GeometryError("true landmarks have the wrong shape", got=points.shape, wanted=(len(ids), dim))
-        if not (np.all(usable(poses)) and np.all(usable(points))):
+        if not (np.all(finite_mask(poses)) and np.all(finite_mask(points))):
             raise GeometryError("truth is not finite", wanted="finite poses and landmarks")
         for name, values in (("keys", keys), ("landmark_ids", ids)):
             if len(np.unique(values)) != len(values):

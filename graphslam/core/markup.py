@@ -34,7 +34,7 @@ _TABLE = """\
 
 
 @cache
-def environment(package: str | None = None) -> Environment:
+def template_environment(package: str | None = None) -> Environment:
     """The template engine, with autoescape; of a package with its folder ``templates``."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -44,20 +44,20 @@ def environment(package: str | None = None) -> Environment:
 
 @cache
 def _template(source: str) -> Any:
-    return environment().from_string(source)
+    return template_environment().from_string(source)
 
 
-def plain(value: Any) -> str:
+def plain_text(value: Any) -> str:
     """The value as text that a page may hold: characters that none may hold become ``�``."""
     return value if isinstance(value, Markup) else _UNFIT.sub("\ufffd", str(value))
 
 
-def escape(value: Any) -> Markup:
+def escape_text(value: Any) -> Markup:
     """The value as text of a page; markup stays as it is."""
-    return value if isinstance(value, Markup) else Markup.escape(plain(value))
+    return value if isinstance(value, Markup) else Markup.escape(plain_text(value))
 
 
-def element(tag: str, *children: Any, **attributes: Any) -> Markup:
+def html_element(tag: str, *children: Any, **attributes: Any) -> Markup:
     """An element; children and values of attributes are escaped. ``class_`` is the attribute ``class``.
 
     Examples
@@ -65,36 +65,36 @@ def element(tag: str, *children: Any, **attributes: Any) -> Markup:
     >>> element("p", "a < b", class_="note")
     Markup('<p class="note">a &lt; b</p>')
     """
-    said = {k.rstrip("_"): plain(v) for k, v in attributes.items() if v is not None and v != ""}
-    inside = [plain(c) for c in children if c is not None]
+    said = {k.rstrip("_"): plain_text(v) for k, v in attributes.items() if v is not None and v != ""}
+    inside = [plain_text(c) for c in children if c is not None]
     return Markup(
         _template(_ELEMENT).render(tag=tag, attributes=said, children=inside, void=tag in ("img", "meta", "br"))
     )
 
 
-def join(parts: Iterable[Any], between: str = "") -> Markup:
+def join_parts(parts: Iterable[Any], between: str = "") -> Markup:
     """Parts after each other, each escaped unless it is markup."""
-    return Markup(between).join(escape(p) for p in parts if p is not None)
+    return Markup(between).join(escape_text(p) for p in parts if p is not None)
 
 
-def figure_text(value: Any) -> str:
+def value_text(value: Any) -> str:
     """A value as a cell of a table shows it: six digits, ``–`` for none and not-a-number, yes and no."""
     if value is None:
         return NOTHING
     if isinstance(value, bool):
         return "yes" if value else "no"
     if hasattr(value, "tolist"):  # NumPy
-        return figure_text(value.tolist())
+        return value_text(value.tolist())
     if isinstance(value, float):
         return NOTHING if math.isnan(value) else f"{value:.6g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{k} {figure_text(v)}" for k, v in value.items()) or NOTHING
+        return ", ".join(f"{k} {value_text(v)}" for k, v in value.items()) or NOTHING
     if isinstance(value, (list, tuple)):
-        return ", ".join(figure_text(v) for v in value) or NOTHING
+        return ", ".join(value_text(v) for v in value) or NOTHING
     return str(value)
 
 
-def is_figure(value: Any) -> bool:
+def is_numeric(value: Any) -> bool:
     """Is it a number, which stands to the right of its cell?"""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
@@ -108,7 +108,7 @@ class Row:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-def table(
+def html_table(
     rows: Sequence[Mapping[str, Any] | Row], columns: Mapping[str, str] | Sequence[str], *, class_: str = ""
 ) -> Markup:
     """Rows as a table.
@@ -125,26 +125,29 @@ def table(
     for r in rows:
         row = r if isinstance(r, Row) else Row(r)
         cells = [_cell(row.cells.get(k)) for k in names]
-        body.append({"class_": plain(row.class_), "data": row.data, "name": None, "cells": cells})
-    head = [plain(h) for h in names.values()]
+        body.append({"class_": plain_text(row.class_), "data": row.data, "name": None, "cells": cells})
+    head = [plain_text(h) for h in names.values()]
     return Markup(_template(_TABLE).render(class_=class_, head=head, rows=body))
 
 
 def _cell(value: Any) -> dict[str, Any]:
-    return {"text": plain(figure_text(value) if not isinstance(value, Markup) else value), "right": is_figure(value)}
+    return {
+        "text": plain_text(value_text(value) if not isinstance(value, Markup) else value),
+        "right": is_numeric(value),
+    }
 
 
-def pairs(values: Mapping[str, Any]) -> Markup:
+def pair_list(values: Mapping[str, Any]) -> Markup:
     """Names and values, one pair a line."""
-    rows = [{"class_": "", "data": {}, "name": plain(k), "cells": [_cell(v)]} for k, v in values.items()]
+    rows = [{"class_": "", "data": {}, "name": plain_text(k), "cells": [_cell(v)]} for k, v in values.items()]
     return Markup(_template(_TABLE).render(class_="", head=[], rows=rows))
 
 
-def items(lines: Iterable[Any]) -> Markup:
+def item_list(lines: Iterable[Any]) -> Markup:
     """Lines as a list."""
-    return element("ul", join((element("li", x) for x in lines), "\n"))
+    return html_element("ul", join_parts((html_element("li", x) for x in lines), "\n"))
 
 
-def frame(rows: Any) -> Markup:
+def html_frame(rows: Any) -> Markup:
     """A pandas table, in full."""
-    return table(rows.to_dict("records"), {c: str(c) for c in rows.columns})
+    return html_table(rows.to_dict("records"), {c: str(c) for c in rows.columns})

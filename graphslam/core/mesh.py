@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 Triangles = npt.NDArray[np.int32]
 
@@ -26,8 +26,8 @@ def check_mesh(vertices: Any, triangles: Any, *, where: str | None = None) -> tu
             got=f"{t.dtype} {t.shape}",
             wanted="integers (t, 3)",
         )
-    if not np.all(usable(v)):
-        k = int(np.argwhere(~usable(v))[0][0])
+    if not np.all(finite_mask(v)):
+        k = int(np.argwhere(~finite_mask(v))[0][0])
         raise GeometryError(f"vertex {k} of a mesh is not finite", where=where, got=v[k], wanted="finite numbers")
     bad = np.flatnonzero(np.any((t < 0) | (t >= len(v)), axis=1))
     if len(bad):

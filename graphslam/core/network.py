@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 Index = npt.NDArray[np.intp]
 Ids = npt.NDArray[np.int64]
@@ -79,7 +79,7 @@ def check_informations(information: ArrayLike, labels: Sequence[str], *, what: s
         How to call matrix k in an error, for example ``"3 -> 7"``.
     """
     info = np.array(information, dtype=np.float64)
-    bad = _where(info, lambda part: ~usable(part).all(axis=(1, 2)))
+    bad = _where(info, lambda part: ~finite_mask(part).all(axis=(1, 2)))
     if len(bad):
         raise CovarianceError(
             f"{len(bad)} of {len(info)} {what} are not finite: {_names(labels, bad)}", where=where, wanted="finite"
@@ -145,8 +145,8 @@ def repair_informations(information: ArrayLike) -> tuple[Array, Index]:
     info = np.array(information, dtype=np.float64)
     if len(info) == 0:
         return info, np.zeros(0, dtype=np.intp)
-    if not usable(info).all():
-        bad = np.flatnonzero(~usable(info).all(axis=(1, 2)))
+    if not finite_mask(info).all():
+        bad = np.flatnonzero(~finite_mask(info).all(axis=(1, 2)))
         raise CovarianceError(
             f"{len(bad)} information matrices are not finite and cannot be repaired", got=f"first: number {bad[0]}"
         )
@@ -285,7 +285,7 @@ class PoseNetwork:
             ("landmark", self.landmarks, lambda k: f"landmark {self.landmark_ids[k]}"),
             ("observation", self.observation_values, self.observation_name),
         ):
-            bad = np.flatnonzero(~usable(values).all(axis=1))
+            bad = np.flatnonzero(~finite_mask(values).all(axis=1))
             if len(bad):
                 raise GeometryError(f"{name} is not finite: {label(int(bad[0]))}", where=self.source)
         if self.dim == 3:

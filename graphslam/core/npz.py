@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import FormatError, MissingDataError
-from graphslam.core.reading import LARGEST, check_size, usable
+from graphslam.core.reading import LARGEST, check_size, finite_mask
 
 MOST_HEADER = 1 << 16
 """Bytes of the longest header of an array that is read."""
@@ -177,7 +177,7 @@ def check_arrays(
                 wanted=f"{field.kind} ({wanted})",
             )
         if field.kind == "float":
-            bad = ~usable(a) if field.finite else ~(usable(a) | ~np.isfinite(a))
+            bad = ~finite_mask(a) if field.finite else ~(finite_mask(a) | ~np.isfinite(a))
             if field.finite is not None and np.any(bad):
                 at = tuple(int(i) for i in np.argwhere(bad)[0])
                 raise FormatError(

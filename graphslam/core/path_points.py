@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 SAME_TIME = 1e-6
 """A fix this near to the instant of a point is at it [s]."""
@@ -50,7 +50,7 @@ class PathPoints:
         if shapes != wanted or self.cross.ndim != 2:
             raise GeometryError("points of the path do not fit each other", got=shapes, wanted=wanted)
         for part in (self.times, self.lever, self.positions, self.covariance, self.cross):
-            if not np.all(usable(part)):
+            if not np.all(finite_mask(part)):
                 raise GeometryError("points of the path are not finite", wanted="finite numbers")
         if np.any(np.diff(self.times) <= 0):
             raise GeometryError("points of the path are not in the order of time", wanted="increasing times")

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
 
 
@@ -66,14 +66,14 @@ class ArrayClouds:
         points = np.ascontiguousarray(self.points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise GeometryError("points have the wrong shape", got=points.shape, wanted="(q, 3)")
-        if not np.all(usable(points)):
-            k = int(np.argwhere(~usable(points))[0][0])
+        if not np.all(finite_mask(points)):
+            k = int(np.argwhere(~finite_mask(points))[0][0])
             raise DataError(f"point {k} is not finite", got=points[k], wanted="finite numbers")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "offsets", check_offsets(self.offsets, len(points)))
         if self.before is not None:
             before = np.ascontiguousarray(self.before, dtype=np.float64)
-            if before.shape != (len(points),) or not np.all(usable(before)):
+            if before.shape != (len(points),) or not np.all(finite_mask(before)):
                 raise DataError("times of points are impossible", got=before.shape, wanted=f"({len(points)},), finite")
             object.__setattr__(self, "before", before)
 
@@ -150,7 +150,7 @@ class PointClouds:
         object.__setattr__(self, "times", check_times(self.times, len(index)))
         for name, n in (("origin", 3), ("T_base_sensor", 7)):
             a = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
-            if a.shape != (n,) or not np.all(usable(a)):
+            if a.shape != (n,) or not np.all(finite_mask(a)):
                 raise GeometryError(f"{name} is impossible", got=a, wanted=f"{n} finite numbers")
             object.__setattr__(self, name, a)
 

@@ -41,12 +41,12 @@ def check_pose(pose: Any, dim: int, *, what: str = "pose") -> Array:
     return T
 
 
-def transform(T_ab: Array, points: Array) -> Array:
+def transform_points(T_ab: Array, points: Array) -> Array:
     """Points ``(m, dim)`` of frame b in frame a; poses may have leading axes to broadcast."""
     return (SE2 if points.shape[-1] == 2 else SE3).transform(T_ab, points)
 
 
-def thin(points: Array, voxel: float) -> Array:
+def voxel_downsample(points: Array, voxel: float) -> Array:
     """One point a voxel, the mean of those in it; voxels in the order of their coordinates, x slowest.
 
     Parameters
@@ -85,7 +85,7 @@ def thin(points: Array, voxel: float) -> Array:
     return np.stack([np.bincount(which, x) / count for x in points.T], axis=1)
 
 
-def spread(points: Array, most: int) -> Array:
+def evenly_spaced(points: Array, most: int) -> Array:
     """At most ``most`` of the points, evenly from first to last."""
     if len(points) <= most:
         return points

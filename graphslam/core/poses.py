@@ -14,7 +14,7 @@ import numpy as np
 from graphslam.core import geometry, se3
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +83,10 @@ def heading_of(poses: ArrayLike) -> Array:
     return np.asarray(np.arctan2(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def level(poses: ArrayLike) -> Array:
+def remove_roll_pitch(poses: ArrayLike) -> Array:
     """The same positions and headings without roll and pitch; in 2-D nothing changes."""
     p = np.array(poses, dtype=np.float64)
-    return p if p.shape[-1] == 3 else upright(p[..., :3], heading_of(p))
+    return p if p.shape[-1] == 3 else level_poses(p[..., :3], heading_of(p))
 
 
 def frame_between(T_a_body: ArrayLike, T_b_body: ArrayLike, *, gravity: bool) -> Array:
@@ -104,12 +104,12 @@ def frame_between(T_a_body: ArrayLike, T_b_body: ArrayLike, *, gravity: bool) ->
     if group.dim == 2 or not gravity:
         return group.compose(T_a_body, group.inverse(T_b_body))
     a, b = np.asarray(T_a_body, dtype=np.float64), np.asarray(T_b_body, dtype=np.float64)
-    turn = upright(np.zeros(a.shape[:-1] + (3,)), heading_of(a) - heading_of(b))
+    turn = level_poses(np.zeros(a.shape[:-1] + (3,)), heading_of(a) - heading_of(b))
     turn[..., :3] = a[..., :3] - se3.quat_rotate(turn[..., 3:], b[..., :3])
     return turn
 
 
-def upright(positions: ArrayLike, headings: ArrayLike) -> Array:
+def level_poses(positions: ArrayLike, headings: ArrayLike) -> Array:
     """Level poses ``(..., 7)`` at positions ``(..., 3)`` [m] with headings ``(...)`` [rad]."""
     half = 0.5 * geometry.wrap_angle(headings)
     zero = np.zeros_like(half)
@@ -117,12 +117,12 @@ def upright(positions: ArrayLike, headings: ArrayLike) -> Array:
     return np.concatenate([np.asarray(positions, dtype=np.float64), turn], axis=-1)
 
 
-def normalised(weights: ArrayLike | None, n: int) -> Array:
+def normalise_weights(weights: ArrayLike | None, n: int) -> Array:
     """Weights ``(n,)`` that sum to one; uniform if none are given."""
     if weights is None:
         return np.full(n, 1.0 / n)
     w = np.asarray(weights, dtype=np.float64)
-    if w.shape != (n,) or not np.all(usable(w)) or np.any(w < 0) or not w.sum() > 0:
+    if w.shape != (n,) or not np.all(finite_mask(w)) or np.any(w < 0) or not w.sum() > 0:
         raise GeometryError("impossible weights", got=w, wanted=f"{n} finite numbers ≥ 0, not all zero")
     return np.asarray(w / w.sum())
 
@@ -139,7 +139,7 @@ def pose_mean(poses: ArrayLike, weights: ArrayLike | None = None, *, iterations:
     group = group_of(p)
     if p.ndim != 2 or not len(p):
         raise GeometryError("no poses to take the mean of", got=p.shape, wanted=f"(n, {group.size})")
-    w = normalised(weights, len(p))
+    w = normalise_weights(weights, len(p))
     mean = p[int(np.argmax(w))]
     for _ in range(iterations):
         step = w @ group.log(group.between(np.broadcast_to(mean, p.shape), p))
@@ -154,12 +154,12 @@ def pose_scatter(poses: ArrayLike, about: ArrayLike, weights: ArrayLike | None =
     mean."""
     p = np.asarray(poses, dtype=np.float64)
     group = group_of(p)
-    w = normalised(weights, len(p))
+    w = normalise_weights(weights, len(p))
     e = group.log(group.between(np.broadcast_to(about, p.shape), p))
     return np.asarray((w[:, None] * e).T @ e)
 
 
-def chained(increments: Array) -> Array:
+def compose_increments(increments: Array) -> Array:
     """Poses of nodes in the frame of the first ``(n + 1, 7|3)``; given, that of each in the one before ``(n, 7|3)``."""
     g = group_of(increments)
     poses = [g.identity]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
 from graphslam.core.se3 import quat_multiply, quat_rotate
 
@@ -87,7 +87,7 @@ class RangeScans:
         if np.any(np.diff(self.beam_times) < 0) or (m and self.beam_times[0] < 0):
             raise DataError("times of the beams fall, or are before the stamp", got=self.beam_times[:3], wanted="≥ 0")
         for name in ("max_range", "sigma"):
-            if not (usable(getattr(self, name)) and getattr(self, name) > 0):
+            if not (finite_mask(getattr(self, name)) and getattr(self, name) > 0):
                 raise DataError(f"{name} is impossible", got=getattr(self, name), wanted="> 0 m")
 
     def take(self, index: Any) -> RangeScans:
@@ -125,6 +125,6 @@ def _finite(value: Any, shape: tuple[int, ...], name: str) -> Array:
     a = np.ascontiguousarray(value, dtype=np.float64)
     if a.shape != shape:
         raise GeometryError(f"{name} has the wrong shape", got=a.shape, wanted=shape)
-    if not np.all(usable(a)):
-        raise DataError(f"{name} is not finite", got=a[~usable(a)][0], wanted="finite numbers")
+    if not np.all(finite_mask(a)):
+        raise DataError(f"{name} is not finite", got=a[~finite_mask(a)][0], wanted="finite numbers")
     return a

@@ -171,12 +171,12 @@ def read_text(path: str | os.PathLike[str]) -> str:
 # --- numbers ------------------------------------------------------------------------------------------------------
 
 
-def usable(values: npt.ArrayLike) -> Any:
+def finite_mask(values: npt.ArrayLike) -> Any:
     """Which numbers are finite and no larger than :data:`LARGEST`: an array of the same shape, or one truth value."""
     return np.abs(np.asarray(values, dtype=np.float64)) <= LARGEST
 
 
-def whole(values: npt.ArrayLike) -> Any:
+def integer_mask(values: npt.ArrayLike) -> Any:
     """Which numbers are whole, and no larger than a float64 counts to: identities and counts in tables of numbers."""
     v = np.asarray(values, dtype=np.float64)
     return (np.abs(v) <= 2.0**53) & (v == np.round(v))
@@ -192,7 +192,7 @@ def safe_name(name: str, where: str) -> str:
     return name
 
 
-def inside(folder: Path, name: str, where: str) -> Path:
+def resolve_inside(folder: Path, name: str, where: str) -> Path:
     """Path of the file ``name`` in ``folder``; a symbolic link that leads out of the folder is refused."""
     path = folder / safe_name(name, where)
     if path.is_symlink():

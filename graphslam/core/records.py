@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 
 IDENTITY2 = np.zeros(3)
 IDENTITY3 = np.array([0.0, 0, 0, 0, 0, 0, 1])
@@ -38,8 +38,8 @@ def check_times(times: Any, n: int | None = None, *, where: str | None = None) -
     t = np.ascontiguousarray(times, dtype=np.float64)
     if t.ndim != 1 or (n is not None and len(t) != n):
         raise DataError("stamps have the wrong shape", where=where, got=t.shape, wanted=f"({n},)" if n else "(n,)")
-    if not np.all(usable(t)):
-        k = int(np.flatnonzero(~usable(t))[0])
+    if not np.all(finite_mask(t)):
+        k = int(np.flatnonzero(~finite_mask(t))[0])
         raise DataError(
             f"stamp of record {k} is not finite", where=where, got=t[k], wanted="seconds, with a decimal point"
         )
@@ -63,8 +63,8 @@ def _array(x: Any, shape: tuple[int, ...], name: str) -> Array:
 
 
 def _finite(a: Array, name: str) -> Array:
-    if not np.all(usable(a)):
-        k = int(np.argwhere(~usable(a))[0][0])
+    if not np.all(finite_mask(a)):
+        k = int(np.argwhere(~finite_mask(a))[0][0])
         raise DataError(f"{name} of record {k} is not finite", got=a[k], wanted="finite numbers")
     return a
 
@@ -131,9 +131,9 @@ class AckermannGeometry:
     model: str = "rear-axle"
 
     def __post_init__(self) -> None:
-        if not (usable(self.wheelbase) and self.wheelbase > 0):
+        if not (finite_mask(self.wheelbase) and self.wheelbase > 0):
             raise GeometryError("wheelbase is impossible", got=self.wheelbase, wanted="> 0 m")
-        if not usable(self.encoder_offset):
+        if not finite_mask(self.encoder_offset):
             raise GeometryError("encoder offset is not finite", got=self.encoder_offset)
         if self.model not in ("rear-axle", "front-steer"):
             raise GeometryError("unknown steering model", got=self.model, wanted="rear-axle or front-steer")

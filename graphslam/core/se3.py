@@ -229,7 +229,7 @@ def se3_right_jacobian(xi: ArrayLike) -> Array:
     return out
 
 
-def roll_pitch(poses: Array) -> tuple[Array, Array]:
+def roll_pitch_jacobian(poses: Array) -> tuple[Array, Array]:
     """Roll and pitch ``(n, 2)`` [rad] and their derivatives by the right tangent ``(n, 2, 6)``."""
     up = quat_to_matrix(poses[:, 3:])[:, 2, :]  # e_z of the world in the body
     x, y, z = up.T

@@ -19,11 +19,11 @@ from graphslam.core.dense import CloudMap, DensePayload
 from graphslam.core.errors import CovarianceError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, vector_to_tangent_covariance, wrap_angle
-from graphslam.core.lasting import LastingErrors
-from graphslam.core.markup import element, join, pairs
+from graphslam.core.markup import html_element, join_parts, pair_list
 from graphslam.core.path_points import PathPoints
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 from graphslam.core.se3 import quat_to_matrix
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.trajectory import Trajectory
 
 
@@ -65,7 +65,7 @@ class LandmarkMap:
         Maps from elsewhere and those of the papers are Cartesian; our front ends make the other kind.
     path : PathPoints or None
         Points of the path where fixes were taken, jointly Gaussian with all of this (2-D only).
-    lasting : LastingErrors or None
+    lasting : SensorBiases or None
         What all of this is if wheels and sensor err by constants; the Gaussian is that of a robot without them.
     """
 
@@ -77,7 +77,7 @@ class LandmarkMap:
     sightings: npt.NDArray[np.int64] | None = None
     chart: str = "cartesian"
     path: PathPoints | None = None
-    lasting: LastingErrors | None = None
+    lasting: SensorBiases | None = None
 
     def __post_init__(self) -> None:
         check_chart(self.chart)
@@ -89,7 +89,7 @@ class LandmarkMap:
         positions = np.ascontiguousarray(self.positions, dtype=np.float64).reshape(-1, dim)
         if len(positions) != len(ids):
             raise GeometryError("landmark ids and positions differ in number", got=len(positions), wanted=len(ids))
-        if not (np.all(usable(pose)) and np.all(usable(positions))):
+        if not (np.all(finite_mask(pose)) and np.all(finite_mask(positions))):
             raise GeometryError("landmark map is not finite", got=pose, wanted="finite poses and positions")
         n = (3 if dim == 2 else 6) + positions.size
         if (self.covariance is None) == (self.information is None):
@@ -103,7 +103,7 @@ class LandmarkMap:
             info = sp.csc_matrix(self.information)
             if info.shape != (n, n):
                 raise CovarianceError("submap information has the wrong shape", got=info.shape, wanted=(n, n))
-            if not np.all(usable(info.data)):
+            if not np.all(finite_mask(info.data)):
                 raise CovarianceError("submap information is not finite", wanted="finite numbers")
             object.__setattr__(self, "information", info)
         if self.path is not None and (self.path.cross.shape[1] != n or len(self.path.lever) != dim):
@@ -169,7 +169,7 @@ class LandmarkMap:
             lasting=None if self.lasting is None else self.lasting.of_landmarks(ix),
         )
 
-    def erring(self, mean: Array, covariance: Array) -> LandmarkMap:
+    def with_biases(self, mean: Array, covariance: Array) -> LandmarkMap:
         """The same map, if the constant errors of wheels and sensor are Gaussian; itself where it knows of none.
 
         Parameters
@@ -241,7 +241,7 @@ class Submap:
     matches : tuple of Match
     uses : frozenset of str
         Streams whose information is already inside.
-    aids : frozenset of str
+    assisting_streams : frozenset of str
         Streams that helped to find what is inside, while nothing that they tell is in its covariances: where a match
         began, how a scan is bent. A factor may still use them.
     report : mapping
@@ -266,7 +266,7 @@ class Submap:
     cloud: CloudMap | None = None
     matches: tuple[Match, ...] = ()
     uses: frozenset[str] = frozenset()
-    aids: frozenset[str] = frozenset()
+    assisting_streams: frozenset[str] = frozenset()
     report: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -322,8 +322,8 @@ class Submap:
 
     def of_session(self, name: str) -> Submap:
         """The same submap with its streams named as those of a session of several: ``name/stream``."""
-        uses, aids = (frozenset(f"{name}/{u}" for u in streams) for streams in (self.uses, self.aids))
-        return replace(self, uses=uses, aids=aids)
+        uses, aids = (frozenset(f"{name}/{u}" for u in streams) for streams in (self.uses, self.assisting_streams))
+        return replace(self, uses=uses, assisting_streams=aids)
 
     def __repr__(self) -> str:
         n = 0 if self.landmarks is None else len(self.landmarks)
@@ -336,4 +336,4 @@ class Submap:
             f" [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks, "
             f"exit {np.array2string(self.exit_pose, precision=3)} σ {np.array2string(s, precision=4)}"
         )
-        return join([element("b", f"Submap {self.key}"), said, pairs(self.report)])
+        return join_parts([html_element("b", f"Submap {self.key}"), said, pair_list(self.report)])

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_compose, se2_exp, se2_log, se2_transform
-from graphslam.core.reading import usable
+from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
 
 Index = npt.NDArray[np.intp]
@@ -48,8 +48,8 @@ class Trajectory:
         poses = np.ascontiguousarray(self.poses, dtype=np.float64)
         if poses.ndim != 2 or poses.shape[1] not in (3, 7):
             raise GeometryError("trajectory poses have the wrong shape", got=poses.shape, wanted="(n, 3) or (n, 7)")
-        if not np.all(usable(poses)):
-            k = int(np.argwhere(~usable(poses))[0][0])
+        if not np.all(finite_mask(poses)):
+            k = int(np.argwhere(~finite_mask(poses))[0][0])
             raise GeometryError(f"trajectory pose {k} is not finite", got=poses[k])
         object.__setattr__(self, "poses", poses)
         if self.covariances is not None:
@@ -59,8 +59,8 @@ class Trajectory:
                 raise GeometryError(
                     "trajectory covariances have the wrong shape", got=C.shape, wanted=(len(poses), d, d)
                 )
-            if not np.all(usable(C)):
-                k = int(np.argwhere(~usable(C))[0][0])
+            if not np.all(finite_mask(C)):
+                k = int(np.argwhere(~finite_mask(C))[0][0])
                 raise GeometryError(f"trajectory covariance {k} is not finite", got=C[k])
             object.__setattr__(self, "covariances", C)
 

@@ -1,14 +1,14 @@
 """Layer 7: accuracy (ATE, RPE) and consistency (NEES, consistency index), with and without ground truth."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "consistency": "Consistency",
     "submap_consistency": "submap_nees submaps_consistency",
     "association": "match_observations",
-    "gps": "gps_residuals in_gps_frame",
-    "gps_floor": "fix_segments revisit_disagreement segment_table",
-    "reckoning": "dead_reckoning",
+    "gps": "gps_residuals move_to_gps_frame",
+    "gps_repeatability": "fix_segments revisit_disagreement segment_table",
+    "dead_reckoning_baseline": "dead_reckoned_path",
     "trajectory_error": "ate fit_alignment",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -22,7 +22,7 @@ from graphslam.core import se3
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.gaussian import check_covariance, chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_log, wrap_angle
-from graphslam.core.markup import pairs
+from graphslam.core.markup import pair_list
 
 Unit = Literal["run", "value"]
 Verdict = Literal["consistent", "over-confident", "pessimistic"]
@@ -233,4 +233,4 @@ class Consistency:
         }
 
     def _repr_html_(self) -> str:
-        return pairs(self.as_row())
+        return pair_list(self.as_row())

@@ -220,7 +220,7 @@ def fix_distances(trajectory: Trajectory, gps: Gps, *, sigma: float | None = Non
     )
 
 
-def in_gps_frame(trajectory: Trajectory, residuals: GpsResiduals) -> Trajectory:
+def move_to_gps_frame(trajectory: Trajectory, residuals: GpsResiduals) -> Trajectory:
     """The trajectory moved into the GPS frame by the alignment of ``residuals``."""
     poses = se2_compose(np.broadcast_to(residuals.T_gps_map, trajectory.poses.shape), trajectory.poses)
     return Trajectory(trajectory.times, poses, trajectory.covariances)

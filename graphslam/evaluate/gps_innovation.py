@@ -19,10 +19,10 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.evaluate.gps_floor import fix_segments
-from graphslam.evaluate.without_truth import correlated_dof, two_sided
+from graphslam.evaluate.gps_repeatability import fix_segments
+from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bounds
 from graphslam.graph.factors.gps import GpsRecord, antenna_terms
-from graphslam.graph.factors.lasting import errors_at
+from graphslam.graph.factors.sensor_biases import sensor_biases_at
 from graphslam.graph.gps import FixErrors, arm_jacobian, datum_columns, lever_arm
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
@@ -109,7 +109,7 @@ class GpsInnovations:
         parts = (("each", self.normalised, correlated_dof(self.covariance, d)), ("joint", self.whitened, float(d * n)))
         for name, y, dof in parts:
             value = float(np.sum(y**2) / (d * n))
-            low, high, verdict = two_sided(value, dof, self.confidence)
+            low, high, verdict = two_sided_bounds(value, dof, self.confidence)
             pairs = y[1:][close] * y[:-1][close]
             rows.append(
                 {
@@ -268,7 +268,7 @@ def _inner(graph: PoseGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inner
     gain = np.linalg.solve(joint, cross.T).T
     z = np.concatenate([inner.mean, path.positions[used].ravel()])
     if inner.lasting is not None:  # as they are with the constant errors that the graph found
-        g = errors_at(values, s.robot)
+        g = sensor_biases_at(values, s.robot)
         z = z + np.concatenate([inner.lasting.response, inner.lasting.points[own]]) @ g
         path = replace(path, positions=path.positions + (inner.lasting.points @ g).reshape(-1, 2))
     marks = np.array([lay.row_of[i] for i in ids.tolist()], dtype=np.int64)

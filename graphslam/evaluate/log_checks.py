@@ -20,7 +20,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.poses import group_of
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry, VelocityControls
-from graphslam.evaluate.stream_checks import Noticed, check_streams
+from graphslam.evaluate.stream_checks import StreamFinding, check_streams
 from graphslam.evaluate.stream_checks_clock import check_clocks
 from graphslam.evaluate.stream_checks_imu import check_turns
 from graphslam.evaluate.stream_checks_motion import check_odometry, check_sighted_motion
@@ -40,20 +40,20 @@ BENT = 0.1
 """Motion within a scan that bends it visibly [m]."""
 
 
-def check_log(log: SensorLog) -> list[Noticed]:
+def check_log(log: SensorLog) -> list[StreamFinding]:
     """Everything that can be told of a log before a run.
 
     Returns
     -------
-    list of Noticed
+    list of StreamFinding
         Faults of the clocks first: they are the cause of many others.
     """
-    out = [Noticed(name, f) for name, f in check_clocks(log)]
+    out = [StreamFinding(name, f) for name, f in check_clocks(log)]
     clocks = any(n.finding.level == "bad" for n in out)
     try:
         out += check_streams(log)
     except GraphSlamError as error:
-        out.append(Noticed("", Finding("bad", "refused", str(error))))
+        out.append(StreamFinding("", Finding("bad", "refused", str(error))))
     for name, stream in log.streams.items():
         found: list[Finding] = []
         if isinstance(stream, Odometry | VelocityControls):
@@ -64,9 +64,9 @@ def check_log(log: SensorLog) -> list[Noticed]:
             found = _gyro(stream, name, log)
         elif isinstance(stream, PointClouds):
             found = _point_times(stream, name, log)
-        out += [Noticed(name, f) for f in found]
+        out += [StreamFinding(name, f) for f in found]
     for name in log.meta.get("unplaced", ()):
-        out.append(Noticed(name, Finding("look", "place-unknown", _UNPLACED.format(name))))
+        out.append(StreamFinding(name, Finding("look", "place-unknown", _UNPLACED.format(name))))
     if not clocks:  # scans and motion of different times differ for that reason
         out += _scans_and_motion(log)
     return _once(out)
@@ -78,7 +78,7 @@ _UNPLACED = (
 )
 
 
-def _once(found: list[Noticed]) -> list[Noticed]:
+def _once(found: list[StreamFinding]) -> list[StreamFinding]:
     seen, out = set(), []
     for n in found:
         if (n.stream, n.finding.code, n.finding.text) not in seen:
@@ -132,7 +132,7 @@ def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding
     return [Finding("bad" if stuck and not moved <= BENT else "look", "points-without-times", text)]
 
 
-def _scans_and_motion(log: SensorLog) -> list[Noticed]:
+def _scans_and_motion(log: SensorLog) -> list[StreamFinding]:
     """Lines on what neighbouring scans say of the motion."""
     scanner = next((n for n, s in log.streams.items() if isinstance(s, PointClouds | RangeScans)), None)
     scanner = scanner or log.of_type(LaserScans)
@@ -156,7 +156,7 @@ def _scans_and_motion(log: SensorLog) -> list[Noticed]:
     try:
         config = StepConfig(period=0.4 if spinning else None, most_points=POINTS, max_range=REACH, silent="unknown")
         steps = make_steps(part, config)
-        return [Noticed(scanner, f) for f in motion_findings(check_motion(steps))]
+        return [StreamFinding(scanner, f) for f in motion_findings(check_motion(steps))]
     except GraphSlamError as error:
         text = f"{scanner} and {', '.join(motion)}: cannot be combined — {error}"
-        return [Noticed(scanner, Finding("bad", "scans-and-motion", text))]
+        return [StreamFinding(scanner, Finding("bad", "scans-and-motion", text))]

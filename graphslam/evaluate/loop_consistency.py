@@ -33,14 +33,14 @@ from scipy import stats
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, se2_log, se2_transform, wrap_angle
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.evaluate.without_truth import correlated_dof, two_sided
+from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bounds
 from graphslam.join.submap_blocks import fuse_repeated, landmark_map_of
 
 Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Loops:
+class LandmarkLoops:
     """Re-observations between the submaps of a chain, and the errors of their cycles.
 
     Parameters
@@ -75,7 +75,7 @@ class Loops:
         return len(self.a)
 
 
-def find_loops(
+def find_landmark_loops(
     submaps: Sequence[Submap],
     poses: npt.ArrayLike,
     *,
@@ -84,7 +84,7 @@ def find_loops(
     min_gap: int = 1,
     max_loops: int = 500,
     covariance_scale: float = 1.0,
-) -> Loops:
+) -> LandmarkLoops:
     """Loops of a chain of landmark submaps by the landmarks they share, and by their front ends' matches.
 
     Parameters
@@ -149,7 +149,7 @@ def find_loops(
         )
     half = sp.vstack(rows, format="csr")
     covariance = (half @ half.T).toarray() + np.asarray(sp.block_diag(own_noise).toarray())
-    return Loops(
+    return LandmarkLoops(
         a=np.array([f[0] for f in found], dtype=np.int64),
         b=np.array([f[1] for f in found], dtype=np.int64),
         shared=np.array([f[2] for f in found], dtype=np.int64),
@@ -263,7 +263,7 @@ class LoopConsistency:
         Of the two-sided bounds.
     """
 
-    loops: Loops
+    loops: LandmarkLoops
     d2: Array
     confidence: float = 0.95
 
@@ -276,12 +276,12 @@ class LoopConsistency:
         """Mean ``D²/3`` of the single loops with two-sided bounds that know how correlated they are.
 
         Loops over one stretch of the chain share its error, so many loops can be worth few: ``dof`` says how many
-        (:func:`~graphslam.evaluate.without_truth.correlated_dof`). ``inside`` is the share of pairs within the
+        (:func:`~graphslam.evaluate.residual_consistency.correlated_dof`). ``inside`` is the share of pairs within the
         confidence region of one pair, ``shape`` the χ²/dof of the shared landmarks against each other.
         """
         value = float(np.mean(self.single) / 3.0)
         dof = correlated_dof(self.loops.covariance, 3)
-        low, high, verdict = two_sided(value, dof, self.confidence)
+        low, high, verdict = two_sided_bounds(value, dof, self.confidence)
         off = self.d2[np.triu_indices(len(self.d2), 1)]
         off = off[np.isfinite(off)]
         limit = stats.chi2.ppf(self.confidence, 3)
@@ -349,7 +349,7 @@ class LoopConsistency:
         )
 
 
-def loop_consistency(loops: Loops, *, confidence: float = 0.95) -> LoopConsistency:
+def loop_consistency(loops: LandmarkLoops, *, confidence: float = 0.95) -> LoopConsistency:
     """Compare every loop with the chain and with every other loop."""
     n = len(loops)
     S = loops.covariance.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from graphslam.core.charts import along_arc
+from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
@@ -26,8 +26,8 @@ from graphslam.evaluate.consistency import joint_nees, vector_pose_error
 from graphslam.evaluate.gauge import aligned_nees, gauge_directions
 from graphslam.evaluate.gps import GpsResiduals, gps_residuals
 from graphslam.evaluate.map_error import landmark_error, match_ids
+from graphslam.evaluate.residual_consistency import class_consistency, two_sided_bounds
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.evaluate.without_truth import class_consistency, two_sided
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
 
@@ -280,14 +280,14 @@ def truth_metrics(
     n_pose = len(error)
     turned = np.zeros(len(solution.poses))  # what the headings differ by
     turned[node] = e_pose[:, 2]
-    charted = np.column_stack([along_arc(e_pose[:, :2], e_pose[:, 2]), e_pose[:, 2]]).ravel()
+    charted = np.column_stack([apply_inverse_left_jacobian(e_pose[:, :2], e_pose[:, 2]), e_pose[:, 2]]).ravel()
     if identities:
         ours, theirs = match_ids(solution.landmark_ids, truth.landmark_ids)
         points = solution.landmarks[ours]
         e_lm = truth.landmarks[theirs] - points
         out.add("landmark_rmse", float(np.sqrt(np.mean(np.sum(e_lm**2, axis=1)))), "m", "lower")
         error = np.concatenate([error, e_lm.ravel()])
-        charted = np.concatenate([charted, along_arc(e_lm, turned[solution.anchors[ours]]).ravel()])
+        charted = np.concatenate([charted, apply_inverse_left_jacobian(e_lm, turned[solution.anchors[ours]]).ravel()])
         ix = np.concatenate([ix, (first_landmark + 2 * ours[:, None] + np.arange(2)).ravel()])
         if len(ours) >= 2:
             rigid = landmark_error(
@@ -351,7 +351,7 @@ def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
         for name, part, unit in (("gyro", slice(0, 3), "rad/s"), ("force", slice(3, 6), "m/s²")):
             out.add(f"{prefix}_{name}_bias", float(np.linalg.norm(bias[part])), unit)
             out.add(f"{prefix}_{name}_bias_sigma", float(np.linalg.norm(sigma[part])), unit)
-        graph.note("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())
+        graph.log_event("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())
     _contradiction(graph)
 
 
@@ -360,9 +360,9 @@ def _contradiction(graph: PoseGraph) -> None:
     ways = class_consistency(graph).get("imu") if graph.imu.used else None
     if ways is None or not np.isfinite(ways.ratio):
         return
-    high = two_sided(ways.ratio, ways.dof, 0.999)[1]
+    high = two_sided_bounds(ways.ratio, ways.dof, 0.999)[1]
     if ways.ratio > high:
-        graph.note("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
+        graph.log_event("imu-contradicted", chi2_per_dof=ways.ratio, high=high)
         logger.warning(
             "submaps and IMU contradict each other: χ²/dof %.1f [≤ %.1f]; the assumed noise of one of them is too "
             "small",

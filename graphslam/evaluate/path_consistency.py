@@ -13,7 +13,7 @@ from graphslam.core.geometry import Array, rotation2
 from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import nees, pose_error, vector_pose_error
-from graphslam.evaluate.trajectory_error import associate
+from graphslam.evaluate.trajectory_error import match_stamps
 
 SAME_INSTANT = 1e-6
 """Stamps of truth and path that differ by no more are one [s]: truth is written at the stamps of the path."""
@@ -97,7 +97,7 @@ def path_consistency(path: Trajectory, truth: Trajectory, *, chart: str) -> Path
         raise DataError("the path has no covariances", wanted="covariances")
     if path.dim != truth.dim:
         raise DataError("path and truth differ in dimension", got=truth.dim, wanted=path.dim)
-    i, rows = associate(truth.times, path.times, max_diff=SAME_INSTANT)
+    i, rows = match_stamps(truth.times, path.times, max_diff=SAME_INSTANT)
     if not len(rows):
         raise DataError("no stamps of path and truth agree", got=f"{len(path)} and {len(truth)} poses")
     P = path.covariances[rows]

@@ -10,7 +10,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
-from graphslam.core.poses import group_of, heading_of, level
+from graphslam.core.poses import group_of, heading_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import Metrics, end_metrics, match_ids
@@ -19,7 +19,7 @@ from graphslam.maps.refined import steps_at
 from graphslam.refine.refine import Refinement
 
 
-def upright_truth(truth: MapTruth, path: Trajectory | None, true_base: Array) -> tuple[MapTruth, Trajectory | None]:
+def level_truth(truth: MapTruth, path: Trajectory | None, true_base: Array) -> tuple[MapTruth, Trajectory | None]:
     """Truth in the gravity-aligned frame at the first base, which is the frame of a refined path.
 
     Parameters
@@ -34,7 +34,7 @@ def upright_truth(truth: MapTruth, path: Trajectory | None, true_base: Array) ->
     g = group_of(true_base)
     if g.dim == 2:
         return truth, path
-    T = g.between(level(true_base), true_base)
+    T = g.between(remove_roll_pitch(true_base), true_base)
     moved = replace(truth, exit_poses=g.compose(np.broadcast_to(T, truth.exit_poses.shape), truth.exit_poses))
     if path is not None:
         path = Trajectory(path.times, g.compose(np.broadcast_to(T, path.poses.shape), path.poses))
@@ -57,7 +57,7 @@ def refined_truth_metrics(
     m : GlobalMap
         With the refined nodes.
     truth : MapTruth
-        Gravity-aligned (:func:`upright_truth`), as ``path``.
+        Gravity-aligned (:func:`level_truth`), as ``path``.
     path : Trajectory, optional
         True path at full rate.
     """

@@ -21,7 +21,7 @@ from graphslam.evaluate.stream_checks_sightings import check_sightings, check_st
 
 
 @dataclass(frozen=True, slots=True)
-class Noticed:
+class StreamFinding:
     """A finding about one stream.
 
     Parameters
@@ -42,15 +42,15 @@ def check_speeds(wheels: VelocityControls, name: str) -> list[Finding]:
     return [Finding("bad", "wheels-still", text)]
 
 
-def check_streams(log: SensorLog) -> list[Noticed]:
+def check_streams(log: SensorLog) -> list[StreamFinding]:
     """Look at every stream of a log.
 
     Returns
     -------
-    list of Noticed
+    list of StreamFinding
         In the order of the streams.
     """
-    out: list[Noticed] = []
+    out: list[StreamFinding] = []
     wheels = next((s for s in log.streams.values() if isinstance(s, VelocityControls)), None)
     for name, stream in log.streams.items():
         found: list[Finding] = []
@@ -68,5 +68,5 @@ def check_streams(log: SensorLog) -> list[Noticed]:
                 found += check_turns(stream, wheels, name)
         elif isinstance(stream, VelocityControls):
             found = check_speeds(stream, name)
-        out += [Noticed(name, f) for f in found]
+        out += [StreamFinding(name, f) for f in found]
     return out

@@ -14,7 +14,7 @@ from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array, se2_compose, se2_transform, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps, Odometry
-from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning, motion_stream
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments, motion_stream
 
 CHORD = 10.0
 """Length of the chords that are compared, in σ of a fix."""
@@ -70,7 +70,7 @@ def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
 def _reckoned(log: SensorLog, t: Array, lever: Array) -> Array | None:
     """Antenna ``(n, 2)`` at the fixes by the wheels alone."""
     try:
-        steps = dead_reckoning(log, t, MotionNoise(), hold=1.0)[0].increments
+        steps = dead_reckoned_increments(log, t, MotionNoise(), hold=1.0)[0].increments
     except DataError:
         return None
     poses = np.zeros((len(steps), 3))

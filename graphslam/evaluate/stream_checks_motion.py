@@ -13,8 +13,8 @@ from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, VelocityControls
-from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments
+from graphslam_frontends.odometry.recorded import chain_odometry
 
 Ints = npt.NDArray[np.int64]
 
@@ -87,7 +87,7 @@ def _too_fast(speed: Array, rate: Array, name: str) -> list[Finding]:
 
 
 @dataclass(frozen=True, slots=True)
-class Hypothesis:
+class MotionFault:
     """One thing that may be wrong: factors on what the log says, and the line for the user.
 
     Parameters
@@ -106,23 +106,23 @@ class Hypothesis:
 
 _DEG = float(np.pi / 180.0)
 HYPOTHESES = (
-    Hypothesis("speeds seem to be in km/h, wanted m/s: divide them by 3.6", speed=1 / 3.6),
-    Hypothesis("speeds seem to be 3.6 times too small (m/s read as km/h)", speed=3.6),
-    Hypothesis("speeds or distances of the motion seem to be in millimetres, wanted metres", speed=1e-3),
-    Hypothesis("speeds or distances of the motion seem to be in centimetres, wanted metres", speed=1e-2),
-    Hypothesis("the speed has the wrong sign: the robot drives forward where the log has backward", speed=-1.0),
-    Hypothesis("yaw rates or headings seem to be in degrees, wanted radians", turn=_DEG),
-    Hypothesis("yaw rates or headings seem to be divided by 57.3 once too often", turn=1 / _DEG),
-    Hypothesis("turns and bearings have opposite signs: both count to the left, seen from above", turn=-1.0),
-    Hypothesis("ranges seem to be in millimetres, wanted metres", ranges=1e-3),
-    Hypothesis("ranges seem to be in centimetres, wanted metres", ranges=1e-2),
-    Hypothesis("ranges seem to be in kilometres, wanted metres", ranges=1e3),
-    Hypothesis("ranges seem to be in feet, wanted metres", ranges=0.3048),
-    Hypothesis("bearings seem to be in degrees, wanted radians", bearings=_DEG),
-    Hypothesis("bearings seem to be divided by 57.3 once too often", bearings=1 / _DEG),
-    Hypothesis("bearings seem to count from the left side of the robot, wanted from ahead", yaw=0.5 * np.pi),
-    Hypothesis("bearings seem to count from the right side of the robot, wanted from ahead", yaw=-0.5 * np.pi),
-    Hypothesis("bearings seem to count from behind the robot, wanted from ahead", yaw=np.pi),
+    MotionFault("speeds seem to be in km/h, wanted m/s: divide them by 3.6", speed=1 / 3.6),
+    MotionFault("speeds seem to be 3.6 times too small (m/s read as km/h)", speed=3.6),
+    MotionFault("speeds or distances of the motion seem to be in millimetres, wanted metres", speed=1e-3),
+    MotionFault("speeds or distances of the motion seem to be in centimetres, wanted metres", speed=1e-2),
+    MotionFault("the speed has the wrong sign: the robot drives forward where the log has backward", speed=-1.0),
+    MotionFault("yaw rates or headings seem to be in degrees, wanted radians", turn=_DEG),
+    MotionFault("yaw rates or headings seem to be divided by 57.3 once too often", turn=1 / _DEG),
+    MotionFault("turns and bearings have opposite signs: both count to the left, seen from above", turn=-1.0),
+    MotionFault("ranges seem to be in millimetres, wanted metres", ranges=1e-3),
+    MotionFault("ranges seem to be in centimetres, wanted metres", ranges=1e-2),
+    MotionFault("ranges seem to be in kilometres, wanted metres", ranges=1e3),
+    MotionFault("ranges seem to be in feet, wanted metres", ranges=0.3048),
+    MotionFault("bearings seem to be in degrees, wanted radians", bearings=_DEG),
+    MotionFault("bearings seem to be divided by 57.3 once too often", bearings=1 / _DEG),
+    MotionFault("bearings seem to count from the left side of the robot, wanted from ahead", yaw=0.5 * np.pi),
+    MotionFault("bearings seem to count from the right side of the robot, wanted from ahead", yaw=-0.5 * np.pi),
+    MotionFault("bearings seem to count from behind the robot, wanted from ahead", yaw=np.pi),
 )
 
 
@@ -138,7 +138,7 @@ def check_sighted_motion(z: LandmarkObservations, name: str, log: SensorLog) -> 
     first, second = pairs
     scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
     paths = {}
-    for h in (Hypothesis(""), *HYPOTHESES):
+    for h in (MotionFault(""), *HYPOTHESES):
         key = h.speed, h.turn
         if key not in paths:
             path = _path(log, z.times, *key)
@@ -147,7 +147,7 @@ def check_sighted_motion(z: LandmarkObservations, name: str, log: SensorLog) -> 
             paths[key] = se2_between(path[scan[first]], path[scan[second]])
     a, b = (np.column_stack([z.ranges[k], z.bearings[k]]) for k in (first, second))
     noise = float(np.median(np.hypot(z.sigmas[first, 0] / z.ranges[first], z.sigmas[first, 1])))
-    as_is = _unrest(a, b, paths[1.0, 1.0], Hypothesis(""))
+    as_is = _unrest(a, b, paths[1.0, 1.0], MotionFault(""))
     if as_is < NOISY * noise:
         return []
     tried = [(_unrest(a, b, paths[h.speed, h.turn], h), k) for k, h in enumerate(HYPOTHESES)]
@@ -193,13 +193,13 @@ def _path(log: SensorLog, times: Array, speed: float, turn: float) -> Array | No
         elif isinstance(s, SteeringControls):
             streams[name] = replace(s, speed=speed * s.speed, steering=turn * s.steering)
     try:
-        odometry = dead_reckoning(replace(log, streams=streams), times, MotionNoise(), hold=np.inf)[0]
+        odometry = dead_reckoned_increments(replace(log, streams=streams), times, MotionNoise(), hold=np.inf)[0]
     except GraphSlamError:
         return None
-    return chain(odometry).poses if odometry.increments.shape[1] == 3 else None
+    return chain_odometry(odometry).poses if odometry.increments.shape[1] == 3 else None
 
 
-def _unrest(first: Array, second: Array, steps: Array, h: Hypothesis) -> float:
+def _unrest(first: Array, second: Array, steps: Array, h: MotionFault) -> float:
     """Median shift of the landmarks over their range."""
     ends = []
     for z in (first, second):

@@ -13,7 +13,7 @@ from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, SteeringControls
-from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments
 
 APART = 1.0
 """Sightings of a landmark are compared over at least this time [s], in which a robot moves by more than the noise."""
@@ -133,7 +133,7 @@ def _pairs(z: LandmarkObservations) -> tuple[Array, Array] | None:
 def _way(log: SensorLog, times: Array) -> Array | None:
     """Metres driven until each of ``times``, by the wheels."""
     try:
-        steps = dead_reckoning(log, times, MotionNoise(), hold=np.inf)[0].increments
+        steps = dead_reckoned_increments(log, times, MotionNoise(), hold=np.inf)[0].increments
     except (DataError, MissingDataError):
         return None
     return np.cumsum(np.hypot(steps[:, 0], steps[:, 1])) if steps.shape[1] == 3 else None

@@ -75,7 +75,7 @@ class TrajectoryError:
         return {**head, **delta, **self.statistics.as_dict(), **rot}
 
 
-def associate(reference_times: ArrayLike, times: ArrayLike, *, max_diff: float = 0.01) -> tuple[Index, Index]:
+def match_stamps(reference_times: ArrayLike, times: ArrayLike, *, max_diff: float = 0.01) -> tuple[Index, Index]:
     """Pairs ``(i, j)`` of stamps that are each other's nearest, not more than ``max_diff`` [s] apart.
 
     Mutual, so no pose is used twice; in order of time.
@@ -145,7 +145,7 @@ def _pair(
         raise DataError(
             "estimate and reference differ in dimension", got=f"a {estimate.dim}-D path", wanted=f"{reference.dim}-D"
         )
-    i, j = associate(reference.times, estimate.times, max_diff=max_diff)
+    i, j = match_stamps(reference.times, estimate.times, max_diff=max_diff)
     if not len(i):
         raise DataError(
             "no stamps of estimate and reference agree",

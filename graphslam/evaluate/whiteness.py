@@ -59,7 +59,7 @@ class Whiteness:
         return self.p_value < level and self.tau > LAST
 
 
-def whiteness(times: Array, residuals: Array, covariance: Array | None = None) -> Whiteness | None:
+def residual_whiteness(times: Array, residuals: Array, covariance: Array | None = None) -> Whiteness | None:
     """Correlation of a series; None where it is too short to tell.
 
     Parameters

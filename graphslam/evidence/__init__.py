@@ -1,10 +1,10 @@
 """Layer 1: evidence grids, log-odds maps of occupied and free space with copy on write (SegSLAM, section 2)."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "grid": "EvidenceGrid",
     "memory": "shared_bricks",
     "batch": "update_grids",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
-from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.interrupt import defer_interrupts
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.mark_kernels import (
     BRICKS,
@@ -31,7 +31,7 @@ from graphslam.evidence.mark_kernels import (
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport, check_number, pose_rows, scan_rows
 from graphslam.evidence.tree_kernels import write_bricks
-from graphslam.evidence.update_kernels import PENDING, apply_grids, drop_left, resolve_grids, settle_grids
+from graphslam.evidence.update_kernels import PENDING, apply_grids, finalise_writes, release_sources, resolve_writes
 
 BATCH = 64
 """Grids whose marks are kept at a time: bounds the scratch memory of filters with many particles."""
@@ -99,22 +99,22 @@ def update_grids(
         if not free:
             return UpdateReport(locked=locked)
         grids, T = [grids[k] for k in free], T[free]
-    with first.pool.lock, deferred_interrupts():
-        tally = insert(grids, T, scan, threads)
-    return report_of(tally, locked)
+    with first.pool.lock, defer_interrupts():
+        tally = insert_scan(grids, T, scan, threads)
+    return update_report(tally, locked)
 
 
-def report_of(tally: npt.NDArray[np.int64], locked: int = 0) -> UpdateReport:
+def update_report(tally: npt.NDArray[np.int64], locked: int = 0) -> UpdateReport:
     """A kernel's tally in words."""
     t = tally.tolist()
     return UpdateReport(t[RAYS], t[CUT], t[NOT_FINITE], t[ZERO_LENGTH], t[OUTSIDE], locked, t[BRICKS])
 
 
-def insert(grids: Sequence[GridTree], poses: Array, scan: Scan, threads: int) -> npt.NDArray[np.int64]:
+def insert_scan(grids: Sequence[GridTree], poses: Array, scan: Scan, threads: int) -> npt.NDArray[np.int64]:
     """Write a checked scan; hold the pool's lock, and Ctrl-C back where there are several grids. ``poses (P, 12)``."""
     pool = grids[0].pool
     tally = np.zeros(TALLY, np.int64)
-    roots = own_grids(grids, pool)
+    roots = make_unique(grids, pool)
     n = len(roots)
     work, size = (_insert_serial, SERIAL_BATCH) if threads == 1 else (_insert_threads, BATCH)
     if n == 1:
@@ -126,11 +126,11 @@ def insert(grids: Sequence[GridTree], poses: Array, scan: Scan, threads: int) ->
         for begin in range(0, n, size):
             work(grids[0], roots[begin : begin + size], poses[begin : begin + size], scan, True, threads, tally)
     finally:  # not before the end: what is shared must not depend on the size of a batch
-        drop_left(shared.left, pool.brick_ref, pool.brick_free, pool.counters)
+        release_sources(shared.left, pool.brick_ref, pool.brick_free, pool.counters)
     return tally
 
 
-def own_grids(grids: Sequence[GridTree], pool: GridPool) -> npt.NDArray[np.int64]:
+def make_unique(grids: Sequence[GridTree], pool: GridPool) -> npt.NDArray[np.int64]:
     """Make every grid the only owner of its root; roots ``(P,)``. Hold the pool's lock."""
     pool.collect()
     boxes = [g._box for g in grids]
@@ -146,8 +146,8 @@ def own_grids(grids: Sequence[GridTree], pool: GridPool) -> npt.NDArray[np.int64
 def write_packed(grid: GridTree, keys: npt.NDArray[np.int64], values: npt.NDArray[np.int16]) -> None:
     """Replace bricks by packed offset coordinates ``(n,)`` and values ``(n, 512)``, unchecked."""
     pool = grid.pool
-    with pool.lock, deferred_interrupts():
-        own_grids((grid,), pool)  # first: it may take a node itself
+    with pool.lock, defer_interrupts():
+        make_unique((grid,), pool)  # first: it may take a node itself
         pool.reserve(len(keys) * (pool.levels - 1), len(keys))
         write_bricks(
             grid.root, keys, values, grid.model.threshold_step, pool.levels, *pool.tree_arrays(), *pool.store_arrays()
@@ -177,12 +177,12 @@ def _insert_serial(
             0, n, roots, ends, levels, grid.model.steps, s.slot_key, s.marks, s.marks64, s.work, pool.children,
             pool.node_occupied, pool.bricks, pool.brick_lines,
         )  # fmt: skip
-        settle_grids(
+        finalise_writes(
             0, n, roots, ends, levels, s.slot_key, s.work, pool.children, pool.node_occupied, pool.brick_lines, s.left,
             pool.counters,
         )  # fmt: skip
         if not share:
-            drop_left(s.left, pool.brick_ref, pool.brick_free, pool.counters)
+            release_sources(s.left, pool.brick_ref, pool.brick_free, pool.counters)
 
     try:
         while not mark_grids(
@@ -194,7 +194,7 @@ def _insert_serial(
         # every touched brick may need itself and a path of its own; the root is there
         pool.reserve(slots * (levels - 1), slots)
         s.reserve_left(slots)
-        resolve_grids(
+        resolve_writes(
             0, n, roots, ends, levels, s.slot_key, s.marks64, s.work, share, s.table, s.made, s.made_marks,
             pool.children, pool.node_ref, pool.node_occupied, pool.brick_ref, pool.node_free, pool.brick_free,
             pool.counters,
@@ -204,7 +204,7 @@ def _insert_serial(
         if pool.counters[PENDING]:
             finish()
         elif not share:
-            drop_left(s.left, pool.brick_ref, pool.brick_free, pool.counters)
+            release_sources(s.left, pool.brick_ref, pool.brick_free, pool.counters)
         s.reset()
         raise
     tally += count
@@ -257,14 +257,14 @@ def _insert_threads(
             s.reset()
         raise
     for i, s in enumerate(scratches):
-        resolve_grids(
+        resolve_writes(
             cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.marks64, s.work, share, shared.table,
             shared.made, shared.made_marks, pool.children, pool.node_ref, pool.node_occupied, pool.brick_ref,
             pool.node_free, pool.brick_free, pool.counters,
         )  # fmt: skip
     _in_threads(apply, threads)
     for i, s in enumerate(scratches):
-        settle_grids(
+        finalise_writes(
             cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.work, pool.children, pool.node_occupied,
             pool.brick_lines, shared.left, pool.counters,
         )  # fmt: skip

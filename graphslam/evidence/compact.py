@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
-from graphslam.core.interrupt import deferred_interrupts
-from graphslam.evidence.batch import own_grids
+from graphslam.core.interrupt import defer_interrupts
+from graphslam.evidence.batch import make_unique
 from graphslam.evidence.cube_kernels import UNSEEN, build_tree, find_states, list_pieces, share_cubes
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE, FAN, MAX_LEVELS, UNKNOWN
@@ -49,7 +49,7 @@ class CompactReport:
 
 
 @dataclass(frozen=True, slots=True)
-class States:
+class UniformStates:
     """Tables of what is of one value below the roots of some grids of a pool (:mod:`cube_kernels`)."""
 
     brick: npt.NDArray[np.int32]
@@ -60,11 +60,11 @@ class States:
 
 def find_all_states(
     grids: Sequence[GridTree], *, classes: bool = False, threshold: int = 0, maxima: bool = False
-) -> States:
+) -> UniformStates:
     """States of everything the grids (of one pool) hold; keep the pool's lock for as long as they are used."""
     pool = grids[0].pool
     b, n = int(pool.counters[BRICKS_USED]), int(pool.counters[NODES_USED])  # ids beyond were never used
-    states = States(
+    states = UniformStates(
         np.full(b, UNSEEN, np.int32),
         np.full(n, UNSEEN, np.int32),
         np.full(b if maxima else 0, UNKNOWN, np.int16),
@@ -79,7 +79,7 @@ def find_all_states(
     return states
 
 
-def compact(grids: GridTree | Sequence[GridTree]) -> CompactReport:
+def compact_grids(grids: GridTree | Sequence[GridTree]) -> CompactReport:
     """Let all cubes of one value in some grids share one brick or node for each size and value, without loss.
 
     Bricks and nodes that are of one value are kept once for each value, those entirely unknown not at all. What the
@@ -100,7 +100,7 @@ def compact(grids: GridTree | Sequence[GridTree]) -> CompactReport:
     pool = several[0].pool
     if any(g.pool is not pool for g in several):
         raise GridError("grids to be compacted together are of different pools", wanted="one pool")
-    with pool.lock, deferred_interrupts():
+    with pool.lock, defer_interrupts():
         nodes, bricks = pool.used_nodes, pool.used_bricks
         states = find_all_states(several)
         # flags of occupied voxels depend on the threshold, so grids of different ones share nothing
@@ -117,7 +117,7 @@ def compact(grids: GridTree | Sequence[GridTree]) -> CompactReport:
 
 
 @dataclass(frozen=True, slots=True)
-class Pieces:
+class GridPieces:
     """A map as bricks, and as cubes of one value where it can be. Ascending in (z, y, x); unknown space is not listed.
 
     Parameters
@@ -141,7 +141,7 @@ class Pieces:
     cube_values: Ints
 
 
-def pieces_of(grid: GridTree) -> Pieces:
+def grid_pieces(grid: GridTree) -> GridPieces:
     """What a grid holds; equal maps give equal pieces, whatever happened to them before."""
     pool = grid.pool
     half = pool.half // BRICK_EDGE
@@ -150,7 +150,9 @@ def pieces_of(grid: GridTree) -> Pieces:
         mixed = mixed[np.argsort(mixed[:, 0])]
         cubes = cubes[np.argsort(cubes[:, 0])]
         values = pool.bricks[mixed[:, 1]]
-    return Pieces(_unpack(mixed[:, 0]) - half, values, _unpack(cubes[:, 0]) - half, 3 + 2 * cubes[:, 1], cubes[:, 2])
+    return GridPieces(
+        _unpack(mixed[:, 0]) - half, values, _unpack(cubes[:, 0]) - half, 3 + 2 * cubes[:, 1], cubes[:, 2]
+    )
 
 
 def list_grid(grid: GridTree) -> tuple[Ints, Ints]:
@@ -166,8 +168,8 @@ def list_grid(grid: GridTree) -> tuple[Ints, Ints]:
     return mixed, cubes
 
 
-def grid_of(grid: G, pieces: Pieces) -> G:
-    """Fill an empty grid. The pieces fit its cube and none overlaps another (:func:`overlap`)."""
+def fill_grid(grid: G, pieces: GridPieces) -> G:
+    """Fill an empty grid. The pieces fit its cube and none overlaps another (:func:`find_overlap`)."""
     pool = grid.pool
     half = pool.half // BRICK_EDGE
     sizes = (pieces.log_edges - 3) // 2  # a cube is one child, or eight, of a node of this level
@@ -181,7 +183,7 @@ def grid_of(grid: G, pieces: Pieces) -> G:
     with pool.lock:
         pool.collect()
         pool.reserve(nodes, len(pieces.bricks) + values)
-        own_grids((grid,), pool)
+        make_unique((grid,), pool)
         build_tree(
             grid.root, pieces.bricks + half, pieces.values, cubes, grid.model.threshold_step, pool.levels, uniform,
             *pool.tree_arrays(), *pool.store_arrays(),
@@ -189,7 +191,7 @@ def grid_of(grid: G, pieces: Pieces) -> G:
     return grid
 
 
-def move(grids: Sequence[GridTree]) -> None:
+def move_grids(grids: Sequence[GridTree]) -> None:
     """Move grids into a pool of their own, the same for all, as large as they need it.
 
     A pool keeps the memory of maps that died. After a particle filter that is many times what is left alive; its memory
@@ -200,10 +202,10 @@ def move(grids: Sequence[GridTree]) -> None:
         levels = grid.pool.levels
         if levels not in pools:
             pools[levels] = GridPool(levels)
-        grid.take(grid_of(grid.empty(pools[levels]), pieces_of(grid)))
+        grid.replace_contents(fill_grid(grid.empty(pools[levels]), grid_pieces(grid)))
 
 
-def overlap(pieces: Pieces) -> str | None:
+def find_overlap(pieces: GridPieces) -> str | None:
     """What is impossible about pieces of an unknown source, or None: order, alignment, overlaps."""
     for name, rows in (("bricks", pieces.bricks), ("cubes", pieces.cubes)):
         if np.any(np.diff(_pack(rows + (1 << 18))) <= 0):
@@ -219,7 +221,7 @@ def overlap(pieces: Pieces) -> str | None:
     return None
 
 
-def levels_for(reach: int) -> int | None:
+def tree_levels(reach: int) -> int | None:
     """Fewest levels of a tree that holds voxels -reach … reach - 1; None if none does."""
     for levels in range(2, MAX_LEVELS + 1):
         if BRICK_EDGE * FAN**levels // 2 >= reach:
@@ -230,7 +232,7 @@ def levels_for(reach: int) -> int | None:
 def check_reach(reach: int, pool: GridPool, where: str) -> None:
     """Refuse a map that reaches beyond a pool's addressable cube."""
     if reach > pool.half:
-        needed = levels_for(reach)
+        needed = tree_levels(reach)
         raise GridError(
             f"map reaches {reach} voxels from the origin, beyond the addressable cube of {pool.levels} levels",
             where=where,

@@ -14,10 +14,10 @@ from tqdm import tqdm
 
 from graphslam.core.jit import without_garbage_collection
 from graphslam.evidence.batch import update_grids
-from graphslam.evidence.compact import compact
-from graphslam.evidence.first_use import COMPILING, start_compiling
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.formats import to_dense
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.jit_notice import COMPILING, start_compiling
 from graphslam.evidence.layout import BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.octomap import read_octomap, write_octomap
 
@@ -71,7 +71,7 @@ def _second_half() -> list[tuple[str, Callable[[], object]]]:
         ("merges", lambda: grid.merge(grid.copy())),
         ("clouds", grid.occupied_cloud),
         ("dense", lambda: to_dense(grid, dtype=np.float32)),
-        ("compaction", lambda: compact([grid, grid.copy()])),
+        ("compaction", lambda: compact_grids([grid, grid.copy()])),
         ("files", lambda: _through_files(grid)),
     ]
 

@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array
 from graphslam.evidence.dense_kernels import known_box
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import STEP
-from graphslam.evidence.query_kernels import count_boxes, count_values, list_occupied, walk_once
+from graphslam.evidence.query_kernels import count_boxes, count_voxel_values, list_occupied, walk_once
 from graphslam.evidence.scan import point_rows
 
 Ints = npt.NDArray[np.int64]
@@ -187,7 +187,7 @@ def value_counts(grid: GridTree) -> Ints:
             np.array([grid.root], np.int64), pool.levels, pool.children, np.zeros(n, np.int64), times,
             np.empty(n, np.int64), bricks, np.empty(pool.levels + 1, np.int64),
         )  # fmt: skip
-        count_values(bricks[:found], times, pool.bricks, counts)
+        count_voxel_values(bricks[:found], times, pool.bricks, counts)
     counts[0] = 0
     return counts
 

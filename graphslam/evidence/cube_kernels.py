@@ -274,7 +274,7 @@ def add_brick(
 
 
 @kernel()
-def settle_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines):
+def finalise_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines):
     """Write the flags of occupied voxels of a tree just built; parts with several parents have theirs already."""
     node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)
     for k in range(9):  # np.zeros would take longer to compile
@@ -326,4 +326,4 @@ def build_tree(
             root, cubes[k, 0], cubes[k, 1], cubes[k, 2], cubes[k, 3], cubes[k, 4], threshold, levels, uniform,
             children, node_ref, node_occupied, bricks, brick_ref, brick_lines, node_free, brick_free, counters,
         )  # fmt: skip
-    settle_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines)
+    finalise_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines)

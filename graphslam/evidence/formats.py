@@ -12,7 +12,7 @@ import numpy.typing as npt
 from graphslam.core.atomic import read_npz
 from graphslam.core.errors import ConfigError, FormatError, GridError
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import Pieces, check_reach, grid_of, overlap
+from graphslam.evidence.compact import GridPieces, check_reach, fill_grid, find_overlap
 from graphslam.evidence.dense_kernels import dense_log_odds, dense_values, known_box
 from graphslam.evidence.grid import FORMAT, EvidenceGrid
 from graphslam.evidence.layout import (
@@ -215,14 +215,14 @@ def load_npz(path: str | os.PathLike[str], *, pool: GridPool | None = None) -> E
             reach = max(reach, BRICK_EDGE * int(max(-corner.min(), (corner + edge).max())))
     if reach > half_edge(levels):
         raise FormatError(f"voxels {reach} from the origin do not fit the {levels} levels named", where=where)
-    wrong = overlap(pieces)
+    wrong = find_overlap(pieces)
     if wrong:
         raise FormatError(wrong, where=where)
     if dim == 2 and (len(pieces.cubes) or np.any(pieces.bricks[:, 2]) or np.any(pieces.values[:, 64:] != UNKNOWN)):
         raise FormatError("a 2-D grid has voxels beside the layer k = 0", where=where)
     pool = GridPool(levels) if pool is None else pool
     check_reach(reach, pool, where)
-    return grid_of(EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim), pieces)
+    return fill_grid(EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim), pieces)
 
 
 def _field(arrays: dict[str, npt.NDArray[Any]], name: str, dtype: Any, shape: tuple[int, ...], where: str) -> Any:
@@ -259,7 +259,7 @@ def _read_head(arrays: dict[str, npt.NDArray[Any]], where: str) -> tuple[BeamMod
     return model, voxel_size, dim, levels
 
 
-def _read_pieces(arrays: dict[str, npt.NDArray[Any]], where: str) -> Pieces:
+def _read_pieces(arrays: dict[str, npt.NDArray[Any]], where: str) -> GridPieces:
     bricks = _field(arrays, "bricks", np.int32, (-1, 3), where).astype(np.int64)
     values = _field(arrays, "values", np.int16, (len(bricks), BRICK_VOXELS), where)
     cubes = _field(arrays, "cubes", np.int32, (-1, 3), where).astype(np.int64)
@@ -271,4 +271,4 @@ def _read_pieces(arrays: dict[str, npt.NDArray[Any]], where: str) -> Pieces:
         )
     if np.any(cube_values == UNKNOWN) or not (values != UNKNOWN).any(axis=1).all():
         raise FormatError("a cube or brick of unknown voxels is listed", where=where)
-    return Pieces(bricks, values, cubes, edges, cube_values)
+    return GridPieces(bricks, values, cubes, edges, cube_values)

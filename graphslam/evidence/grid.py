@@ -17,14 +17,14 @@ import numpy.typing as npt
 from graphslam.core.atomic import write_npz
 from graphslam.core.errors import GridError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import element, join, pairs
+from graphslam.core.markup import html_element, join_parts, pair_list
 from graphslam.evidence import contents, queries
-from graphslam.evidence.batch import insert, report_of, write_packed
-from graphslam.evidence.compact import pieces_of
+from graphslam.evidence.batch import insert_scan, update_report, write_packed
+from graphslam.evidence.compact import grid_pieces
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS
-from graphslam.evidence.memory import Memory, memory
-from graphslam.evidence.merge import merge
+from graphslam.evidence.memory import MemoryUse, measure_memory
+from graphslam.evidence.merge import merge_grids
 from graphslam.evidence.scan import UpdateReport, pose_row, scan_rows
 from graphslam.evidence.tree_kernels import gather_bricks
 
@@ -102,7 +102,7 @@ class EvidenceGrid(GridTree):
         scan = scan_rows(points, origin, returns, max_range, self.dim, self.voxel_size)
         T = pose_row(pose, self.dim)[None]
         with self.pool.lock:
-            return report_of(insert((self,), T, scan, 1))
+            return update_report(insert_scan((self,), T, scan, 1))
 
     def write_bricks(self, coordinates: Any, values: Any) -> None:
         """Replace whole bricks: the bulk way in for readers.
@@ -146,7 +146,7 @@ class EvidenceGrid(GridTree):
 
     def merge(self, other: EvidenceGrid, pose: Any = None) -> int:
         """Add the log-odds of another map under ``T_self_other``; see `merge.merge`."""
-        return merge(self, other, pose)
+        return merge_grids(self, other, pose)
 
     # --- reading ---------------------------------------------------------------------------------------------
 
@@ -178,9 +178,9 @@ class EvidenceGrid(GridTree):
         pose: Any = None,
         ignore_unknown: bool = True,
         voxels: bool = False,
-    ) -> queries.Cast:
+    ) -> queries.CastResult:
         """Expected ranges of beams: `queries.cast`; for many grids at once, `queries.cast_grids`."""
-        return queries.cast(
+        return queries.cast_beams(
             self, origins, directions, max_range, pose=pose, ignore_unknown=ignore_unknown, voxels=voxels
         )
 
@@ -224,9 +224,9 @@ class EvidenceGrid(GridTree):
         """Entropy of the observed voxels times their volume (SegSLAM eq. 20–22) [nat m³]: `contents.entropy`."""
         return contents.entropy(self)
 
-    def memory(self) -> Memory:
+    def memory(self) -> MemoryUse:
         """Memory of this grid, and what of it no other grid shares; for sets of grids, `memory.memory`."""
-        return memory(self)
+        return measure_memory(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an npz archive that `formats.load_npz` reads: whole or not at all, the same map always as the same
@@ -236,7 +236,7 @@ class EvidenceGrid(GridTree):
         ``graphslam.evidence/1``: arrays ``voxel_size``, ``dim``, ``levels``, ``model`` (hit, miss, clamp low, clamp
         high, threshold), and those of `compact.Pieces`).
         """
-        pieces, m = pieces_of(self), self.model
+        pieces, m = grid_pieces(self), self.model
         write_npz(
             path,
             {
@@ -262,7 +262,7 @@ class EvidenceGrid(GridTree):
             "memory, own / shared": f"{m.private / 1e6:.2f} / {m.shared / 1e6:.2f} MB",
         }
         said = f" {self.dim}-D, {self.voxel_size:g} m voxels{', locked' if self.locked else ''}"
-        return join([element("b", "EvidenceGrid"), said, pairs(facts)])
+        return join_parts([html_element("b", "EvidenceGrid"), said, pair_list(facts)])
 
     def __repr__(self) -> str:
         state = ", locked" if self.locked else ""

@@ -84,7 +84,7 @@ class GridTree:
         """Root node in the pool, 0 of an empty grid; valid until the next write."""
         return self._box.root
 
-    def take(self, other: GridTree) -> None:
+    def replace_contents(self, other: GridTree) -> None:
         """Become what ``other``, a grid of the same kind, is now: how a long change is made whole or not at all."""
         other._box.shared = True
         self.pool, self._box = other.pool, other._box

@@ -80,7 +80,7 @@ def find_slot(code, n, window, slot_key, slot_next):
 
 
 @kernel(error_model="numpy")
-def fixed(parameter):
+def fixed_point(parameter):
     """Parameter along a beam in fixed point, far beyond its end where it is no number we can hold."""
     f = parameter * ONE
     return np.int64(f) if f < 2.0**61 else np.int64(NEVER)
@@ -197,12 +197,12 @@ def mark_grids(
                 ix = 1.0 / abs(vx) if ex != x else 0.0
                 iy = 1.0 / abs(vy) if ey != y else 0.0
                 iz = 1.0 / abs(vz) if ez != z else 0.0
-                L[a] = fixed((x + 1 - ox if ex > x else ox - x) * ix) if ex != x else NEVER
-                L[16 + a] = fixed((y + 1 - oy if ey > y else oy - y) * iy) if ey != y else NEVER
-                L[32 + a] = fixed((z + 1 - oz if ez > z else oz - z) * iz) if ez != z else NEVER
-                L[48 + a] = fixed(ix)
-                L[64 + a] = fixed(iy)
-                L[80 + a] = fixed(iz)
+                L[a] = fixed_point((x + 1 - ox if ex > x else ox - x) * ix) if ex != x else NEVER
+                L[16 + a] = fixed_point((y + 1 - oy if ey > y else oy - y) * iy) if ey != y else NEVER
+                L[32 + a] = fixed_point((z + 1 - oz if ez > z else oz - z) * iz) if ez != z else NEVER
+                L[48 + a] = fixed_point(ix)
+                L[64 + a] = fixed_point(iy)
+                L[80 + a] = fixed_point(iz)
                 p = voxel_code(x, y, z)
                 L[96 + a], L[112 + a], L[128 + a] = p & MASK_X, p & MASK_Y, p & MASK_Z
                 L[144 + a] = ~MASK_X if ex > x else 0

@@ -17,7 +17,7 @@ from graphslam.evidence.query_kernels import count_private, walk_once
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class MemoryUse:
     """Memory of one grid or of a set of grids; what they share among themselves counts once.
 
     Parameters
@@ -49,7 +49,7 @@ class Memory:
         return self.total - self.private
 
 
-def memory(grids: GridTree | Sequence[GridTree]) -> Memory:
+def measure_memory(grids: GridTree | Sequence[GridTree]) -> MemoryUse:
     """Memory of a grid or of a set of grids of one pool, by one walk over what they reach.
 
     Parameters
@@ -58,7 +58,7 @@ def memory(grids: GridTree | Sequence[GridTree]) -> Memory:
     """
     several = list(grids) if isinstance(grids, Sequence) else [grids]
     if not several:
-        return Memory(0, 0, 0, 0)
+        return MemoryUse(0, 0, 0, 0)
     pool = several[0].pool
     if any(g.pool is not pool for g in several):
         raise GridError("the memory of grids of different pools cannot be counted together", wanted="one pool")
@@ -82,7 +82,7 @@ def memory(grids: GridTree | Sequence[GridTree]) -> Memory:
             nodes, begins, np.array(list(free.values()), np.bool_), pool.levels, pool.children, pool.node_ref,
             pool.brick_ref, np.zeros(n, np.int32), np.zeros(b, np.int32),
         )  # fmt: skip
-    return Memory(int(begins[-1]), found, int(private[0]), int(private[1]))
+    return MemoryUse(int(begins[-1]), found, int(private[0]), int(private[1]))
 
 
 def shared_bricks(grid: GridTree, others: Sequence[GridTree]) -> npt.NDArray[np.bool_]:

@@ -19,7 +19,7 @@ CHUNK = 2048
 """Bricks worked on at a time: bounds the memory of a merge to some megabytes."""
 
 
-def merge(grid: GridTree, other: GridTree, pose: Any = None) -> int:
+def merge_grids(grid: GridTree, other: GridTree, pose: Any = None) -> int:
     """Add the log-odds of ``other`` to ``grid``; returns how many voxels got something.
 
     A voxel takes the value of the voxel of ``other`` that its centre lies in; unknown there adds nothing. Sums are
@@ -77,7 +77,7 @@ def merge(grid: GridTree, other: GridTree, pose: Any = None) -> int:
         with pool.lock:
             old = pool.bricks[_ids(bricks, part)]
         write_packed(work, part, _sum(old, values, *grid.model.clamp_steps))
-    grid.take(work)
+    grid.replace_contents(work)
     return found
 
 

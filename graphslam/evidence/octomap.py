@@ -19,7 +19,7 @@ from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import FormatError, GridError
 from graphslam.core.reading import read_bytes
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import Pieces, check_reach, find_all_states, grid_of, levels_for
+from graphslam.evidence.compact import GridPieces, check_reach, fill_grid, find_all_states, tree_levels
 from graphslam.evidence.cube_kernels import UNSEEN
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_VOXELS, DEFAULT_LEVELS, LARGEST_VOXEL, LIMIT, SMALLEST_VOXEL, STEP, UNKNOWN
@@ -96,11 +96,11 @@ def read_octomap(
     records = _read_records(data, head, where)
     model = BeamModel() if model is None else model
     pieces, reach = _pieces_of(records, head, model, where)
-    levels = levels_for(reach)
+    levels = tree_levels(reach)
     assert levels is not None  # OctoMap's cube is smaller than the largest of ours
     pool = GridPool(max(levels, DEFAULT_LEVELS)) if pool is None else pool
     check_reach(reach, pool, where)
-    return grid_of(EvidenceGrid(head.resolution, model=model, pool=pool), pieces)
+    return fill_grid(EvidenceGrid(head.resolution, model=model, pool=pool), pieces)
 
 
 def _read_header(data: bytes, where: str) -> _Header:
@@ -182,7 +182,7 @@ def _read_records(data: bytes, head: _Header, where: str) -> _Records:
     return _Records(rows["code"].astype(np.uint16), values, width)
 
 
-def _pieces_of(records: _Records, head: _Header, model: BeamModel, where: str) -> tuple[Pieces, int]:
+def _pieces_of(records: _Records, head: _Header, model: BeamModel, where: str) -> tuple[GridPieces, int]:
     """What the records say, and how far it reaches [voxels]; their structure is checked before room is made."""
     stack, tally = np.zeros((8 * 17, 5), np.int64), np.zeros(6, np.int64)
     bricks, cubes = np.zeros((0, 3), np.int64), np.zeros((0, 5), np.int64)
@@ -193,7 +193,7 @@ def _pieces_of(records: _Records, head: _Header, model: BeamModel, where: str) -
     bricks, cubes = np.empty((tally[BRICKS], 3), np.int64), np.empty((tally[CUBES], 5), np.int64)
     values = np.full((len(bricks), BRICK_VOXELS), UNKNOWN, np.int16)
     read_tree(records.codes, records.values, low, high, stack, bricks, values, cubes, tally)
-    return Pieces(bricks, values, cubes[:, :3], cubes[:, 3], cubes[:, 4]), int(tally[REACH])
+    return GridPieces(bricks, values, cubes[:, :3], cubes[:, 3], cubes[:, 4]), int(tally[REACH])
 
 
 def _check_tree(records: _Records, head: _Header, tally: Ints, where: str) -> None:

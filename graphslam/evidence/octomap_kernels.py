@@ -123,7 +123,7 @@ def child_of(m, node, part, i, levels, children):
 
 
 @kernel()
-def look_at(
+def tree_node_state(
     m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
 ):  # fmt: skip
     """State of a node of the octree, and its largest known value where ``brick_max`` is not empty."""
@@ -220,7 +220,7 @@ def write_tree(
     # by way of the stack: for literals look_at would be compiled once more
     stack[0, 0], stack[0, 1], stack[0, 2] = 16, root, 0
     m, node, part = stack[0, 0], stack[0, 1], stack[0, 2]
-    state, largest = look_at(
+    state, largest = tree_node_state(
         m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
     )  # fmt: skip
     room = codes.shape[0]
@@ -246,7 +246,7 @@ def write_tree(
             for k in range(8):
                 i = 7 - k
                 child, where = child_of(m, node, part, i, levels, children)
-                s, v = look_at(
+                s, v = tree_node_state(
                     m - 1, child, where, levels, classes, threshold, children, bricks, brick_state, node_state,
                     brick_max, node_max,
                 )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import GridError
-from graphslam.evidence.first_use import announce_compilation
+from graphslam.evidence.jit_notice import announce_compilation
 from graphslam.evidence.layout import BRICK_VOXELS, CHILDREN, DEFAULT_LEVELS, MAX_LEVELS, UNKNOWN, half_edge
 from graphslam.evidence.scratch import Scratch, aligned_empty, aligned_zeros
 from graphslam.evidence.tree_kernels import (
@@ -23,8 +23,8 @@ from graphslam.evidence.tree_kernels import (
     BRICKS_USED,
     NODES_FREE,
     NODES_USED,
-    own_roots,
     release_roots,
+    unique_roots,
 )
 
 NODE_BYTES = 4 * CHILDREN + 4 + 8
@@ -79,7 +79,7 @@ class GridPool:
         self.dead: deque[int] = deque()
         self._scratches: list[Scratch] = []
         self.kept: RootBox | None = None
-        """A tree that lives as long as the pool (:mod:`graphslam.evidence.shelved`)."""
+        """A tree that lives as long as the pool (:mod:`graphslam.evidence.spilled_grid`)."""
 
     def tree_arrays(self) -> tuple[Any, ...]:
         """``(children, node_ref, node_occupied, bricks, brick_ref, brick_lines)``; hold `lock` while they are used."""
@@ -191,7 +191,7 @@ class GridPool:
                 box.root = new if new != old else 0
 
         try:
-            own_roots(
+            unique_roots(
                 roots,
                 np.ones(len(foreign), np.uint8),
                 self.levels,

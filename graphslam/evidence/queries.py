@@ -29,7 +29,7 @@ from graphslam.evidence.cast_kernels import (
 )
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import STEP
-from graphslam.evidence.query_kernels import look_up
+from graphslam.evidence.query_kernels import look_up_values
 from graphslam.evidence.scan import check_number, point_rows, pose_row, pose_rows
 
 __all__ = [
@@ -39,8 +39,8 @@ __all__ = [
     "MAX_RANGE",
     "UNKNOWN_SPACE",
     "UNUSABLE",
-    "Cast",
-    "cast",
+    "CastResult",
+    "cast_beams",
     "cast_grids",
     "endpoint_log_odds",
     "endpoint_probability",
@@ -53,7 +53,7 @@ _NO_VOXELS = np.empty((0, 0, 0), np.int32)
 
 
 @dataclass(frozen=True, slots=True)
-class Cast:
+class CastResult:
     """Expected ranges of beams, for one grid ``(n,)`` or for P of them ``(P, n)``.
 
     Parameters
@@ -82,7 +82,7 @@ class Cast:
         return (self.status == HIT) | (self.status == INSIDE)
 
 
-def cast(
+def cast_beams(
     grid: GridTree,
     origins: Any,
     directions: Any,
@@ -91,7 +91,7 @@ def cast(
     pose: Any = None,
     ignore_unknown: bool = True,
     voxels: bool = False,
-) -> Cast:
+) -> CastResult:
     """First occupied voxel along each beam in one grid.
 
     Parameters
@@ -111,12 +111,12 @@ def cast(
 
     Returns
     -------
-    Cast
+    CastResult
         Arrays ``(n, …)``.
     """
     rows = pose_row(pose, grid.dim)[None]
     found = _cast([grid], rows, origins, directions, max_range, ignore_unknown, voxels, 1)
-    return Cast(found.ranges[0], found.status[0], None if found.voxels is None else found.voxels[0])
+    return CastResult(found.ranges[0], found.status[0], None if found.voxels is None else found.voxels[0])
 
 
 def cast_grids(
@@ -129,8 +129,8 @@ def cast_grids(
     ignore_unknown: bool = True,
     voxels: bool = False,
     threads: int = 1,
-) -> Cast:
-    """As :func:`cast` for one scan in many grids, each at a pose of its own.
+) -> CastResult:
+    """As :func:`cast_beams` for one scan in many grids, each at a pose of its own.
 
     Parameters
     ----------
@@ -143,12 +143,14 @@ def cast_grids(
 
     Returns
     -------
-    Cast
+    CastResult
         Arrays ``(P, n, …)``.
     """
     if not len(grids):
         n = len(np.asarray(directions))
-        return Cast(np.zeros((0, n)), np.zeros((0, n), np.int8), np.zeros((0, n, 3), np.int32) if voxels else None)
+        return CastResult(
+            np.zeros((0, n)), np.zeros((0, n), np.int8), np.zeros((0, n, 3), np.int32) if voxels else None
+        )
     rows = pose_rows(poses, grids[0].dim)
     return _cast(grids, rows, origins, directions, max_range, ignore_unknown, voxels, threads)
 
@@ -162,7 +164,7 @@ def _cast(
     ignore_unknown: bool,
     voxels: bool,
     threads: int,
-) -> Cast:
+) -> CastResult:
     first = check_together(grids, same_threshold=True)
     check_number("poses", rows, len(grids))
     limit = float(max_range)
@@ -191,7 +193,7 @@ def _cast(
             )  # fmt: skip
 
         _share(run, len(grids), threads)
-    return Cast(ranges, status, ends if voxels else None)
+    return CastResult(ranges, status, ends if voxels else None)
 
 
 def endpoint_log_odds(
@@ -291,7 +293,7 @@ def _look_up(
         roots = np.array([g.root for g in grids], np.int64)
 
         def run(begin: int, end: int) -> None:
-            look_up(
+            look_up_values(
                 begin, end, roots, rows, p, 1.0 / first.voxel_size, pool.half, pool.levels, trilinear, table,
                 pool.children, pool.bricks, out,
             )  # fmt: skip

@@ -36,7 +36,7 @@ def find_brick(root, x, y, z, levels, children, last):
 
 
 @kernel(error_model="numpy")
-def look_up(begin, end, roots, poses, points, scale, half, levels, trilinear, table, children, bricks, out):
+def look_up_values(begin, end, roots, poses, points, scale, half, levels, trilinear, table, children, bricks, out):
     """Figures of ``table (65536,)``, one for each value a voxel may hold, at points seen from grids ``begin … end-1``.
 
     Parameters
@@ -220,7 +220,7 @@ def walk_once(roots, levels, children, node_times, brick_times, nodes, links, be
 
 
 @kernel()
-def count_values(ids, times, bricks, counts):
+def count_voxel_values(ids, times, bricks, counts):
     """Histogram ``counts (65536,) int64`` of the values of bricks ``ids (n,)``, each counted ``times[id]`` times."""
     for k in range(ids.shape[0]):
         b = ids[k]

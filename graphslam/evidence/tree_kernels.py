@@ -76,7 +76,7 @@ def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node
 
 
 @kernel()
-def own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
+def unique_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
     """Node of level 0 over a brick, with no other parent on the way from the root: missing nodes are made, shared ones
     copied. The root is the caller's own."""
     node = root
@@ -134,7 +134,7 @@ def set_occupied(root, bx, by, bz, levels, occupied, children, node_occupied):
 
 
 @kernel()
-def own_roots(roots, shared, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
+def unique_roots(roots, shared, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
     """Copy the roots ``(n,)`` marked ``shared (n,)`` (and those that are 0: empty maps), in place.
 
     The old root keeps its parent count: other handles still hold it.
@@ -272,7 +272,9 @@ def write_bricks(
     """Replace bricks (packed offset coordinates ``keys (n,)``) by ``values (n, 512)``. Root owned, room reserved."""
     for k in range(keys.shape[0]):
         bx, by, bz = keys[k] & 0xFFFFF, (keys[k] >> 20) & 0xFFFFF, keys[k] >> 40
-        parent = own_parent(root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters)
+        parent = unique_parent(
+            root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, counters
+        )
         c = ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)
         b = np.int64(children[parent, c])
         if b == 0 or brick_ref[b] > 1:

@@ -20,7 +20,7 @@ PENDING = 4
 
 
 @kernel()
-def find_twin(s, source, marks64, table, made, made_marks):
+def find_identical_write(s, source, marks64, table, made, made_marks):
     """Place in ``made`` of the brick made of this source and these marks, and the last one is the new brick's own if
     there was none; -1 where there is no room for it.
 
@@ -66,7 +66,7 @@ def find_twin(s, source, marks64, table, made, made_marks):
 
 
 @kernel()
-def resolve_grids(
+def resolve_writes(
     begin,
     end,
     roots,
@@ -93,8 +93,8 @@ def resolve_grids(
     else's. Bricks with the same source and the same marks will be equal, so several grids get one target: particles
     that came from one parent see most of their surroundings alike for some scans, and what they see alike stays one
     brick. State is 0, or ~source where another slot writes the target. Sources keep all their parents until
-    :func:`drop_left`, at the end of the update: what is shared must not depend on who came first. From here to
-    :func:`settle_grids` ``counters[PENDING]`` is set: the trees are no maps. Room was reserved.
+    :func:`release_sources`, at the end of the update: what is shared must not depend on who came first. From here to
+    :func:`finalise_writes` ``counters[PENDING]`` is set: the trees are no maps. Room was reserved.
 
     ``share``: look for such bricks, among those of this update, with ``table, made, made_marks`` of the scratch. The
     loops are inside: handing a dozen arrays to a function for every brick would cost more than the work.
@@ -136,7 +136,7 @@ def resolve_grids(
             target, state = source, 0
             work[s, 2] = source
             if source == 0 or brick_ref[source] > 1:
-                twin = find_twin(s, source, marks64, table, made, made_marks) if share else np.int64(-1)
+                twin = find_identical_write(s, source, marks64, table, made, made_marks) if share else np.int64(-1)
                 if twin >= 0 and made[twin, 1] != 0:
                     target, state = made[twin, 1], ~source
                     brick_ref[target] += 1
@@ -268,7 +268,7 @@ def apply_grids(
 
 
 @kernel()
-def settle_grids(
+def finalise_writes(
     begin, end, roots, ends, levels, slot_key, work, children, node_occupied, brick_lines, left, counters
 ):  # fmt: skip
     """Once every brick is written, whatever thread did it: flags of those another slot wrote, and the sources that
@@ -291,7 +291,7 @@ def settle_grids(
 
 
 @kernel()
-def drop_left(left, brick_ref, brick_free, counters):
+def release_sources(left, brick_ref, brick_free, counters):
     """Take one parent from each of the bricks that were left for a copy."""
     for k in range(left[0]):
         drop_brick(left[k + 1], brick_ref, brick_free, counters)

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.dense import CloudMap, MapView
+from graphslam.core.dense import CloudMap, DenseMapView
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.points import thin
+from graphslam.core.points import voxel_downsample
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
-from graphslam.evidence.shelved import shelved
+from graphslam.evidence.spilled_grid import spill_grid
 
 
 class GridView:
-    """A `graphslam.core.dense.MapView` of an evidence grid."""
+    """A `graphslam.core.dense.DenseMapView` of an evidence grid."""
 
     cloud: CloudMap | None = None
     knows_space = True
@@ -50,7 +50,8 @@ class GridView:
 
 
 class CloudView:
-    """A `graphslam.core.dense.MapView` of a cloud: points as measured, space from the grid beside it or its own beams.
+    """A `graphslam.core.dense.DenseMapView` of a cloud: points as measured, space from the grid beside it or its own
+    beams.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ class CloudView:
 
     def points(self, level: int = 0) -> Array:
         """Means of the points in cells."""
-        return thin(self._cloud.points, self._cloud.cell * 2**level)
+        return voxel_downsample(self._cloud.points, self._cloud.cell * 2**level)
 
     def known_at(self, points: Any) -> npt.NDArray[np.bool_]:
         """See `MapView`. Where no space is known, that is in a column through one of its points."""
@@ -97,7 +98,7 @@ class CloudView:
         c, grid = self._cloud, EvidenceGrid(self._cloud.cell, dim=self._cloud.dim)
         if c.origins is None or c.scan is None:
             _mark(grid, c.points)
-            return shelved(grid)
+            return spill_grid(grid)
         scan, points = c.scan, c.points
         order = np.argsort(scan, kind="stable")
         bounds = np.searchsorted(scan[order], np.arange(len(c.origins) + 1))
@@ -105,10 +106,10 @@ class CloudView:
             rows = order[bounds[k] : bounds[k + 1]]
             if len(rows):
                 grid.insert_scan(points[rows], origin)
-        return shelved(grid)
+        return spill_grid(grid)
 
 
-def view_of(submap: Submap) -> MapView:
+def dense_view(submap: Submap) -> DenseMapView:
     """The dense map of a submap."""
     grid = submap.grid
     if submap.cloud is not None and (grid is None or isinstance(grid, EvidenceGrid)):
@@ -120,7 +121,7 @@ def view_of(submap: Submap) -> MapView:
     return GridView(grid)
 
 
-def has_view(submap: Submap) -> bool:
+def has_dense_view(submap: Submap) -> bool:
     """Whether a submap has a dense map."""
     return submap.cloud is not None or isinstance(submap.grid, EvidenceGrid)
 

@@ -16,7 +16,7 @@ from scipy.linalg import lapack
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
-from graphslam.graph.variables import Layout
+from graphslam.graph.variables import VariableLayout
 from graphslam.linear.symmetric_factor import SymmetricFactor
 
 
@@ -29,7 +29,7 @@ class JointCovariance:
         Gauss-Newton matrix.
     """
 
-    def __init__(self, layout: Layout, A: Array | sp.csc_matrix) -> None:
+    def __init__(self, layout: VariableLayout, A: Array | sp.csc_matrix) -> None:
         self.layout = layout
         self._inverse_factor: Array | None = None
         self._sparse: SymmetricFactor | None = None

@@ -12,8 +12,8 @@ from scipy.sparse.csgraph import connected_components
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
-from graphslam.graph.flat import FlatGraph
-from graphslam.graph.variables import KINDS, Layout, Values, split_name
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
 
 # Eigenvalues of the unit-diagonal matrix below this are rounding, not information: double precision keeps 1e-16 of the
 # largest, and a chain of a thousand honest submaps stays above 1e-9 (measured).
@@ -52,7 +52,7 @@ class Diagnosis:
             )
 
 
-def unreached(flat: FlatGraph) -> tuple[list[str], int]:
+def unconnected_variables(flat: FactorArrays) -> tuple[list[str], int]:
     """Variables that no chain of factors ties to a held pose (cheap, no numbers), and in how many parts they are."""
     lay, (factor, variable) = flat.layout, flat.links
     ground = lay.size
@@ -71,7 +71,7 @@ def unreached(flat: FlatGraph) -> tuple[list[str], int]:
     return [names[k] for k in loose.tolist()], len(np.unique(label[first[loose]]))
 
 
-def diagnose(flat: FlatGraph, values: Values, *, waiting_fixes: int = 0) -> Diagnosis:
+def diagnose(flat: FactorArrays, values: Values, *, waiting_fixes: int = 0) -> Diagnosis:
     """Find unconstrained variables by structure and by number.
 
     Parameters
@@ -82,7 +82,7 @@ def diagnose(flat: FlatGraph, values: Values, *, waiting_fixes: int = 0) -> Diag
         GPS fixes without a datum yet (for the remedy's wording).
     """
     lay = flat.layout
-    lost, _ = unreached(flat)
+    lost, _ = unconnected_variables(flat)
     if not lost:
         system = flat.evaluate(values)
         lost = null_variables(system.A, lay)
@@ -91,7 +91,7 @@ def diagnose(flat: FlatGraph, values: Values, *, waiting_fixes: int = 0) -> Diag
     return Diagnosis(tuple(lost), tuple(_remedies(lost, flat, waiting_fixes)))
 
 
-def null_variables(A: Array | sp.csc_matrix, lay: Layout) -> list[str]:
+def null_variables(A: Array | sp.csc_matrix, lay: VariableLayout) -> list[str]:
     diagonal = np.asarray(A.diagonal())
     owner = np.array(lay.owner_of_columns(), dtype=object)
     if lay.size == 0:
@@ -118,7 +118,7 @@ def _inverse(matrix: sp.csc_matrix) -> spla.LinearOperator:
     return spla.LinearOperator(matrix.shape, matvec=lu.solve, dtype=np.float64)  # type: ignore[arg-type]
 
 
-def _remedies(lost: Sequence[str], flat: FlatGraph, waiting: int) -> list[str]:
+def _remedies(lost: Sequence[str], flat: FactorArrays, waiting: int) -> list[str]:
     out = []
     nodes = [n for n in lost if n[0] == "x"]
     if nodes:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
 from graphslam.core.poses import group_of
@@ -22,11 +22,11 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, antenna_terms
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.factors.pseudorange import PseudorangeRecord
-from graphslam.graph.noise import Robust, whitener
+from graphslam.graph.noise import RobustKernel, whitener
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
 if TYPE_CHECKING:
-    from graphslam.graph.graph_record import GraphRecord
+    from graphslam.graph.factor_graph_state import FactorGraphState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +35,7 @@ class GpsConfig:
 
     Parameters
     ----------
-    robust : Robust
+    robust : RobustKernel
         Kernel on each fix.
     sigma : float or None
         Standard deviation of a coordinate [m] in place of the stream's own.
@@ -56,7 +56,7 @@ class GpsConfig:
         first (:mod:`graphslam.backend.fix_errors`). With a ``bias_sigma`` it is stated, and nothing is fitted.
     """
 
-    robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
+    robust: RobustKernel = flattened_field(RobustKernel("none", 2.385), robust="kind", robust_width="k")
     sigma: float | None = None
     baseline: float = 20.0
     bias_sigma: float | None = None
@@ -105,7 +105,7 @@ class FixErrors:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fix:
+class PendingFix:
     """A fix that has not become a factor yet."""
 
     factor_id: int
@@ -126,10 +126,10 @@ class Fix:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TiedFix:
+class AttachedFix:
     """A fix with its node in a submap: all it needs but a datum."""
 
-    fix: Fix
+    fix: PendingFix
     node: int
     arm: Array
     covariance: Array
@@ -137,7 +137,7 @@ class TiedFix:
     """Row of the point of the path that it measures, where its submap has one."""
 
 
-def arm_of(trajectory: Trajectory, times: Array, lever: Array) -> tuple[Array, Array]:
+def antenna_in_base(trajectory: Trajectory, times: Array, lever: Array) -> tuple[Array, Array]:
     """Antenna in the base frame, and its covariance from the submap's own trajectory.
 
     Parameters
@@ -199,7 +199,7 @@ def arm_jacobian(T: Array, lever: Array) -> Array:
     return G
 
 
-def datum_columns(graph: GraphRecord, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def datum_columns(graph: FactorGraphState, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Columns ``(k, c)`` of what an antenna at nodes ``(k,)`` depends on: node, datum, tilt if there is one; -1: held.
 
     They stand in the order of :func:`~graphslam.graph.factors.gps.antenna_terms`.
@@ -209,7 +209,7 @@ def datum_columns(graph: GraphRecord, nodes: npt.NDArray[np.int64]) -> npt.NDArr
     return np.concatenate([lay.at("x", nodes), *(lay.at(w, one) for w in words)], axis=1)
 
 
-def spread(points: Array) -> float:
+def greatest_distance(points: Array) -> float:
     """Greatest distance from the first point [m]: zero for none."""
     return float(np.max(np.linalg.norm(points - points[0], axis=1))) if len(points) else 0.0
 
@@ -241,11 +241,11 @@ class GpsFixes:
     one. The very last instant of a finished graph belongs to the last submap.
     """
 
-    def __init__(self, graph: GraphRecord) -> None:
+    def __init__(self, graph: FactorGraphState) -> None:
         self.graph = graph
         self.config = GpsConfig()
-        self.waiting: list[Fix] = []  # for their submap, in the order of time
-        self.tied: list[TiedFix] = []  # for a datum
+        self.waiting: list[PendingFix] = []  # for their submap, in the order of time
+        self.tied: list[AttachedFix] = []  # for a datum
         self.last_time = -np.inf
         self.bias_begin = -np.inf  # of the last bias
         self.fitted: FixErrors | None = None
@@ -267,23 +267,23 @@ class GpsFixes:
         uneven = None if self.config.sigma is not None else gps.covariances
         for k, (t, p, s) in enumerate(zip(gps.times.tolist(), gps.positions, gps.sigma.tolist())):
             P = None if uneven is None else uneven[k]
-            fixes.append(Fix(g.next_factor(), t, p, s, gps.lever, self.config, P))
+            fixes.append(PendingFix(g.next_factor(), t, p, s, gps.lever, self.config, P))
             g.ledger.spend(fixes[-1].factor_id, f"GPS fix at {t:.3f} s", [stream], (t, t))
         self.waiting = sorted([*self.waiting, *fixes], key=lambda f: f.time)
         first = min((f.time for f in fixes), default=np.inf)
         for s in g.submaps:
             if s.interval[1] >= first or s is g.submaps[-1]:
-                self.tie(s, more=s is not g.submaps[-1])
+                self.attach(s, more=s is not g.submaps[-1])
         return [f.factor_id for f in fixes]
 
     def finish(self) -> None:
         """No more submaps will come."""
         if self.graph.submaps:
-            self.tie(self.graph.submaps[-1], closed=True)
+            self.attach(self.graph.submaps[-1], closed=True)
         self._drop([(f.factor_id, "after the last submap") for f in self.waiting])
         self.waiting = []
 
-    def tie(self, s: SubmapNode, *, closed: bool = False, more: bool = False) -> None:
+    def attach(self, s: SubmapNode, *, closed: bool = False, more: bool = False) -> None:
         """Give a submap its waiting fixes, ``closed`` that at its end too; with ``more`` to follow no datum starts."""
         g = self.graph
         dropped = self._queue(s, closed)
@@ -299,7 +299,7 @@ class GpsFixes:
             if start is None:
                 return
             g.values.datum = start
-            g.note("datum", fixes=len(self.tied), T_gps_world=start.tolist())
+            g.log_event("datum", fixes=len(self.tied), T_gps_world=start.tolist())
         for t in sorted(self.tied, key=lambda t: t.fix.time):
             bias = self._bias_of(t.fix)
             W = whitener(self._in_its_frame(t), what=f"covariance of the GPS fix at {t.fix.time:.3f} s")
@@ -314,7 +314,7 @@ class GpsFixes:
             )  # fmt: skip
         self.tied = []
 
-    def _in_its_frame(self, t: TiedFix) -> Array:
+    def _in_its_frame(self, t: AttachedFix) -> Array:
         """Covariance of a fix with its arm: in the node's frame, or in that of an uneven fix."""
         if t.fix.uneven is None:
             return t.covariance
@@ -326,7 +326,7 @@ class GpsFixes:
         turn = J[:, :2] if self.graph.dim == 2 else J[:, 3:6]  # the node's axes in the GPS frame
         return np.asarray(t.fix.uneven + turn @ t.covariance @ turn.T)
 
-    def leave(self, s: SubmapNode) -> None:
+    def detach(self, s: SubmapNode) -> None:
         """Take out the fixes of a submap that goes: their arms come from its trajectory."""
         own = set(s.nodes[:-1])
         inside = [r.factor_id for r in self.graph.records.values() if isinstance(r, GpsRecord) and r.node in own]
@@ -337,13 +337,13 @@ class GpsFixes:
         self._drop([(i, "its submap was removed") for i in [*tied, *inside]])
         self._leave_points(self.graph.submap(s.key))
 
-    def tidy(self) -> None:
+    def remove_unused(self) -> None:
         """A datum that no fix holds any more goes, and the biases with it."""
         g = self.graph
         holders = (GpsRecord, PseudorangeRecord)
         if g.structure.count("datum") and not any(isinstance(r, holders) for r in g.records.values()):
             for fid in [k for k, r in g.records.items() if isinstance(r, BiasPriorRecord)]:
-                g.ledger.refund(fid)
+                g.ledger.release(fid)
                 del g.records[fid]
             g.values.datum, g.values.biases = None, np.zeros((0, g.dim))
             self.fitted = None
@@ -351,8 +351,8 @@ class GpsFixes:
 
     def _drop(self, dropped: Iterable[tuple[int, str]]) -> None:
         for fid, reason in dropped:
-            self.graph.ledger.refund(fid)
-            self.graph.note("gps-dropped", factor_id=fid, reason=reason)
+            self.graph.ledger.release(fid)
+            self.graph.log_event("gps-dropped", factor_id=fid, reason=reason)
 
     def _queue(self, s: SubmapNode, closed: bool) -> list[tuple[int, str]]:
         """Move the fixes of one submap to its nodes; (factor_id, reason) of those that have no place."""
@@ -378,11 +378,11 @@ class GpsFixes:
                 cov = np.zeros_like(cov)
             # of a fix that is not equally sure in all directions the arm's alone, until the datum says how to turn it
             covariance = cov[0] if f.uneven is not None else sigma**2 * np.eye(len(f.lever)) + cov[0]
-            self.tied.append(TiedFix(f, s.nodes[int(at[0])], arm[0], covariance, point))
+            self.tied.append(AttachedFix(f, s.nodes[int(at[0])], arm[0], covariance, point))
         self._tie_points(s)
         return dropped
 
-    def _inner_point(self, s: SubmapNode, fix: Fix) -> int | None:
+    def _inner_point(self, s: SubmapNode, fix: PendingFix) -> int | None:
         """Row of the point of a submap's path at a fix; a new one where it has none yet. None: no such point."""
         g, s = self.graph, self.graph.submap(s.key)
         inner = s.inner_points
@@ -426,7 +426,7 @@ class GpsFixes:
             return
         if inner.factor_id is not None:
             del g.records[inner.factor_id]
-            g.ledger.refund(inner.factor_id)
+            g.ledger.release(inner.factor_id)
         gone = set(inner.rows.values())
         kept = [k for k in range(g.structure.count("point")) if k not in gone]
         new = {old: k for k, old in enumerate(kept)}
@@ -452,7 +452,9 @@ class GpsFixes:
         group = group_of(poses)
         world = group.transform(poses[[t.node for t in self.tied]], np.array([t.arm for t in self.tied]))
         fixes = np.array([t.fix.position for t in self.tied]) - origin
-        if min(spread(world[:, :2]), spread(fixes[:, :2])) < baseline:  # only a level way says where north is
+        if (
+            min(greatest_distance(world[:, :2]), greatest_distance(fixes[:, :2])) < baseline
+        ):  # only a level way says where north is
             return None
         fix = [np.zeros((group.dim, group.dim)) if t.fix.uneven is None else t.fix.uneven for t in self.tied]
         sigma = np.array([np.sqrt(np.trace((t.covariance + P)[:2, :2]) / 2.0) for t, P in zip(self.tied, fix)])
@@ -461,7 +463,7 @@ class GpsFixes:
             return level
         return np.array([*level[:2], np.median(fixes[:, 2] - world[:, 2]), level[2]])
 
-    def _bias_of(self, fix: Fix) -> int | None:
+    def _bias_of(self, fix: PendingFix) -> int | None:
         cfg, previous = fix.config, self.last_time
         self.last_time = fix.time
         g = self.graph

@@ -18,20 +18,20 @@ from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se3_adjoint, se3_compose, so3_log
 from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, up_turn, without_tilt
-from graphslam.graph.factors.batch import Record
+from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.imu.axes import check_imu_axes
-from graphslam.graph.factors.imu.batch import GYRO_ROWS, XI, XJ, Ways, way_terms
-from graphslam.graph.factors.imu.config import ImuConfig, Place, path_of, places_of
-from graphslam.graph.factors.imu.plan import FEWEST, Plan, joined, plan_of, window_of
+from graphslam.graph.factors.imu.batch import GYRO_ROWS, XI, XJ, PreintegrationArrays, preintegration_terms
+from graphslam.graph.factors.imu.config import BodyPlace, ImuConfig, body_path, places_on_nodes
+from graphslam.graph.factors.imu.plan import FEWEST, ImuFactorPlan, force_window, join_readings, plan_factors
 from graphslam.graph.factors.imu.preintegration import Preintegrated, bias_sigma, mean_force, preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
-from graphslam.graph.factors.imu.states import ImuStates, compacted, links_wanted
+from graphslam.graph.factors.imu.states import ImuStates, renumber_states, required_bias_links
 from graphslam.graph.noise import whitener
 from graphslam.graph.submap_node import SubmapNode
 
 if TYPE_CHECKING:
-    from graphslam.graph.graph_record import GraphRecord
+    from graphslam.graph.factor_graph_state import FactorGraphState
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class ImuUse:
 class ImuUnits:
     """The IMUs of a graph in space."""
 
-    def __init__(self, graph: GraphRecord) -> None:
+    def __init__(self, graph: FactorGraphState) -> None:
         self.graph = graph
         self.used: dict[str, ImuUse] = {}
 
@@ -60,19 +60,19 @@ class ImuUnits:
             raise GeometryError("an IMU says little of poses in the plane", where=stream, wanted="a graph in space")
         known = self.used.get(stream)
         cfg = config or (ImuConfig() if known is None else known.config)
-        imu = imu if known is None else joined(known.imu, imu, stream)
+        imu = imu if known is None else join_readings(known.imu, imu, stream)
         if len(imu.times) < 2:
             raise DataError("an IMU needs readings", where=stream, got=len(imu.times), wanted="two or more")
         bias_sigma(imu.noise)
-        places = places_of(self.graph.submaps, cfg.window)
+        places = places_on_nodes(self.graph.submaps, cfg.window)
         waiting = self.graph.submaps[-1].exit_node if more and self.graph.submaps else None
         if waiting is not None:
             places.pop(waiting, None)
-        plan = plan_of(self.graph.submaps, self.graph.records.values(), imu, stream, cfg, places, waiting)
+        plan = plan_factors(self.graph.submaps, self.graph.records.values(), imu, stream, cfg, places, waiting)
         for a, b in plan.pairs:
             self.graph.ledger.check(f"{stream} x{a} → x{b}", [stream], (places[a].time, places[b].time))
         for n in plan.gravity:
-            self.graph.ledger.check(f"gravity seen by {stream} at x{n}", [stream], window_of(places[n].time, cfg))
+            self.graph.ledger.check(f"gravity seen by {stream} at x{n}", [stream], force_window(places[n].time, cfg))
         if not more:
             self.check(imu, stream=stream, axes=cfg.axes)
         self.used[stream] = ImuUse(imu, cfg)
@@ -81,7 +81,7 @@ class ImuUnits:
         ids += self._relink(stream)
         if not more:
             mine = [r for r in self.graph.records.values() if getattr(r, "stream", None) == stream]
-            self.graph.note(
+            self.graph.log_event(
                 "imu", stream=stream, factors=len(mine), ways=sum(isinstance(r, ImuRecord) for r in mine),
                 gravity=sum(isinstance(r, ForceRecord) for r in mine), dropped=dict(plan.dropped),
             )  # fmt: skip
@@ -92,13 +92,13 @@ class ImuUnits:
         if axes == "ignore":
             return ""
         try:
-            found = check_imu_axes(imu, path_of(self.graph.submaps, self.graph.values))
+            found = check_imu_axes(imu, body_path(self.graph.submaps, self.graph.values))
         except DataError as error:
-            self.graph.note("imu-axes", stream=stream, verdict="not checked", why=str(error))
+            self.graph.log_event("imu-axes", stream=stream, verdict="not checked", why=str(error))
             return ""
         words = found.words()
         verdict = "wrong" if found.wrong else "as stated" if found.turns is None else "unlike"
-        self.graph.note(
+        self.graph.log_event(
             "imu-axes", stream=stream, verdict=verdict, words=words, excess=found.excess, alike=found.alike,
             windows=found.windows, turns=found.turns,
         )  # fmt: skip
@@ -127,7 +127,7 @@ class ImuUnits:
         """See :meth:`~graphslam.graph.pose_graph.PoseGraph.imu_states`."""
         return ImuStates.of(self.graph.records.values(), stream)
 
-    def leave(self, s: SubmapNode) -> None:
+    def detach(self, s: SubmapNode) -> None:
         """Take out what IMUs said inside a submap that goes."""
         inside = set(s.nodes)
         for fid, r in list(self.graph.records.items()):
@@ -135,7 +135,7 @@ class ImuUnits:
             if way or (isinstance(r, ForceRecord) and r.node in inside):
                 self.graph.take_out(fid, "its submap was removed")
 
-    def tidy(self, removed: Record) -> None:
+    def remove_unused(self, removed: FactorRecord) -> None:
         """Make good what a factor leaves that was removed: a bias that loses the way to the one before walks over the
         time between instead; velocities and biases that nothing holds any more go."""
         if not self.used:
@@ -150,7 +150,7 @@ class ImuUnits:
     # ---------------------------------------------------------------- inside
 
     def _add_ways(
-        self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, Place], pairs: Sequence[tuple[int, int]]
+        self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, BodyPlace], pairs: Sequence[tuple[int, int]]
     ) -> list[int]:
         if not pairs:
             return []
@@ -255,8 +255,8 @@ class ImuUnits:
             records, pim.R, pim.p, pim.v, pim.J, pim.bias)]  # fmt: skip
         i, j = (np.array([getattr(r, n) for r in fresh]) for n in "ij")
         vs, bs = np.array([r.velocities for r in fresh]), np.array([r.biases for r in fresh])
-        ways = Ways(fresh)
-        J = way_terms(
+        ways = PreintegrationArrays(fresh)
+        J = preintegration_terms(
             ways, x[i], v[vs[:, 0]], b[bs[:, 0]], x[j], v[vs[:, 1]], b[bs[:, 1]], tilt
         )[1]  # fmt: skip
         local = np.array([r.local for r in fresh])
@@ -270,7 +270,9 @@ class ImuUnits:
             W = whitener(Pk, what=f"covariance of {r.label()}", dim=len(Pk))
             self.graph.insert(replace(r, whitener=W))
 
-    def _add_forces(self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, Place], plan: Plan) -> list[int]:
+    def _add_forces(
+        self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, BodyPlace], plan: ImuFactorPlan
+    ) -> list[int]:
         if not plan.gravity:
             return []
         self.graph.start_tilt()
@@ -293,7 +295,7 @@ class ImuUnits:
                 last = self.graph.values.imu_biases[-1:]
                 row = self.graph.values.append("imubias", last if len(last) else np.zeros(6))
             r = ForceRecord(self.graph.next_factor(), stream, n, float(at[k]), row, L, force[k], W, cfg.robust)
-            self.graph.ledger.spend(r.factor_id, r.label(), [stream], window_of(at[k], cfg))
+            self.graph.ledger.spend(r.factor_id, r.label(), [stream], force_window(at[k], cfg))
             self.graph.insert(r)
             ids.append(r.factor_id)
         return ids
@@ -301,13 +303,13 @@ class ImuUnits:
     def _relink(self, stream: str) -> list[int]:
         """The first bias starts, and each that no way ties to the one before walks on from it."""
         noise = self.used[stream].imu.noise
-        wanted = links_wanted(self.states(stream), self.graph.records.values(), stream, noise)
+        wanted = required_bias_links(self.states(stream), self.graph.records.values(), stream, noise)
         for fid, r in list(self.graph.records.items()):
             if isinstance(r, ImuBiasRecord) and r.stream == stream:
                 sigma = wanted.get((r.before, r.bias))
                 if sigma is None or not np.array_equal(sigma, r.sigma):
                     self.graph.records.pop(fid)
-                    self.graph.ledger.refund(fid)
+                    self.graph.ledger.release(fid)
                     self.graph.revision += 1
                 else:
                     del wanted[(r.before, r.bias)]
@@ -321,7 +323,7 @@ class ImuUnits:
 
     def _compact(self) -> None:
         """Velocities and biases that no factor holds any more go; the others move up."""
-        changed, v, b = compacted(self.graph.records)
+        changed, v, b = renumber_states(self.graph.records)
         if changed or len(v) < len(self.graph.values.velocities) or len(b) < len(self.graph.values.imu_biases):
             self.graph.values.velocities, self.graph.values.imu_biases = (
                 self.graph.values.velocities[v],

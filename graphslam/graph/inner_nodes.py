@@ -31,7 +31,7 @@ FLOOR = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cut:
+class SubmapChain:
     """A submap as a chain.
 
     Parameters
@@ -64,7 +64,7 @@ def inner_rows(path: Trajectory, spacing: float) -> npt.NDArray[np.intp]:
     return np.asarray(rows[(rows > 0) & (rows < len(path) - 1)], dtype=np.intp)
 
 
-def cut_submap(submap: Submap, spacing: float | None) -> Cut:
+def cut_submap(submap: Submap, spacing: float | None) -> SubmapChain:
     """The chain of a dense submap; of one increment without a path, without ``spacing``, or where it is short.
 
     Parameters
@@ -83,7 +83,7 @@ def cut_submap(submap: Submap, spacing: float | None) -> Cut:
     times = np.concatenate([[t0], path.times[rows] if path is not None else [], [t1]])
     increments = group.between(T[:-1], T[1:])
     if len(rows) == 0 or path is None:
-        return Cut(times, T, submap.exit_pose[None].copy(), submap.exit_covariance[None].copy())
+        return SubmapChain(times, T, submap.exit_pose[None].copy(), submap.exit_covariance[None].copy())
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(increments[:, : group.dim], axis=1))])
     share = np.diff(way) / way[-1] if way[-1] > 0 else np.full(len(increments), 1.0 / len(increments))
     if path.covariances is None:
@@ -92,10 +92,10 @@ def cut_submap(submap: Submap, spacing: float | None) -> Cut:
         P = np.concatenate([np.zeros((1, group.dof, group.dof)), path.covariances[rows], submap.exit_covariance[None]])
         ad = group.adjoint(group.inverse(increments))
         Q = P[1:] - ad @ P[:-1] @ np.swapaxes(ad, 1, 2)
-    return Cut(times, T, increments, reconciled(group, T, Q, submap.exit_covariance, share))
+    return SubmapChain(times, T, increments, reconcile_increments(group, T, Q, submap.exit_covariance, share))
 
 
-def reconciled(group: Group, T_base_node: Array, Q: Array, P_exit: Array, share: Array) -> Array:
+def reconcile_increments(group: Group, T_base_node: Array, Q: Array, P_exit: Array, share: Array) -> Array:
     """Increment covariances ``(k, d, d)`` that compose to ``P_exit``, from what the marginals leave.
 
     Parameters

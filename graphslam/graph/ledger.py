@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError
-from graphslam.core.markup import frame
+from graphslam.core.markup import html_frame
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,7 +33,7 @@ DECLARED = {
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Entry:
+class LedgerEntry:
     """One spending: ``stream`` over ``[t_start, t_end)`` by a factor."""
 
     t_start: float
@@ -61,8 +61,8 @@ second time: submap 0 spent it over [0.000, 10.000) s
 
     def __init__(self) -> None:
         self._kinds = dict(DECLARED)
-        self._exclusive: dict[str, list[Entry]] = {}  # stream -> entries in order of start; they never overlap
-        self._by_factor: dict[int, list[Entry]] = {}
+        self._exclusive: dict[str, list[LedgerEntry]] = {}  # stream -> entries in order of start; they never overlap
+        self._by_factor: dict[int, list[LedgerEntry]] = {}
 
     def declare(self, kind: str, reason: str) -> None:
         """Declare a kind of factor that may share evidence, and why."""
@@ -75,7 +75,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
         """Declared kinds and their reasons."""
         return dict(self._kinds)
 
-    def conflict(self, stream: str, interval: tuple[float, float]) -> Entry | None:
+    def conflict(self, stream: str, interval: tuple[float, float]) -> LedgerEntry | None:
         """The entry that already spent ``stream`` over an overlapping interval, or None."""
         t0, t1 = interval
         entries = self._exclusive.get(stream, [])
@@ -117,12 +117,12 @@ second time: submap 0 spent it over [0.000, 10.000) s
         self.check(factor, names, interval, kind)
         note = note or (self._kinds[kind] if kind != EXCLUSIVE else "")
         for stream in names:
-            e = Entry(float(interval[0]), float(interval[1]), stream, factor_id, factor, kind, note)
+            e = LedgerEntry(float(interval[0]), float(interval[1]), stream, factor_id, factor, kind, note)
             if kind == EXCLUSIVE:
                 insort(self._exclusive.setdefault(stream, []), e)
             self._by_factor.setdefault(factor_id, []).append(e)
 
-    def refund(self, factor_id: int) -> None:
+    def release(self, factor_id: int) -> None:
         """Take a factor's spendings back (the factor was removed)."""
         for e in self._by_factor.pop(factor_id, []):
             if e.kind == EXCLUSIVE:
@@ -136,7 +136,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
             out.spend(e.factor_id, e.factor, [e.stream], (e.t_start, e.t_end), "start")
         return out
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[LedgerEntry]:
         """All entries in order of time."""
         return sorted(e for es in self._by_factor.values() for e in es)
 
@@ -151,7 +151,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
         return pd.DataFrame(rows, columns=["factor_id", "factor", "stream", "t_start", "t_end", "kind", "note"])
 
     def _repr_html_(self) -> str:
-        return frame(self.table())
+        return html_frame(self.table())
 
 
 def _overlap(a0: float, a1: float, b0: float, b1: float) -> bool:

@@ -9,26 +9,26 @@ import numpy as np
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import FactorBatch
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.sighting import SightingBatch
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.noise import whiteners
-from graphslam.graph.variables import KINDS, Layout, Values
+from graphslam.graph.variables import KINDS, Values, VariableLayout
 from graphslam.linear.symmetric_factor import elimination_order
 
 if TYPE_CHECKING:
     from graphslam.graph.pose_graph import PoseGraph
 
 
-def values_of(network: PoseNetwork, poses: Array, landmarks: Array | None = None) -> Values:
+def network_values(network: PoseNetwork, poses: Array, landmarks: Array | None = None) -> Values:
     """Values of the variables of a network's problem; the landmarks are the network's own if not given."""
     marks = network.landmarks if landmarks is None else landmarks
     return Values(network.dim, {"x": poses, "l": marks}, network.landmark_ids)
 
 
-def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FlatGraph:
+def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FactorArrays:
     """The measurements of a network as a least-squares problem, with no object for each.
 
     Factors count through the edges, then the observations. Fixed vertices (the first, if there are none) are held.
@@ -49,7 +49,7 @@ def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FlatGra
         i, j = at[np.concatenate([network.edges, network.observations + [0, n]])].T
         tied = (i >= 0) & (j >= 0)
         order = free[elimination_order(i[tied], j[tied], len(free))] if len(free) else free
-    layout = Layout(network.dim, counts, network.landmark_ids, fixed, order)
+    layout = VariableLayout(network.dim, counts, network.landmark_ids, fixed, order)
     batches: list[FactorBatch] = [
         BetweenBatch.of_arrays(network.edges, network.measurements, whiteners(network.information), layout)
     ]
@@ -57,10 +57,10 @@ def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FlatGra
         polar = network.observation_kind == "bearing-range"
         W = whiteners(network.observation_information)
         batches.append(SightingBatch.of_arrays(network.observations, network.observation_values, polar, W, layout))
-    return FlatGraph((), layout, batches)
+    return FactorArrays((), layout, batches)
 
 
-def network_of(flat: FlatGraph, values: Values) -> PoseNetwork:
+def network_of(flat: FactorArrays, values: Values) -> PoseNetwork:
     """A problem of relative poses as a network: for what knows nothing else (chordal starts, the certificate)."""
     others = sorted({name for f in flat.batches if not isinstance(f, BetweenBatch) for name, _ in f.classes()})
     if others or flat.has_kernels:

@@ -101,7 +101,7 @@ def covariance_whiteners(covariances: ArrayLike, count: int, dim: int, *, what: 
 
 
 @dataclass(frozen=True, slots=True)
-class Robust:
+class RobustKernel:
     """A robust kernel on the whitened norm ``d`` of one residual, with GTSAM's formulae.
 
     Parameters
@@ -135,7 +135,7 @@ class Robust:
 
 
 _CODE = {"none": 0, "huber": 1, "cauchy": 2}
-NO_KERNEL = Robust()
+NO_KERNEL = RobustKernel()
 
 
 def robust_terms(d2: Array, code: Any, k: Any) -> tuple[Array, Array]:
@@ -146,7 +146,7 @@ def robust_terms(d2: Array, code: Any, k: Any) -> tuple[Array, Array]:
     d2 : (n,)
         Squared whitened norms.
     code, k : (n,)
-        :attr:`Robust.code` and width of each.
+        :attr:`RobustKernel.code` and width of each.
     """
     d2 = np.asarray(d2, dtype=np.float64)
     if not np.any(code):

@@ -14,7 +14,7 @@ Index = npt.NDArray[np.int64]
 
 
 @njit
-def arc_terms(d: float) -> tuple[float, float, float]:
+def inverse_left_jacobian_kernel(d: float) -> tuple[float, float, float]:
     """``a``, ``b``, ``da/dd`` of ``V(d)⁻¹ = a I - b S`` (:mod:`graphslam.core.charts`)."""
     h = 0.5 * d
     if abs(h) < 1e-3:
@@ -23,7 +23,7 @@ def arc_terms(d: float) -> tuple[float, float, float]:
     return h * c / s, h, 0.5 * (c / s - h / (s * s))
 
 
-class SubmapArrays(NamedTuple):
+class SubmapFactorArrays(NamedTuple):
     """Landmark submaps one after the other."""
 
     start: Index
@@ -60,7 +60,7 @@ class SubmapBlocks(NamedTuple):
 
 
 @njit
-def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: bool, out: SubmapBlocks) -> None:
+def submap_blocks(poses: Array, points: Array, submaps: SubmapFactorArrays, hessian: bool, out: SubmapBlocks) -> None:
     """Objective, gradient block and Gauss-Newton block of every submap (eq. 15–16, right tangents).
 
     Local variables of submap s are ``[x_start (3), x_{start+1} (3), entry_1 (2), …]``; an entry that stands twice is
@@ -87,7 +87,7 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapArrays, hessian: b
         t = np.pi - ((np.pi - t) % (2.0 * np.pi))
         va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
         if group[s]:
-            va, vb, slope = arc_terms(t)
+            va, vb, slope = inverse_left_jacobian_kernel(t)
             half = 0.5
         # q: everything in the start frame; r = H(X) - z (eq. 15) in its chart; h: what it changes by with the heading
         q = np.empty((n + 1, 2))

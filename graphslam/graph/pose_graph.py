@@ -35,35 +35,35 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_transform
 from graphslam.core.imu import Imu
-from graphslam.core.lasting import LastingErrors
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.se3 import quat_normalize
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.submap import Match, Submap
+from graphslam.graph.factor_graph_state import BetweenBlock, FactorGraphState
 from graphslam.graph.factors.attitude import DOWN, LEVELLED, AttitudeRecord, without_tilt
-from graphslam.graph.factors.batch import Record
+from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.states import ImuStates
 from graphslam.graph.factors.landmark_submap import CONSTANT, SubmapRecord
-from graphslam.graph.factors.lasting import SIZE, LastingRecord, errors_at, names_of
 from graphslam.graph.factors.range import RangeRecord
+from graphslam.graph.factors.sensor_biases import SIZE, SensorBiasRecord, bias_variable_names, sensor_biases_at
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.graph_record import BetweenBlock, GraphRecord
 from graphslam.graph.imu import RECENTRE
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
-from graphslam.graph.noise import NO_KERNEL, Robust, covariance_whiteners, whitener
-from graphslam.graph.readings import BeaconConfig, CompassConfig
+from graphslam.graph.noise import NO_KERNEL, RobustKernel, covariance_whiteners, whitener
+from graphslam.graph.pending_measurements import BeaconConfig, CompassConfig
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
 __all__ = ["PoseGraph", "SubmapNode"]
 
 
-class PoseGraph(GraphRecord):
+class PoseGraph(FactorGraphState):
     """A graph of submaps, landmarks and GPS, in the plane or in space: the functions that add factors.
 
     The first base is fixed at the origin. Queries of the graph are in
-    :class:`~graphslam.graph.graph_record.GraphRecord`.
+    :class:`~graphslam.graph.factor_graph_state.FactorGraphState`.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class PoseGraph(GraphRecord):
         )
         node, fid = self.structure.count("x") - 1, self._next_factor
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
-        self.ledger.spend(fid, f"submap {submap.key}", submap.aids, submap.interval, "aid")
+        self.ledger.spend(fid, f"submap {submap.key}", submap.assisting_streams, submap.interval, "aid")
         # from here on nothing fails
         fresh = np.flatnonzero(ids < 0)
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
@@ -180,11 +180,11 @@ class PoseGraph(GraphRecord):
             inner = InnerPoints(lm.path, lm.mean, lm.dense_covariance(), covariance_scale, lasting=lm.lasting)
             self.submaps[-1] = replace(self.submaps[-1], inner_points=inner)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
-        self.gps.tie(self.submaps[-1])
-        self.readings.tie(self.submaps[-1])
+        self.gps.attach(self.submaps[-1])
+        self.readings.attach(self.submaps[-1])
         return fid
 
-    def _tell_lasting(self, lasting: LastingErrors, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
+    def _tell_lasting(self, lasting: SensorBiases, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
         """What the last submap's own measurements say of the constant errors: it comes and goes with the submap.
 
         All submaps of the same streams share them; the first one brings what is known of them beforehand.
@@ -195,7 +195,7 @@ class PoseGraph(GraphRecord):
                 self.structure.append(word, np.zeros((1, 2)))
             fid = self.next_factor()
             self.ledger.spend(fid, "constant errors, beforehand", ["-"], s.interval, "prior")
-            self.insert(LastingRecord(fid, robot, np.diag(1.0 / lasting.sigmas), np.zeros(SIZE)))
+            self.insert(SensorBiasRecord(fid, robot, np.diag(1.0 / lasting.sigmas), np.zeros(SIZE)))
             self._event("lasting", factor_id=fid, names=list(lasting.names), sigmas=lasting.sigmas.tolist())
         R, d = lasting.likelihood()
         none = SIZE - len(d)
@@ -203,7 +203,7 @@ class PoseGraph(GraphRecord):
         fid = self.next_factor()
         self.ledger.spend(fid, f"submap {s.key} of constant errors", uses, s.interval, "lasting")
         root = np.sqrt(covariance_scale)
-        self.insert(LastingRecord(fid, robot, R / root, d / root, what=f"by submap {s.key}"))
+        self.insert(SensorBiasRecord(fid, robot, R / root, d / root, what=f"by submap {s.key}"))
         self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid), lasting=lasting, robot=robot)
 
     def as_known(self, submap: Submap) -> Submap:
@@ -213,12 +213,12 @@ class PoseGraph(GraphRecord):
         robot = self._robots.get(submap.uses)
         before = np.zeros(SIZE), np.diag(submap.landmarks.lasting.sigmas**2)
         known = before if robot is None else self.lasting_errors(robot)
-        return replace(submap, landmarks=submap.landmarks.erring(*known))
+        return replace(submap, landmarks=submap.landmarks.with_biases(*known))
 
     def lasting_errors(self, robot: int = 0) -> tuple[Array, Array]:
         """Constant errors of a robot's wheels and sensor ``(4,)`` at the graph's values, and their covariance.
 
-        In the order of :data:`~graphslam.core.lasting.CONSTANTS`; their prior is in it.
+        In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; their prior is in it.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class PoseGraph(GraphRecord):
             raise DataError(
                 f"the graph has no constant errors of robot {robot}", wanted="submaps with systematic errors"
             )
-        return errors_at(self.values, robot), self.covariance().joint(names_of(robot))
+        return sensor_biases_at(self.values, robot), self.covariance().joint(bias_variable_names(robot))
 
     def _add_dense(
         self, submap: Submap, covariance_scale: float, spacing: float | None, level_sigma: float | None
@@ -251,7 +251,7 @@ class PoseGraph(GraphRecord):
             for k, (T, P) in enumerate(zip(cut.increments, cut.covariances))
         ]
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
-        self.ledger.spend(fid, f"submap {submap.key}", submap.aids, submap.interval, "aid")
+        self.ledger.spend(fid, f"submap {submap.key}", submap.assisting_streams, submap.interval, "aid")
         # from here on nothing fails
         self._append(submap, records, cut.times, cut.T_base_node, covariance_scale * cut.covariances, stated)
         if level_sigma is not None:
@@ -259,8 +259,8 @@ class PoseGraph(GraphRecord):
         self._event(
             "submap", factor_id=fid, submap=submap.key, landmarks=0, new=0, scale=covariance_scale, nodes=len(records)
         )
-        self.gps.tie(self.submaps[-1])
-        self.readings.tie(self.submaps[-1])
+        self.gps.attach(self.submaps[-1])
+        self.readings.attach(self.submaps[-1])
         return fid
 
     def _level_ends(self, sigma: float) -> None:
@@ -278,7 +278,7 @@ class PoseGraph(GraphRecord):
         )
 
     def _append(
-        self, submap: Submap, records: Sequence[Record], times: Array, T_base_node: Array, *covariances: Array
+        self, submap: Submap, records: Sequence[FactorRecord], times: Array, T_base_node: Array, *covariances: Array
     ) -> None:
         """New nodes after the last one, the submap's entry, and its factors."""
         node, group, base = (
@@ -461,7 +461,7 @@ class PoseGraph(GraphRecord):
         streams: Iterable[str] = (),
         interval: tuple[float, float] | None = None,
         evidence: str = EXCLUSIVE,
-        robust: Robust = NO_KERNEL,
+        robust: RobustKernel = NO_KERNEL,
         group: str = "attitude",
     ) -> int:
         """Where gravity points, seen from a node: roll and pitch, and nothing of the heading.
@@ -480,7 +480,7 @@ class PoseGraph(GraphRecord):
             Streams and interval that it uses; an exclusive measurement needs both.
         evidence : str
             ``"measurement"``, or a kind declared in the ledger.
-        robust : Robust
+        robust : RobustKernel
         group : str
             Class under which :meth:`objective` reports it.
 
@@ -529,7 +529,7 @@ class PoseGraph(GraphRecord):
         streams: Iterable[str] = (),
         interval: tuple[float, float] | None = None,
         evidence: str = EXCLUSIVE,
-        robust: Robust = NO_KERNEL,
+        robust: RobustKernel = NO_KERNEL,
     ) -> int:
         """A distance between two nodes, antennas ``(dim,)`` in their frames [m].
 
@@ -587,7 +587,7 @@ class PoseGraph(GraphRecord):
         streams: Iterable[str] = (),
         interval: tuple[float, float] | None = None,
         evidence: str = EXCLUSIVE,
-        robust: Robust = NO_KERNEL,
+        robust: RobustKernel = NO_KERNEL,
         group: str = "between",
     ) -> int:
         """A relative pose between nodes i and j; ``covariance`` (d, d) in the right tangent, d = 3 or 6.
@@ -598,7 +598,7 @@ class PoseGraph(GraphRecord):
             Streams and interval that it uses; an exclusive measurement needs both.
         evidence : str
             ``"measurement"``, or a kind declared in the ledger (``"shared-scan"``).
-        robust : Robust
+        robust : RobustKernel
         group : str
             Class under which :meth:`objective` reports it.
         """
@@ -688,7 +688,7 @@ class PoseGraph(GraphRecord):
             rows[:, 3:] = quat_normalize(rows[:, 3:])
         return rows
 
-    def add_match(self, submap_key: int, match: Match, *, robust: Robust = NO_KERNEL) -> int:
+    def add_match(self, submap_key: int, match: Match, *, robust: RobustKernel = NO_KERNEL) -> int:
         """A front end's re-entry into an earlier submap, as declared ``shared-scan`` evidence.
 
         A scan matches what the map shows around it, and that was laid down by the nearest stretch of the target's
@@ -701,7 +701,7 @@ class PoseGraph(GraphRecord):
         submap_key : int
             Submap whose base was matched.
         match : Match
-        robust : Robust
+        robust : RobustKernel
         """
         here, target = self.node_of(submap_key), self.submap(match.target)
         node, T, P = self._into(target, self._pose(match.T_target_here, "match"), np.asarray(match.covariance))

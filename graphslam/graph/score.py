@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from graphslam.core.geometry import Array
-from graphslam.core.markup import table
-from graphslam.graph.flat import FlatGraph
+from graphslam.core.markup import html_table
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import KINDS
 
 
@@ -39,7 +39,7 @@ class ClassScore:
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class GraphScore:
     """Objective of a graph at given values; ``score["submap"].chi2_per_dof`` is the *χ²/dof of the join*."""
 
     classes: dict[str, ClassScore]
@@ -68,10 +68,10 @@ class Score:
             {"class": n, "factors": c.factors, "χ²": c.chi2, "dof": c.dof, "χ²/dof": c.chi2_per_dof}
             for n, c in self.classes.items()
         ]
-        return table(rows, ["class", "factors", "χ²", "dof", "χ²/dof"])
+        return html_table(rows, ["class", "factors", "χ²", "dof", "χ²/dof"])
 
 
-def score(flat: FlatGraph, chi2: Array) -> Score:
+def score_graph(flat: FactorArrays, chi2: Array) -> GraphScore:
     """Sum ``chi2`` ``(f,)``, in the order of ``flat.records``, by class."""
     lay = flat.layout
     sums: dict[str, list[float]] = {}
@@ -90,6 +90,6 @@ def score(flat: FlatGraph, chi2: Array) -> Score:
         elif free:
             owner = next((c for c in kind.classes if c in sums), next(iter(sums), ""))
             unknowns[owner] = unknowns.get(owner, 0) + free
-    return Score(
+    return GraphScore(
         {g: ClassScore(float(v), int(f), int(r), int(r) - unknowns.get(g, 0)) for g, (v, f, r) in sums.items()}
     )

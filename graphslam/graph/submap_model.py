@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.core.charts import arc_terms, map_difference
+from graphslam.core.charts import inverse_left_jacobian_terms, map_difference
 from graphslam.core.geometry import Array, rotation2, wrap_angle
 
 
@@ -68,7 +68,7 @@ def submap_jacobians(
     Vi, bent = np.eye(2), np.zeros((1 + n, 2))
     if chart == "group":
         d = wrap_angle(end[2] - start[2] - z[2])
-        a, b, slope = (float(v) for v in arc_terms(d))
+        a, b, slope = (float(v) for v in inverse_left_jacobian_terms(d))
         Vi = np.array([[a, b], [-b, a]])
         e = q - np.concatenate([z[:2], z[3:]]).reshape(-1, 2)
         bent = e @ np.array([[slope, 0.5], [-0.5, slope]]).T  # d(V⁻¹ e)/dd

@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.lasting import LastingErrors
 from graphslam.core.path_points import PathPoints
 from graphslam.core.poses import Group, group_of
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.noise import whitener
@@ -29,7 +29,7 @@ _FLOOR = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bridge:
+class PathBridge:
     """Instants of a path between two nodes a and b, given both.
 
     Inside a stretch the error walks from a to b. If the increment a → b has the covariance S, of which Q had been
@@ -65,7 +65,7 @@ class InnerPoints:
         Its :class:`~graphslam.graph.factors.landmark_submap.PathRecord`, once a fix is used.
     rows : mapping of int to int
         Points that are used → rows of the graph's points.
-    lasting : LastingErrors or None
+    lasting : SensorBiases or None
         What all of it is with constant errors.
     """
 
@@ -75,7 +75,7 @@ class InnerPoints:
     scale: float = 1.0
     factor_id: int | None = None
     rows: Mapping[int, int] = field(default_factory=dict)
-    lasting: LastingErrors | None = None
+    lasting: SensorBiases | None = None
 
     def record(self, submap: SubmapRecord, factor_id: int) -> PathRecord:
         """Factor of the points that are used, beside the submap's own."""
@@ -119,7 +119,7 @@ class SubmapNode:
         relative poses by itself is worth, for instance in cycles of loops and chain.
     inner_points : InnerPoints or None
         Of a landmark submap that holds points of its path.
-    lasting : LastingErrors or None
+    lasting : SensorBiases or None
         What a landmark submap is with constant errors of the robot's wheels and sensor, and
     robot : int
         their row in the graph; -1: it has none.
@@ -139,7 +139,7 @@ class SubmapNode:
     covariances: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     stated: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     inner_points: InnerPoints | None = None
-    lasting: LastingErrors | None = None
+    lasting: SensorBiases | None = None
     robot: int = -1
 
     @property
@@ -190,7 +190,7 @@ class SubmapNode:
         P = None if path.covariances is None else path.covariances[rows]
         return self._seen(path.times[rows], path.poses[rows], P, at)
 
-    def between(self, rows: npt.NDArray[Any], at: npt.NDArray[np.intp]) -> Bridge:
+    def between(self, rows: npt.NDArray[Any], at: npt.NDArray[np.intp]) -> PathBridge:
         """The path's own instants ``rows`` between the nodes ``at`` and the next ones: what each of the two says."""
         T, Q = self.local_rows(rows, at)
         if self.trajectory is None or Q is None:
@@ -207,7 +207,7 @@ class SubmapNode:
         back = np.linalg.solve(B, np.broadcast_to(np.eye(group.dof), B.shape))
         gain = back @ ((V * w) @ Vt) @ np.linalg.inv(L)
         left = back @ ((V * (w * (1.0 - w))) @ Vt) @ np.swapaxes(back, 1, 2)
-        return Bridge(T, gain, left)
+        return PathBridge(T, gain, left)
 
     def _seen(self, t: Array, T: Array, P: Array | None, at: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
         assert self.trajectory is not None
@@ -220,16 +220,16 @@ class SubmapNode:
             P = P.copy()
             P_node = path.interpolate_covariance(self.times[at[inner]])
             after = t[inner] >= self.times[at[inner]]
-            ahead = grown(group, P_node, P[inner], out[inner])
+            ahead = added_covariance(group, P_node, P[inner], out[inner])
             # a body before the node: the error from it to the node, seen from the other side
             back = group.inverse(out[inner])
             ad = group.adjoint(out[inner])
-            behind = ad @ grown(group, P[inner], P_node, back) @ np.swapaxes(ad, 1, 2)
+            behind = ad @ added_covariance(group, P[inner], P_node, back) @ np.swapaxes(ad, 1, 2)
             P[inner] = np.where(after[:, None, None], ahead, behind)
         return out, P
 
 
-def grown(group: Group, P_a: Array, P_b: Array, T_ab: Array) -> Array:
+def added_covariance(group: Group, P_a: Array, P_b: Array, T_ab: Array) -> Array:
     """Covariance ``(q, d, d)`` that a path adds from a to b: ``P_b - Ad(T_ab⁻¹) P_a Ad(T_ab⁻¹)ᵀ``.
 
     Made positive semi-definite (in units of the spread at b): a path told by its marginals may seem to know more later

@@ -96,8 +96,8 @@ for _kind in (
         "point", "y", {2: "mm"}, classes=("path",),
         remedy="a point of a submap's path has no submap: remove the GPS fixes of this point.",
     ),
-    # Constant errors of a robot (graphslam.core.lasting): turn and log distance of its wheels; ranges and bearings of
-    # its sensor, and where that stands.
+    # Constant errors of a robot (graphslam.core.sensor_biases): turn and log distance of its wheels; ranges and
+    # bearings of # its sensor, and where that stands.
     VariableKind(
         "wheels", "w", {2: "rr"}, classes=("lasting",),
         remedy="constant errors of the wheels need a prior.",
@@ -292,12 +292,12 @@ class Values:
         """Independent copy."""
         return Values(self.dim, {w: r.array.copy() for w, r in self._rows.items()}, self.landmark_ids.copy())
 
-    def layout(self) -> Layout:
+    def layout(self) -> VariableLayout:
         """Columns of these variables."""
-        return Layout(self.dim, tuple(self.count(w) for w in KINDS), self.landmark_ids)
+        return VariableLayout(self.dim, tuple(self.count(w) for w in KINDS), self.landmark_ids)
 
     def retract(self, step: Array) -> Values:
-        """See :meth:`Layout.retract`, with the first pose alone held."""
+        """See :meth:`VariableLayout.retract`, with the first pose alone held."""
         return self.layout().retract(self, step)
 
     def distance(self, other: Values) -> float:
@@ -309,7 +309,7 @@ class Values:
         return all(bool(np.all(np.isfinite(r.array))) for r in self._rows.values())
 
 
-class Layout:
+class VariableLayout:
     """Columns of the free scalars: kinds in the order of :data:`KINDS`, rows in their order, unless told otherwise.
 
     Parameters
@@ -376,7 +376,7 @@ class Layout:
 
     def __eq__(self, other: object) -> bool:
         return (
-            isinstance(other, Layout)
+            isinstance(other, VariableLayout)
             and (self.dim, self.counts, self.fixed) == (other.dim, other.counts, other.fixed)
             and np.array_equal(self.landmark_ids, other.landmark_ids)
         )

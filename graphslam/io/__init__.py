@@ -1,10 +1,10 @@
 """Layer 6: readers and writers, one file format each, and the catalogue of data sets."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
-    "cards": "card",
+_EXPORTS = {
+    "cards": "find_card",
     "notebook": "load_or_stop",
-    "catalog": "load",
+    "catalog": "load_recording",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -37,14 +37,14 @@ from graphslam.core.gnss import TangentPlane
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
-from graphslam.core.reading import most_bytes, usable
+from graphslam.core.reading import finite_mask, most_bytes
 from graphslam.core.records import Gps, LaserScans, Odometry, Stream
 from graphslam.io import ros_messages as ros
 from graphslam.io.clock import usable_records
 from graphslam.io.cloud_logs import IMU_NOISE, ages_of
-from graphslam.io.look import Look
-from graphslam.io.planar_scans import one_layout
+from graphslam.io.planar_scans import unify_layout
 from graphslam.io.recognise import bag_kind
+from graphslam.io.source_probe import SourceProbe
 
 KINDS = {
     "sensor_msgs/msg/LaserScan": "laser",
@@ -213,7 +213,7 @@ class _Bag:
 
         self.path = path
         files = _files(path)
-        kinds = {f: "" if f.is_dir() else bag_kind(Look(f), f) for f in files}
+        kinds = {f: "" if f.is_dir() else bag_kind(SourceProbe(f), f) for f in files}
         self.ros2 = "ROS 1 bag" not in kinds.values()
         self.readers: list[Any] = []
         for f in files:
@@ -288,7 +288,7 @@ def _files(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise MissingDataError("no such file or folder", where=str(path), wanted="a bag")
-    look = Look(path)
+    look = SourceProbe(path)
     metadata = [
         p for p in look.files if p.name == "metadata.yaml" and look.lines(p, 1)[:1] == ["rosbag2_bagfile_information:"]
     ]
@@ -334,9 +334,9 @@ class _Frames:
     def add(self, message: Any, bag_stamp: float, static: bool) -> None:
         for t in message.transforms:
             key = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
-            pose = ros.pose_of(t.transform)
+            pose = ros.pose_of_message(t.transform)
             norm = float(np.linalg.norm(pose[3:]))
-            if not np.all(usable(pose)) or abs(norm - 1.0) > 0.05:
+            if not np.all(finite_mask(pose)) or abs(norm - 1.0) > 0.05:
                 continue
             if static:
                 self.fixed[key] = pose
@@ -609,7 +609,7 @@ def _take_fix(m: Any) -> tuple[list[float], Array, int, int]:
 _TAKE: dict[str, Callable[[Any], Any]] = {
     "laser": _take_laser,
     "imu": _take_imu,
-    "odometry": lambda m: ros.pose_of(m.pose.pose),
+    "odometry": lambda m: ros.pose_of_message(m.pose.pose),
     "gps": _take_fix,
 }
 
@@ -651,7 +651,7 @@ def _place(
 ) -> Array:
     """``T_base_sensor`` ``(7,)``."""
     if mount is not None:
-        if not np.all(usable(mount)):
+        if not np.all(finite_mask(mount)):
             raise ConfigError(f"bag: mount is {mount}; wanted 6 finite numbers")
         q = np.array([0.0, 0, 0, 1.0])
         for axis, angle in ((2, mount[5]), (1, mount[4]), (0, mount[3])):
@@ -705,7 +705,7 @@ def _laser(
     scans, odd, reach = [], np.zeros(len(r.values), np.bool_), []
     for k, (ranges, start, step, low, high) in enumerate(r.values):
         n = len(ranges)
-        if n < 2 or not np.all(usable([start, step])) or not 0 < abs(step) * (n - 1) <= 2.2 * np.pi:
+        if n < 2 or not np.all(finite_mask([start, step])) or not 0 < abs(step) * (n - 1) <= 2.2 * np.pi:
             odd[k] = True
             scans.append((np.zeros(2, np.float32), np.array([0.0, 1.0])))
             continue
@@ -717,7 +717,7 @@ def _laser(
         scans.append((values[::-1] if step < 0 else values, beams))
         reach.append(high)
     times, keep = _kept(r, "laser", {"angles are impossible, or fewer than 2 beams": odd}, counter, notes, where)
-    rows, beams, moved = one_layout([s for s, good in zip(scans, keep) if good])
+    rows, beams, moved = unify_layout([s for s, good in zip(scans, keep) if good])
     counter.drop("laser", f"scan of other beams mapped to the usual {len(beams)} (kept)", moved)
     stated = [v for v in reach if np.isfinite(v) and v > 0]
     far = max_range or (float(np.median(stated)) if stated else 80.0)
@@ -740,9 +740,9 @@ def _odometry(
     where: str,
 ) -> Odometry:
     a = np.array(r.values)
-    norm = np.linalg.norm(np.where(usable(a[:, 3:]), a[:, 3:], 0.0), axis=1)
+    norm = np.linalg.norm(np.where(finite_mask(a[:, 3:]), a[:, 3:], 0.0), axis=1)
     bad = {
-        "pose is not finite": np.asarray(~usable(a).all(axis=1)),
+        "pose is not finite": np.asarray(~finite_mask(a).all(axis=1)),
         "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.05,
     }
     times, keep = _kept(r, "odometry", bad, counter, notes, where)
@@ -770,7 +770,9 @@ def _odometry(
 
 def _imu(r: _Rows, place: Array | None, unit: str, counter: DropCounter, notes: list[str], where: str) -> Imu:
     a = np.array(r.values)
-    times, keep = _kept(r, "imu", {"reading is not finite": np.asarray(~usable(a).all(axis=1))}, counter, notes, where)
+    times, keep = _kept(
+        r, "imu", {"reading is not finite": np.asarray(~finite_mask(a).all(axis=1))}, counter, notes, where
+    )
     force = a[keep, 3:] * (GRAVITY if unit == "g" else 1.0)
     T = np.array([0.0, 0, 0, 0, 0, 0, 1]) if place is None else place
     return Imu(times=times, angular_rate=a[keep, :3], specific_force=force, noise=IMU_NOISE, T_base_imu=T)
@@ -779,7 +781,7 @@ def _imu(r: _Rows, place: Array | None, unit: str, counter: DropCounter, notes: 
 def _gps(r: _Rows, planar: bool, place: Array | None, counter: DropCounter, notes: list[str], where: str) -> Gps | None:
     g = np.array([v[0] for v in r.values])
     status = np.array([v[2] for v in r.values])
-    place_ok = usable(g[:, :2]).all(axis=1) & (np.abs(g[:, 0]) <= 90) & (np.abs(g[:, 1]) <= 360)
+    place_ok = finite_mask(g[:, :2]).all(axis=1) & (np.abs(g[:, 0]) <= 90) & (np.abs(g[:, 1]) <= 360)
     bad = {
         "no fix (status)": status < 0,
         "no place on Earth": ~np.asarray(place_ok),
@@ -797,8 +799,8 @@ def _gps(r: _Rows, planar: bool, place: Array | None, counter: DropCounter, note
         counter.drop("gps", reason, int(mask.sum()))
     inner = usable_records(times[good], {}, stream="gps", where=f"{where}, gps", drops=counter, limit=0.5)
     keep = good[inner]
-    flat = planar or not np.all(usable(g[keep, 2]))
-    heights = np.where(usable(g[keep, 2]), g[keep, 2], 0.0)
+    flat = planar or not np.all(finite_mask(g[keep, 2]))
+    heights = np.where(finite_mask(g[keep, 2]), g[keep, 2], 0.0)
     llh = np.column_stack([g[keep, :2], heights])
     plane = TangentPlane(*llh[0].tolist())
     enu = plane.from_ecef(geodetic_to_ecef(llh))
@@ -807,7 +809,7 @@ def _gps(r: _Rows, planar: bool, place: Array | None, counter: DropCounter, note
     for k, row in enumerate(keep):
         stated, kind = r.values[row][1], r.values[row][3]
         S = 0.5 * (stated + stated.T)
-        if kind > 0 and np.all(usable(S)) and np.linalg.eigvalsh(S)[0] > 1e-6:
+        if kind > 0 and np.all(finite_mask(S)) and np.linalg.eigvalsh(S)[0] > 1e-6:
             P[k] = S
         else:
             unknown += 1

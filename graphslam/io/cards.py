@@ -16,7 +16,7 @@ from typing import Any
 
 import graphslam
 from graphslam.core.errors import FormatError, MissingDataError, UnknownNameError
-from graphslam.core.markup import element, items, join, pairs
+from graphslam.core.markup import html_element, item_list, join_parts, pair_list
 from graphslam.core.reading import read_text
 
 CARD_FORMAT = "graphslam.card/1"
@@ -129,7 +129,7 @@ class Card:
             "licence": f"{self.licence}. {self.terms}",
             "files": f"{len(self.files)}, {self.bytes / 1e6:.1f} MB",
         }
-        return join([element("b", self.name), f": {self.title}", pairs(rows), items(self.caveats)])
+        return join_parts([html_element("b", self.name), f": {self.title}", pair_list(rows), item_list(self.caveats)])
 
 
 def cards_folder() -> Path:
@@ -147,7 +147,7 @@ def list_cards() -> tuple[Card, ...]:
     return tuple(read_card(p) for p in sorted(cards_folder().glob("*.toml")))
 
 
-def card(name: str) -> Card:
+def find_card(name: str) -> Card:
     """The data set description of that name.
 
     Raises

@@ -28,13 +28,13 @@ from scipy.optimize import isotonic_regression
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_inverse
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import LaserScans, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED
-from graphslam.io.look import Look
-from graphslam.io.planar_scans import one_layout
+from graphslam.io.planar_scans import unify_layout
 from graphslam.io.recognise import CARMEN_SCANS
+from graphslam.io.source_probe import SourceProbe
 
 MAX_RANGE = 80.0
 """Ranges at or above it are no return, where lines state none [m]."""
@@ -43,7 +43,7 @@ _SPACING = 1e-3  # least time between mended stamps [s]
 _POSED = {"FLASER": 9, "RLASER": 9, "ROBOTLASER": 14, "RAWLASER": 3}  # words after ranges (and remissions)
 
 
-def bearings(n: int) -> Array:
+def beam_bearings(n: int) -> Array:
     """Directions ``(n,)`` of the beams of a scanner of 180°, from the right to the left [rad].
 
     An odd number of beams has one at either end, an even number none at the left end.
@@ -181,7 +181,7 @@ def _files(path: Path) -> tuple[Path, Path | None]:
         return path, None
     if not path.is_dir():
         raise MissingDataError("no such file or folder", where=str(path), wanted="a CARMEN log")
-    look = Look(path)
+    look = SourceProbe(path)
     logs = [p for p in look.texts if any(CARMEN_SCANS.match(s) or s.startswith("PARAM ") for s in look.lines(p, 4000))]
     corrected = [p for p in logs if "-corrected" in p.name]
     raw = [p for p in logs if p not in corrected]
@@ -238,7 +238,7 @@ def _parse(words: list[str]) -> _Line | str:
         return "scan is truncated, or of another size"
     except ValueError:
         return "scan holds something that is no number"
-    if not np.all(usable([*rest, *head])):
+    if not np.all(finite_mask([*rest, *head])):
         return "pose or stamp is not finite"
     if at == 1:
         return _Line((-0.5 * np.pi, 0.0, n), ranges.astype(np.float32), rest[:6], rest[6], None)
@@ -264,7 +264,7 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
                 w = [float(x) for x in (*words[-3:-2], *words[1:4])]
             except ValueError:
                 w = [np.nan]
-            if len(w) == 4 and np.all(usable(w)):
+            if len(w) == 4 and np.all(finite_mask(w)):
                 odom.append((w[0], w[1], w[2], w[3]))
             else:
                 drops.drop("odometry", "line ODOM is truncated or not finite")
@@ -296,7 +296,7 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
     for reason, numbers_of in lost.items():
         drops.drop("laser", reason, len(numbers_of))
     directions = {x.layout: _directions(x.layout) for x in lines}
-    ranges, beams, moved = one_layout([(x.ranges, directions[x.layout]) for x in lines])
+    ranges, beams, moved = unify_layout([(x.ranges, directions[x.layout]) for x in lines])
     drops.drop("laser", f"scan of other beams mapped to the usual {len(beams)} (kept)", moved)
     poses = [x.pose for x in lines if x.pose is not None]
     reach = [x.max_range for x in lines if x.max_range is not None]
@@ -312,7 +312,7 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
 
 def _directions(layout: tuple[float, float, int]) -> Array:
     start, step, n = layout
-    return np.asarray(start + step * np.arange(n, dtype=np.float64)) if step > 0 else bearings(n)
+    return np.asarray(start + step * np.arange(n, dtype=np.float64)) if step > 0 else beam_bearings(n)
 
 
 def _still(poses: Array) -> bool:

@@ -1,7 +1,8 @@
 """Recorded data by name: find it, check it, load it.
 
 Files are looked for under the folders of the environment variable ``GRAPHSLAM_DATA``, then in the cache
-(``GRAPHSLAM_CACHE``, or the platform's cache folder for graphslam), where :func:`graphslam.io.fetch.fetch` puts them.
+(``GRAPHSLAM_CACHE``, or the platform's cache folder for graphslam), where :func:`graphslam.io.fetch.fetch_dataset` puts
+them.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from typing import Any, Literal
 
 from graphslam.core.errors import DataError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.io.cards import Card, CardFile, card, list_cards
-from graphslam.io.readers import reader as find_reader
-from graphslam.io.readers import readers, recognise
+from graphslam.io.cards import Card, CardFile, find_card, list_cards
+from graphslam.io.readers import find_reader as find_reader
+from graphslam.io.readers import list_readers, recognise
 
 DATA_VARIABLE = "GRAPHSLAM_DATA"
 CACHE_VARIABLE = "GRAPHSLAM_CACHE"
@@ -48,7 +49,7 @@ def find_file(folder: Path, file: CardFile) -> Path | None:
 
 def locate(data: Card | str) -> Path:
     """Folder that holds the data set's needed files."""
-    c = card(data) if isinstance(data, str) else data
+    c = find_card(data) if isinstance(data, str) else data
     needed = [f for f in c.files if not f.optional]
     roots = data_roots()
     fewest: list[CardFile] = needed
@@ -68,7 +69,7 @@ def locate(data: Card | str) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class FileCheck:
-    """What :func:`check` found of one file."""
+    """What :func:`check_files` found of one file."""
 
     file: CardFile
     state: State
@@ -92,15 +93,15 @@ def check_file(folder: Path, file: CardFile) -> FileCheck:
     return FileCheck(file, "ok" if same else "differs", path)
 
 
-def check(data: Card | str) -> list[FileCheck]:
+def check_files(data: Card | str) -> list[FileCheck]:
     """Compare every file with the card, in the first root that holds any of them."""
-    c = card(data) if isinstance(data, str) else data
+    c = find_card(data) if isinstance(data, str) else data
     folders = [root / c.folder for root in data_roots()]
     folder = next((d for d in folders if any(find_file(d, f) for f in c.files)), folders[-1])
     return [check_file(folder, f) for f in c.files]
 
 
-def load(source: str | os.PathLike[str], *, reader: str | None = None, **options: Any) -> Any:
+def load_recording(source: str | os.PathLike[str], *, reader: str | None = None, **options: Any) -> Any:
     """Load recorded data by data set name, or from a path.
 
     Parameters
@@ -109,7 +110,7 @@ def load(source: str | os.PathLike[str], *, reader: str | None = None, **options
         Name of a data set; ``name/file`` for one file of it (the ending may be left out, as ``posegraphs/intel``);
         ``name/part`` where a set holds several logs (``mrclam-dataset7/robot1``); or an existing file or folder.
     reader : str, optional
-        Name of the reader (:func:`graphslam.io.readers.readers`). Default: that of the data set, or the first one
+        Name of the reader (:func:`graphslam.io.readers.list_readers`). Default: that of the data set, or the first one
         that recognises the content of the path.
     options
         For the reader.
@@ -137,7 +138,7 @@ def load(source: str | os.PathLike[str], *, reader: str | None = None, **options
     text = os.fspath(source)
     known = {c.name for c in list_cards()}
     if text in known:
-        c = card(text)
+        c = find_card(text)
         if c.reader == "pose-network":
             return _only_file(c)
         if c.reader is None and reader is None:
@@ -146,8 +147,8 @@ def load(source: str | os.PathLike[str], *, reader: str | None = None, **options
         return _read(name, locate(c), f"data set {c.name}", {"name": c.name}, {**c.options, **options})
     name, slash, part = text.partition("/")
     if slash and name in known and not Path(text).exists():
-        c = card(name)
-        parts = readers()[c.reader].parts if c.reader in readers() else {}
+        c = find_card(name)
+        parts = list_readers()[c.reader].parts if c.reader in list_readers() else {}
         if not parts:
             return _named_file(c, part)
         if part not in parts:

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
-from graphslam.core.reading import check_size, read_bytes, usable
-from graphslam.io.look import ending, plain_name
+from graphslam.core.reading import check_size, finite_mask, read_bytes
+from graphslam.io.source_probe import file_ending, plain_name
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestampoffset", "time_offset", "gps_time")
 """Names of fields with times of points, in small letters and without ``scalar_`` before them."""
@@ -39,7 +39,7 @@ USUAL_COLUMNS = (3, 4, 5, 6)
 
 
 @dataclass(frozen=True, slots=True)
-class Cloud:
+class CloudData:
     """Points of one file.
 
     Parameters
@@ -61,15 +61,15 @@ class Cloud:
     at_origin: int = 0
 
 
-def clean(points: Array, times: Array | None = None, field: str = "") -> Cloud:
+def clean_cloud(points: Array, times: Array | None = None, field: str = "") -> CloudData:
     """A cloud of what is usable of ``points`` ``(m, 3)``."""
-    finite = np.asarray(usable(points).all(axis=1))
+    finite = np.asarray(finite_mask(points).all(axis=1))
     if times is not None:
-        finite &= np.asarray(usable(times))
+        finite &= np.asarray(finite_mask(times))
     with np.errstate(invalid="ignore"):
         zero = finite & (points == 0.0).all(axis=1)
     keep = finite & ~zero
-    return Cloud(
+    return CloudData(
         np.ascontiguousarray(points[keep], dtype=np.float64),
         None if times is None else np.ascontiguousarray(times[keep], dtype=np.float64),
         field,
@@ -78,7 +78,7 @@ def clean(points: Array, times: Array | None = None, field: str = "") -> Cloud:
     )
 
 
-def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> Cloud:
+def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> CloudData:
     """Read one cloud; the format is told by the first bytes, that of BIN by its ending.
 
     Parameters
@@ -94,7 +94,7 @@ def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> Cloud:
         return _las(raw, str(p))
     if re.match(_PCD, raw[:2000]):
         return _pcd(raw, str(p))
-    if ending(p) == ".bin":
+    if file_ending(p) == ".bin":
         return _bin(raw, str(p), columns)
     raise FormatError("no cloud of a known format", where=str(p), got=repr(raw[:12]), wanted=_KNOWN)
 
@@ -171,7 +171,7 @@ def count_points(path: str | os.PathLike[str], *, columns: int = 4) -> int:
         return _las_count(head, size, str(p))
     elif re.match(_PCD, head[:2000]):
         said = _pcd_layout(head, str(p))
-    elif ending(p) == ".bin":
+    elif file_ending(p) == ".bin":
         return _bin_count(size, str(p), columns)
     else:
         raise FormatError("no cloud of a known format", where=str(p), got=repr(head[:12]), wanted=_KNOWN)
@@ -199,12 +199,12 @@ def _bin_count(size: int, where: str, columns: int) -> int:
     return size // (4 * columns)
 
 
-def _bin(raw: bytes, where: str, columns: int) -> Cloud:
+def _bin(raw: bytes, where: str, columns: int) -> CloudData:
     _bin_count(len(raw), where, columns)
-    return clean(np.frombuffer(raw, "<f4").reshape(-1, columns)[:, :3].astype(np.float64))
+    return clean_cloud(np.frombuffer(raw, "<f4").reshape(-1, columns)[:, :3].astype(np.float64))
 
 
-def columns_cloud(fields: dict[str, npt.NDArray[Any]], where: str) -> Cloud:
+def columns_cloud(fields: dict[str, npt.NDArray[Any]], where: str) -> CloudData:
     """A cloud of columns by name."""
     lower = {k.lower().removeprefix("scalar_"): k for k in fields}
     if not {"x", "y", "z"} <= lower.keys():
@@ -212,7 +212,7 @@ def columns_cloud(fields: dict[str, npt.NDArray[Any]], where: str) -> Cloud:
     xyz = np.column_stack([fields[lower[c]].astype(np.float64) for c in "xyz"])
     name = next((lower[n] for n in TIME_FIELDS if n in lower), "")
     times = fields[name].astype(np.float64) if name else None
-    return clean(xyz, times, name)
+    return clean_cloud(xyz, times, name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +276,7 @@ def _ply_layout(head: bytes, where: str) -> _Layout:
     return _Layout(end.end() + first, n, labels, dtype)
 
 
-def _ply(raw: bytes, where: str) -> Cloud:
+def _ply(raw: bytes, where: str) -> CloudData:
     said = _ply_layout(raw[:_HEADER], where)
     body = raw[said.begin :]
     if said.dtype is None:
@@ -351,7 +351,7 @@ def _pcd_layout(head: bytes, where: str) -> _Layout:
     return _Layout(end.end(), n, fields, dtype, packed=columns if form == "binary_compressed" else None)
 
 
-def _pcd(raw: bytes, where: str) -> Cloud:
+def _pcd(raw: bytes, where: str) -> CloudData:
     said = _pcd_layout(raw[:_HEADER], where)
     body, n = raw[said.begin :], said.count
     if said.dtype is None:
@@ -363,7 +363,7 @@ def _pcd(raw: bytes, where: str) -> Cloud:
     check_size(plain, where)
     if plain != n * said.dtype.itemsize or packed > len(body) - 8:
         raise FormatError("file is truncated", where=where, got=f"{len(body) - 8} bytes", wanted=f"{packed} packed")
-    data = lzf(body[8 : 8 + packed], plain, where)
+    data = unpack_lzf(body[8 : 8 + packed], plain, where)
     out, at = {}, 0
     for f, d, c in said.packed:  # field after field, not point after point
         size = np.dtype(d).itemsize * c * n
@@ -373,7 +373,7 @@ def _pcd(raw: bytes, where: str) -> Cloud:
     return columns_cloud(out, where)
 
 
-def lzf(data: bytes, size: int, where: str) -> bytes:
+def unpack_lzf(data: bytes, size: int, where: str) -> bytes:
     """Unpack LZF (as liblzf of PCL packs) to ``size`` bytes."""
     out = bytearray()
     at, end = 0, len(data)
@@ -410,7 +410,7 @@ def lzf(data: bytes, size: int, where: str) -> bytes:
     return bytes(out)
 
 
-def _las(raw: bytes, where: str) -> Cloud:
+def _las(raw: bytes, where: str) -> CloudData:
     laspy = import_extra("laspy", "a LAS file", where=where)
     n = _las_count(raw, len(raw), where)  # before laspy allocates
     if raw[104] & 0x80 and n:
@@ -427,7 +427,7 @@ def _las(raw: bytes, where: str) -> Cloud:
         raise FormatError(f"LAS is damaged ({type(error).__name__}: {error})", where=where) from None
     if times is not None and (not len(times) or np.ptp(times) == 0.0):
         times = None
-    return clean(xyz, times, "" if times is None else "gps_time")
+    return clean_cloud(xyz, times, "" if times is None else "gps_time")
 
 
 def _las_count(head: bytes, length: int, where: str) -> int:

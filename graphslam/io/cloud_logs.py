@@ -28,13 +28,13 @@ from graphslam.core.gnss import TangentPlane
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Gps, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
-from graphslam.io.cloud_files import BIN_COLUMNS, Cloud, bin_columns, count_points, read_cloud
-from graphslam.io.look import Look, ending
-from graphslam.io.recognise import cloud_folder, is_kitti_poses, numbers, pose_file
+from graphslam.io.cloud_files import BIN_COLUMNS, CloudData, bin_columns, count_points, read_cloud
+from graphslam.io.recognise import cloud_folder, is_kitti_poses, parse_numbers, pose_file
+from graphslam.io.source_probe import SourceProbe, file_ending
 from graphslam.io.text_records import read_table
 
 PERIOD = 0.1
@@ -96,7 +96,7 @@ class FileClouds:
         return b"".join(hashlib.blake2b(p.read_bytes(), digest_size=16).digest() for p in self._paths)
 
 
-def ages_of(cloud: Cloud, stamp: float) -> Array | None:
+def ages_of(cloud: CloudData, stamp: float) -> Array | None:
     """Time from each point to the stamp of the scan ``(m,)`` [s]; None where they say nothing.
 
     Times on the clock of the stamps are taken as they are, others as offsets from the stamp.
@@ -146,7 +146,7 @@ def read_clouds(
     root = Path(path)
     if not root.is_dir():
         raise MissingDataError("no such folder", where=str(root), wanted="a folder of clouds, one file a scan")
-    look = Look(root)
+    look = SourceProbe(root)
     files, _ = cloud_folder(look)
     told = ""
     if columns is None:
@@ -171,7 +171,7 @@ def read_clouds(
 
 def _cloud_log(
     root: Path,
-    look: Look,
+    look: SourceProbe,
     files: list[Path],
     table: Path | None,
     stamps: Array | None,
@@ -233,7 +233,7 @@ def _cloud_log(
                 got=f"{len(matrices)} poses, {n} clouds",
                 wanted="one pose a cloud, or option poses=none",
             )
-        bad["pose is not finite"] = ~np.asarray(usable(matrices).all(axis=(1, 2)))
+        bad["pose is not finite"] = ~np.asarray(finite_mask(matrices).all(axis=(1, 2)))
     keep = np.flatnonzero(usable_records(stamps, bad, stream="clouds", where=str(root), drops=counter))
     if path_poses is not None:
         slack = 0.5 * float(np.median(np.diff(path_poses.times)))
@@ -260,7 +260,7 @@ def _cloud_log(
         else:
             assert path_poses is not None
             T = path_poses.interpolate(np.clip(times, path_poses.times[0], path_poses.times[-1]))
-            T = embed(T)
+            T = embed_poses(T)
         streams["odometry"] = _odometry(times, T, sigmas)
         streams["reference"] = Trajectory(times, T)
         assert table is not None
@@ -280,7 +280,7 @@ def _cloud_log(
     return SensorLog(name=name or root.name, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
 
-def embed(poses: Array) -> Array:
+def embed_poses(poses: Array) -> Array:
     """Poses ``(n, 3)`` as ``(n, 7)``; those that are it already, as they are."""
     if poses.shape[1] == 7:
         return poses
@@ -304,7 +304,7 @@ def _number_in_name(path: Path) -> tuple[list[tuple[int, int, str]], str]:
 
 def _stamps_in_names(files: list[Path]) -> Array | None:
     """Stamps in names: seconds with a fraction, or so many digits that they are unix time in ms, µs or ns."""
-    found = [re.findall(r"\d+\.\d+|\d+", p.name[: -len(ending(p))]) for p in files]
+    found = [re.findall(r"\d+\.\d+|\d+", p.name[: -len(file_ending(p))]) for p in files]
     if any(not f for f in found):
         return None
     words = [max(f, key=len) for f in found]
@@ -324,7 +324,7 @@ def _times(path: Path, n: int) -> Array | None:
     for line in read_text(path).splitlines():
         if not line.strip() or line.startswith("#"):
             continue
-        v = numbers(line)
+        v = parse_numbers(line)
         if v is None:
             date = re.fullmatch(r"(\d{4}-\d\d-\d\d)[ T](\d\d):(\d\d):(\d\d(?:\.\d+)?)", line.strip())
             if date is None:
@@ -350,13 +350,13 @@ def _tum(path: Path, counter: DropCounter) -> Trajectory:
     """A TUM table, also with commas; rows that are not usable are dropped and counted."""
     rows = []
     for line in read_text(path).lstrip("\ufeff").splitlines():
-        v = numbers(line) if line.strip() and not line.lstrip().startswith(("#", "%")) else None
+        v = parse_numbers(line) if line.strip() and not line.lstrip().startswith(("#", "%")) else None
         if v is not None:
             rows.append(v if len(v) == 8 else [np.nan] * 8)
     a = np.array(rows).reshape(-1, 8)
-    norm = np.linalg.norm(np.where(usable(a[:, 4:]), a[:, 4:], 0.0), axis=1)
+    norm = np.linalg.norm(np.where(finite_mask(a[:, 4:]), a[:, 4:], 0.0), axis=1)
     bad = {
-        "row is not 8 finite numbers": np.asarray(~usable(a[:, 1:]).all(axis=1)),
+        "row is not 8 finite numbers": np.asarray(~finite_mask(a[:, 1:]).all(axis=1)),
         "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.01,
     }
     keep = usable_records(a[:, 0], bad, stream="poses", where=str(path), drops=counter)
@@ -427,7 +427,7 @@ def read_kitti(
     root = Path(path)
     if not root.is_dir():
         raise MissingDataError("no such folder", where=str(root), wanted="a sequence or drive of KITTI")
-    look = Look(root)
+    look = SourceProbe(root)
     files = [p for p in look.by_ending.get(".bin", []) if p.parent.name in ("velodyne", "data")]
     counter = DropCounter()
     stamps: Array | None = None
@@ -452,12 +452,12 @@ def read_kitti(
     return replace(log, meta={**log.meta, "notes": [*log.meta["notes"], *notes]})
 
 
-def _calibration(look: Look) -> Array | None:
+def _calibration(look: SourceProbe) -> Array | None:
     """``T_camera_lidar`` ``(7,)`` of the line ``Tr``."""
     path = look.named("calib.txt")
     row = next((s for s in look.lines(path) if s.startswith(("Tr:", "Tr ", "Tr_velo"))), None) if path else None
-    v = numbers(row.partition(":")[2] or row[2:]) if row else None
-    if v is None or len(v) != 12 or not np.all(usable(v)):
+    v = parse_numbers(row.partition(":")[2] or row[2:]) if row else None
+    if v is None or len(v) != 12 or not np.all(finite_mask(v)):
         return None
     m = np.array(v).reshape(3, 4)
     if np.abs(m[:, :3] @ m[:, :3].T - np.eye(3)).max() > 1e-2:
@@ -465,7 +465,7 @@ def _calibration(look: Look) -> Array | None:
     return np.concatenate([m[:, 3], se3.matrix_to_quat(m[None, :, :3])[0]])
 
 
-def _oxts(root: Path, look: Look, counter: DropCounter) -> dict[str, Stream]:
+def _oxts(root: Path, look: SourceProbe, counter: DropCounter) -> dict[str, Stream]:
     """``gps`` and ``imu`` of the records of oxts: 30 numbers each, in files of their own."""
     files = [p for p in look.by_ending.get(".txt", []) if p.parent.name == "data" and p.parent.parent.name == "oxts"]
     files = sorted(files, key=_number_in_name)
@@ -477,15 +477,15 @@ def _oxts(root: Path, look: Look, counter: DropCounter) -> dict[str, Stream]:
         return {}
     times = _times(beside, len(files))
     assert times is not None
-    rows = [numbers(read_text(p)) or [] for p in files]
+    rows = [parse_numbers(read_text(p)) or [] for p in files]
     a = np.array([r[:30] if len(r) >= 30 else [np.nan] * 30 for r in rows])
-    place = usable(a[:, :3]).all(axis=1) & (np.abs(a[:, 0]) <= 90) & (np.abs(a[:, 1]) <= 360)
-    bad = {"record is not whole": np.asarray(~(place & usable(a[:, 8:26]).all(axis=1)))}
+    place = finite_mask(a[:, :3]).all(axis=1) & (np.abs(a[:, 0]) <= 90) & (np.abs(a[:, 1]) <= 360)
+    bad = {"record is not whole": np.asarray(~(place & finite_mask(a[:, 8:26]).all(axis=1)))}
     keep = usable_records(times, bad, stream="oxts", where=str(files[0].parent), drops=counter)
     a, t = a[keep], times[keep]
     plane = TangentPlane(*a[0, :3].tolist())
     enu = plane.from_ecef(geodetic_to_ecef(a[:, :3]))
-    accuracy = np.clip(np.where(usable(a[:, 23]), a[:, 23], 1.0), 0.05, 100.0)
+    accuracy = np.clip(np.where(finite_mask(a[:, 23]), a[:, 23], 1.0), 0.05, 100.0)
     gps = Gps.upright(times=t, positions=enu, horizontal=accuracy, vertical=2 * accuracy, lever=np.zeros(3))
     imu = Imu(times=t, angular_rate=a[:, 17:20], specific_force=a[:, 11:14], noise=IMU_NOISE)
     return {"gps": gps, "imu": imu}

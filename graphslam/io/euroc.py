@@ -21,12 +21,12 @@ from graphslam.core.errors import ConfigError, FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Gps, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
-from graphslam.io.look import Look
-from graphslam.io.recognise import euroc_tables, numbers
+from graphslam.io.recognise import euroc_tables, parse_numbers
+from graphslam.io.source_probe import SourceProbe
 from graphslam.io.text_records import find_text_file, read_table
 
 GYRO_BIAS, FORCE_BIAS = 0.1, 0.3
@@ -74,7 +74,7 @@ def read_euroc(
     if not (sigma > 0 and noise_scale > 0 and np.isfinite([sigma, late, noise_scale]).all()):
         raise ConfigError(f"sigma = {sigma}, late = {late}, noise_scale = {noise_scale}; wanted σ and scale above 0")
     counter = DropCounter()
-    tables = euroc_tables(Look(root))
+    tables = euroc_tables(SourceProbe(root))
     a_file = tables.get("imu") or find_text_file(root, "imu0_data.csv")
     sheet = _sheet(a_file)
     stated = read_text(sheet)
@@ -134,11 +134,11 @@ def _sheet(table: Path) -> Path:
 def _reference(path: Path, counter: DropCounter) -> tuple[Array, int]:
     """Rows of stamp, position and quaternion (w first), and how many there were."""
     lines = [s for s in read_text(path).splitlines() if s.strip() and not s.startswith("#")]
-    rows = [numbers(s) or [] for s in lines]
+    rows = [parse_numbers(s) or [] for s in lines]
     table = np.array([r[:8] if len(r) >= 8 else [np.nan] * 8 for r in rows]).reshape(-1, 8)
-    norm = np.linalg.norm(np.where(usable(table[:, 4:]), table[:, 4:], 0.0), axis=1)
+    norm = np.linalg.norm(np.where(finite_mask(table[:, 4:]), table[:, 4:], 0.0), axis=1)
     bad = {
-        "a number is not finite": np.asarray(~usable(table[:, 1:]).all(axis=1)),
+        "a number is not finite": np.asarray(~finite_mask(table[:, 1:]).all(axis=1)),
         "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.01,
     }
     keep = usable_records(table[:, 0], bad, stream="reference", where=str(path), drops=counter)
@@ -148,7 +148,7 @@ def _reference(path: Path, counter: DropCounter) -> tuple[Array, int]:
 def _table(path: Path, columns: int, stream: str, counter: DropCounter) -> tuple[Array, int]:
     """Rows that can be used, and how many there were."""
     table, _ = read_table(path, columns, separator=",")
-    bad = {"a number is not finite": np.asarray(~usable(table[:, 1:]).all(axis=1))}
+    bad = {"a number is not finite": np.asarray(~finite_mask(table[:, 1:]).all(axis=1))}
     keep = usable_records(table[:, 0], bad, stream=stream, where=str(path), drops=counter)
     return table[keep], len(table)
 
@@ -165,6 +165,6 @@ def _matrix(path: Path) -> Array:
     found = re.search(r"data:\s*\[([^\]]{1,2000})\]", read_text(path))
     numbers = re.findall(_NUMBER, found[1]) if found else []
     T = np.array([float(x) for x in numbers])
-    if len(T) != 16 or not np.all(usable(T)):
+    if len(T) != 16 or not np.all(finite_mask(T)):
         raise FormatError("holds no place of the sensor", where=str(path), got=f"{len(T)} numbers", wanted="16")
     return T.reshape(4, 4)

@@ -12,7 +12,7 @@ from urllib.parse import urljoin, urlsplit
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import DataError, FormatError, MissingDataError
 from graphslam.core.reading import most_bytes
-from graphslam.io.cards import Card, CardArchive, CardFile, card
+from graphslam.io.cards import Card, CardArchive, CardFile, find_card
 from graphslam.io.catalog import cache_folder, check_file, data_roots
 
 log = logging.getLogger(__name__)
@@ -23,7 +23,7 @@ SCHEMES = ("https",)
 MOST_REDIRECTS = 5
 
 
-def fetch(data: Card | str, *, progress: bool = False) -> Path:
+def fetch_dataset(data: Card | str, *, progress: bool = False) -> Path:
     """Have all files of a data set on this machine; download what is missing or differs.
 
     Parameters
@@ -36,7 +36,7 @@ def fetch(data: Card | str, *, progress: bool = False) -> Path:
     Path
         Folder that holds the files: the cache, or where they already were.
     """
-    c = card(data) if isinstance(data, str) else data
+    c = find_card(data) if isinstance(data, str) else data
     log.info("%s: %s", c.name, c.title)
     log.info("%s: licence: %s. %s", c.name, c.licence, c.terms)
     log.info("%s: please cite: %s", c.name, c.citation)

@@ -11,12 +11,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from graphslam.core.errors import DataError, MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LaserScans, Stream
-from graphslam.io.log_kinds import KINDS, Kind, kind_name
+from graphslam.io.log_kinds import KINDS, StreamKind, kind_name
 
 BEAMS = (LaserScans, RangeScans, PointClouds)
 """Streams whose records are let go of: all others are small, and figures are made of them at the end."""
@@ -24,7 +24,7 @@ ROWS = ("n", "q")
 """Lengths that grow with the records."""
 
 
-class GrowingLog(Feed):
+class GrowingLog(RecordSource):
     """A log whose records come one by one, or in portions.
 
     A portion is a stream of the usual kind with one record or more. What does not change from record to record
@@ -63,45 +63,45 @@ class GrowingLog(Feed):
 
     @property
     def name(self) -> str:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._name
 
     @property
     def ended(self) -> bool:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._whole is not None
 
     @property
     def log(self) -> SensorLog:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         if self._whole is None:
             raise DataError("the log has not ended", where=self._name)
         return self._whole
 
     def names(self, kind: type) -> list[str]:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return [name for name, held in self._held.items() if issubclass(held.kind.cls, kind)]
 
     def count(self, stream: str) -> int:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._of(stream).ends[-1] if self.ended or stream in self._held else 0
 
     def until(self, stream: str) -> float:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         return self._of(stream).until if self.ended or stream in self._held else -np.inf
 
     def part(self, stream: str, first: int = 0, last: int | None = None) -> Stream:
-        """See :class:`~graphslam.core.feed.Feed`."""
+        """See :class:`~graphslam.core.record_source.RecordSource`."""
         if self._whole is not None:
             whole: Stream = self._whole[stream]
             return whole.take(slice(first, last))
         held = self._of(stream)
         return held.part(first, held.ends[-1] if last is None else min(last, held.ends[-1]))
 
-    def let_go(self, stream: str, before: int) -> None:
-        """See :class:`~graphslam.core.feed.Feed`; records of beams leave the memory."""
+    def discard_before(self, stream: str, before: int) -> None:
+        """See :class:`~graphslam.core.record_source.RecordSource`; records of beams leave the memory."""
         if self._whole is None:
-            self._of(stream).let_go(before)
+            self._of(stream).discard_before(before)
 
     @property
     def held_records(self) -> dict[str, int]:
@@ -160,13 +160,13 @@ class _Held:
         if first < self.ends[0]:
             raise DataError("records that were already freed", where=self.where, got=first, wanted=f"≥ {self.ends[0]}")
         if first == self.ends[0] and last == self.ends[-1] and len(self.parts) > 1:
-            self.parts, self.ends = [joined(self.kind, self.parts)], [first, last]  # next time it is one portion
+            self.parts, self.ends = [join_portions(self.kind, self.parts)], [first, last]  # next time it is one portion
         a = int(np.searchsorted(self.ends, first, side="right")) - 1
         b = max(int(np.searchsorted(self.ends, last, side="left")), a + 1)
-        here = self.parts[a] if b == a + 1 else joined(self.kind, self.parts[a:b])
+        here = self.parts[a] if b == a + 1 else join_portions(self.kind, self.parts[a:b])
         return here.take(slice(first - self.ends[a], last - self.ends[a]))
 
-    def let_go(self, before: int) -> None:
+    def discard_before(self, before: int) -> None:
         if self.spool is None:
             return
         k = int(np.searchsorted(self.ends, before, side="right")) - 1
@@ -183,7 +183,7 @@ class _Held:
 class _Spool:
     """Arrays that grow, on disk: raw numbers, one file an array."""
 
-    def __init__(self, kind: Kind, folder: Path) -> None:
+    def __init__(self, kind: StreamKind, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.kind, self.folder = kind, folder
         self.files: dict[str, BinaryIO] = {}
@@ -224,7 +224,7 @@ class _Spool:
         return {n for n, f in {**self.kind.fields, **self.kind.more}.items() if f.shape and f.shape[0] == "n+1"}
 
 
-def joined(kind: Kind, parts: list[Stream]) -> Any:
+def join_portions(kind: StreamKind, parts: list[Stream]) -> Any:
     """Portions of one stream behind each other, as a stream."""
     arrays = [kind.arrays(p) for p in parts]
     out = dict(arrays[0])
@@ -239,7 +239,7 @@ def joined(kind: Kind, parts: list[Stream]) -> Any:
     return kind.stream(out, "records")
 
 
-def _constants(kind: Kind, arrays: Mapping[str, Any]) -> dict[str, Any]:
+def _constants(kind: StreamKind, arrays: Mapping[str, Any]) -> dict[str, Any]:
     """What is the same for all records."""
     shapes = {n: f.shape for n, f in {**kind.fields, **kind.more}.items()}
     return {n: a for n, a in arrays.items() if not (shapes.get(n) and shapes[n][0] in (*ROWS, "n+1"))}

@@ -16,7 +16,7 @@ import numpy as np
 from graphslam.core.errors import ConfigError, FormatError, MissingDataError
 from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Gps
 from graphslam.io.clock import usable_records
 from graphslam.io.text_records import find_text_file, read_table
@@ -54,7 +54,7 @@ def read_kitti_gps(
     counter = DropCounter()
     path = find_text_file(root, FIXES)
     table = _rows(path, "Time,X,Y,Z", 4, ",")
-    bad = {"position is not finite": np.asarray(~usable(table[:, 1:]).all(axis=1))}
+    bad = {"position is not finite": np.asarray(~finite_mask(table[:, 1:]).all(axis=1))}
     keep = usable_records(table[:, 0], bad, stream="gps", where=str(path), drops=counter)
     fixes = table[keep]
     start = fixes[0, 0]
@@ -90,13 +90,13 @@ def _rows(path: Path, header: str, columns: int, separator: str | None) -> np.nd
 def _imu(root: Path, path: Path, start: float, counter: DropCounter) -> tuple[Imu, int]:
     sheet = find_text_file(root, SHEET)
     values = _rows(sheet, _COLUMNS, 12, None)
-    if len(values) != 1 or not np.all(usable(values)) or np.any(values[0, 6:] < 0):
+    if len(values) != 1 or not np.all(finite_mask(values)) or np.any(values[0, 6:] < 0):
         raise FormatError("is no data sheet", where=str(sheet), got=values.shape, wanted="one line of 12 numbers")
     s = dict(zip(_COLUMNS.split(), values[0].tolist()))
     if any(s[f"BodyP{c}"] for c in ("tx", "ty", "tz", "rx", "ry", "rz")):
         raise FormatError("the IMU is not at the body", where=str(sheet), got=values[0, :6], wanted="zeros")
     a = _rows(path, "Time dt accelX accelY accelZ omegaX omegaY omegaZ", 8, None)
-    bad = {"reading is not finite": np.asarray(~usable(a[:, 2:]).all(axis=1))}
+    bad = {"reading is not finite": np.asarray(~finite_mask(a[:, 2:]).all(axis=1))}
     keep = usable_records(a[:, 0], bad, stream="imu", where=str(path), drops=counter)
     noise = ImuNoise(
         gyro=s["GyroscopeSigma"],

@@ -23,10 +23,10 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
 from graphslam.io.clock import usable_records
-from graphslam.io.look import Claim, Look
+from graphslam.io.source_probe import ReaderMatch, SourceProbe
 
 NAMES = {
     "t": ("t", "time", "stamp", "timestamp", "secs", "seconds"),
@@ -130,31 +130,33 @@ def _header_in(lines: list[str]) -> Header | None:
     return None
 
 
-def claim_tables(look: Look) -> Claim | None:
+def claim_tables(look: SourceProbe) -> ReaderMatch | None:
     """See :mod:`graphslam.io.recognise`."""
     motion, seen = _tables(look)
     guess = [p for p in look.files if re.match(r"(odom|sighting|landmark_obs|observation)", p.name.lower())]
     guess = [p for p in guess if p.suffix.lower() in TABLE_ENDINGS and look.lines(p, 1)]
     if motion and seen:
-        return Claim(f"odometry ({look.relative(motion[0])}) and landmark observations ({look.relative(seen[0])})")
+        return ReaderMatch(
+            f"odometry ({look.relative(motion[0])}) and landmark observations ({look.relative(seen[0])})"
+        )
     if motion or seen:
         have, lack = (motion[0], "sightings") if motion else (seen[0], "odometry")
         header = SIGHTINGS_HEADER if motion else ODOMETRY_HEADER
         bad = [p for p in guess if p != have]
         there = f"; the first line of {look.relative(bad[0])} is {look.lines(bad[0], 1)[0][:80]!r}" if bad else ""
-        return Claim(
+        return ReaderMatch(
             f"a table of {'odometry' if motion else 'sightings'}, {look.relative(have)}{there}",
             f"{lack}.csv beside it, with the header {header}",
         )
     if len(guess) >= 2 and {g.name.lower()[0] for g in guess} >= {"o", "s"}:
         heads = "; ".join(f"{look.relative(p)} begins {look.lines(p, 1)[0][:60]!r}" for p in guess[:2])
-        return Claim(
+        return ReaderMatch(
             heads, f"a first line with names: odometry.csv {ODOMETRY_HEADER}; sightings.csv {SIGHTINGS_HEADER}"
         )
     return None
 
 
-def _tables(look: Look) -> tuple[list[Path], list[Path]]:
+def _tables(look: SourceProbe) -> tuple[list[Path], list[Path]]:
     """Tables of odometry, and of sightings; those whose name says it first."""
     motion: list[Path] = []
     seen: list[Path] = []
@@ -200,7 +202,7 @@ def read_landmark_tables(
     numbers = [range_sigma, bearing_sigma, *floor, 1.0 if max_range is None else max_range]
     if not (all(np.isfinite(v) and v > 0 for v in numbers) and min(*per_metre, per_radian) >= 0):
         raise ConfigError(f"landmark tables: σ {numbers}, {per_metre}, {per_radian}; wanted positive numbers")
-    look = Look(root if root.is_dir() else root.parent)
+    look = SourceProbe(root if root.is_dir() else root.parent)
     motion, seen = _tables(look)
     if not (motion and seen):
         claim = claim_tables(look)
@@ -291,7 +293,11 @@ def _motion(
     kind = header.odometry
     a = _in_order(a, "odometry", counter)
     names = ("v", "w") if kind == "velocity" else ("x", "y", "theta")
-    bad = {"a number is missing or not finite": np.asarray(~usable(np.column_stack([a[k] for k in names])).all(axis=1))}
+    bad = {
+        "a number is missing or not finite": np.asarray(
+            ~finite_mask(np.column_stack([a[k] for k in names])).all(axis=1)
+        )
+    }
     keep = usable_records(a["t"], bad, stream="odometry", where=str(path), drops=counter)
     if keep.sum() < 2:
         raise DataError("holds too few records", where=str(path), got=int(keep.sum()), wanted="2 or more")
@@ -324,7 +330,7 @@ def _sightings(
     ids = a.get("id")
     good = np.ones(n, dtype=np.bool_)
     for reason, wrong in (
-        ("stamp, range or bearing is missing or not finite", ~(usable(t) & usable(r) & usable(b))),
+        ("stamp, range or bearing is missing or not finite", ~(finite_mask(t) & finite_mask(r) & finite_mask(b))),
         ("range is not positive", ~(r > 0)),
         ("stamp outside the time of the odometry", ~((span[0] <= t) & (t <= span[1]))),
     ):

@@ -16,7 +16,7 @@ from graphslam.core.errors import FormatError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.mesh import Triangles
-from graphslam.core.reading import inside
+from graphslam.core.reading import resolve_inside
 from graphslam.io.log_store import INDEX_NAME, LOG_FORMAT, load_log, save_log
 from graphslam.io.mesh_file import read_mesh, write_mesh
 
@@ -64,7 +64,7 @@ def read_log_mesh(path: str | os.PathLike[str]) -> tuple[Array, Triangles] | Non
         raise FormatError(
             "mesh of another name", where=str(root / INDEX_NAME), got=repr(entry["file"]), wanted=MESH_NAME
         )
-    vertices, triangles = read_mesh(inside(root, MESH_NAME, str(root / INDEX_NAME)))
+    vertices, triangles = read_mesh(resolve_inside(root, MESH_NAME, str(root / INDEX_NAME)))
     found = {"file": MESH_NAME, "vertices": len(vertices), "triangles": len(triangles)}
     if found != entry:
         raise FormatError("mesh and log do not agree", where=str(root / MESH_NAME), got=found, wanted=entry)
@@ -73,7 +73,7 @@ def read_log_mesh(path: str | os.PathLike[str]) -> tuple[Array, Triangles] | Non
 
 def _meta(root: Path) -> dict[str, Any]:
     """``meta`` of a log folder, no stream read."""
-    where = inside(root, INDEX_NAME, str(root))
+    where = resolve_inside(root, INDEX_NAME, str(root))
     meta = read_json(where, fmt=LOG_FORMAT).get("meta")
     if not isinstance(meta, dict):
         raise FormatError("key 'meta' is missing or of the wrong type", where=str(where), wanted="dict")

@@ -35,7 +35,7 @@ def _nothing(_: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class StreamKind:
     """How streams of one class are stored.
 
     Parameters
@@ -128,13 +128,13 @@ def _floats(*names: str) -> dict[str, Any]:
 
 
 _TIMES = {"times": floats("n")}
-KINDS: dict[str, Kind] = {
-    "laser-scans": Kind(
+KINDS: dict[str, StreamKind] = {
+    "laser-scans": StreamKind(
         LaserScans,
         {**_TIMES, "ranges": floats("n", "m", finite=False), "bearings": floats("m"), "T_base_sensor": floats(3)},
         **_floats("max_range"),
     ),
-    "range-scans": Kind(
+    "range-scans": StreamKind(
         RangeScans,
         {
             **_TIMES,
@@ -147,14 +147,14 @@ KINDS: dict[str, Kind] = {
         },
         **_floats("max_range", "sigma"),
     ),
-    "point-clouds": Kind(
+    "point-clouds": StreamKind(
         PointClouds,
         {**_TIMES, "origin": floats(3), "T_base_sensor": floats(7)},
         _pack_clouds,
         _unpack_clouds,
         {"points": floats("q", 3), "offsets": ints("n+1"), "before": floats("q", optional=True)},
     ),
-    "imu": Kind(
+    "imu": StreamKind(
         Imu,
         {
             **_TIMES,
@@ -169,24 +169,24 @@ KINDS: dict[str, Kind] = {
             **{f"noise_{f.name}": floats() for f in dataclasses.fields(ImuNoise)},
         },
     ),
-    "steering-controls": Kind(
+    "steering-controls": StreamKind(
         SteeringControls,
         {**_TIMES, "speed": floats("n"), "steering": floats("n")},
         _pack_steering,
         _unpack_steering,
         {"wheelbase": floats(), "encoder_offset": floats(), "model": texts()},
     ),
-    "compass": Kind(Compass, {**_TIMES, "headings": floats("n"), "sigma": floats("n")}),
-    "velocity-controls": Kind(VelocityControls, {**_TIMES, "speed": floats("n"), "yaw_rate": floats("n")}),
-    "odometry": Kind(Odometry, {**_TIMES, "increments": floats("n", "p"), "covariances": floats("n", "d", "d")}),
-    "gps": Kind(
+    "compass": StreamKind(Compass, {**_TIMES, "headings": floats("n"), "sigma": floats("n")}),
+    "velocity-controls": StreamKind(VelocityControls, {**_TIMES, "speed": floats("n"), "yaw_rate": floats("n")}),
+    "odometry": StreamKind(Odometry, {**_TIMES, "increments": floats("n", "p"), "covariances": floats("n", "d", "d")}),
+    "gps": StreamKind(
         Gps,
         {**_TIMES, "positions": floats("n", "c"), "sigma": floats("n"), "lever": floats("c")},
         lambda s: {} if s.covariances is None else {"covariances": s.covariances},
         lambda a: {"covariances": a.get("covariances")},
         {"covariances": floats("n", "c", "c", optional=True)},
     ),
-    "pseudoranges": Kind(
+    "pseudoranges": StreamKind(
         Pseudoranges,
         {
             **_TIMES,
@@ -201,7 +201,7 @@ KINDS: dict[str, Kind] = {
             "lever": floats(3),
         },
     ),
-    "landmark-observations": Kind(
+    "landmark-observations": StreamKind(
         LandmarkObservations,
         {
             **_TIMES,
@@ -215,7 +215,7 @@ KINDS: dict[str, Kind] = {
         _unpack_landmarks,
         {"max_range": floats(finite=False), "field_of_view": floats(2), "ids": ints("q", optional=True)},
     ),
-    "trajectory": Kind(
+    "trajectory": StreamKind(
         Trajectory,
         {**_TIMES, "poses": floats("n", "p")},
         lambda s: {} if s.covariances is None else {"covariances": s.covariances},

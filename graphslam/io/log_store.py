@@ -17,7 +17,7 @@ from graphslam.core.atomic import read_json, read_npz, write_json, write_npz
 from graphslam.core.errors import DataError, FormatError
 from graphslam.core.log import BeamLabels, SensorLog, Truth
 from graphslam.core.npz import check_arrays, floats, ints
-from graphslam.core.reading import inside
+from graphslam.core.reading import resolve_inside
 from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.log_kinds import KINDS, Arrays, kind_name
@@ -61,13 +61,13 @@ def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
 def load_log(folder: str | os.PathLike[str]) -> SensorLog:
     """Read a log written by :func:`save_log`."""
     root = Path(folder)
-    index_path = inside(root, INDEX_NAME, str(root))
+    index_path = resolve_inside(root, INDEX_NAME, str(root))
     where = str(index_path)
     index = read_json(index_path, fmt=LOG_FORMAT, shape=_INDEX)
     streams: dict[str, Stream] = {}
     for entry in index["streams"]:
         name, kind = entry["name"], entry["kind"]
-        path = inside(root, entry["file"], where)
+        path = resolve_inside(root, entry["file"], where)
         if name in streams:
             raise FormatError("stream listed twice", where=where, got=repr(name[:80]))
         arrays = read_npz(path, fmt=STREAM_FORMAT)
@@ -82,7 +82,7 @@ def load_log(folder: str | os.PathLike[str]) -> SensorLog:
             )
     truth = None
     if index.get("truth") is not None:
-        path = inside(root, index["truth"], where)
+        path = resolve_inside(root, index["truth"], where)
         truth = _build(str(path), lambda: _truth(read_npz(path, fmt=TRUTH_FORMAT), str(path)))
     return SensorLog(
         name=index["name"],

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import FormatError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import LARGEST, check_size, most_bytes, read_bytes, usable
+from graphslam.core.reading import LARGEST, check_size, finite_mask, most_bytes, read_bytes
 
 _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
@@ -53,7 +53,7 @@ def read_mat(path: str | os.PathLike[str], *names: str) -> tuple[Array, ...]:
                 wanted=", ".join(names),
             )
         numbers = np.ascontiguousarray(value, dtype=np.float64)
-        if np.any(bad := np.isfinite(numbers) & ~usable(numbers)):
+        if np.any(bad := np.isfinite(numbers) & ~finite_mask(numbers)):
             wanted = f"at most {LARGEST:g}"
             raise FormatError(
                 f"array {name!r} holds a number too large", where=where, got=numbers[bad][0], wanted=wanted

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from graphslam.core.errors import MissingDataError
-from graphslam.io.cards import card
-from graphslam.io.catalog import DATA_VARIABLE, load
+from graphslam.io.cards import find_card
+from graphslam.io.catalog import DATA_VARIABLE, load_recording
 
 
 class NotebookStop(Exception):
@@ -27,9 +27,9 @@ def load_or_stop(name: str) -> Any:
     UnknownNameError, DataError
     """
     try:
-        return load(name)
+        return load_recording(name)
     except MissingDataError as error:
-        c = card(name)
+        c = find_card(name)
         get = f"graphslam data fetch {name}" if c.fetchable else f"(no direct download) a copy from {c.source}"
         raise NotebookStop(
             f"This notebook needs the recorded data set {name!r}, which is not on this machine ({error.what}).\n"

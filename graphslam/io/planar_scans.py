@@ -13,7 +13,7 @@ from graphslam.core.geometry import Array
 Ranges = npt.NDArray[np.float32]
 
 
-def on_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
+def resample_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
     """Ranges of a scan on other beams: each takes the nearest one within a step, NaN where there is none.
 
     Parameters
@@ -28,7 +28,7 @@ def on_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
     return np.where(near, ranges[k], np.nan).astype(np.float32)
 
 
-def one_layout(scans: Sequence[tuple[Ranges, Array]]) -> tuple[Ranges, Array, int]:
+def unify_layout(scans: Sequence[tuple[Ranges, Array]]) -> tuple[Ranges, Array, int]:
     """Scans of any beams as one table.
 
     Parameters
@@ -48,5 +48,5 @@ def one_layout(scans: Sequence[tuple[Ranges, Array]]) -> tuple[Ranges, Array, in
     counts = Counter(keys)
     usual = max(counts, key=lambda k: (counts[k], k))
     beams = scans[keys.index(usual)][1]
-    rows = [r if k == usual else on_beams(r, b, beams) for (r, b), k in zip(scans, keys)]
+    rows = [r if k == usual else resample_beams(r, b, beams) for (r, b), k in zip(scans, keys)]
     return np.stack(rows), beams, len(scans) - counts[usual]

@@ -19,7 +19,7 @@ import numpy as np
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.log import DropCounter, SensorLog, Truth
-from graphslam.core.reading import whole
+from graphslam.core.reading import integer_mask
 from graphslam.core.records import LandmarkObservations, VelocityControls
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED, usable_records
@@ -157,7 +157,7 @@ def _truth(path: Path, counter: DropCounter) -> Truth | None:
     for array, columns, what in ((poses, 4, "GT"), (beacons, 3, "TL")):
         if array.ndim != 2 or array.shape[1] != columns:
             raise FormatError(f"{what} has the wrong shape", where=str(path), got=array.shape, wanted=f"(n, {columns})")
-    wrong = np.flatnonzero(~(whole(beacons[:, 0]) & np.isfinite(beacons[:, 1:]).all(axis=1)))
+    wrong = np.flatnonzero(~(integer_mask(beacons[:, 0]) & np.isfinite(beacons[:, 1:]).all(axis=1)))
     if len(wrong):
         raise FormatError(
             f"row {wrong[0]} of TL is no beacon", where=str(path), got=beacons[wrong[0]], wanted="id, x, y"

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from graphslam.core.config import convert
+from graphslam.core.config import convert_option
 from graphslam.core.errors import ConfigError
-from graphslam.io.look import Claim, Look
+from graphslam.io.source_probe import ReaderMatch, SourceProbe
 
 _NOT_OPTIONS = ("name", "drops")
 
@@ -29,8 +29,9 @@ class Reader:
         ``module:function``; the function takes the path, and options as keyword arguments with annotations. Imported
         when used.
     recognise : callable
-        Takes a :class:`~graphslam.io.look.Look` and gives a :class:`~graphslam.io.look.Claim`, or None where the
-        source is not its. It goes by what files hold, and must not raise.
+        Takes a :class:`~graphslam.io.source_probe.SourceProbe` and gives a
+        :class:`~graphslam.io.source_probe.ReaderMatch`, or None where the source is not its. It goes by what files
+        hold, and must not raise.
     parts : mapping of str to mapping
         Logs inside one data set, by the name that stands after the card's (``mrclam-dataset7/robot1``), and what the
         function is told for each.
@@ -40,7 +41,7 @@ class Reader:
 
     says: str
     target: str
-    recognise: Callable[[Look], Claim | None]
+    recognise: Callable[[SourceProbe], ReaderMatch | None]
     parts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     preset: str = ""
 
@@ -69,5 +70,5 @@ class Reader:
             elif key not in known:
                 raise ConfigError(f"unknown reader option {key!r}; known: {', '.join(sorted(known)) or 'none'}")
             else:
-                values[key] = convert(hints.get(key, Any), value, f"reader option {key}")
+                values[key] = convert_option(hints.get(key, Any), value, f"reader option {key}")
         return function(path, **values)

@@ -19,15 +19,15 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from graphslam.core.errors import FormatError, GraphSlamError, MissingDataError, UnknownNameError
-from graphslam.io.look import Claim, Look
 from graphslam.io.reader import Reader
 from graphslam.io.recognise import BUILT_IN
+from graphslam.io.source_probe import ReaderMatch, SourceProbe
 
 GROUP = "graphslam.readers"
 
 
 @cache
-def readers() -> dict[str, Reader]:
+def list_readers() -> dict[str, Reader]:
     """All readers by name: those of other packages first, then our own, in the order in which they are asked."""
     out: dict[str, Reader] = {}
     for entry in sorted(entry_points(group=GROUP), key=lambda e: e.name):
@@ -41,16 +41,16 @@ def readers() -> dict[str, Reader]:
     return {**out, **{k: v for k, v in BUILT_IN.items() if k not in out}}
 
 
-def reader(name: str) -> Reader:
+def find_reader(name: str) -> Reader:
     """The reader of that name."""
     try:
-        return readers()[name]
+        return list_readers()[name]
     except KeyError:
-        raise UnknownNameError("reader", name, readers()) from None
+        raise UnknownNameError("reader", name, list_readers()) from None
 
 
 @dataclass(frozen=True, slots=True)
-class Recognised:
+class RecognisedSource:
     """Who reads a source.
 
     Parameters
@@ -66,18 +66,18 @@ class Recognised:
     also: tuple[str, ...] = ()
 
 
-def recognise(path: Path) -> Recognised:
+def recognise(path: Path) -> RecognisedSource:
     """The first reader that can read a source."""
-    look = Look(path)
-    whole: list[tuple[str, Claim]] = []
-    nearly: list[tuple[str, Claim]] = []
-    for name, r in readers().items():
+    look = SourceProbe(path)
+    whole: list[tuple[str, ReaderMatch]] = []
+    nearly: list[tuple[str, ReaderMatch]] = []
+    for name, r in list_readers().items():
         claim = r.recognise(look)
         if claim is not None:
             (nearly if claim.missing else whole).append((name, claim))
     if whole:
         name, claim = whole[0]
-        return Recognised(name, claim.found, tuple(f"{n}: {c.found}" for n, c in whole[1:]))
+        return RecognisedSource(name, claim.found, tuple(f"{n}: {c.found}" for n, c in whole[1:]))
     if nearly:
         name, claim = nearly[0]
         raise MissingDataError(
@@ -107,6 +107,6 @@ _ADVICE = {
 }
 
 
-def _advice(look: Look) -> str:
+def _advice(look: SourceProbe) -> str:
     said = next((text for end, text in _ADVICE.items() if end in look.by_ending), "")
     return f"; {said}" if said else ""

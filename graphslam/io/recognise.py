@@ -13,8 +13,8 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from graphslam.io.look import Claim, Look, ending, plain_name
 from graphslam.io.reader import Reader
+from graphslam.io.source_probe import ReaderMatch, SourceProbe, file_ending, plain_name
 
 CARMEN_SCANS = re.compile(r"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d)\b")
 CARMEN_OTHER = re.compile(r"^(PARAM|ODOM|TRUEPOS|SYNC|# message formats|# robot-id)\b")
@@ -23,7 +23,7 @@ CLOUD_ENDINGS = (".bin", ".ply", ".pcd", ".las", ".laz")
 SQLITE, MCAP, BAG1 = b"SQLite format 3\0", b"\x89MCAP0\r\n", b"#ROSBAG V"
 
 
-def numbers(line: str) -> list[float] | None:
+def parse_numbers(line: str) -> list[float] | None:
     """Numbers of a line, separated by white space, commas or semicolons; None if it holds anything else."""
     words = [w for w in re.split(r"[\s,;]+", line.strip()) if w]
     try:
@@ -32,43 +32,43 @@ def numbers(line: str) -> list[float] | None:
         return None
 
 
-def rows_of(look: Look, path: Path, most: int = 20) -> list[list[float]]:
+def first_rows(look: SourceProbe, path: Path, most: int = 20) -> list[list[float]]:
     """Numbers of the first lines, comments and one line of names left out; empty if a line holds anything else."""
     lines = [s for s in look.lines(path, most) if not s.lstrip().startswith(("#", "%"))]
-    found = [numbers(s) for s in lines]
+    found = [parse_numbers(s) for s in lines]
     if found and found[0] is None:
         found = found[1:]
     return [] if any(r is None for r in found) else [r for r in found if r is not None]
 
 
-def is_tum(look: Look, path: Path) -> bool:
+def is_tum(look: SourceProbe, path: Path) -> bool:
     """Rows of stamp, position and a unit quaternion?"""
-    rows = rows_of(look, path)
+    rows = first_rows(look, path)
     return bool(rows) and all(len(r) == 8 and abs(math.hypot(*r[4:]) - 1.0) < 0.025 for r in rows)
 
 
-def is_kitti_poses(look: Look, path: Path) -> bool:
+def is_kitti_poses(look: SourceProbe, path: Path) -> bool:
     """Rows of a 3×4 matrix with a rotation in it?"""
-    rows = rows_of(look, path)
+    rows = first_rows(look, path)
     return bool(rows) and all(
         len(r) == 12 and all(abs(math.hypot(*r[a : a + 3]) - 1.0) < 0.025 for a in (0, 4, 8)) for r in rows
     )
 
 
-def bag_kind(look: Look, path: Path) -> str:
+def bag_kind(look: SourceProbe, path: Path) -> str:
     """``ROS 1 bag``, ``ROS 2 bag (sqlite3)``, ``MCAP``; empty if it is none of them."""
     head = look.head(path)
     if head.startswith(BAG1):
         return "ROS 1 bag"
     if head.startswith(MCAP):
         return "MCAP"
-    return "ROS 2 bag (sqlite3)" if head.startswith(SQLITE) and ending(path) == ".db3" else ""
+    return "ROS 2 bag (sqlite3)" if head.startswith(SQLITE) and file_ending(path) == ".db3" else ""
 
 
 # --- one function a reader ----------------------------------------------------------------------------------------
 
 
-def _json_format(look: Look, names: tuple[str, ...], form: str) -> Path | None:
+def _json_format(look: SourceProbe, names: tuple[str, ...], form: str) -> Path | None:
     for name in names:
         path = look.path / name
         if path.is_file():
@@ -81,86 +81,90 @@ def _json_format(look: Look, names: tuple[str, ...], form: str) -> Path | None:
     return None
 
 
-def _log_store(look: Look) -> Claim | None:
-    return Claim("a log of graphslam") if _json_format(look, ("log.json",), "graphslam.log/") else None
+def _log_store(look: SourceProbe) -> ReaderMatch | None:
+    return ReaderMatch("a log of graphslam") if _json_format(look, ("log.json",), "graphslam.log/") else None
 
 
-def _submap_store(look: Look) -> Claim | None:
+def _submap_store(look: SourceProbe) -> ReaderMatch | None:
     found = _json_format(look, ("index.json", "submaps/index.json"), "graphslam.submaps/")
-    return Claim("submaps of graphslam") if found else None
+    return ReaderMatch("submaps of graphslam") if found else None
 
 
-def _victoria_park(look: Look) -> Claim | None:
+def _victoria_park(look: SourceProbe) -> ReaderMatch | None:
     laser = look.named("laser.txt")
-    if laser is None or numbers(look.head(laser)[:60].decode("latin-1").rpartition("\t")[0]) is None:
+    if laser is None or parse_numbers(look.head(laser)[:60].decode("latin-1").rpartition("\t")[0]) is None:
         return None
     if look.path.is_file() or look.named("drs.txt") is None:
-        return Claim("LASER.txt of the ACFR", "the folder with DRS.txt, speed and steering, in it")
-    return Claim("laser, speed and steering of the ACFR in the text form of Victoria Park (LASER.txt, DRS.txt)")
+        return ReaderMatch("LASER.txt of the ACFR", "the folder with DRS.txt, speed and steering, in it")
+    return ReaderMatch("laser, speed and steering of the ACFR in the text form of Victoria Park (LASER.txt, DRS.txt)")
 
 
-def _slsjf_maps(look: Look) -> Claim | None:
+def _slsjf_maps(look: SourceProbe) -> ReaderMatch | None:
     found = [p for p in look.by_ending.get(".mat", []) if re.fullmatch(r"localmap_\d+\.mat", p.name)]
     if not found:
         return None
-    return Claim(f"{len(found)} local maps of 2D I-SLSJF") if look.path.is_dir() else Claim("a local map", "its folder")
+    return (
+        ReaderMatch(f"{len(found)} local maps of 2D I-SLSJF")
+        if look.path.is_dir()
+        else ReaderMatch("a local map", "its folder")
+    )
 
 
-def _slsjf_network(look: Look) -> Claim | None:
+def _slsjf_network(look: SourceProbe) -> ReaderMatch | None:
     found = [p for p in look.by_ending.get(".mat", []) if b"clean_data" in look.head(p)[128:4096]]
     found += [p for p in look.by_ending.get(".mat", []) if p.name.lower().endswith("clean_data.mat") and p not in found]
-    return Claim(f"odometry and observations of 2D I-SLSJF ({found[0].name})") if found else None
+    return ReaderMatch(f"odometry and observations of 2D I-SLSJF ({found[0].name})") if found else None
 
 
-def _ufastslam(look: Look) -> Claim | None:
+def _ufastslam(look: SourceProbe) -> ReaderMatch | None:
     found = look.named("ufastslam_observationdistance.txt")
-    return Claim("detections of trees as UFastSLAM publishes them") if found and look.path.is_dir() else None
+    return ReaderMatch("detections of trees as UFastSLAM publishes them") if found and look.path.is_dir() else None
 
 
-def _mrclam(look: Look) -> Claim | None:
+def _mrclam(look: SourceProbe) -> ReaderMatch | None:
     robots = [p for p in look.files if re.fullmatch(r"robot\d+_odometry\.dat", plain_name(p))]
     if not robots:
         return None
     said = f"UTIAS MRCLAM, {len(robots)} robots"
     if look.path.is_file() or len({p.parent for p in robots}) > 1:
-        return Claim(said, "the one folder that holds Barcodes.dat and the files of its robots")
+        return ReaderMatch(said, "the one folder that holds Barcodes.dat and the files of its robots")
     if look.named("barcodes.dat") is None:
-        return Claim(said, "Barcodes.dat beside them: which barcode is which landmark")
-    return Claim(said)
+        return ReaderMatch(said, "Barcodes.dat beside them: which barcode is which landmark")
+    return ReaderMatch(said)
 
 
-def _plaza(look: Look) -> Claim | None:
+def _plaza(look: SourceProbe) -> ReaderMatch | None:
     tables = [p for p in look.files if re.fullmatch(r".+_dr\.txt", plain_name(p))]
-    tables = [p for p in tables if (r := rows_of(look, p)) and all(len(x) == 3 for x in r)]
+    tables = [p for p in tables if (r := first_rows(look, p)) and all(len(x) == 3 for x in r)]
     if not tables:
         return None
     prefix = plain_name(tables[0])[: -len("_dr.txt")]
     said = f"Plaza (range only), {tables[0].name}"
     if look.path.is_file() or look.named(f"{prefix}_td.txt") is None:
-        return Claim(said, f"the folder with {prefix}_TD.txt, the ranges, in it")
-    return Claim(said)
+        return ReaderMatch(said, f"the folder with {prefix}_TD.txt, the ranges, in it")
+    return ReaderMatch(said)
 
 
-def _tagged(look: Look, tags: tuple[str, ...]) -> Path | None:
+def _tagged(look: SourceProbe, tags: tuple[str, ...]) -> Path | None:
     return next((p for p in look.texts if look.lines(p, 1)[0].split()[0] in tags), None)
 
 
-def _tuc(look: Look) -> Claim | None:
+def _tuc(look: SourceProbe) -> ReaderMatch | None:
     path = _tagged(look, ("odom2", "loop"))
-    return Claim(f"odometry and loop candidates of TU Chemnitz ({path.name})") if path else None
+    return ReaderMatch(f"odometry and loop candidates of TU Chemnitz ({path.name})") if path else None
 
 
-def _smartloc(look: Look) -> Claim | None:
+def _smartloc(look: SourceProbe) -> ReaderMatch | None:
     path = _tagged(look, ("odom3", "pseudorange3"))
-    return Claim(f"odometry and pseudoranges of smartLoc ({path.name})") if path else None
+    return ReaderMatch(f"odometry and pseudoranges of smartLoc ({path.name})") if path else None
 
 
-def _kitti_gps(look: Look) -> Claim | None:
+def _kitti_gps(look: SourceProbe) -> ReaderMatch | None:
     path = next((p for p in look.texts if look.lines(p, 1)[0].split() == ["Time,X,Y,Z"]), None)
-    return Claim(f"positions of KITTI as GTSAM ships them ({path.name})") if path else None
+    return ReaderMatch(f"positions of KITTI as GTSAM ships them ({path.name})") if path else None
 
 
-def euroc_tables(look: Look) -> dict[str, Path]:
+def euroc_tables(look: SourceProbe) -> dict[str, Path]:
     """Tables of a EuRoC recording by what their header says: ``imu``, ``leica``, ``vicon``, ``truth``."""
     out: dict[str, Path] = {}
     marks = {"w_RS_S_x": "imu", "p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q": "truth", "p_RS_R_x": "leica"}
@@ -176,38 +180,42 @@ def euroc_tables(look: Look) -> dict[str, Path]:
     return out
 
 
-def _euroc(look: Look) -> Claim | None:
+def _euroc(look: SourceProbe) -> ReaderMatch | None:
     found = euroc_tables(look)
     if not found:
         return None
     said = "EuRoC: " + ", ".join(f"{k} ({look.relative(p)})" for k, p in found.items())
-    return Claim(said) if "imu" in found and look.path.is_dir() else Claim(said, "a folder with imu0's data.csv in it")
+    return (
+        ReaderMatch(said)
+        if "imu" in found and look.path.is_dir()
+        else ReaderMatch(said, "a folder with imu0's data.csv in it")
+    )
 
 
-def _lidar_pack(look: Look) -> Claim | None:
+def _lidar_pack(look: SourceProbe) -> ReaderMatch | None:
     found = look.named("xyz_i16_planar.npy")
-    return Claim("packed clouds (int16)") if found is not None and look.path.is_dir() else None
+    return ReaderMatch("packed clouds (int16)") if found is not None and look.path.is_dir() else None
 
 
-def _bag(look: Look) -> Claim | None:
+def _bag(look: SourceProbe) -> ReaderMatch | None:
     candidates = [p for e in (".bag", ".db3", ".mcap", "") for p in look.by_ending.get(e, [])]
     if look.path.is_file():
         candidates = [look.path]
     kinds = [(p, k) for p in candidates[:200] if (k := bag_kind(look, p))]
     index = look.named("metadata.yaml")
     if index is not None and look.lines(index, 1)[:1] == ["rosbag2_bagfile_information:"]:
-        return Claim(f"ROS 2 bag {look.relative(index.parent) if index.parent != look.path else look.path.name}")
+        return ReaderMatch(f"ROS 2 bag {look.relative(index.parent) if index.parent != look.path else look.path.name}")
     if not kinds:
-        empty = [p for p in look.files if ending(p) in (".bag", ".db3", ".mcap")]
+        empty = [p for p in look.files if file_ending(p) in (".bag", ".db3", ".mcap")]
         if not empty:
             return None
         what = "is empty" if empty[0].stat().st_size == 0 else "does not begin like one"
-        return Claim(f"a bag by its name, {look.relative(empty[0])}, which {what}", "a bag that is whole")
+        return ReaderMatch(f"a bag by its name, {look.relative(empty[0])}, which {what}", "a bag that is whole")
     said = f"{kinds[0][1]} {look.relative(kinds[0][0])}"
-    return Claim(said if len(kinds) == 1 else f"{said} and {len(kinds) - 1} more files")
+    return ReaderMatch(said if len(kinds) == 1 else f"{said} and {len(kinds) - 1} more files")
 
 
-def _kitti(look: Look) -> Claim | None:
+def _kitti(look: SourceProbe) -> ReaderMatch | None:
     clouds = [p for p in look.by_ending.get(".bin", []) if p.parent.name in ("velodyne", "data")]
     clouds = [p for p in clouds if p.parent.name == "velodyne" or p.parent.parent.name.startswith("velodyne_points")]
     oxts = [p for p in look.by_ending.get(".txt", []) if p.parent.name == "data" and p.parent.parent.name == "oxts"]
@@ -216,31 +224,33 @@ def _kitti(look: Look) -> Claim | None:
     folders = sorted({p.parent for p in clouds})
     said = f"KITTI {'raw' if oxts or any(f.name == 'data' for f in folders) else 'odometry'}, {len(clouds)} clouds"
     if not clouds:
-        return Claim(f"KITTI raw: {len(oxts)} records of oxts and no cloud", "velodyne_points/data/*.bin beside oxts")
+        return ReaderMatch(
+            f"KITTI raw: {len(oxts)} records of oxts and no cloud", "velodyne_points/data/*.bin beside oxts"
+        )
     if len(folders) > 1:
         names = ", ".join(look.relative(f) for f in folders[:4])
-        return Claim(f"{said} in {len(folders)} drives", f"one of them: {names}")
-    return Claim(said)
+        return ReaderMatch(f"{said} in {len(folders)} drives", f"one of them: {names}")
+    return ReaderMatch(said)
 
 
-def _carmen(look: Look) -> Claim | None:
+def _carmen(look: SourceProbe) -> ReaderMatch | None:
     for p in sorted(look.texts, key=lambda p: "-corrected" in p.name):
         tags = {m[1] for s in look.lines(p, 4000) if (m := CARMEN_SCANS.match(s))}
         if tags:
-            return Claim(f"CARMEN log {look.relative(p)}: {', '.join(sorted(tags))}")
+            return ReaderMatch(f"CARMEN log {look.relative(p)}: {', '.join(sorted(tags))}")
     for p in look.texts:
         if sum(bool(CARMEN_OTHER.match(s)) for s in look.lines(p, 50)) > 3:
-            return Claim(f"CARMEN log {look.relative(p)}")
+            return ReaderMatch(f"CARMEN log {look.relative(p)}")
     return None
 
 
-def _tables(look: Look) -> Claim | None:
+def _tables(look: SourceProbe) -> ReaderMatch | None:
     from graphslam.io.landmark_tables import claim_tables
 
     return claim_tables(look)
 
 
-def cloud_folder(look: Look) -> tuple[list[Path], str]:
+def cloud_folder(look: SourceProbe) -> tuple[list[Path], str]:
     """The clouds of one ending in one folder, most of all there are, and the ending."""
     groups: dict[tuple[Path, str], list[Path]] = {}
     for e in CLOUD_ENDINGS:
@@ -252,7 +262,7 @@ def cloud_folder(look: Look) -> tuple[list[Path], str]:
     return found, e
 
 
-def _clouds(look: Look) -> Claim | None:
+def _clouds(look: SourceProbe) -> ReaderMatch | None:
     found, e = cloud_folder(look)
     if not found:
         return None
@@ -260,23 +270,23 @@ def _clouds(look: Look) -> Claim | None:
     said = f"{len(found)} cloud{'s' if len(found) > 1 else ''} ({e[1:].upper()}{f', in {where}' if where else ''})"
     head = look.head(found[0])
     if e == ".ply" and b"element vertex" in head and re.search(rb"element face [1-9]", head) and len(found) == 1:
-        return Claim(f"{said}, a surface", "scans, one file each")
+        return ReaderMatch(f"{said}, a surface", "scans, one file each")
     if len(found) == 1:
-        return Claim(said, "a folder with one cloud a scan, in the order of their names: one cloud is no log")
+        return ReaderMatch(said, "a folder with one cloud a scan, in the order of their names: one cloud is no log")
     folders = Counter(p.parent for p in look.by_ending[e])
     alike = sorted(f for f, n in folders.items() if 2 * n >= len(found))
     if len(alike) > 1:
         names = ", ".join(look.relative(f) for f in alike[:4])
-        return Claim(
+        return ReaderMatch(
             f"folders of {e[1:].upper()} clouds: {len(alike)}", f"one of them, for they are no one log: {names}"
         )
     poses = pose_file(look)
-    return Claim(f"{said}, poses in {look.relative(poses)}" if poses else f"{said}, no poses")
+    return ReaderMatch(f"{said}, poses in {look.relative(poses)}" if poses else f"{said}, no poses")
 
 
-def pose_file(look: Look) -> Path | None:
+def pose_file(look: SourceProbe) -> Path | None:
     """A TUM or KITTI table of poses beside clouds."""
-    some = [p for p in look.texts if ending(p) not in CLOUD_ENDINGS]
+    some = [p for p in look.texts if file_ending(p) not in CLOUD_ENDINGS]
     clouds, _ = cloud_folder(look)
     beside = {look.path, *(c.parent for c in clouds[:1]), *(c.parent.parent for c in clouds[:1])}
     some = [p for p in some if p.parent in beside or p.parent.name.startswith("pose")]
@@ -285,17 +295,19 @@ def pose_file(look: Look) -> Path | None:
     return min(good, key=lambda p: (p.name not in first, len(p.parts), p), default=None)
 
 
-def _network(look: Look) -> Claim | None:
+def _network(look: SourceProbe) -> ReaderMatch | None:
     found = [p for p in look.texts if any(NETWORK.match(s) for s in look.lines(p, 50))]
     if not found:
         return None
     said = f"a pose network, {look.relative(found[0])}"
-    return Claim(said) if look.path.is_file() else Claim(said, f"the file itself: graphslam solve {found[0]}")
+    return (
+        ReaderMatch(said) if look.path.is_file() else ReaderMatch(said, f"the file itself: graphslam solve {found[0]}")
+    )
 
 
-def _tum(look: Look) -> Claim | None:
+def _tum(look: SourceProbe) -> ReaderMatch | None:
     path = next((p for p in look.texts if is_tum(look, p)), None)
-    return Claim(f"a TUM trajectory, {look.relative(path)}") if path else None
+    return ReaderMatch(f"a TUM trajectory, {look.relative(path)}") if path else None
 
 
 def _parts() -> Iterator[tuple[str, dict[str, int]]]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.io.cloud_files import Cloud, clean, columns_cloud
+from graphslam.io.cloud_files import CloudData, clean_cloud, columns_cloud
 
 LIVOX = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -25,20 +25,20 @@ def stamp_of(message: Any) -> float:
     return float(t.sec) + 1e-9 * float(t.nanosec)
 
 
-def pose_of(pose: Any) -> list[float]:
+def pose_of_message(pose: Any) -> list[float]:
     """``x y z qx qy qz qw`` of a pose, or of a transform."""
     p = getattr(pose, "position", None) or pose.translation
     q = getattr(pose, "orientation", None) or pose.rotation
     return [float(v) for v in (p.x, p.y, p.z, q.x, q.y, q.z, q.w)]
 
 
-def point_cloud(m: Any) -> Cloud:
+def point_cloud(m: Any) -> CloudData:
     """Points of ``sensor_msgs/PointCloud2``, in the units of the message."""
     order = ">" if m.is_bigendian else "<"
     step, width, height = int(m.point_step), int(m.width), int(m.height)
     n = width * height
     if n == 0:
-        return clean(np.zeros((0, 3)))
+        return clean_cloud(np.zeros((0, 3)))
     data = np.ascontiguousarray(m.data, dtype=np.uint8)
     row = int(m.row_step) or width * step
     if step <= 0 or row < width * step or len(data) < (height - 1) * row + width * step:
@@ -68,7 +68,7 @@ class LivoxCloud:
 
     stamp: float
     frame: str
-    cloud: Cloud
+    cloud: CloudData
 
 
 def livox_cloud(raw: bytes, *, ros2: bool) -> LivoxCloud:
@@ -104,4 +104,4 @@ def livox_cloud(raw: bytes, *, ros2: bool) -> LivoxCloud:
     )
     a = np.frombuffer(data, dtype, count=n)
     xyz: Array = np.column_stack([a["x"], a["y"], a["z"]]).astype(np.float64)
-    return LivoxCloud(sec + 1e-9 * nanosec, frame, clean(xyz, a["offset_time"].astype(np.float64), "offset_time"))
+    return LivoxCloud(sec + 1e-9 * nanosec, frame, clean_cloud(xyz, a["offset_time"].astype(np.float64), "offset_time"))

@@ -16,7 +16,7 @@ import numpy as np
 
 from graphslam.core.errors import CovarianceError, FormatError, MissingDataError
 from graphslam.core.gaussian import check_covariance
-from graphslam.core.reading import whole
+from graphslam.core.reading import integer_mask
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.io.mat import read_mat
 
@@ -68,7 +68,7 @@ def read_slsjf_local_map(path: str | os.PathLike[str], key: int) -> Submap:
         raise FormatError(f"row {k} of the state is not finite", where=where, got=state[k])
     features = ids[3:].reshape(-1, 2)
     twice = np.all(features[:, 0] == features[:, 1]) and np.all(features > 0)
-    if np.any(ids[:3] != 0) or not twice or not np.all(whole(features)):
+    if np.any(ids[:3] != 0) or not twice or not np.all(integer_mask(features)):
         raise FormatError("feature ids are not robot, robot, robot, a, a, b, b, …", where=where, got=ids[:7])
     try:
         covariance = check_covariance(P, what="covariance", where=where, dim=len(values))

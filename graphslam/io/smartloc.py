@@ -23,7 +23,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.gnss import Pseudoranges, TangentPlane
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import SE3
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED, usable_records
@@ -75,8 +75,8 @@ def _odometry(rows: Rows, where: str, counter: DropCounter) -> Odometry:
     """Increments over the time *after* each record, standing at the next one."""
     a = rows.real
     bad = {
-        "a velocity is not finite": np.asarray(~usable(a[:, 1:7]).all(axis=1)),
-        "a variance is not positive": np.asarray(~(usable(a[:, 7:]) & (a[:, 7:] > 0)).all(axis=1)),
+        "a velocity is not finite": np.asarray(~finite_mask(a[:, 1:7]).all(axis=1)),
+        "a variance is not positive": np.asarray(~(finite_mask(a[:, 7:]) & (a[:, 7:] > 0)).all(axis=1)),
     }
     a = a[usable_records(a[:, 0], bad, stream="odometry", where=where, drops=counter)]
     if len(a) < 2:
@@ -96,12 +96,12 @@ def _pseudoranges(rows: Rows, where: str, counter: DropCounter) -> Pseudoranges:
     a = rows.real
     if len(a) == 0:
         raise DataError("holds no pseudorange", where=where, wanted="at least one")
-    distance = np.linalg.norm(np.where(usable(a[:, 3:6]), a[:, 3:6], 0.0), axis=1)
+    distance = np.linalg.norm(np.where(finite_mask(a[:, 3:6]), a[:, 3:6], 0.0), axis=1)
     whole = np.isfinite(a[:, 6:8]).all(axis=1)
     whole &= (np.round(np.where(np.isfinite(a[:, 6:8]), a[:, 6:8], -1.0)) == a[:, 6:8]).all(axis=1)
     good = np.ones(len(a), dtype=np.bool_)
     for reason, wrong in (
-        ("a number is not finite", ~usable(a).all(axis=1)),
+        ("a number is not finite", ~finite_mask(a).all(axis=1)),
         ("variance is not positive", ~(a[:, 2] > 0)),
         ("no number of a satellite", ~(whole & (a[:, 6] >= 0) & (a[:, 6] < 1e6) & np.isin(a[:, 7], _SYSTEMS))),
         ("satellite is not in an orbit", ~((_ORBIT[0] < distance) & (distance < _ORBIT[1]))),
@@ -147,9 +147,9 @@ def _again(keys: Array) -> np.ndarray:
 
 def _reference(rows: Rows, where: str, counter: DropCounter) -> tuple[Trajectory, TangentPlane]:
     a = rows.real
-    radius = np.linalg.norm(np.where(usable(a[:, 1:4]), a[:, 1:4], 0.0), axis=1)
+    radius = np.linalg.norm(np.where(finite_mask(a[:, 1:4]), a[:, 1:4], 0.0), axis=1)
     bad = {
-        "position is not finite": np.asarray(~usable(a[:, 1:4]).all(axis=1)),
+        "position is not finite": np.asarray(~finite_mask(a[:, 1:4]).all(axis=1)),
         "position is not on the ground": np.asarray(~((_SURFACE[0] < radius) & (radius < _SURFACE[1]))),
     }
     a = a[usable_records(a[:, 0], bad, stream="reference", where=where, drops=counter)]

@@ -16,9 +16,9 @@ from graphslam.core.errors import ConfigError, DataError, FormatError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import tangent_to_vector_covariance
 from graphslam.core.json_file import check_json, parse_json
-from graphslam.core.lasting import LastingErrors
 from graphslam.core.npz import check_arrays, flags, floats, ints, texts
 from graphslam.core.path_points import PathPoints
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.core.trajectory import Trajectory
 
@@ -40,7 +40,7 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
         "exit_covariance": submap.exit_covariance,
         "has_landmarks": np.bool_(submap.landmarks is not None),
         "used": np.array(sorted(submap.uses), dtype=np.str_),
-        "aided": np.array(sorted(submap.aids), dtype=np.str_),
+        "aided": np.array(sorted(submap.assisting_streams), dtype=np.str_),
         "report": json.dumps(dict(submap.report), sort_keys=True, default=_plain),
     }
     landmarks = submap.landmarks
@@ -101,7 +101,7 @@ def submap_from_arrays(arrays: Arrays, *, where: str) -> Submap:
             raise FormatError("dim and exit_pose do not agree", where=where, got=(dim, exit_pose.shape))
         rest: dict[str, Any] = {
             "uses": frozenset(a["used"].tolist()) if "used" in a else frozenset(),
-            "aids": frozenset(a["aided"].tolist()) if "aided" in a else frozenset(),
+            "assisting_streams": frozenset(a["aided"].tolist()) if "aided" in a else frozenset(),
             "report": check_json(parse_json(str(a.get("report", "{}")), f"{where}, report"), {str: object}, where),
             "trajectory": _trajectory(a, where),
             "matches": _matches(a, where),
@@ -215,11 +215,11 @@ def _path(a: Arrays, where: str) -> PathPoints | None:
 _LASTING = ("sigmas", "response", "score", "information", "path", "points")
 
 
-def _lasting(a: Arrays, where: str) -> LastingErrors | None:
+def _lasting(a: Arrays, where: str) -> SensorBiases | None:
     if "lasting_names" not in a:
         return None
     arrays = {part: _need(a, f"lasting_{part}", where) for part in _LASTING}
-    return LastingErrors(names=tuple(a["lasting_names"].tolist()), **arrays)
+    return SensorBiases(names=tuple(a["lasting_names"].tolist()), **arrays)
 
 
 def _chart(a: Arrays, where: str) -> str:

@@ -22,7 +22,7 @@ from graphslam.core.dense import DensePayload
 from graphslam.core.errors import DataError, FormatError, GeometryError, GraphSlamError, MissingDataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.npz import check_arrays, floats, ints
-from graphslam.core.reading import inside, safe_name
+from graphslam.core.reading import resolve_inside, safe_name
 from graphslam.core.submap import Submap
 from graphslam.io.submap_file import OLD_FORMATS, SUBMAP_FORMAT, submap_arrays, submap_from_arrays
 
@@ -59,7 +59,7 @@ class SubmapStore:
     def entries(self) -> list[dict[str, Any]]:
         """The index: key, file, interval and number of landmarks of every submap. Empty where there is none yet."""
         if self._entries is None:
-            file = inside(self.path, INDEX, str(self.path))
+            file = resolve_inside(self.path, INDEX, str(self.path))
             self._entries = _read_index(file) if file.exists() else []
         return self._entries
 
@@ -69,7 +69,7 @@ class SubmapStore:
     def __getitem__(self, k: int) -> Submap:
         """Submap k of the index (not: of key k)."""
         entry = self.entries[k]
-        file = inside(self.path, entry["file"], str(self.path / INDEX))
+        file = resolve_inside(self.path, entry["file"], str(self.path / INDEX))
         submap = submap_from_arrays(read_npz(file, fmt=SUBMAP_FORMAT, old=OLD_FORMATS), where=str(file))
         found = {**_entry(submap), "file": entry["file"]}
         if found != entry:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.geometry import Array
-from graphslam.core.reading import LARGEST, read_text, usable
+from graphslam.core.reading import LARGEST, finite_mask, read_text
 
 _WRITERS: dict[str, Callable[[bytes], bytes]] = {".xz": lzma.compress, ".gz": gzip.compress, ".bz2": bz2.compress}
 
@@ -198,7 +198,7 @@ class Records:
             np.array(whole, dtype=np.int64).reshape(n, abs(k)),
             np.array(real, dtype=np.float64).reshape(n, f),
         )
-        bad = np.flatnonzero(~usable(rows.real).all(axis=1))
+        bad = np.flatnonzero(~finite_mask(rows.real).all(axis=1))
         if len(bad):
             value = next(v for v in rows.real[bad[0]].tolist() if not abs(v) <= LARGEST)
             raise FormatError(

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.association.consistent_set import Chain
+from graphslam.association.consistent_set import OdometryChain
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
-from graphslam.core.gaussian import inverses
+from graphslam.core.gaussian import information_matrices
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_exp, se2_inverse
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.io.text_records import find_text_file
 
 INPUT, TRUTH = "Lecture_Hall_Input.txt", "Lecture_Hall_GT.txt"
@@ -121,7 +121,7 @@ class TucLog:
             has_initial=np.ones(n, dtype=np.bool_),
             edges=np.concatenate([chain, ends]).astype(np.intp),
             measurements=np.concatenate([increments, np.zeros((len(ends), 3))]),
-            information=np.concatenate([inverses(covariances, self.source), loop]),
+            information=np.concatenate([information_matrices(covariances, self.source), loop]),
             source=self.source,
         )
         return network, stamps
@@ -138,7 +138,7 @@ class TucLog:
         length = np.append(np.diff(self.times), np.median(np.diff(self.times)))[record]
         Q = np.zeros((len(dt), 3, 3))
         Q[:, [0, 1, 2], [0, 1, 2]] = self.variances[record] * (dt * length)[:, None]
-        fine = Chain.of(se2_exp(self.velocities[record] * dt[:, None]), Q)
+        fine = OdometryChain.of(se2_exp(self.velocities[record] * dt[:, None]), Q)
         at = np.searchsorted(t, stamps)
         poses, spread = fine.poses[at], fine.spread[at]
         home = se2_adjoint(se2_inverse(poses[1:]))
@@ -166,7 +166,7 @@ def read_tuc(folder: str | os.PathLike[str], *, drops: DropCounter | None = None
     path = find_text_file(root, INPUT)
     tables = _tables(path, _INPUT)
     odometry, loops = tables["odom2"], tables["loop"]
-    keep = usable(odometry).all(axis=1) & (odometry[:, 4:] > 0.0).all(axis=1)
+    keep = finite_mask(odometry).all(axis=1) & (odometry[:, 4:] > 0.0).all(axis=1)
     counter.drop("odometry", "not finite, or a variance that is not positive", int((~keep).sum()))
     odometry = odometry[keep]
     forward = odometry[:, 0] > np.maximum.accumulate(np.concatenate([[-np.inf], odometry[:, 0]]))[:-1]

@@ -15,11 +15,11 @@ from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import ConfigError, FormatError
 from graphslam.core.geometry import Array, se2_between, wrap_angle
 from graphslam.core.log import SensorLog
-from graphslam.core.reading import read_text, usable
+from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.look import Look
 from graphslam.io.recognise import is_tum
+from graphslam.io.source_probe import SourceProbe
 
 # Files in the wild print quaternions with as few as three digits.
 _NORM_TOLERANCE = 1e-2
@@ -79,7 +79,7 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
             raise FormatError(f"not a number ({error})", where=f"{where}:{number}") from None
         lines.append(number)
     data = np.array(rows).reshape(-1, 8)
-    _refuse(~np.all(usable(data), axis=1), "not finite", where, lines, rows)
+    _refuse(~np.all(finite_mask(data), axis=1), "not finite", where, lines, rows)
     norm = np.linalg.norm(data[:, 4:], axis=1)
     _refuse(np.abs(norm - 1.0) > _NORM_TOLERANCE, "rotation is no unit quaternion", where, lines, norm)
     _refuse(np.r_[False, np.diff(data[:, 0]) <= 0][: len(data)], "stamps do not increase", where, lines, data[:, 0])
@@ -119,7 +119,7 @@ def read_tum_log(
         raise ConfigError(f"tum: odometry_sigmas are {odometry_sigmas}; wanted positive numbers")
     file = Path(path)
     if file.is_dir():
-        look = Look(file)
+        look = SourceProbe(file)
         file = next((p for p in look.texts if is_tum(look, p)), file / "trajectory.tum")
     found = read_tum(file)
     if len(found) < 2:

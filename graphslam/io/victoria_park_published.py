@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, FormatError
-from graphslam.core.gaussian import inverses
+from graphslam.core.gaussian import information_matrices
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
-from graphslam.core.reading import whole
+from graphslam.core.reading import integer_mask
 from graphslam.core.records import LandmarkObservations
 from graphslam.io.clock import MAX_DROPPED, usable_records
 from graphslam.io.mat import read_mat
@@ -95,7 +95,7 @@ def read_slsjf_observations(
     if table.ndim != 2 or table.shape[1] != 6:
         raise FormatError("wrong number of columns", where=str(path), got=table.shape, wanted="(n, 6)")
     counter = drops if drops is not None else DropCounter()
-    bad = ~np.isfinite(table[:, :3]).all(axis=1) | ~(table[:, 1] > 0.0) | ~whole(table[:, 5])
+    bad = ~np.isfinite(table[:, :3]).all(axis=1) | ~(table[:, 1] > 0.0) | ~integer_mask(table[:, 5])
     _count_bad(bad, "observations", "time, range, bearing or id is impossible", counter, path)
     ignored = ~bad & (table[:, 5] < 0)
     counter.drop("observations", "marked as poor", int(ignored.sum()))
@@ -128,7 +128,7 @@ def read_slsjf_network(folder: str | os.PathLike[str]) -> PoseNetwork:
     (table,) = read_mat(path, "VicPark_clean_data")
     if table.ndim != 2 or table.shape[1] != 12:
         raise FormatError("wrong number of columns", where=str(path), got=table.shape, wanted="(n, 12)")
-    good = np.isfinite(table).all(axis=1) & np.isin(table[:, 0], (0.0, 1.0)) & whole(table[:, 1:3]).all(axis=1)
+    good = np.isfinite(table).all(axis=1) & np.isin(table[:, 0], (0.0, 1.0)) & integer_mask(table[:, 1:3]).all(axis=1)
     if not good.all():
         k = int(np.flatnonzero(~good)[0])
         raise FormatError(f"row {k} is neither odometry nor an observation", where=str(path), got=table[k])
@@ -151,13 +151,13 @@ def read_slsjf_network(folder: str | os.PathLike[str]) -> PoseNetwork:
         has_initial=np.zeros(len(pose_ids), dtype=np.bool_),
         edges=np.stack([index(odometry[:, 1], pose_ids), index(odometry[:, 2], pose_ids)], -1),
         measurements=odometry[:, 3:6],
-        information=inverses(tangent, str(path)),
+        information=information_matrices(tangent, str(path)),
         landmark_ids=feature_ids + SLSJF_LANDMARK_OFFSET,
         landmarks=np.zeros((len(feature_ids), 2)),
         has_landmark=np.zeros(len(feature_ids), dtype=np.bool_),
         observations=np.stack([index(seen[:, 1], pose_ids), index(seen[:, 2], feature_ids)], -1),
         observation_values=seen[:, 3:5],
-        observation_information=inverses(Q, str(path)),
+        observation_information=information_matrices(Q, str(path)),
         observation_kind="cartesian",
         noise="covariance of (dx, dy, dφ), turned to the right tangent",
         source=path.name,

@@ -1,9 +1,9 @@
 """Layer 5: map joining: extended information filters in sequence and by binary tree, and an EKF."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
-    "registry": "join",
+_EXPORTS = {
+    "registry": "join_by_method",
     "online": "RelinearisationPolicy join_online",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

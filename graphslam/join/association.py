@@ -16,11 +16,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from graphslam.association.compatibility import distance2, joint_limits, most_pairings, nearest, search
+from graphslam.association.compatibility import (
+    joint_limits,
+    mahalanobis2,
+    most_pairings,
+    nearest_neighbour_pairs,
+    search_compatible_sets,
+)
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_compose
-from graphslam.join.joined_map import MapView, landmark_scalars, pose_scalars
+from graphslam.join.joined_map import JoinedMapView, landmark_scalars, pose_scalars
 
 logger = logging.getLogger(__name__)
 Index = npt.NDArray[np.intp]
@@ -31,7 +37,7 @@ _MOST_PAIRS = 2_000
 
 
 @dataclass(frozen=True)
-class Association:
+class MapAssociationConfig:
     """How landmarks are recognised.
 
     Parameters
@@ -67,7 +73,7 @@ class Association:
             raise ConfigError(f"association confidence is {self.confidence}; wanted 0 < p < 1")
 
 
-def associate(a: MapView, b: MapView, options: Association) -> Index:
+def match_landmarks(a: JoinedMapView, b: JoinedMapView, options: MapAssociationConfig) -> Index:
     """Match the landmarks of B, which starts where A ends, to those of A.
 
     Returns
@@ -94,7 +100,7 @@ def associate(a: MapView, b: MapView, options: Association) -> Index:
     return match
 
 
-def _candidate_pairs(a: MapView, b: MapView, options: Association) -> tuple[Index, Index]:
+def _candidate_pairs(a: JoinedMapView, b: JoinedMapView, options: MapAssociationConfig) -> tuple[Index, Index]:
     """Pairs (landmark of B, landmark of A) that geometry allows: Algorithm 1, TH1 and TH2."""
     none = np.zeros(0, dtype=np.intp)
     if len(a.landmark_at) == 0 or len(b.landmark_at) == 0:
@@ -198,11 +204,11 @@ class CandidatePairs:
 
     def mahalanobis2(self) -> Array:
         """Squared distance of every pair by itself ``(p,)``."""
-        return distance2(self.innovation, self.covariances())
+        return mahalanobis2(self.innovation, self.covariances())
 
     def nearest(self) -> Index:
         """Exclusive nearest neighbours: the smallest Mahalanobis distance of all is taken first, and so on."""
-        return nearest(self.mahalanobis2(), self.i, self.j)
+        return nearest_neighbour_pairs(self.mahalanobis2(), self.i, self.j)
 
     def joint(self, confidence: float, starts: int) -> Index:
         """Largest jointly compatible set that a search from ``starts`` pairs finds.
@@ -226,7 +232,7 @@ class CandidatePairs:
             few = self.subset(np.sort(best_first[:_MOST_PAIRS]))
             return np.sort(best_first[:_MOST_PAIRS])[few.joint(confidence, starts)]
         limits = joint_limits(confidence, most_pairings(self.i, self.j))
-        found = search(
+        found = search_compatible_sets(
             self.i, self.j, self.innovation, self.joint_covariance(), best_first[:starts], limits[1], limits,
             persistent=True,
         )  # fmt: skip

@@ -66,7 +66,7 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
     if a.anchor is not None and b.anchor is not None:
         return _join_along_arcs(a, b, match, times)
     with times.measure("update"):
-        joined, gradient, news = _assemble(a, b, match, blocks_of(a), blocks_of(b), np.zeros(len(b.x)))
+        joined, gradient, news = _assemble(a, b, match, block_map_of(a), block_map_of(b), np.zeros(len(b.x)))
     if not news:  # nothing in B was known before: the mean stays, and no factorisation is needed
         return joined
     with times.measure("recovery"):
@@ -83,16 +83,16 @@ def _join_along_arcs(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes)
     """
     assert a.anchor is not None
     assert b.anchor is not None
-    first, second, start = blocks_of(a), blocks_of(b), int(a.pose_node[-1])
+    first, second, start = block_map_of(a), block_map_of(b), int(a.pose_node[-1])
     x, image, left = a.x, _image(a, b, match)[0], _PASSES
     joined: JoinedMap | None = None
     while True:
         with times.measure("update"):
-            seen = kernels.predicted(first, second, image, start, x)
+            seen = kernels.predict_nodes(first, second, image, start, x)
             if joined is None and np.all(np.abs(seen - b.x) < _ROUNDING * (1.0 + np.abs(b.x))):
                 return _assemble(a, b, match, first, second, np.zeros(len(b.x)))[0]  # no news
-            ours, g_a = kernels.pulled_back(first, a.anchor, x[: len(a.x)])
-            theirs, g_b = kernels.pulled_back(second, b.anchor, seen)
+            ours, g_a = kernels.relinearise_in_chart(first, a.anchor, x[: len(a.x)])
+            theirs, g_b = kernels.relinearise_in_chart(second, b.anchor, seen)
             if joined is None:
                 joined, gradient, _ = _assemble(a, b, match, ours, theirs, -g_b)
             else:  # all passes have one pattern
@@ -193,5 +193,5 @@ def _keep_order_sparse(joined: JoinedMap) -> None:
         joined.reorder(elimination_order(owner, joined.neighbours, len(joined.width)).astype(np.int64))
 
 
-def blocks_of(m: JoinedMap) -> kernels.BlockMap:
+def block_map_of(m: JoinedMap) -> kernels.BlockMap:
     return kernels.BlockMap(m.x, m.width, m.ptr, m.neighbours, m.block, m.values)

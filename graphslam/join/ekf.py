@@ -27,7 +27,7 @@ from tqdm.auto import tqdm
 from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.join.association import Association, associate
+from graphslam.join.association import MapAssociationConfig, match_landmarks
 from graphslam.join.joined_map import (
     Ids,
     JoinedMap,
@@ -36,7 +36,7 @@ from graphslam.join.joined_map import (
     OnJoin,
     check_chain,
     distinct_landmarks,
-    finish,
+    finish_map,
     landmark_scalars,
     last_pose,
 )
@@ -47,7 +47,7 @@ Form = Literal["square", "naive"]
 
 
 class DenseMap:
-    """A map in moment form (see :class:`~graphslam.join.joined_map.MapView`); grows in place.
+    """A map in moment form (see :class:`~graphslam.join.joined_map.JoinedMapView`); grows in place.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _about_start(q: Array, Rt: Array) -> Array:
 def join_ekf(
     submaps: Sequence[Submap],
     *,
-    association: Association | None = None,
+    association: MapAssociationConfig | None = None,
     form: Form = "square",
     on_join: OnJoin | None = None,
     progress: bool = False,
@@ -208,7 +208,7 @@ def join_ekf(
 
     Parameters
     ----------
-    association : Association, optional
+    association : MapAssociationConfig, optional
         Recognise landmarks; default: by the ids they bear.
     form : "square" or "naive"
         Covariance update ``P - Wᵀ W``, O(n²) a join; or ``(I - K H) P`` with dense products, O(n³), for timing only.
@@ -235,7 +235,7 @@ def join_ekf(
                 match = np.array([known.get(int(j), -1) for j in fused.ids], dtype=np.intp)
             else:
                 leaf = JoinedMap.leaf(submap, identified=False)
-                match = associate(dense, leaf, association)
+                match = match_landmarks(dense, leaf, association)
             if identified:
                 for j in fused.ids[match < 0]:
                     known.setdefault(int(j), len(known))
@@ -247,7 +247,7 @@ def join_ekf(
         if on_join is not None:
             on_join(k, dense)
     assert dense is not None
-    return finish(submaps, dense, identified=identified, method="ekf", times=times)
+    return finish_map(submaps, dense, identified=identified, method="ekf", times=times)
 
 
 def _scalars(submaps: Sequence[Submap]) -> int:

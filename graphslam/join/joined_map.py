@@ -51,7 +51,7 @@ class JoinTimes:
             self.wall += time.perf_counter() - start
 
 
-class MapView(Protocol):
+class JoinedMapView(Protocol):
     """What association and scoring need of a map, in information or in covariance form.
 
     The state ``x`` ``(n,)`` is in the frame of the map's first base, headings not wrapped. ``pose_at`` ``(m,)`` and
@@ -87,7 +87,7 @@ class MapView(Protocol):
         ...
 
 
-class DenseView(MapView, Protocol):
+class DenseJoinedView(JoinedMapView, Protocol):
     """A map that carries its whole covariance ``(n, n)``."""
 
     @property
@@ -96,11 +96,11 @@ class DenseView(MapView, Protocol):
         ...
 
 
-OnJoin = Callable[[int, MapView], None]
+OnJoin = Callable[[int, JoinedMapView], None]
 """Called with k and the map once submap k (from 0) is in. The view is valid during the call only."""
 
 
-def last_pose(view: MapView) -> Array:
+def last_pose(view: JoinedMapView) -> Array:
     """Last end pose ``(3,)`` of a map, heading in [-π, π)."""
     pose = view.x[view.pose_at[-1] : view.pose_at[-1] + 3].copy()
     pose[2] = wrap_angle(pose[2])
@@ -351,14 +351,14 @@ class JoinResult(SubmapEstimate):
         return {**self.__dict__, "problem": None}
 
 
-def landmark_labels(view: MapView, ids: Ids, *, identified: bool) -> Ids:
+def landmark_labels(view: JoinedMapView, ids: Ids, *, identified: bool) -> Ids:
     """Ids ``(L,)`` of the landmarks of a finished map: those given, or their rank by first sighting."""
     return ids if identified else np.arange(len(view.landmark_at), dtype=np.int64)
 
 
-def finish(
+def finish_map(
     submaps: Sequence[Submap],
-    view: JoinedMap | DenseView,
+    view: JoinedMap | DenseJoinedView,
     *,
     identified: bool,
     method: str,

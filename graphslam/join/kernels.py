@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.jit import njit
-from graphslam.graph.normal_kernels import arc_terms
+from graphslam.graph.normal_kernels import inverse_left_jacobian_kernel
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -50,7 +50,8 @@ def join_blocks(
     rounding : float
         Innovations smaller than this, relative to 1 + the value, are arithmetic and count as zero.
     pull : (n_b,)
-        What is added to ``I_B ν``: the gradient of a map that was pulled back (:func:`pulled_back`), less its sign.
+        What is added to ``I_B ν``: the gradient of a map that was pulled back (:func:`relinearise_in_chart`), less its
+        sign.
 
     Returns
     -------
@@ -236,7 +237,7 @@ def join_blocks(
 
 
 @njit
-def predicted(known: BlockMap, new: BlockMap, image: Index, start: int, values: Array) -> Array:
+def predict_nodes(known: BlockMap, new: BlockMap, image: Index, start: int, values: Array) -> Array:
     """``H(X)``: the nodes of map B ``(n_b,)`` as seen from node ``start`` of the joined map at its ``values`` ``(n,)``.
 
     Values end where those of A do on the first call; what is new is then where B has it.
@@ -270,7 +271,7 @@ def predicted(known: BlockMap, new: BlockMap, image: Index, start: int, values: 
 
 
 @njit
-def pulled_back(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
+def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
     """A map that is Gaussian in the group chart about its mean, as a Gauss–Newton system at other values.
 
     With u the chart's difference of ``x`` from the mean (:mod:`graphslam.core.charts`) and J its derivative, the map
@@ -300,7 +301,7 @@ def pulled_back(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
         k, p = at[i], at[anchor[i]] + 2
         d = x[p] - mean[p]
         d -= 2.0 * np.pi * np.floor((d + np.pi) / (2.0 * np.pi))
-        a, b, slope = arc_terms(d)
+        a, b, slope = inverse_left_jacobian_kernel(d)
         ex, ey = x[k] - mean[k], x[k + 1] - mean[k + 1]
         arc[i] = a, b, slope * ex + 0.5 * ey, slope * ey - 0.5 * ex
         u[k], u[k + 1] = a * ex + b * ey, a * ey - b * ex
@@ -425,7 +426,9 @@ def cut_into_blocks(A: Array, width: Index) -> Array:
 
 
 @njit
-def both_ways(width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array) -> tuple[Index, Array]:
+def symmetrise_blocks(
+    width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array
+) -> tuple[Index, Array]:
     """Blocks that are stored once for each pair (``flip`` = 1: with the neighbour's rows) as blocks stored both ways.
 
     Returns

@@ -22,11 +22,11 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.submap import Submap
 from graphslam.join import kernels
-from graphslam.join.association import Association, associate
+from graphslam.join.association import MapAssociationConfig, match_landmarks
 from graphslam.join.eif import join_maps, match_by_id
-from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish, landmark_labels
+from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish_map, landmark_labels
 from graphslam.join.submap_blocks import SubmapProblem
-from graphslam.join.submap_solver import Minimum, minimise
+from graphslam.join.submap_solver import MinimisationResult, minimise_submaps
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class RelinearisationPolicy:
     every : int
         After every so many submaps in any case; 0: never for that reason alone.
     rtol, max_iterations
-        See :func:`~graphslam.join.submap_solver.minimise`.
+        See :func:`~graphslam.join.submap_solver.minimise_submaps`.
     """
 
     closure_gap: int = 5
@@ -85,7 +85,7 @@ def join_online(
     submaps: Sequence[Submap],
     *,
     policy: RelinearisationPolicy | None = None,
-    association: Association | None = None,
+    association: MapAssociationConfig | None = None,
     on_join: OnJoin | None = None,
     progress: bool = False,
 ) -> JoinResult:
@@ -95,7 +95,7 @@ def join_online(
     ----------
     policy : RelinearisationPolicy, optional
         With ``every=1`` the map is the least-squares optimum of the submaps so far after each of them.
-    association : Association, optional
+    association : MapAssociationConfig, optional
         Recognise landmarks; default: by the ids they bear.
     on_join : callable, optional
         See :func:`~graphslam.join.order.join_sequential`; called after the relinearisation, where there is one.
@@ -127,7 +127,9 @@ def join_online(
     for k, leaf in enumerate(tqdm(leaves[1:], desc="join", unit="submap", disable=not progress), start=1):
         with times.measure("association"):
             match = (
-                match_by_id(state.joined, leaf) if association is None else associate(state.joined, leaf, association)
+                match_by_id(state.joined, leaf)
+                if association is None
+                else match_landmarks(state.joined, leaf, association)
             )
         start = state.joined.x[state.joined.pose_at[-1] + 2]
         state.joined = join_maps(state.joined, leaf, match, times)
@@ -149,7 +151,7 @@ def join_online(
             logger.debug("submap %d: relinearised (%s), %d iterations", k, ", ".join(why), best.iterations)
         if on_join is not None:
             on_join(k, state.joined)
-    joined = finish(
+    joined = finish_map(
         submaps, state.joined, identified=identified, method="eif-online", times=times, information=matrices
     )
     return replace(joined, iterations=iterations, converged=converged, relinearisations=counts)
@@ -161,7 +163,7 @@ def _relinearise(
     matrices: Sequence[Array] | None,
     policy: RelinearisationPolicy,
     identified: bool,
-) -> tuple[JoinedMap, Minimum]:
+) -> tuple[JoinedMap, MinimisationResult]:
     """The same map at the least-squares optimum of its submaps, reached from its present mean."""
     labels = landmark_labels(joined, joined.ids, identified=identified)
     problem = SubmapProblem(submaps, ids=[labels[e] for e in joined.entries], information=matrices)
@@ -169,9 +171,9 @@ def _relinearise(
     scalars = np.concatenate(
         [(joined.pose_at[:, None] + np.arange(3)).ravel(), (joined.landmark_at[:, None] + np.arange(2)).ravel()]
     )
-    best = minimise(problem, joined.x[scalars], rtol=policy.rtol, max_iterations=policy.max_iterations)
+    best = minimise_submaps(problem, joined.x[scalars], rtol=policy.rtol, max_iterations=policy.max_iterations)
     pattern = problem.pattern
-    block, values = kernels.both_ways(
+    block, values = kernels.symmetrise_blocks(
         pattern.width, pattern.ptr, pattern.neighbours, pattern.block, pattern.flip, best.data
     )
     m = problem.m

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from tqdm.auto import tqdm
 
 from graphslam.core.submap import Submap
-from graphslam.join.association import Association
-from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish
+from graphslam.join.association import MapAssociationConfig
+from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish_map
 from graphslam.join.parallel import join_leaves, join_two
 from graphslam.join.submap_kernels import adjacency
 from graphslam.linear.symmetric_factor import elimination_order
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def join_sequential(
     submaps: Sequence[Submap],
     *,
-    association: Association | None = None,
+    association: MapAssociationConfig | None = None,
     on_join: OnJoin | None = None,
     classical: bool = False,
     progress: bool = False,
@@ -35,11 +35,11 @@ def join_sequential(
 
     Parameters
     ----------
-    association : Association, optional
+    association : MapAssociationConfig, optional
         Recognise landmarks; default: by the ids they bear.
     on_join : callable, optional
         ``on_join(k, view)`` is called after submap k (from 0, the first included) is in, outside the clock; the
-        :class:`~graphslam.join.joined_map.MapView` is valid during the call only.
+        :class:`~graphslam.join.joined_map.JoinedMapView` is valid during the call only.
     classical : bool
         Join as the paper does, whatever the chart of the submaps: Cartesian, each join linearised once.
     progress : bool
@@ -57,7 +57,7 @@ def join_sequential(
         joined = join_two(joined, leaf, association, times)
         if on_join is not None:
             on_join(k, joined)
-    return finish(
+    return finish_map(
         submaps,
         joined,
         identified=identified,
@@ -70,7 +70,7 @@ def join_sequential(
 def join_tree(
     submaps: Sequence[Submap],
     *,
-    association: Association | None = None,
+    association: MapAssociationConfig | None = None,
     executor: str | Executor | Client | None = None,
     workers: int | None = None,
     classical: bool = False,
@@ -109,7 +109,7 @@ def join_tree(
     for part, seconds in times.parts.items():
         spent.parts[part] += seconds
     spent.wall += times.wall
-    return finish(
+    return finish_map(
         submaps, joined, identified=identified, method=_name("eif-tree", classical), times=spent, information=matrices
     )
 

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 from threadpoolctl import ThreadpoolController
 from tqdm.auto import tqdm
 
-from graphslam.core.cluster import connect
+from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError
-from graphslam.join.association import Association, associate
+from graphslam.join.association import MapAssociationConfig, match_landmarks
 from graphslam.join.eif import join_maps, match_by_id
 from graphslam.join.joined_map import JoinedMap, JoinTimes
 
@@ -45,14 +45,14 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def join_two(a: JoinedMap, b: JoinedMap, association: Association | None, times: JoinTimes) -> JoinedMap:
+def join_two(a: JoinedMap, b: JoinedMap, association: MapAssociationConfig | None, times: JoinTimes) -> JoinedMap:
     """Join B to A; landmarks are one by id, or recognised where there is an ``association``."""
     with times.measure("association"):
-        match = match_by_id(a, b) if association is None else associate(a, b, association)
+        match = match_by_id(a, b) if association is None else match_landmarks(a, b, association)
     return join_maps(a, b, match, times)
 
 
-def join_subtree(level: Sequence[JoinedMap], association: Association | None, progress: bool = False) -> _Done:
+def join_subtree(level: Sequence[JoinedMap], association: MapAssociationConfig | None, progress: bool = False) -> _Done:
     """Join maps pairwise, then the pairs, and so on; an odd one out goes up a level by itself."""
     times = JoinTimes()
     with (
@@ -66,7 +66,7 @@ def join_subtree(level: Sequence[JoinedMap], association: Association | None, pr
     return level[0], times
 
 
-def _join_done(a: _Done, b: _Done, association: Association | None) -> _Done:
+def _join_done(a: _Done, b: _Done, association: MapAssociationConfig | None) -> _Done:
     """The join of two subtrees; their times add up."""
     joined, times = join_subtree([a[0], b[0]], association)
     for part in (a[1], b[1]):
@@ -78,7 +78,7 @@ def _join_done(a: _Done, b: _Done, association: Association | None) -> _Done:
 
 def join_leaves(
     leaves: Sequence[JoinedMap],
-    association: Association | None,
+    association: MapAssociationConfig | None,
     executor: str | Pool | None,
     workers: int | None,
     progress: bool,
@@ -103,7 +103,7 @@ def _pool(executor: str | Pool, workers: int | None) -> Iterator[tuple[Pool, int
         with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
             yield pool, count
     elif isinstance(executor, str):
-        with connect(executor) as client:
+        with connect_cluster(executor) as client:
             yield client, _hands(client)
     else:
         yield executor, _hands(executor)
@@ -116,7 +116,7 @@ def _hands(pool: Pool) -> int:
 
 
 def _submit(
-    leaves: Sequence[JoinedMap], association: Association | None, pool: Pool, hands: int, progress: bool
+    leaves: Sequence[JoinedMap], association: MapAssociationConfig | None, pool: Pool, hands: int, progress: bool
 ) -> _Done:
     size = _LEAST
     while size * _TASKS * hands < len(leaves):

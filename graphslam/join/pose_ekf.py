@@ -15,8 +15,8 @@ from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
 from graphslam.core.se3 import quat_to_matrix
-from graphslam.join.pose_map import Blocks, PoseMap, level_meeting, level_tangent
-from graphslam.join.pose_problem import PoseProblem, Ties
+from graphslam.join.pose_map import PoseMap, SymmetricBlocks, level_meeting, level_tangent
+from graphslam.join.pose_problem import PoseProblem, RelativePoseFactors
 from graphslam.join.submap_solver import dense_inverse
 
 MOST = 8000
@@ -55,7 +55,7 @@ class PoseFilter:
         order = np.roll(np.arange(self._n), -self._levels)
         return self._P[np.ix_(order, order)]
 
-    def join(self, leaf: PoseMap, ties: Ties) -> None:
+    def join(self, leaf: PoseMap, ties: RelativePoseFactors) -> None:
         """Append a submap, then one measurement update."""
         d, n, P = self._d, self._n, self._P
         Q = dense_inverse(leaf.matrix())
@@ -96,7 +96,7 @@ class PoseFilter:
         if len(y):
             self._update(sp.csr_matrix(H), y, noise, rows)
 
-    def _measured(self, ties: Ties, rows: int) -> tuple[sp.csr_matrix, Array]:
+    def _measured(self, ties: RelativePoseFactors, rows: int) -> tuple[sp.csr_matrix, Array]:
         """Whitened Jacobian ``(e d, rows)`` and residuals of ties here."""
         d = self._d
         r, J, _, _ = ties.whitened(self.poses, None)
@@ -122,7 +122,7 @@ class PoseFilter:
         P = self._P[:n, :n]
         P -= W.T @ W
         # the errors are now those about the new values
-        here = PoseMap(self.poses, self.up, Blocks(np.zeros((0, 2), dtype=np.int64), np.zeros((0, d, d))))
+        here = PoseMap(self.poses, self.up, SymmetricBlocks(np.zeros((0, 2), dtype=np.int64), np.zeros((0, d, d))))
         step = np.zeros((len(self.poses) + 1, d))
         step[1:-1] = x[self._levels :].reshape(-1, d)
         step[-1, : self._levels] = x[: self._levels]

@@ -16,7 +16,7 @@ from graphslam.graph.variables import Values
 from graphslam.join.joined_map import JoinResult, JoinTimes
 from graphslam.join.pose_map import PoseMap, level_step
 from graphslam.join.pose_problem import PoseProblem
-from graphslam.solve.batch import LevenbergConfig, optimise
+from graphslam.solve.batch import LevenbergConfig, optimise_problem
 from graphslam.solve.sparse import SparseProblem
 
 Index = npt.NDArray[np.int64]
@@ -68,12 +68,12 @@ class PoseEstimate(JoinResult):
         return self.width * (k - 1) + np.arange(self.width)
 
 
-def tilt_of(up: Array | None) -> Array | None:
+def up_direction(up: Array | None) -> Array | None:
     """Where up is in the frame of the base, of a level frame seen from there."""
     return None if up is None else level_step(SE3.identity, up)
 
 
-def estimate(
+def evaluate_map(
     problem: PoseProblem,
     poses: Array,
     tilt: Array | None,
@@ -108,13 +108,13 @@ def estimate(
 
 def estimate_of_map(problem: PoseProblem, found: PoseMap, *, method: str, times: JoinTimes) -> PoseEstimate:
     """A joined map in information form."""
-    return estimate(
-        problem, found.poses, tilt_of(found.up), method=method, seconds=times.wall, times=times,
+    return evaluate_map(
+        problem, found.poses, up_direction(found.up), method=method, seconds=times.wall, times=times,
         information=found.matrix(),
     )  # fmt: skip
 
 
-def polish_poses(problem: PoseProblem, joined: PoseEstimate) -> PoseEstimate:
+def optimise_poses(problem: PoseProblem, joined: PoseEstimate) -> PoseEstimate:
     """Linearise all measurements afresh at the joined map, again and again, until the objective is at its minimum.
 
     Returns
@@ -123,7 +123,7 @@ def polish_poses(problem: PoseProblem, joined: PoseEstimate) -> PoseEstimate:
         Poses and information of the optimum; ``objective`` stays that of the joined map.
     """
     start, cpu = time.perf_counter(), time.process_time()
-    best = optimise(SparseProblem(problem.flat), problem.values(joined.poses, joined.tilt), POLISH)
+    best = optimise_problem(SparseProblem(problem.flat), problem.values(joined.poses, joined.tilt), POLISH)
     values: Values = best.values
     system = problem.flat.evaluate(values, dense=False)
     cpu = time.process_time() - cpu

@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from graphslam.join.joined_map import JoinTimes
 from graphslam.join.pose_ekf import PoseFilter
-from graphslam.join.pose_estimate import PoseEstimate, estimate, estimate_of_map, polish_poses, tilt_of
+from graphslam.join.pose_estimate import PoseEstimate, estimate_of_map, evaluate_map, optimise_poses, up_direction
 from graphslam.join.pose_map import PoseMap, join_poses
 from graphslam.join.pose_problem import PoseProblem
 
@@ -21,7 +21,7 @@ Index = npt.NDArray[np.int64]
 _NONE = np.zeros(0, dtype=np.int64)
 
 
-class Sorted:
+class SortedFactors:
     """The ties of a problem, by where they enter.
 
     Attributes
@@ -61,7 +61,7 @@ def load_kernels() -> None:
     leaf.solve(*leaf.linearised(tiny))  # the sparse one
 
 
-def leaves_of(problem: PoseProblem, ties: Sorted, times: JoinTimes, progress: bool = False) -> list[PoseMap]:
+def leaf_maps(problem: PoseProblem, ties: SortedFactors, times: JoinTimes, progress: bool = False) -> list[PoseMap]:
     """Every submap as a map of its own, at its own optimum."""
     load_kernels()
     with times.measure("leaves"):
@@ -81,8 +81,8 @@ def join_poses_sequential(problem: PoseProblem, *, passes: int = 1, progress: bo
     progress : bool
         Show a progress bar.
     """
-    ties, times = Sorted(problem), JoinTimes()
-    leaves = leaves_of(problem, ties, times, progress)
+    ties, times = SortedFactors(problem), JoinTimes()
+    leaves = leaf_maps(problem, ties, times, progress)
     joined = leaves[0]
     for k, leaf in enumerate(tqdm(leaves[1:], desc="join", unit="submap", disable=not progress), start=1):
         joined = join_poses(joined, leaf, problem.take(ties.across[k], _NONE), times, passes=passes)
@@ -97,8 +97,8 @@ def join_poses_tree(problem: PoseProblem, *, passes: int = 1, progress: bool = F
     problem, passes, progress
         As in :func:`join_poses_sequential`.
     """
-    ties, times = Sorted(problem), JoinTimes()
-    leaves = leaves_of(problem, ties, times, progress)
+    ties, times = SortedFactors(problem), JoinTimes()
+    leaves = leaf_maps(problem, ties, times, progress)
     bases = problem.bases
     with tqdm(total=len(leaves) - 1, desc="join", unit="join", disable=not progress) as bar:
 
@@ -119,14 +119,14 @@ def join_poses_tree(problem: PoseProblem, *, passes: int = 1, progress: bool = F
 
 def join_poses_ekf(problem: PoseProblem, *, progress: bool = False) -> PoseEstimate:
     """Join submaps one after the other with a dense extended Kalman filter."""
-    ties, times = Sorted(problem), JoinTimes()
+    ties, times = SortedFactors(problem), JoinTimes()
     dense = PoseFilter(problem)
-    leaves = leaves_of(problem, ties, times, progress)
+    leaves = leaf_maps(problem, ties, times, progress)
     for k, leaf in enumerate(tqdm(leaves, desc="join", unit="submap", disable=not progress)):
         with times.measure("update"):
             dense.join(leaf, problem.take(ties.across[k], _NONE))
-    return estimate(
-        problem, dense.poses, tilt_of(dense.up), method="ekf", seconds=times.wall, times=times,
+    return evaluate_map(
+        problem, dense.poses, up_direction(dense.up), method="ekf", seconds=times.wall, times=times,
         covariance=dense.covariance,
     )  # fmt: skip
 
@@ -135,8 +135,8 @@ def solve_poses(problem: PoseProblem, *, polish: bool = True, progress: bool = F
     """Least squares of everything at once, from the chain alone: at its optimum whatever ``polish`` says."""
     load_kernels()
     t0 = time.perf_counter()
-    begun = estimate(problem, problem.start, None, method="batch", seconds=time.perf_counter() - t0)
-    best = polish_poses(problem, begun)
+    begun = evaluate_map(problem, problem.start, None, method="batch", seconds=time.perf_counter() - t0)
+    best = optimise_poses(problem, begun)
     assert best.objective_polished is not None
     return replace(best, objective=best.objective_polished)
 
@@ -149,13 +149,13 @@ def join_poses_isam2(problem: PoseProblem, *, progress: bool = False) -> PoseEst
     PoseEstimate
         As iSAM2 leaves it, above the optimum by its linearisation gap; ``iterations`` are the updates.
     """
-    from graphslam.graph.graph_record import BetweenBlock  # gtsam takes a second to load
+    from graphslam.graph.factor_graph_state import BetweenBlock  # gtsam takes a second to load
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.solve.isam2 import Isam2Solver
 
     load_kernels()
     start = time.perf_counter()
-    ties, g = Sorted(problem), problem.group
+    ties, g = SortedFactors(problem), problem.group
     graph = PoseGraph(problem.dim)
     solver = Isam2Solver(graph)
     number = 0
@@ -178,7 +178,7 @@ def join_poses_isam2(problem: PoseProblem, *, progress: bool = False) -> PoseEst
         solver.update()
     values = graph.values
     system = problem.flat.evaluate(values, dense=False)
-    return estimate(
+    return evaluate_map(
         problem, values.poses.copy(), values.tilt, method="isam2", seconds=time.perf_counter() - start,
         information=system.A, iterations=solver.updates,
     )  # fmt: skip

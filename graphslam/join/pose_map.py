@@ -28,17 +28,17 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3, Group, group_of
 from graphslam.core.se3 import quat_rotate, so3_exp, so3_left_jacobian
 from graphslam.join.joined_map import JoinTimes
-from graphslam.join.pose_problem import PoseProblem, Ties
+from graphslam.join.pose_problem import PoseProblem, RelativePoseFactors
 from graphslam.linear.block_cholesky import BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
-from graphslam.solve.batch import optimise
+from graphslam.solve.batch import optimise_problem
 from graphslam.solve.sparse import SparseProblem
 
 Index = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class SymmetricBlocks:
     """A symmetric matrix of blocks ``(d, d)``: the upper triangle, every pair of nodes once, in rising order.
 
     The last node is the level frame; of its blocks only the first two rows and columns mean anything.
@@ -55,7 +55,7 @@ class Blocks:
     values: Array
 
     @classmethod
-    def summed(cls, pairs: Index, values: Array) -> Blocks:
+    def summed(cls, pairs: Index, values: Array) -> SymmetricBlocks:
         """Of blocks in any order and triangle, those of one pair added."""
         swap = pairs[:, 0] > pairs[:, 1]
         pairs = np.where(swap[:, None], pairs[:, ::-1], pairs)
@@ -67,8 +67,10 @@ class Blocks:
         first = np.flatnonzero(np.diff(key[order], prepend=-1))
         return cls(pairs[order[first]], np.add.reduceat(values[order], first, axis=0))
 
-    def __add__(self, other: Blocks) -> Blocks:
-        return Blocks.summed(np.concatenate([self.pairs, other.pairs]), np.concatenate([self.values, other.values]))
+    def __add__(self, other: SymmetricBlocks) -> SymmetricBlocks:
+        return SymmetricBlocks.summed(
+            np.concatenate([self.pairs, other.pairs]), np.concatenate([self.values, other.values])
+        )
 
     def __matmul__(self, vector: Array) -> Array:
         """Product with ``(n, d)``."""
@@ -78,10 +80,10 @@ class Blocks:
         np.add.at(out, j[off], np.einsum("bij,bi->bj", self.values[off], vector[i[off]]))
         return out
 
-    def carried(self, T: Array) -> Blocks:
+    def carried(self, T: Array) -> SymmetricBlocks:
         """``Tᵀ A T`` for ``T`` ``(n, d, d)``, block by block."""
         i, j = self.pairs.T
-        return Blocks(self.pairs, np.swapaxes(T[i], 1, 2) @ self.values @ T[j])
+        return SymmetricBlocks(self.pairs, np.swapaxes(T[i], 1, 2) @ self.values @ T[j])
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +96,13 @@ class PoseMap:
         ``T_base_node``; the first is the identity, the last the end of the map.
     up : (7,) or None
         Level frame, its position of no meaning.
-    information : Blocks
+    information : SymmetricBlocks
         Over the nodes, the base among them; node n is ``up``.
     """
 
     poses: Array
     up: Array | None
-    information: Blocks
+    information: SymmetricBlocks
 
     @property
     def group(self) -> Group:
@@ -133,14 +135,14 @@ class PoseMap:
         """One submap, at its own optimum."""
         poses, up = part.start, None
         if part.levelled or len(part.ends) >= len(part.times):
-            best = optimise(SparseProblem(part.flat), part.values(poses, _first_tilt(part))).values
+            best = optimise_problem(SparseProblem(part.flat), part.values(poses, _first_tilt(part))).values
             poses = best.poses
             up = None if best.tilt is None else _frame(so3_exp(np.append(best.tilt, 0.0)))
         d = part.group.dof
-        nothing = cls(poses, up, Blocks(np.zeros((0, 2), dtype=np.int64), np.zeros((0, d, d))))
+        nothing = cls(poses, up, SymmetricBlocks(np.zeros((0, 2), dtype=np.int64), np.zeros((0, d, d))))
         return cls(poses, up, nothing.linearised(part)[0])
 
-    def linearised(self, ties: Ties) -> tuple[Blocks, Array]:
+    def linearised(self, ties: RelativePoseFactors) -> tuple[SymmetricBlocks, Array]:
         """``Jᵀ J`` and ``Jᵀ r`` ``(n + 1, d)`` of ties here."""
         n, d = len(self.poses), self.group.dof
         r, J, s, K = ties.whitened(self.poses, self.up)
@@ -154,7 +156,7 @@ class PoseMap:
         np.add.at(gradient, i, g[:, :d])
         np.add.at(gradient, j, g[:, d:])
         pairs = np.concatenate([np.stack(p, axis=1) for p in ((i, i), (j, j), (i, j))])
-        return Blocks.summed(pairs, np.concatenate([H[:, :d, :d], H[:, d:, d:], H[:, :d, d:]])), gradient
+        return SymmetricBlocks.summed(pairs, np.concatenate([H[:, :d, :d], H[:, d:, d:], H[:, :d, d:]])), gradient
 
     def moved(self, step: Array) -> PoseMap:
         """Values after a step ``(n + 1, d)``; the matrix stays."""
@@ -171,7 +173,7 @@ class PoseMap:
             T[n, :2, :2] = level_tangent(step[n, :2])
         return T
 
-    def solve(self, A: Blocks, gradient: Array) -> Array:
+    def solve(self, A: SymmetricBlocks, gradient: Array) -> Array:
         """Step ``(n + 1, d)`` of ``A ξ = -gradient`` with the base held."""
         n, d = len(self.poses), self.group.dof
         N = n - 1 + (self.up is not None)
@@ -201,7 +203,9 @@ class PoseMap:
         step[1:].ravel()[: len(x)] = x
         return step
 
-    def updated(self, ties: Ties, times: JoinTimes, *, passes: int = 1, gradient: Array | None = None) -> PoseMap:
+    def updated(
+        self, ties: RelativePoseFactors, times: JoinTimes, *, passes: int = 1, gradient: Array | None = None
+    ) -> PoseMap:
         """The map after ties between its nodes.
 
         Parameters
@@ -241,12 +245,12 @@ class PoseMap:
         return step
 
 
-def join_poses(a: PoseMap, b: PoseMap, ties: Ties, times: JoinTimes, *, passes: int = 1) -> PoseMap:
+def join_poses(a: PoseMap, b: PoseMap, ties: RelativePoseFactors, times: JoinTimes, *, passes: int = 1) -> PoseMap:
     """Join B, whose base is the end of A, and the ties of which one end lies in each.
 
     Parameters
     ----------
-    ties : Ties
+    ties : RelativePoseFactors
         Nodes counted from the base of A; node ``len(a.poses) - 1`` is the base of B, ``len(a.poses)`` its next one.
     passes : int
         How often the ties are linearised.
@@ -275,7 +279,9 @@ def join_poses(a: PoseMap, b: PoseMap, ties: Ties, times: JoinTimes, *, passes: 
         joined = PoseMap(
             poses,
             up,
-            Blocks.summed(np.concatenate([image_a[A.pairs], image_b[B.pairs]]), np.concatenate([A.values, B.values])),
+            SymmetricBlocks.summed(
+                np.concatenate([image_a[A.pairs], image_b[B.pairs]]), np.concatenate([A.values, B.values])
+            ),
         )
     if gradient is None and not len(ties):
         return joined

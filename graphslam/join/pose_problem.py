@@ -26,15 +26,15 @@ from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.npz import floats, ints
-from graphslam.core.poses import SE2, SE3, Group, chained
+from graphslam.core.poses import SE2, SE3, Group, compose_increments
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, attitude_terms
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord, between_terms
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.noise import robust_terms, whiteners
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.variables import KINDS, Layout, Values
+from graphslam.graph.variables import KINDS, Values, VariableLayout
 
 Index = npt.NDArray[np.int64]
 
@@ -55,7 +55,7 @@ PROBLEM = {
 
 
 @dataclass(frozen=True, eq=False)
-class Ties:
+class RelativePoseFactors:
     """Measurements between nodes, and of gravity at nodes.
 
     Parameters
@@ -83,10 +83,10 @@ class Ties:
     def __len__(self) -> int:
         return len(self.ends) + len(self.level_nodes)
 
-    def take(self, edges: npt.ArrayLike, levels: npt.ArrayLike, first: int = 0) -> Ties:
+    def take(self, edges: npt.ArrayLike, levels: npt.ArrayLike, first: int = 0) -> RelativePoseFactors:
         """Some of them, with nodes counted from ``first``."""
         e, k = np.asarray(edges), np.asarray(levels)
-        return Ties(
+        return RelativePoseFactors(
             self.ends[e] - first, self.measured[e], self.whiteners[e],
             self.level_nodes[k] - first, self.directions[k], self.level_whiteners[k],
         )  # fmt: skip
@@ -118,7 +118,7 @@ class Ties:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseProblem(Ties):
+class PoseProblem(RelativePoseFactors):
     """Submaps in a chain, as nodes and ties between them; node 0 is the base of the first and is held.
 
     Parameters
@@ -202,7 +202,7 @@ class PoseProblem(Ties):
         """The chain alone ``(n, 3|7)``: every node by its first edge to the one before."""
         g, edge = self.group, self._steps[1]
         back = (self.ends[edge, 0] > self.ends[edge, 1])[:, None]
-        return chained(np.where(back, g.inverse(self.measured[edge]), self.measured[edge]))
+        return compose_increments(np.where(back, g.inverse(self.measured[edge]), self.measured[edge]))
 
     def submap_of(self, nodes: npt.ArrayLike) -> Index:
         """The first submap that holds each node: an exit belongs to the submap that ends there."""
@@ -211,13 +211,13 @@ class PoseProblem(Ties):
     # ---------------------------------------------------------------- as a least-squares problem
 
     @cached_property
-    def flat(self) -> FlatGraph:
+    def flat(self) -> FactorArrays:
         """Of all measurements; columns are the poses 1 … n - 1, then the tilt."""
         counts = {"x": len(self.times), "tilt": int(self.levelled)}
-        layout = Layout(self.dim, tuple(counts.get(word, 0) for word in KINDS), np.zeros(0, dtype=np.int64))
+        layout = VariableLayout(self.dim, tuple(counts.get(word, 0) for word in KINDS), np.zeros(0, dtype=np.int64))
         level = self.attitudes(np.arange(len(self.level_nodes)))
         between = BetweenBatch.of_arrays(self.ends, self.measured, self.whiteners, layout)
-        return FlatGraph(level, layout, [between])
+        return FactorArrays(level, layout, [between])
 
     def attitudes(self, rows: npt.ArrayLike, first_id: int = 0) -> list[AttitudeRecord]:
         """Factors of gravity ``rows``."""

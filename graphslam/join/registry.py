@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
 
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.submap import Submap
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import join_online
+from graphslam.join.optimise import optimise_from_join as polish_join
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.polish import polish as polish_join
 from graphslam.join.submap_blocks import relabel, scale_covariances
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 
@@ -51,7 +51,7 @@ Material: TypeAlias = Union[Sequence[Submap], "PoseProblem"]
 """
 
 
-class Methods(NamedTuple):
+class JoinMethods(NamedTuple):
     """The methods of one kind of material: those that filter, those that solve, and the way on to the optimum."""
 
     joiners: dict[str, Callable[..., Any]]
@@ -64,35 +64,37 @@ class Methods(NamedTuple):
             raise UnknownNameError("method", method, [*self.joiners, *self.solvers])
 
 
-def is_dense(submaps: Sequence[Submap]) -> bool:
+def are_dense(submaps: Sequence[Submap]) -> bool:
     """Whether submaps are to be joined by their poses: none of them has landmarks."""
     return bool(submaps) and all(s.landmarks is None for s in submaps)
 
 
-def in_space(submaps: Sequence[Submap]) -> bool:
+def have_space_landmarks(submaps: Sequence[Submap]) -> bool:
     """Whether submaps with landmarks are three-dimensional."""
     return any(s.dim == 3 for s in submaps)
 
 
-def methods_for(material: Material) -> Methods:
+def methods_for(material: Material) -> JoinMethods:
     """The methods that take landmark submaps, in the plane or in space, or those that take dense ones."""
     if not isinstance(material, Sequence):
-        from graphslam.join.pose_estimate import polish_poses
+        from graphslam.join.pose_estimate import optimise_poses
         from graphslam.join.pose_join import POSE_JOINERS, POSE_SOLVERS
 
-        return Methods(POSE_JOINERS, POSE_SOLVERS, polish_poses)
-    if in_space(material):
-        from graphslam.join.space import SPACE_JOINERS, SPACE_SOLVERS, polish_space
+        return JoinMethods(POSE_JOINERS, POSE_SOLVERS, optimise_poses)
+    if have_space_landmarks(material):
+        from graphslam.join.space import SPACE_JOINERS, SPACE_SOLVERS, optimise_space
 
-        return Methods(SPACE_JOINERS, SPACE_SOLVERS, polish_space)
-    return Methods(JOINERS, SOLVERS, polish_join)
+        return JoinMethods(SPACE_JOINERS, SPACE_SOLVERS, optimise_space)
+    return JoinMethods(JOINERS, SOLVERS, polish_join)
 
 
-def prepared(submaps: Material, *, associate: str | Association = "given", covariance_scale: float = 1.0) -> Material:
+def prepare_submaps(
+    submaps: Material, *, associate: str | MapAssociationConfig = "given", covariance_scale: float = 1.0
+) -> Material:
     """Submaps with their covariances as they are to be joined; dense ones with the matches that tie them."""
     association = association_of(associate)
-    if isinstance(submaps, Sequence) and not is_dense(submaps):
-        if association is not None and in_space(submaps):
+    if isinstance(submaps, Sequence) and not are_dense(submaps):
+        if association is not None and have_space_landmarks(submaps):
             raise ConfigError(f"landmarks in space are joined by the ids that they bear; got {associate!r}")
         return list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
     if association is not None:
@@ -106,22 +108,22 @@ def prepared(submaps: Material, *, associate: str | Association = "given", covar
     return submaps
 
 
-def association_of(associate: str | Association) -> Association | None:
-    if isinstance(associate, Association):
+def association_of(associate: str | MapAssociationConfig) -> MapAssociationConfig | None:
+    if isinstance(associate, MapAssociationConfig):
         return associate
     if associate == "given":
         return None
     if associate in ("nearest", "joint"):
-        return Association(rule=associate)  # type: ignore[arg-type]
+        return MapAssociationConfig(rule=associate)  # type: ignore[arg-type]
     raise ConfigError(f"unknown association {associate!r}; wanted 'given', 'nearest' or 'joint'")
 
 
-def join(
+def join_by_method(
     submaps: Material,
     method: str = "eif-tree",
     *,
     polish: bool = False,
-    associate: str | Association = "given",
+    associate: str | MapAssociationConfig = "given",
     covariance_scale: float = 1.0,
     workers: int | None = None,
     cluster: str | None = None,
@@ -160,7 +162,7 @@ def join(
     ------
     UnknownNameError, ConfigError, DataError, GeometryError, CovarianceError
     """
-    submaps = prepared(submaps, associate=associate, covariance_scale=covariance_scale)
+    submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
     methods = methods_for(submaps)
     methods.check(method)
     if (workers is not None or cluster is not None) and not method.startswith("eif-tree"):
@@ -168,7 +170,7 @@ def join(
     if workers is not None and cluster is not None:
         raise ConfigError("wanted either a number of workers or the address of a cluster; got both")
     association = association_of(associate)
-    if not isinstance(submaps, Sequence) or in_space(submaps):
+    if not isinstance(submaps, Sequence) or have_space_landmarks(submaps):
         if workers is not None or cluster is not None:
             raise ConfigError(
                 "dense submaps and those in space are joined in one process; wanted neither workers nor a cluster"
@@ -179,13 +181,15 @@ def join(
         return methods.polish(submaps, found) if polish else found
     if method in SOLVERS:
         if association is not None:
-            submaps = identify(submaps, association, progress=progress)
+            submaps = identify_landmarks(submaps, association, progress=progress)
         return SOLVERS[method](submaps, polish=polish, progress=progress)
     shared = {"workers": workers, "executor": cluster} if method.startswith("eif-tree") else {}
     joined = JOINERS[method](submaps, association=association, progress=progress, **shared)
     return polish_join(submaps, joined) if polish else joined
 
 
-def identify(submaps: Sequence[Submap], association: Association, *, progress: bool = False) -> list[Submap]:
+def identify_landmarks(
+    submaps: Sequence[Submap], association: MapAssociationConfig, *, progress: bool = False
+) -> list[Submap]:
     """The same submaps with the landmark ids that joining them in sequence finds."""
     return relabel(submaps, join_sequential(submaps, association=association, progress=progress).submap_ids)

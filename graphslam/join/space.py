@@ -18,14 +18,22 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from tqdm.auto import tqdm
 
-from graphslam.core.charts import bent, pose_differences
+from graphslam.core.charts import chart_difference, pose_differences
 from graphslam.core.errors import CovarianceError, DataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
 from graphslam.core.se3 import quat_to_matrix, se3_compose, se3_transform, skew
 from graphslam.core.submap import LandmarkMap, Submap, turned_covariance
 from graphslam.join.joined_map import JoinResult, JoinTimes
-from graphslam.linear.space_maps import ORIGIN, Placed, SpaceMap, minimise, moved, normal_equations, objective
+from graphslam.linear.space_maps import (
+    ORIGIN,
+    PlacedMap,
+    SpaceMap,
+    minimise_space_maps,
+    normal_equations,
+    space_objective,
+    step_values,
+)
 from graphslam.linear.symmetric_factor import SymmetricFactor
 
 Index = npt.NDArray[np.int64]
@@ -81,7 +89,7 @@ class SpaceEstimate(JoinResult):
         chart = chart or self.chart
         assert self.anchors is not None
         e, w = pose_differences(poses, self.poses[1:], chart)
-        return np.concatenate([e.ravel(), bent(landmarks - self.landmarks, w[self.anchors], chart).ravel()])
+        return np.concatenate([e.ravel(), chart_difference(landmarks - self.landmarks, w[self.anchors], chart).ravel()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +120,7 @@ class SpaceProblem:
     ids: Index
     anchors: Index
     chart: str
-    placed: list[Placed] = field(default_factory=list)
+    placed: list[PlacedMap] = field(default_factory=list)
 
     @classmethod
     def of(cls, submaps: Sequence[Submap]) -> SpaceProblem:
@@ -147,7 +155,7 @@ class SpaceProblem:
             leaf = SpaceMap(m.exit_pose[None], m.positions, np.zeros(len(m), np.int64), information, m.chart)
             leaves.append(leaf)
             points = np.array([place[i] for i in m.ids.tolist()], dtype=np.int64)
-            placed.append(Placed(leaf, k - 1 if k else ORIGIN, np.array([k]), points))
+            placed.append(PlacedMap(leaf, k - 1 if k else ORIGIN, np.array([k]), points))
         ids = np.array(list(first), dtype=np.int64)
         return cls(
             submaps, leaves, [m.ids for m in maps], ids, np.array(list(first.values()), dtype=np.int64), chart, placed
@@ -183,8 +191,8 @@ class SpaceProblem:
         """A map with the objective of all submaps there."""
         return SpaceEstimate(
             poses=np.vstack([SE3.identity, poses]), landmark_ids=self.ids, landmarks=points, information=information,
-            objective=objective(self.placed, poses, points), objective_polished=rest.pop("objective_polished", None),
-            iterations=rest.pop("iterations", 0), converged=rest.pop("converged", False), seconds=seconds,
+            objective=space_objective(self.placed, poses, points), objective_polished=rest.pop("objective_polished",
+            None), iterations=rest.pop("iterations", 0), converged=rest.pop("converged", False), seconds=seconds,
             chart=rest.pop("chart", self.chart), anchors=self.anchors, method=method, dof=self.dof,
             submap_ids=tuple(self.leaf_ids), **rest,
         )  # fmt: skip
@@ -224,15 +232,15 @@ def _join(a: _Joined, b: _Joined, times: JoinTimes, passes: int) -> _Joined:
         poses = np.vstack([A.poses, se3_compose(A.poses[-1], B.poses)])
         points = np.vstack([A.points, se3_transform(A.poses[-1], B.points[new])])
         maps = [
-            Placed(A, ORIGIN, np.arange(m), np.arange(len(A.points))),
-            Placed(B, m - 1, m + np.arange(len(B.poses)), mine),
+            PlacedMap(A, ORIGIN, np.arange(m), np.arange(len(A.points))),
+            PlacedMap(B, m - 1, m + np.arange(len(B.poses)), mine),
         ]
         _, g, H = normal_equations(maps, poses, points)
     known = not new.all()
     while known and passes:
         with times.measure("recovery"):
             step = -SymmetricFactor(H).solve(g)
-            poses, points = moved(poses, points, step)
+            poses, points = step_values(poses, points, step)
             passes = passes - 1 if -(g @ step) > _STEP**2 * len(step) else 0
         if A.chart == "cartesian" and not passes:
             break  # linearised once: the matrix is that of the values before
@@ -349,7 +357,7 @@ def join_space_ekf(submaps: Sequence[Submap], *, progress: bool = False) -> Spac
                 factor = np.linalg.cholesky(S)
                 half = np.linalg.solve(factor, T.T)
                 full = full - half.T @ half
-                poses, points = moved(poses, points, -half.T @ np.linalg.solve(factor, z))
+                poses, points = step_values(poses, points, -half.T @ np.linalg.solve(factor, z))
             P = 0.5 * (full + full.T)
     rank = {i: j for j, i in enumerate(ids.tolist())}
     order = np.array([rank[i] for i in problem.ids.tolist()], dtype=np.int64)
@@ -361,11 +369,11 @@ def join_space_ekf(submaps: Sequence[Submap], *, progress: bool = False) -> Spac
     )  # fmt: skip
 
 
-def polish_space(submaps: Sequence[Submap], joined: SpaceEstimate) -> SpaceEstimate:
+def optimise_space(submaps: Sequence[Submap], joined: SpaceEstimate) -> SpaceEstimate:
     """Go on from a joined map to the least-squares optimum of its submaps; ``objective`` stays that of the joiner."""
     start, cpu = time.perf_counter(), time.process_time()
     problem = SpaceProblem.of(submaps)
-    best = minimise(problem.placed, joined.poses[1:], joined.landmarks)
+    best = minimise_space_maps(problem.placed, joined.poses[1:], joined.landmarks)
     return replace(
         joined, poses=np.vstack([SE3.identity, best.poses]), landmarks=best.points, information=best.information,
         covariance=None, objective_polished=best.objective, iterations=best.iterations, converged=best.converged,
@@ -378,7 +386,7 @@ def solve_space(submaps: Sequence[Submap], *, polish: bool = True, progress: boo
     """Least-squares optimum of landmark submaps in space, from the chain of their ends."""
     start = time.perf_counter()
     problem = SpaceProblem.of(submaps)
-    best = minimise(problem.placed, *problem.chain())
+    best = minimise_space_maps(problem.placed, *problem.chain())
     return problem.result(
         best.poses, best.points, best.information, method="batch", seconds=time.perf_counter() - start,
         objective_polished=best.objective, iterations=best.iterations, converged=best.converged,
@@ -387,13 +395,13 @@ def solve_space(submaps: Sequence[Submap], *, polish: bool = True, progress: boo
 
 def solve_space_isam2(submaps: Sequence[Submap], *, polish: bool = True, progress: bool = False) -> SpaceEstimate:
     """Landmark submaps in space through iSAM2, one by one, then to the optimum where it is asked for."""
-    from graphslam.solve.space_isam2 import incremental
+    from graphslam.solve.space_isam2 import run_space_isam2
 
     start = time.perf_counter()
     problem = SpaceProblem.of(submaps)
-    poses, points, updates = incremental(problem.placed, *problem.chain(), progress=progress)
-    own = objective(problem.placed, poses, points)
-    best = minimise(problem.placed, poses, points, max_iterations=60 if polish else 0)
+    poses, points, updates = run_space_isam2(problem.placed, *problem.chain(), progress=progress)
+    own = space_objective(problem.placed, poses, points)
+    best = minimise_space_maps(problem.placed, poses, points, max_iterations=60 if polish else 0)
     found = problem.result(
         best.poses, best.points, best.information, method="isam2", seconds=time.perf_counter() - start,
         objective_polished=best.objective if polish else None, iterations=updates, converged=best.converged,

@@ -281,19 +281,19 @@ class SubmapProblem:
     def residual(self, x: Array) -> Array:
         """``H(X) - z``, submap by submap in the order of its mean ``(measurements,)`` (eq. 15), each in its chart."""
         r = self._difference(x)
-        kernels.into_chart(self._row_ptr, self._group, r)
+        kernels.chart_residuals(self._row_ptr, self._group, r)
         return r
 
     def _difference(self, x: Array) -> Array:
         poses, points = self._split(np.ascontiguousarray(x, dtype=np.float64))
         r = np.empty(self.measurements)
-        kernels.predict(poses, points, self.m, self._entry_ptr, self._node, self._z, r)
+        kernels.predict_submaps(poses, points, self.m, self._entry_ptr, self._node, self._z, r)
         return r
 
     def objective_per_submap(self, x: Array) -> Array:
         """The share ``(m,)`` of every submap in the objective: which of them disagrees with the rest."""
         out = np.empty(self.m)
-        kernels.chi2(self._row_ptr, self._omega, self._omega_ptr, self.residual(x), out)
+        kernels.submap_chi2(self._row_ptr, self._omega, self._omega_ptr, self.residual(x), out)
         return out
 
     def objective(self, x: Array) -> float:
@@ -306,10 +306,10 @@ class SubmapProblem:
         r, poses = self._difference(x), self._split(x)[0]
         g, values = np.zeros(self.size), np.zeros(self.pattern.entries)
         pair_ptr, slots = self._slots
-        submaps = kernels.SubmapArrays(
+        submaps = kernels.SubmapChainArrays(
             self._entry_ptr, self._node, self._row_ptr, self._z, self._omega, self._omega_ptr, self._group
         )
-        f = kernels.linearise(poses, submaps, kernels.Slots(self._node_at, pair_ptr, slots), r, g, values)
+        f = kernels.linearise_submaps(poses, submaps, kernels.SystemSlots(self._node_at, pair_ptr, slots), r, g, values)
         return float(f), g, values
 
 

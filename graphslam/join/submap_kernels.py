@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.jit import njit
-from graphslam.graph.normal_kernels import arc_terms
+from graphslam.graph.normal_kernels import inverse_left_jacobian_kernel
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -130,7 +130,9 @@ def entry_slots(
 
 
 @njit
-def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: Index, z: Array, r: Array) -> None:
+def predict_submaps(
+    poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: Index, z: Array, r: Array
+) -> None:
     """Residual ``H(X) - z`` of all submaps, one after the other in the order of their means (eq. 15)."""
     at = 0
     for k in range(m):
@@ -154,13 +156,13 @@ def predict(poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: I
 
 
 @njit
-def into_chart(row_ptr: Index, group: Flags, r: Array) -> None:
+def chart_residuals(row_ptr: Index, group: Flags, r: Array) -> None:
     """Differences ``H(X) - z`` of all submaps, in the group chart where ``group`` ``(m,)``; in place."""
     for k in range(len(row_ptr) - 1):
         if not group[k]:
             continue
         first = row_ptr[k]
-        a, b, _ = arc_terms(r[first + 2])
+        a, b, _ = inverse_left_jacobian_kernel(r[first + 2])
         for i in range(row_ptr[k + 1] - first):
             if i == 0 or (i > 2 and i % 2 == 1):
                 x, y = r[first + i], r[first + i + 1]
@@ -168,7 +170,7 @@ def into_chart(row_ptr: Index, group: Flags, r: Array) -> None:
 
 
 @njit
-def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -> None:
+def submap_chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -> None:
     """``rᵀ Ω r`` of every submap."""
     for k in range(len(row_ptr) - 1):
         n, a = row_ptr[k + 1] - row_ptr[k], row_ptr[k]
@@ -182,7 +184,7 @@ def chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: Array) -
         out[k] = total
 
 
-class SubmapArrays(NamedTuple):
+class SubmapChainArrays(NamedTuple):
     """Submaps one after the other."""
 
     entry_ptr: Index
@@ -199,7 +201,7 @@ class SubmapArrays(NamedTuple):
     """(m,): in the group chart."""
 
 
-class Slots(NamedTuple):
+class SystemSlots(NamedTuple):
     """Where nodes and pairs stand in the system."""
 
     node_at: Index
@@ -210,7 +212,9 @@ class Slots(NamedTuple):
 
 
 @njit
-def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Array, value: Array) -> float:
+def linearise_submaps(
+    poses: Array, submaps: SubmapChainArrays, where: SystemSlots, r: Array, g: Array, value: Array
+) -> float:
     """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
 
     A position is measured through ``V(d)⁻¹ Rᵀ``, d being the residual of the end heading (V = I in a Cartesian chart),
@@ -242,7 +246,7 @@ def linearise(poses: Array, submaps: SubmapArrays, where: Slots, r: Array, g: Ar
         st = poses[k - 1, 2] if k else 0.0
         va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
         if group[k]:
-            va, vb, slope = arc_terms(r[a0 + 2])
+            va, vb, slope = inverse_left_jacobian_kernel(r[a0 + 2])
             half = 0.5
         # Rows: 0, 1 end position, 2 end heading, then landmarks. u is the residual, d the column of the start heading,
         # h that of the end heading.

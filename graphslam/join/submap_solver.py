@@ -17,10 +17,10 @@ import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from graphslam.core.charts import along_arc
+from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
-from graphslam.core.markup import element, join
+from graphslam.core.markup import html_element, join_parts
 from graphslam.core.submap import Submap
 from graphslam.join.submap_blocks import SubmapProblem
 from graphslam.linear.symmetric_factor import SymmetricFactor
@@ -101,8 +101,8 @@ class SubmapEstimate:
         if (chart or self.chart) == "group":
             if self.anchors is None:
                 raise SolverError("the map has no anchors of its landmarks")
-            e[:, :2] = along_arc(e[:, :2], e[:, 2])
-            f = along_arc(f, e[self.anchors, 2])
+            e[:, :2] = apply_inverse_left_jacobian(e[:, :2], e[:, 2])
+            f = apply_inverse_left_jacobian(f, e[self.anchors, 2])
         return np.concatenate([e.ravel(), f.ravel()])
 
     @property
@@ -165,7 +165,7 @@ class SubmapEstimate:
             f": {len(self.poses)} bases, {len(self.landmark_ids)} landmarks, {self.states} scalars, "
             f"objective {self.objective:.4f}{polished}, {self.iterations} iterations, {self.seconds:.3f} s"
         )
-        return join([element("b", "Joined map"), said])
+        return join_parts([html_element("b", "Joined map"), said])
 
 
 # A step is halved no further than this before its direction is given up and damped.
@@ -173,8 +173,8 @@ _SHORTEST = 0.05
 
 
 @dataclass(frozen=True)
-class Minimum:
-    """What :func:`minimise` found.
+class MinimisationResult:
+    """What :func:`minimise_submaps` found.
 
     Parameters
     ----------
@@ -196,7 +196,9 @@ class Minimum:
     history: list[float] = field(default_factory=list)
 
 
-def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_iterations: int = 50) -> Minimum:
+def minimise_submaps(
+    problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_iterations: int = 50
+) -> MinimisationResult:
     """Damped Gauss–Newton.
 
     A step is tried as a straight line and along the chain (:meth:`SubmapProblem.bent`), and the lower end is taken:
@@ -248,7 +250,7 @@ def minimise(problem: SubmapProblem, x: Array, *, rtol: float = 1e-12, max_itera
         logger.debug("iteration %d: objective %.9g, promised %.3g, damping %.1g", iterations, f, promised, damping)
     if not converged:
         logger.warning("no convergence after %d iterations: objective %.9g", iterations, f)
-    return Minimum(x, f, iterations, converged, data, history)
+    return MinimisationResult(x, f, iterations, converged, data, history)
 
 
 def _lowest(problem: SubmapProblem, x: Array, step: Array) -> tuple[float, Array]:
@@ -266,7 +268,7 @@ def solve_submaps(
     rtol: float = 1e-12,
     max_iterations: int = 50,
 ) -> SubmapEstimate:
-    """Least-squares optimum of a chain of landmark submaps (see :class:`SubmapProblem` and :func:`minimise`).
+    """Least-squares optimum of a chain of landmark submaps (see :class:`SubmapProblem` and :func:`minimise_submaps`).
 
     Parameters
     ----------
@@ -279,11 +281,11 @@ def solve_submaps(
     scale : (m,) or float, optional
         Factor on the covariance of each submap.
     rtol, max_iterations
-        See :func:`minimise`.
+        See :func:`minimise_submaps`.
     """
     start = time.perf_counter()
     problem = SubmapProblem(submaps, scale=scale)
-    best = minimise(
+    best = minimise_submaps(
         problem, problem.initial(initial_poses, initial_landmarks), rtol=rtol, max_iterations=max_iterations
     )
     return SubmapEstimate(

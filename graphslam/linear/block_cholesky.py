@@ -48,7 +48,7 @@ class BlockSymbolic:
 
     def __init__(self, order: Index, width: Index, ptr: Index, neighbours: Index) -> None:
         self._ptr, self._idx = ptr, neighbours
-        self._parts = analysis.analyse(order, width, ptr, neighbours, _SLACK)
+        self._parts = analysis.analyse_blocks(order, width, ptr, neighbours, _SLACK)
         post, offset, first, parent, row_ptr, rows, panel_ptr, sizes = self._parts
         self.nnz = int(sizes[2])
         self.size = int(offset[-1])
@@ -83,8 +83,8 @@ class BlockSymbolic:
         value : (k,)
         """
         L = np.empty(self._entries)
-        matrix = analysis.Blocks(self._ptr, self._idx, block, value)
-        bad = analysis.factorise(analysis.Analysis(*self._parts), matrix, damping, L)
+        matrix = analysis.BlockMatrix(self._ptr, self._idx, block, value)
+        bad = analysis.factorise_blocks(analysis.SymbolicAnalysis(*self._parts), matrix, damping, L)
         if bad:
             node = int(self._post[bad - 1])
             raise IndeterminateError(
@@ -109,8 +109,8 @@ class BlockFactor:
         """``A⁻¹ rhs`` for ``rhs`` ``(n,)``, in the caller's order."""
         s = self._symbolic
         x = np.asarray(rhs, dtype=np.float64)[s.permutation]
-        solving.forward(*s._solve, s._panel_ptr, self._L, x)
-        solving.backward(*s._solve, s._panel_ptr, self._L, x)
+        solving.solve_lower(*s._solve, s._panel_ptr, self._L, x)
+        solving.solve_upper(*s._solve, s._panel_ptr, self._L, x)
         out = np.empty_like(x)
         out[s.permutation] = x
         return out
@@ -119,7 +119,7 @@ class BlockFactor:
         """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹ = L⁻ᵀ L⁻¹``, never the whole inverse (Algorithm 1)."""
         s = self._symbolic
         unit = s._place[np.asarray(indices, dtype=np.intp)]
-        W, _ = solving.forward_units(*s._solve, s._parent, s._panel_ptr, self._L, unit)
+        W, _ = solving.solve_lower_units(*s._solve, s._parent, s._panel_ptr, self._L, unit)
         return np.asarray(W.T @ W)
 
     def inverse_diagonal_blocks(self, first: npt.ArrayLike, width: int) -> Array:
@@ -129,5 +129,5 @@ class BlockFactor:
         """
         s = self._symbolic
         begin = s._place[np.asarray(first, dtype=np.intp)]
-        panels = solving.Panels(*s._solve, s._parent, s._panel_ptr, self._L)
+        panels = solving.FactorPanels(*s._solve, s._parent, s._panel_ptr, self._L)
         return np.asarray(solving.inverse_diagonal(panels, begin, width, s._most))

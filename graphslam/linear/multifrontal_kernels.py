@@ -98,7 +98,7 @@ def _postorder(parent: Index) -> Index:
 
 
 @njit
-def analyse(
+def analyse_blocks(
     order: Index, width: Index, ptr: Index, idx: Index, slack: int
 ) -> tuple[Index, Index, Index, Index, Index, Index, Index, Index]:
     """Symbolic factorisation.
@@ -286,8 +286,8 @@ def _eliminate(F: Array, w: int, r: int) -> int:
     return 0
 
 
-class Analysis(NamedTuple):
-    """From :func:`analyse`."""
+class SymbolicAnalysis(NamedTuple):
+    """From :func:`analyse_blocks`."""
 
     order: Index
     offset: Index
@@ -299,12 +299,13 @@ class Analysis(NamedTuple):
     sizes: Index
 
 
-class Blocks(NamedTuple):
+class BlockMatrix(NamedTuple):
     """A sparse matrix of blocks."""
 
     ptr: Index
     idx: Index
-    """Neighbours as given to :func:`analyse`; one at an earlier position is skipped (its own list has the pair)."""
+    """Neighbours as given to :func:`analyse_blocks`; one at an earlier position is skipped (its own list has the
+    pair)."""
     block: Index
     """(nb,): where each pair's block begins in ``value``: rows of the node, columns of the neighbour, row-major."""
     value: Array
@@ -312,7 +313,7 @@ class Blocks(NamedTuple):
 
 
 @njit
-def factorise(analysis: Analysis, matrix: Blocks, damping: float, L: Array) -> int:
+def factorise_blocks(analysis: SymbolicAnalysis, matrix: BlockMatrix, damping: float, L: Array) -> int:
     """Numeric factorisation of ``A + damping · diag(A)`` into the panels ``L``.
 
     Parameters

@@ -20,7 +20,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 @njit
-def forward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
+def solve_lower(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
     """``x ← L⁻¹ x`` for ``x`` ``(n,)``; ``own`` ``(S + 1,)`` is the first scalar of every supernode."""
     for s in range(len(own) - 1):
         w, r, at = own[s + 1] - own[s], start[s + 1] - start[s], start[s]
@@ -33,7 +33,7 @@ def forward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x:
 
 
 @njit
-def backward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
+def solve_upper(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x: Array) -> None:
     """``x ← L⁻ᵀ x`` for ``x`` ``(n,)``."""
     for s in range(len(own) - 2, -1, -1):
         w, r, at = own[s + 1] - own[s], start[s + 1] - start[s], start[s]
@@ -46,7 +46,7 @@ def backward(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array, x
 
 
 @njit(fastmath={"contract"})
-def forward_units(
+def solve_lower_units(
     own: Index, start: Index, row: Index, parent: Index, panel_ptr: Index, L: Array, unit: Index
 ) -> tuple[Array, Index]:
     """``L⁻¹ E`` for unit columns ``unit`` ``(k,)``: its rows that are not zero, and which they are.
@@ -92,7 +92,7 @@ def forward_units(
     return W, which
 
 
-class Panels(NamedTuple):
+class FactorPanels(NamedTuple):
     """A factor."""
 
     own: Index
@@ -117,7 +117,7 @@ def _solve_upper(P: Array, X: Array, first: int, end: int) -> None:
 
 
 @njit(fastmath={"contract"})
-def inverse_diagonal(panels: Panels, begin: Index, width: int, most: int) -> Array:
+def inverse_diagonal(panels: FactorPanels, begin: Index, width: int, most: int) -> Array:
     """Diagonal blocks of the inverse without the rest of it (selected inversion, from the root down).
 
     With a panel's own scalars S and those below R, ``Y = L_RS L_SS⁻¹``: ``Z_RS = -Z_RR Y`` and

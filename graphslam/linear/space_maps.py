@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from graphslam.core.charts import arc_matrices, arc_slopes
+from graphslam.core.charts import inverse_left_jacobian_slopes, inverse_left_jacobians
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import (
@@ -67,7 +67,7 @@ class SpaceMap:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedMap:
     """A map, and which unknowns of a problem it speaks of.
 
     Parameters
@@ -95,7 +95,7 @@ class Placed:
         blocks = _Blocks()
         back, w, V, e = seen.back, seen.w, seen.V, seen.e
         if self.map.chart == "group":
-            curve = arc_slopes(seen.turn, e)  # of every position by the turn that it goes along
+            curve = inverse_left_jacobian_slopes(seen.turn, e)  # of every position by the turn that it goes along
             true = V
         else:
             curve, true = np.zeros((m + n, 3, 3)), so3_left_jacobian_inverse(w)
@@ -129,7 +129,7 @@ class Placed:
             q = quat_multiply(np.broadcast_to(base[3:] * _CONJUGATE, q.shape), q)
         w = so3_log(quat_multiply(q, M.poses[:, 3:] * _CONJUGATE)) if m else np.zeros((0, 3))
         e = off @ back.T - np.concatenate([M.poses[:, :3], M.points])
-        V = arc_matrices(w) if M.chart == "group" else np.broadcast_to(np.eye(3), (m, 3, 3))
+        V = inverse_left_jacobians(w) if M.chart == "group" else np.broadcast_to(np.eye(3), (m, 3, 3))
         held = np.concatenate([np.arange(m), M.anchors])
         turn = np.where(held[:, None] >= 0, w[held], 0.0) if m else np.zeros((len(held), 3))
         Va = np.where(held[:, None, None] >= 0, V[held], np.eye(3)) if m else np.tile(np.eye(3), (len(held), 1, 1))
@@ -173,14 +173,14 @@ class _Blocks:
         return sp.csr_matrix((np.concatenate(self.values), at), shape=(rows, columns))
 
 
-def moved(poses: Array, points: Array, step: Array) -> tuple[Array, Array]:
+def step_values(poses: Array, points: Array, step: Array) -> tuple[Array, Array]:
     """Values after a step ``(6 M + 3 N,)``."""
     d = step[: 6 * len(poses)].reshape(-1, 6)
     q = quat_normalize(quat_multiply(so3_exp(d[:, :3]), poses[:, 3:])) if len(poses) else poses[:, 3:]
     return np.hstack([poses[:, :3] + d[:, 3:], q]), points + step[6 * len(poses) :].reshape(-1, 3)
 
 
-def objective(maps: Sequence[Placed], poses: Array, points: Array) -> float:
+def space_objective(maps: Sequence[PlacedMap], poses: Array, points: Array) -> float:
     """``Σ uᵀ I u``."""
     total = 0.0
     for one in maps:
@@ -189,7 +189,7 @@ def objective(maps: Sequence[Placed], poses: Array, points: Array) -> float:
     return total
 
 
-def normal_equations(maps: Sequence[Placed], poses: Array, points: Array) -> tuple[float, Array, sp.csc_matrix]:
+def normal_equations(maps: Sequence[PlacedMap], poses: Array, points: Array) -> tuple[float, Array, sp.csc_matrix]:
     """Objective, half its gradient ``Jᵀ I u`` and the Gauss–Newton matrix ``Jᵀ I J``."""
     jacobians, weights, residuals = [], [], []
     for one in maps:
@@ -204,7 +204,7 @@ def normal_equations(maps: Sequence[Placed], poses: Array, points: Array) -> tup
 
 @dataclass(frozen=True)
 class SpaceMinimum:
-    """What :func:`minimise` found: values, objective there, Gauss–Newton matrix there, and how it ended."""
+    """What :func:`minimise_space_maps` found: values, objective there, Gauss–Newton matrix there, and how it ended."""
 
     poses: Array
     points: Array
@@ -214,8 +214,8 @@ class SpaceMinimum:
     converged: bool
 
 
-def minimise(
-    maps: Sequence[Placed], poses: Array, points: Array, *, rtol: float = 1e-12, max_iterations: int = 60
+def minimise_space_maps(
+    maps: Sequence[PlacedMap], poses: Array, points: Array, *, rtol: float = 1e-12, max_iterations: int = 60
 ) -> SpaceMinimum:
     """Damped Gauss–Newton; it ends when the decrease that the linear model promises is below ``rtol · max(f, 1)``."""
     from graphslam.linear.symmetric_factor import SymmetricFactor
@@ -232,8 +232,8 @@ def minimise(
         small = promised <= rtol * max(f, 1.0)
         share = 1.0
         while True:
-            trial = moved(poses, points, share * step)
-            found = objective(maps, *trial)
+            trial = step_values(poses, points, share * step)
+            found = space_objective(maps, *trial)
             if (np.isfinite(found) and found <= f) or small or share <= _SHORTEST:
                 break
             share *= 0.5

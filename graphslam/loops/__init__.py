@@ -1,9 +1,9 @@
 """Layer 5: loop closures between submaps and between sessions: candidates, gates, consistency, ledger."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "find_loops": "FindConfig",
     "measure": "Loop",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, upright
-from graphslam.loops.candidates import APPEARANCE, Candidate
+from graphslam.core.poses import group_of, level_poses
+from graphslam.loops.candidates import APPEARANCE, LoopCandidate
 from graphslam.loops.places import Places
-from graphslam.registration.place_descriptor import Descriptors, similarity
+from graphslam.registration.place_descriptor import PlaceDescriptors, descriptor_similarity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,23 +47,23 @@ class AppearanceConfig:
 
 def appearance_candidates(
     places: Places,
-    descriptors: Descriptors,
+    descriptors: PlaceDescriptors,
     config: AppearanceConfig | None = None,
     *,
     exclude: Collection[tuple[int, int]] = (),
-) -> list[Candidate]:
+) -> list[LoopCandidate]:
     """Pairs of places in different submaps that look alike, most alike first; one place of a stretch, not all.
 
     Parameters
     ----------
-    descriptors : Descriptors
+    descriptors : PlaceDescriptors
         Of these places.
     exclude : collection of (int, int)
         Pairs of submaps, either way round, that are not tried.
 
     Returns
     -------
-    list of Candidate
+    list of LoopCandidate
         ``T_ij`` has no translation but the heading at which the two look most alike; its covariance is the stated one.
         ``facts``: ``correlation`` and ``lead``, by how much it is better than what was not taken.
     """
@@ -75,7 +75,7 @@ def appearance_candidates(
     tree = cKDTree(keys)
     g = group_of(places.T_base_node)
     covariance = _covariance(c, g.dim)
-    found: list[Candidate] = []
+    found: list[LoopCandidate] = []
     for j in range(len(places)):
         if places.way[j] < c.least_way:
             continue
@@ -86,7 +86,7 @@ def appearance_candidates(
         rows = rows[usable]
         if not len(rows):
             continue
-        correlation, turn = similarity(descriptors, j, descriptors, rows)
+        correlation, turn = descriptor_similarity(descriptors, j, descriptors, rows)
         best = _stretches(places.way[rows], correlation, c.stretch, c.top + 1)
         # the best as a group must stand out from the next stretch, else this place looks like many
         beaten = float(correlation[best[c.top]]) if len(best) > c.top else -1.0
@@ -95,11 +95,11 @@ def appearance_candidates(
             if correlation[k] < c.least or lead < c.lead:
                 break
             found.append(
-                Candidate(
+                LoopCandidate(
                     i=int(rows[k]),
                     j=j,
                     source=APPEARANCE,
-                    T_ij=np.array([0.0, 0.0, turn[k]]) if g.dim == 2 else upright(np.zeros(3), turn[k]),
+                    T_ij=np.array([0.0, 0.0, turn[k]]) if g.dim == 2 else level_poses(np.zeros(3), turn[k]),
                     covariance=covariance,
                     gain=math.nan,
                     score=float(correlation[k]),
@@ -129,9 +129,9 @@ def _stretches(way: Array, score: Array, stretch: float, count: int) -> list[int
     return out
 
 
-def _thinned(places: Places, found: list[Candidate], stretch: float) -> list[Candidate]:
+def _thinned(places: Places, found: list[LoopCandidate], stretch: float) -> list[LoopCandidate]:
     """One pair of two stretches, the best."""
-    kept: list[Candidate] = []
+    kept: list[LoopCandidate] = []
     for x in found:
         if all(
             abs(places.way[x.i] - places.way[y.i]) >= stretch or abs(places.way[x.j] - places.way[y.j]) >= stretch

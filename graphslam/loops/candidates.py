@@ -22,7 +22,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
-from graphslam.loops.places import Ints, Places, Relative
+from graphslam.loops.places import Ints, Places, RelativePoses
 
 FRONT_END, PROXIMITY, APPEARANCE, TIE = "front-end", "proximity", "appearance", "tie"
 
@@ -65,7 +65,7 @@ class CandidateConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
+class LoopCandidate:
     """A pair of places that may be tied.
 
     Parameters
@@ -73,7 +73,7 @@ class Candidate:
     i, j : int
         Places, ``i`` before ``j`` on the way: the map of i's submap is the target, what j sees the source.
     source : str
-        ``front-end``, ``proximity``, ``appearance``, ``tie`` (:mod:`~graphslam.loops.ties`).
+        ``front-end``, ``proximity``, ``appearance``, ``tie`` (:mod:`~graphslam.loops.overlap_constraints`).
     T_ij : (7,) or (3,)
         The prediction; for a front end's match or a tie the measurement itself.
     covariance : (d, d)
@@ -105,7 +105,7 @@ def information_gain(P: Array, match_sigma: float, match_angle: float, dim: int)
     return np.asarray(0.5 * np.linalg.slogdet(scaled)[1])
 
 
-def nearness(T: Array, P: Array, config: CandidateConfig) -> tuple[Array, npt.NDArray[np.bool_]]:
+def overlap_probability(T: Array, P: Array, config: CandidateConfig) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Chance that two places overlap ``(k,)``, and whether they may ``(k,)``.
 
     Horizontally by the distance and its σ along the line between the two (or across it, where they may coincide), in
@@ -135,18 +135,18 @@ def nearness(T: Array, P: Array, config: CandidateConfig) -> tuple[Array, npt.ND
 
 def proximity_candidates(
     places: Places,
-    relative: Relative,
+    relative: RelativePoses,
     config: CandidateConfig | None = None,
     *,
     exclude: Collection[tuple[int, int]] = (),
     tried: Sequence[tuple[int, int]] = (),
     since: int = 0,
-) -> list[Candidate]:
+) -> list[LoopCandidate]:
     """Pairs that may see the same surroundings by what the graph knows, most telling first.
 
     Parameters
     ----------
-    relative : Relative
+    relative : RelativePoses
         Of the graph, asked for the nodes of places.
     exclude : collection of (int, int)
         Pairs of submaps (either way round) that are not tried: their maps hold the same scans.
@@ -172,7 +172,7 @@ def proximity_candidates(
     for k in range(0, len(first), c.batch):
         a, b = first[k : k + c.batch].astype(np.int64), second[k : k + c.batch].astype(np.int64)
         T, P = relative(places.node[a], places.node[b])
-        chance, may = nearness(T, P, c)
+        chance, may = overlap_probability(T, P, c)
         a, b, T, P, chance = a[may], b[may], T[may], P[may], chance[may]
         g = group_of(T)
         gain = information_gain(P, c.match_sigma, c.match_angle, g.dim)
@@ -184,9 +184,9 @@ def proximity_candidates(
         return []
     ends_i, ends_j, T, P, gain, score = (np.concatenate([part[k] for part in kept]) for k in range(6))
     before = [(int(places.submap[p]), float(places.way[q])) for p, q in tried]
-    chosen = thinned(places.submap[ends_i], places.way[ends_j], score, c.stretch, c.keep, before)
+    chosen = thin_candidates(places.submap[ends_i], places.way[ends_j], score, c.stretch, c.keep, before)
     return [
-        Candidate(
+        LoopCandidate(
             i=int(ends_i[k]),
             j=int(ends_j[k]),
             source=PROXIMITY,
@@ -199,7 +199,7 @@ def proximity_candidates(
     ]
 
 
-def thinned(
+def thin_candidates(
     target: Ints,
     way: Array,
     score: Array,
@@ -238,7 +238,7 @@ def thinned(
 
 def front_end_candidates(
     submaps: Sequence[Submap], places: Places, config: CandidateConfig | None = None
-) -> list[Candidate]:
+) -> list[LoopCandidate]:
     """Matches that the front end made, most supported first; they are measured already, and need no registration.
 
     ``i`` is the place of the target nearest to the match, ``j`` the base of the submap that entered it. Matches into
@@ -256,7 +256,7 @@ def front_end_candidates(
             j = int(places.of_submap(k)[0])
             T = g.between(places.T_base_node[i], g.compose(m.T_target_here, places.T_base_node[j]))
             out.append(
-                Candidate(
+                LoopCandidate(
                     i=i,
                     j=j,
                     source=FRONT_END,
@@ -270,7 +270,7 @@ def front_end_candidates(
     return sorted(out, key=lambda x: -x.score)
 
 
-def sharing_maps(submaps: Sequence[Submap]) -> set[tuple[int, int]]:
+def pairs_sharing_scans(submaps: Sequence[Submap]) -> set[tuple[int, int]]:
     """Pairs of submaps whose maps hold the same scans, by number: one entered the other's map and went on in it.
 
     Matching the two would find what the front end put there. What submaps hold is said by ``report["holds"]``, the keys

@@ -12,20 +12,20 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import (
     FRONT_END,
-    Candidate,
     CandidateConfig,
+    LoopCandidate,
     front_end_candidates,
+    pairs_sharing_scans,
     proximity_candidates,
-    sharing_maps,
 )
+from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.graph_loops import GraphLoops, GraphSolver, chain_of_graph
-from graphslam.loops.judge import settled_loops
 from graphslam.loops.loops import LoopCloser, LoopConfig
 from graphslam.loops.measure import LoopMeasurer
+from graphslam.loops.overlap_constraints import Entry, OverlapConfig, overlap_candidates, overlap_entries
 from graphslam.loops.places import Places
-from graphslam.loops.ties import Entry, TieConfig, tie_candidates, ties_entries
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.place_descriptor import DescriptorConfig, describe, join
+from graphslam.registration.place_descriptor import DescriptorConfig, concatenate_descriptors, describe_places
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ class FindConfig:
     """Of the places, for that."""
     front_end: bool = False
     """Also the front end's matches; not where they are factors of the graph already."""
-    ties: TieConfig | None = field(default_factory=TieConfig)
+    ties: OverlapConfig | None = field(default_factory=OverlapConfig)
     """Along submaps, where they were in a map that holds them (with ``front_end``: by its matches that are believed);
     None: not. They come last, and one is worth as much as the match by which it is in that map."""
     rounds: int = 3
@@ -133,13 +133,15 @@ class LoopSearch:
         if self.closer is None or self._measurer is None:
             self._measurer = m = LoopMeasurer(submaps, p, c.pairs)
             chain = chain_of_graph(graph)
-            self.closer = LoopCloser(ours, *chain, c.decisions, judge=settled_loops, witness=m.contradictions)
+            self.closer = LoopCloser(
+                ours, *chain, c.decisions, judge=truncated_least_squares_inliers, witness=m.contradictions
+            )
         closer, measurer = self.closer, self._measurer
-        closer.go_on(ours, *chain_of_graph(graph))
-        measurer.go_on(submaps, p)
-        shared, since = sharing_maps(submaps), 0 if last else self._seen
+        closer.extend_chain(ours, *chain_of_graph(graph))
+        measurer.extend_chain(submaps, p)
+        shared, since = pairs_sharing_scans(submaps), 0 if last else self._seen
 
-        def go(candidates: Sequence[Candidate]) -> int:
+        def go(candidates: Sequence[LoopCandidate]) -> int:
             before = len(closer.accepted)
             closer.propose(measurer.measure(candidates, progress=progress))
             return len(closer.accepted) - before
@@ -157,7 +159,7 @@ class LoopSearch:
         if last:
             self._look_alike(p, shared, tried, go)
             if c.ties is not None and c.front_end:
-                go(tie_candidates(submaps, p, _believed(closer), c.ties))
+                go(overlap_candidates(submaps, p, _believed(closer), c.ties))
                 _drop_orphans(closer)
             measurer.forget()
         logger.info("loops: %s", closer.ledger.counts() or "no candidates")
@@ -168,18 +170,18 @@ class LoopSearch:
         p: Places,
         shared: set[tuple[int, int]],
         tried: Sequence[tuple[int, int]],
-        go: Callable[[Sequence[Candidate]], int],
+        go: Callable[[Sequence[LoopCandidate]], int],
     ) -> None:
         """Also places that look alike, wherever they are."""
         c, measurer = self.config, self._measurer
         if c.appearance is None or measurer is None or len(measurer.submaps) < 2:
             return
         parts = [
-            describe(measurer.prepared(k).view, p.T_base_node[p.of_submap(k)], c.descriptors)
+            describe_places(measurer.prepared(k).view, p.T_base_node[p.of_submap(k)], c.descriptors)
             for k in range(len(measurer.submaps))
         ]
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
-        alike = appearance_candidates(p, join(parts), c.appearance, exclude=shared)
+        alike = appearance_candidates(p, concatenate_descriptors(parts), c.appearance, exclude=shared)
         go([x for x in alike if (int(p.submap[x.i]), round(float(p.way[x.j]), 1)) not in seen])
 
 
@@ -193,5 +195,5 @@ def _drop_orphans(closer: LoopCloser) -> None:
     """Ties whose entry was switched off, perhaps by their company, go too."""
     believed = _believed(closer)
     for n in closer.accepted:
-        if not ties_entries(closer.loops[n].gates) <= believed:
+        if not overlap_entries(closer.loops[n].gates) <= believed:
             closer.switch_off(n, "the match by which it is in that map is not believed")

@@ -8,9 +8,9 @@ import numpy as np
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.graph_record import GraphRecord
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
@@ -87,7 +87,7 @@ class GraphLoops:
         x = self.graph.values.poses
         return relative_poses(x[i], x[j], S[a, :, a], S[a, :, b], S[b, :, b])
 
-    def add_loop(self, loop: Loop, robust: Robust) -> int:
+    def add_loop(self, loop: Loop, robust: RobustKernel) -> int:
         """A between-factor of declared ``shared-scan`` evidence."""
         s = self.graph.submaps[int(self.places.submap[loop.j])]
         return self.graph.add_between(
@@ -116,10 +116,10 @@ class GraphLoops:
         return {r.factor_id: float(v) for r, v in zip(blocks.records, blocks.d2)}
 
 
-class GraphRelative:
-    """A :class:`~graphslam.loops.places.Relative` of a graph at its values, which must be its optimum."""
+class GraphRelativePoses:
+    """A :class:`~graphslam.loops.places.RelativePoses` of a graph at its values, which must be its optimum."""
 
-    def __init__(self, graph: GraphRecord) -> None:
+    def __init__(self, graph: FactorGraphState) -> None:
         self.graph = graph
 
     def __call__(self, i: Ints, j: Ints) -> tuple[Array, Array]:

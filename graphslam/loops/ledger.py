@@ -39,7 +39,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Decision:
+class LoopDecision:
     """What was decided of a loop, and on what grounds; the latest of a loop is the one in force.
 
     Parameters
@@ -114,40 +114,40 @@ class LoopLedger:
     'undone'
     """
 
-    def __init__(self, decisions: Iterable[Decision] = ()) -> None:
-        self.decisions: list[Decision] = list(decisions)
+    def __init__(self, decisions: Iterable[LoopDecision] = ()) -> None:
+        self.decisions: list[LoopDecision] = list(decisions)
 
     @classmethod
     def from_events(cls, events: Iterable[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
         """The ledger of a run from its events; those of other kinds are passed over."""
         out = []
-        names = set(Decision.__slots__)
+        names = set(LoopDecision.__slots__)
         for k, e in enumerate(events):
             if e.get("event") != EVENT:
                 continue
             # not-a-number is null in JSON
             facts: dict[str, Any] = {n: math.nan if v is None else v for n, v in e.items() if n in names}
             try:
-                out.append(Decision(**facts))
+                out.append(LoopDecision(**facts))
             except TypeError as error:
                 raise DataError(f"loop event {k} is not whole ({error})", where=where) from None
         return cls(out)
 
-    def write(self, decision: Decision) -> None:
+    def write(self, decision: LoopDecision) -> None:
         """Add a decision."""
         self.decisions.append(decision)
 
     def __len__(self) -> int:
         return len(self.decisions)
 
-    def current(self) -> list[Decision]:
+    def current(self) -> list[LoopDecision]:
         """The decision in force of every loop, by its number."""
-        last: dict[int, Decision] = {}
+        last: dict[int, LoopDecision] = {}
         for d in self.decisions:
             last[d.loop] = d
         return [last[k] for k in sorted(last)]
 
-    def of(self, loop: int) -> Decision:
+    def of(self, loop: int) -> LoopDecision:
         """The decision in force of one loop."""
         for d in reversed(self.decisions):
             if d.loop == loop:
@@ -197,7 +197,7 @@ def ledger_of_events(events: Sequence[Mapping[str, Any]], *, where: str = "event
     return ledger
 
 
-def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Decision | None:
+def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> LoopDecision | None:
     """A front end's match that became a factor, or did not; None for other events."""
     taken = e.get("event") == "between" and e.get("group") == "match"
     if not taken and e.get("event") != "match-not-used":
@@ -213,7 +213,7 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Dec
         return None  # it is among the loops
     support = figure("support")
     why = f"removed: {removed[fid]}" if gone else f"support {support:.2f}"
-    return Decision(
+    return LoopDecision(
         loop=number,
         verdict="undone" if gone else "accepted" if taken else "rejected",
         why=why if taken else f"{why} is too little",
@@ -229,7 +229,7 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Dec
     )
 
 
-def same_loop(d: Decision, ledger: LoopLedger) -> Decision | None:
+def same_loop(d: LoopDecision, ledger: LoopLedger) -> LoopDecision | None:
     """The loop of another ledger that is in the graph, between the same nodes, and found the same way; or None.
 
     Numbers may differ where something else was tried in between; of several the one of that number is taken.
@@ -239,5 +239,5 @@ def same_loop(d: Decision, ledger: LoopLedger) -> Decision | None:
     return found[0] if found else None
 
 
-def _identity(d: Decision) -> tuple[str, int, int, int, int]:
+def _identity(d: LoopDecision) -> tuple[str, int, int, int, int]:
     return d.source, d.submap_i, d.submap_j, d.i, d.j

@@ -11,12 +11,12 @@ One wrong loop ruins a map, so a loop passes, in this order,
 5. and if more loops that agree were shut out by a group than the group has, the two change places: by what pairs say,
    and by what a second opinion says that judges all of them together;
 6. of two groups that cannot both be right the one is believed by which maps lie on each other as they do elsewhere
-   (:mod:`~graphslam.loops.witness`); if they do not tell, the one that the rest of the graph bears out, whatever their
-   number; neither, if that cannot tell (:mod:`~graphslam.loops.disputes`).
+   (:mod:`~graphslam.loops.map_overlap_test`); if they do not tell, the one that the rest of the graph bears out,
+   whatever their number; neither, if that cannot tell (:mod:`~graphslam.loops.conflicting_groups`).
 
 With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
 without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
-solution is needed for it. Every step writes a :class:`~graphslam.loops.ledger.Decision`.
+solution is needed for it. Every step writes a :class:`~graphslam.loops.ledger.LoopDecision`.
 """
 
 from __future__ import annotations
@@ -29,18 +29,25 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from graphslam.association.consistent_set import Chain, ConsistentSet, LoopArrays, chain_chi2, consistent_loops
+from graphslam.association.consistent_set import ConsistentSet, LoopArrays, OdometryChain, chain_chi2, consistent_loops
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.noise import Robust
-from graphslam.loops.disputes import AMBIGUOUS, CLASH, SETTLED, SHUTS_OUT, disputes, weigh
-from graphslam.loops.ledger import Decision, LoopLedger, Verdict
+from graphslam.graph.noise import RobustKernel
+from graphslam.loops.conflicting_groups import (
+    AMBIGUOUS,
+    CLASH,
+    SETTLED,
+    SHUTS_OUT,
+    choose_group,
+    find_conflicting_groups,
+)
+from graphslam.loops.ledger import LoopDecision, LoopLedger, Verdict
+from graphslam.loops.map_overlap_test import Witness, disagreement_shares, overlap_log_likelihood_ratio
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
 from graphslam.loops.rules import Judge, LoopConfig, LoopGraph, chi2_without
-from graphslam.loops.witness import Witness, log_ratio, of_pairs
 from graphslam.registration.submap_pairs import prediction_chi2
 
 
@@ -56,9 +63,9 @@ class LoopCloser:
     judge : callable, optional
         Which of all loops the chain and the others bear out, judged together: from increments, covariances and the
         loops' ends, relative poses and covariances to ``(l,) bool``
-        (:func:`graphslam.loops.judge.settled_loops`).
+        (:func:`graphslam.loops.global_inlier_check.truncated_least_squares_inliers`).
     witness : callable, optional
-        What the maps of loops say at relative poses of their ends (:mod:`graphslam.loops.witness`).
+        What the maps of loops say at relative poses of their ends (:mod:`graphslam.loops.map_overlap_test`).
     """
 
     def __init__(
@@ -82,7 +89,7 @@ class LoopCloser:
 
     # ---------------------------------------------------------------- deciding
 
-    def go_on(self, graph: LoopGraph, increments: Array, covariances: Array) -> None:
+    def extend_chain(self, graph: LoopGraph, increments: Array, covariances: Array) -> None:
         """The chain has grown: the same loops, in a longer chain."""
         self.graph, self.increments, self.covariances = graph, increments, covariances
 
@@ -99,7 +106,7 @@ class LoopCloser:
         return [(a, b) for a, b in pairs if a and b]
 
     @contextmanager
-    def tried(self, numbers: Sequence[int]) -> Iterator[list[int]]:
+    def with_trial_loops(self, numbers: Sequence[int]) -> Iterator[list[int]]:
         """Of loops that are not in the graph those that it bears, in it while the block lasts; nothing is written."""
         inside: dict[int, int] = {}
         for _, n in sorted(zip(self._against_chain(list(numbers)), numbers)):
@@ -113,12 +120,12 @@ class LoopCloser:
                 self.graph.remove_loop(fid)
             self.graph.solve()
 
-    def propose(self, loops: Sequence[Loop]) -> list[Decision]:
+    def propose(self, loops: Sequence[Loop]) -> list[LoopDecision]:
         """Decide on new loops, and again on those that are in or were refused by the company they were in.
 
         Returns
         -------
-        list of Decision
+        list of LoopDecision
             In force for the new ones, in their order.
         """
         first = 1 + max((d.loop for d in self.ledger.decisions), default=-1)
@@ -135,7 +142,7 @@ class LoopCloser:
             self._decide(usable)
         return [self.ledger.of(n) for n in numbers]
 
-    def undo(self, loop: int, why: str = "asked for") -> Decision:
+    def undo(self, loop: int, why: str = "asked for") -> LoopDecision:
         """Take a loop out of the graph, and solve without it."""
         d = self.ledger.of(loop)
         if d.verdict != "accepted":
@@ -235,7 +242,7 @@ class LoopCloser:
             why = f"effect: χ² of earlier factors rises by {earlier:.1f} > {earlier_limit:.1f} (most: factor {worst})"
             return "switched-off", why, facts
         weight = float(self._kernel().weight(np.array([after[fid]]))[0])
-        return "accepted", found_why(expected, d), {**facts, "factor_id": fid, "weight": weight}
+        return "accepted", acceptance_reason(expected, d), {**facts, "factor_id": fid, "weight": weight}
 
     def _exchange(self) -> bool:
         """Were more loops shut out by the company of others than these are? Then they take the others' place.
@@ -302,7 +309,7 @@ class LoopCloser:
         ends = self._arrays(both)[0]
         limit = float(stats.chi2.ppf(CLASH, self._dof))
         changed = False
-        for rows, columns in disputes(self._consistent(both).chi2, len(inside), ends, limit, least):
+        for rows, columns in find_conflicting_groups(self._consistent(both).chi2, len(inside), ends, limit, least):
             a, b = [both[k] for k in rows], [both[k] for k in columns]
             if not set(a) <= set(self.accepted):
                 continue  # another dispute has changed that
@@ -311,7 +318,7 @@ class LoopCloser:
                 self.graph.remove_loop(self.ledger.of(n).factor_id)
             self.graph.solve()
             other = self._against_graph(b)
-            outcome, why = weigh(self._against_graph(a), other, self._maps_say(a, b, with_a))
+            outcome, why = choose_group(self._against_graph(a), other, self._maps_say(a, b, with_a))
             for n in a:
                 d = self.ledger.of(n)
                 if outcome == "stays":
@@ -353,7 +360,9 @@ class LoopCloser:
         D = np.concatenate([D, g.inverse(D)])
         moved = g.compose(at, D[np.arange(len(at)) % len(D)])
         shares = [self.witness(x, T) for x, T in ((calm, at), (calm, moved), (asked, with_b), (asked, with_a))]
-        return log_ratio(*(of_pairs(x, s) for x, s in zip((calm, calm, asked, asked), shares)))
+        return overlap_log_likelihood_ratio(
+            *(disagreement_shares(x, s) for x, s in zip((calm, calm, asked, asked), shares))
+        )
 
     def _relative(self, numbers: list[int]) -> Array:
         """Relative poses of the ends of loops in the graph as it is ``(k, 7|3)``."""
@@ -423,7 +432,7 @@ class LoopCloser:
         measured = bool(np.all(np.isfinite(x.covariance)))
         fid = int(known.pop("factor_id", -1))
         self.ledger.write(
-            Decision(
+            LoopDecision(
                 loop=n, verdict=verdict, why=why, i=int(x.i), j=int(x.j), submap_i=int(x.submaps[0]),
                 submap_j=int(x.submaps[1]), source=x.source, score=x.score, gain=x.gain, gates=x.gates, factor_id=fid,
                 T_ij=x.T_ij.tolist() if measured else [], covariance=x.covariance.tolist() if measured else [],
@@ -445,7 +454,7 @@ class LoopCloser:
         return ends, np.stack([a.T_ij for a in x]), np.stack([a.covariance for a in x])
 
     def _against_chain(self, numbers: list[int]) -> list[float]:
-        chain = Chain.of(self.increments, self.covariances)
+        chain = OdometryChain.of(self.increments, self.covariances)
         return [float(v) for v in chain_chi2(chain, LoopArrays.of(chain, *self._arrays(numbers)))]
 
     def _consistent(self, numbers: list[int]) -> ConsistentSet:
@@ -453,10 +462,10 @@ class LoopCloser:
             self.increments, self.covariances, self._arrays(numbers), self.config.pairwise, against_chain=False
         )
 
-    def _kernel(self) -> Robust:
+    def _kernel(self) -> RobustKernel:
         return self.config.robust(self._dof)
 
 
-def found_why(chi2: float, dof: int) -> str:
+def acceptance_reason(chi2: float, dof: int) -> str:
     """Why a loop was accepted, in words."""
     return f"agrees with the graph: χ² {chi2:.1f} of {dof}"

@@ -12,11 +12,11 @@ from tqdm import tqdm
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
-from graphslam.evidence.views import view_of
-from graphslam.loops.candidates import FRONT_END, TIE, Candidate
+from graphslam.evidence.views import dense_view
+from graphslam.loops.candidates import FRONT_END, TIE, LoopCandidate
 from graphslam.loops.places import Places
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.submap_pairs import PreparedMap, contradiction, match_pair
+from graphslam.registration.submap_pairs import PreparedMap, contradiction_share, match_pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +72,7 @@ class LoopMeasurer:
         self.config = PairConfig() if config is None else config
         self._maps: dict[int, PreparedMap] = {}
 
-    def go_on(self, submaps: Sequence[Submap], places: Places) -> None:
+    def extend_chain(self, submaps: Sequence[Submap], places: Places) -> None:
         """The chain has grown; maps that are prepared stay so."""
         self.submaps, self.places = submaps, places
 
@@ -83,7 +83,7 @@ class LoopMeasurer:
     def prepared(self, k: int) -> PreparedMap:
         """The map of submap ``k`` of the chain."""
         found = self._maps.pop(k, None)
-        self._maps[k] = found = PreparedMap(view_of(self.submaps[k]), self.config) if found is None else found
+        self._maps[k] = found = PreparedMap(dense_view(self.submaps[k]), self.config) if found is None else found
         return found
 
     def _let_go(self) -> None:
@@ -94,11 +94,11 @@ class LoopMeasurer:
                 break
             held -= self._maps.pop(k).nbytes
 
-    def measure(self, candidates: Sequence[Candidate], *, progress: bool = False) -> list[Loop]:
+    def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
         """Loops of candidates, in their order; a front end's match or a tie is one already."""
         return [self.one(c) for c in tqdm(candidates, "matching submaps", disable=not progress, leave=False)]
 
-    def one(self, c: Candidate) -> Loop:
+    def one(self, c: LoopCandidate) -> Loop:
         """The loop of one candidate, accepted by the gates or not."""
         p = self.places
         a, b = int(p.submap[c.i]), int(p.submap[c.j])
@@ -127,6 +127,6 @@ class LoopMeasurer:
         for x, T in zip(loops, T_ij):
             source, target = self.prepared(int(p.submap[x.j])), self.prepared(int(p.submap[x.i]))
             at_j, at_i = p.T_base_node[x.j], p.T_base_node[x.i]
-            out.append(contradiction(source, at_j, target, g.compose(at_i, T), source.around(at_j)))
+            out.append(contradiction_share(source, at_j, target, g.compose(at_i, T), source.around(at_j)))
             self._let_go()
         return np.array(out)

@@ -2,7 +2,7 @@
 
 A place is a node of the graph: the base of a submap, or a pose of its path. The *way* says how far along the whole
 chain it lies, so that stretches can be told apart. What is known of the relative pose of two places is asked of the
-graph (:class:`Relative`); as long as there is no graph, the chain itself says it (:class:`ChainRelative`).
+graph (:class:`RelativePoses`); as long as there is no graph, the chain itself says it (:class:`ChainRelativePoses`).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, arc_length
-from graphslam.core.poses import chained, group_of
+from graphslam.core.poses import compose_increments, group_of
 from graphslam.core.submap import Submap
 from graphslam.graph.inner_nodes import inner_rows
 
 Ints = npt.NDArray[np.int64]
 
 
-class Relative(Protocol):
+class RelativePoses(Protocol):
     """What is known of the pose of nodes j seen from nodes i, ``(k,)`` each.
 
     Returns ``T_ij (k, 7|3)`` and its covariance ``(k, d, d)`` in the right tangent, from the joint marginal of each
@@ -82,7 +82,7 @@ class Places:
         return int(at[np.argmin(np.einsum("ij,ij->i", d, d))])
 
 
-def places_of(submaps: Sequence[Submap], spacing: float = 3.0) -> Places:
+def loop_places(submaps: Sequence[Submap], spacing: float = 3.0) -> Places:
     """Places about every ``spacing`` [m] of the paths of a chain of submaps; nodes are numbered as they come.
 
     The exit of a submap is the base of the next; that of the last is no place, for nothing was mapped there yet.
@@ -131,7 +131,7 @@ def _places(stretches: Sequence[tuple[Array, Array, Array, float]]) -> Places:
     )
 
 
-class ChainRelative:
+class ChainRelativePoses:
     """What a chain of submaps alone says of two of its places: exits and paths, no loops.
 
     Parameters
@@ -151,7 +151,7 @@ class ChainRelative:
         T, Q = chain_increments(submaps, places)
         g = group_of(T)
         self.increments, self.covariances = T, Q
-        self.poses = chained(T)
+        self.poses = compose_increments(T)
         """In the frame of the first ``(n + 1, 7|3)``; the last is the end of the chain."""
         # in the axes of the first place contributions add: W = Σ Ad(X_k) Q_k Ad(X_k)ᵀ
         A = g.adjoint(self.poses[1:])

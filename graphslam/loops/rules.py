@@ -14,7 +14,7 @@ from scipy import stats
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
 
@@ -33,7 +33,7 @@ class LoopGraph(Protocol):
         """``T_ij (k, 7|3)`` and covariances ``(k, d, d)``, right tangents, from the joint marginals."""
         ...
 
-    def add_loop(self, loop: Loop, robust: Robust) -> int:
+    def add_loop(self, loop: Loop, robust: RobustKernel) -> int:
         """Add a between-factor; its id."""
         ...
 
@@ -96,9 +96,9 @@ class LoopConfig:
     earlier: float = 0.9999
     """… or that raises the χ² of earlier factors by more than this quantile of its own."""
 
-    def robust(self, dof: int) -> Robust:
+    def robust(self, dof: int) -> RobustKernel:
         """The kernel of loops in the graph."""
-        return Robust("huber", math.sqrt(float(stats.chi2.ppf(self.kernel, dof))))
+        return RobustKernel("huber", math.sqrt(float(stats.chi2.ppf(self.kernel, dof))))
 
     def __post_init__(self) -> None:
         for f in fields(self):

@@ -1,18 +1,18 @@
 """Layer 6: maps that follow the graph: pieces of submaps, fused at the estimated poses."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "run_map": "make_run_map nodes_by_submap solved_poses",
-    "alternatives": "Alternative choose",
-    "minimum_entropy": "Candidate",
+    "alternatives": "Alternative rank_alternatives",
+    "minimum_entropy": "MapHypothesis",
     "terrain.lines": "lines_of_scans",
-    "terrain.plan": "CostConfig cost_map plan_way",
+    "terrain.plan": "CostConfig cost_map plan_vehicle_path",
     "terrain.pyramid": "Pyramid",
-    "terrain.tables": "Tables fixed_tables read_tables",
+    "terrain.tables": "TerrainWeights fixed_tables read_tables",
     "terrain.vehicle": "CELLS LineSensor Vehicle",
     "surface.layer": "SurfaceLayer",
     "surface.mesh": "position_sigma zero_set",
     "surface.piece": "SurfaceConfig",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

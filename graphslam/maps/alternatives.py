@@ -17,9 +17,9 @@ from graphslam.core.errors import DataError
 from graphslam.evidence.beams import BeamModel
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.maps.entropy import Clarity
+from graphslam.maps.entropy import MapEntropy
 from graphslam.maps.fuse import FusedMap
-from graphslam.maps.minimum_entropy import Candidate, rank_by_entropy
+from graphslam.maps.minimum_entropy import MapHypothesis, rank_by_entropy
 from graphslam.solve.solution import Solution
 
 TIES = ("match", "loop")
@@ -53,7 +53,7 @@ class Alternative:
     name: str
     graph: PoseGraph
     solution: Solution
-    candidate: Candidate
+    candidate: MapHypothesis
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -66,7 +66,7 @@ class Alternative:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class ScoredMap:
     """An alternative's figures.
 
     Parameters
@@ -77,7 +77,7 @@ class Judged:
         Of its graph; of matches and loops without their kernels, under which a wrong one hardly counts.
     contradicted : bool
         By that χ².
-    clarity : Clarity
+    clarity : MapEntropy
         Of its fused map.
     """
 
@@ -86,7 +86,7 @@ class Judged:
     chi2: float
     dof: int
     contradicted: bool
-    clarity: Clarity
+    clarity: MapEntropy
 
     @property
     def chi2_per_dof(self) -> float:
@@ -95,12 +95,12 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class RankedAlternatives:
     """Alternatives, the chosen one first.
 
     Parameters
     ----------
-    order : tuple of Judged
+    order : tuple of ScoredMap
         Those that nothing contradicts, by entropy; then the others, the least contradicted first.
     best_map : FusedMap
         Of the first.
@@ -108,12 +108,12 @@ class Choice:
         Variance of the chain by which every χ² was divided: 1, or what most ties say.
     """
 
-    order: tuple[Judged, ...]
+    order: tuple[ScoredMap, ...]
     best_map: FusedMap
     scale: float = 1.0
 
     @property
-    def best(self) -> Judged:
+    def best(self) -> ScoredMap:
         """The chosen one."""
         return self.order[0]
 
@@ -158,14 +158,14 @@ class Choice:
         return out
 
 
-def choose(
+def rank_alternatives(
     alternatives: Sequence[Alternative],
     *,
     model: BeamModel | None = None,
     placements: int = 1,
     contradiction: float = CONTRADICTION,
     progress: bool = False,
-) -> Choice:
+) -> RankedAlternatives:
     """Judge alternatives: by the χ² of their graphs, then by the entropy of their maps.
 
     Parameters
@@ -192,7 +192,7 @@ def choose(
     fits = [(chi2_of(a.graph), a.solution.score.dof) for a in alternatives]
     scale = noise_scale([a.ties for a in alternatives], fits)
     judged = [
-        Judged(k, a, chi2, dof, dof > 0 and float(stats.chi2.sf(chi2 / scale, dof)) < contradiction, clarity[k])
+        ScoredMap(k, a, chi2, dof, dof > 0 and float(stats.chi2.sf(chi2 / scale, dof)) < contradiction, clarity[k])
         for k, (a, (chi2, dof)) in enumerate(zip(alternatives, fits))
     ]
     order = sorted(judged, key=lambda j: (j.contradicted, j.chi2_per_dof if j.contradicted else 0.0,
@@ -200,7 +200,7 @@ def choose(
     best = ranking.best
     if order[0].number != ranking.order[0].index:
         best = rank_by_entropy([candidates[order[0].number]], model=model).best
-    return Choice(tuple(order), best, scale)
+    return RankedAlternatives(tuple(order), best, scale)
 
 
 def chi2_of(graph: PoseGraph) -> float:
@@ -233,11 +233,11 @@ def noise_scale(ties: Sequence[int], fits: Sequence[tuple[float, int]]) -> float
     return max(1.0, min(chi2 / dof for n, (chi2, dof) in zip(ties, fits) if n >= KEPT * most and dof > 0))
 
 
-def _contradiction(j: Judged) -> str:
+def _contradiction(j: ScoredMap) -> str:
     return f"contradicted by its own graph (χ² {j.chi2:.1f} of {j.dof})"
 
 
-def _dimmer(j: Judged, best: Judged) -> str:
+def _dimmer(j: ScoredMap, best: ScoredMap) -> str:
     if best.contradicted:
         return _contradiction(j)
     return f"entropy {j.clarity.entropy - best.clarity.entropy:+.1f} nat m³"

@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 
 from graphslam.core.dense import CloudMap
 from graphslam.core.geometry import Array
-from graphslam.core.points import thin
-from graphslam.core.poses import group_of, level
+from graphslam.core.points import voxel_downsample
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
-from graphslam.evidence.views import has_view, view_of
+from graphslam.evidence.views import dense_view, has_dense_view
 from graphslam.maps.pieces import DivisionConfig, owning_places
 from graphslam.maps.submaps import local_nodes
 
@@ -35,19 +35,19 @@ def fused_points(
     """
     made, cells = [], []
     for s in submaps:
-        cloud = view_of(s).cloud if has_view(s) else None
+        cloud = dense_view(s).cloud if has_dense_view(s) else None
         if cloud is None:
             continue
         times, T_world = nodes[s.key]
         local = local_nodes(s, times, level_nodes) if len(times) > 1 else group_of(T_world).identity[None]
-        T_world = level(T_world) if level_nodes else T_world
+        T_world = remove_roll_pitch(T_world) if level_nodes else T_world
         made.append(_placed(cloud, s, times, local, T_world, DivisionConfig() if config is None else config))
         cells.append(cloud.cell)
     if not made:
         return None
     points = np.concatenate(made)
     made.clear()
-    return thin(points, min(cells))
+    return voxel_downsample(points, min(cells))
 
 
 def _placed(cloud: CloudMap, s: Submap, times: Array, local: Array, T_world: Array, config: DivisionConfig) -> Array:

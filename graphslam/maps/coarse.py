@@ -23,7 +23,7 @@ PIXELS = 1 << 25
 """Of a floor plan or a picture at most: about a square kilometre of 0.2 m voxels. One takes 20 bytes as it is drawn."""
 
 
-def levels_for(reach: float) -> int:
+def pool_levels(reach: float) -> int:
     """Levels of a pool that addresses voxels so far from its origin, at most those there are."""
     return next((k for k in range(DEFAULT_LEVELS, MAX_LEVELS) if half_edge(k) > reach), MAX_LEVELS)
 
@@ -66,7 +66,7 @@ def coarse_grid(grid: EvidenceGrid) -> EvidenceGrid:
     return out
 
 
-def drawable(grid: EvidenceGrid, pixels: int = PIXELS) -> EvidenceGrid:
+def drawable_map(grid: EvidenceGrid, pixels: int = PIXELS) -> EvidenceGrid:
     """The map, or a coarser one of which no picture from above or from the side has more pixels."""
     while True:
         low, high = known_bounds(grid)
@@ -76,7 +76,7 @@ def drawable(grid: EvidenceGrid, pixels: int = PIXELS) -> EvidenceGrid:
         grid = coarse_grid(grid)
 
 
-def within_octomap(grid: EvidenceGrid) -> EvidenceGrid:
+def fit_octomap(grid: EvidenceGrid) -> EvidenceGrid:
     """The map, or a coarser one that the cube of OctoMap's files holds."""
     while max(-int(known_bounds(grid)[0].min()), int(known_bounds(grid)[1].max())) > OCTOMAP_HALF:
         grid = coarse_grid(grid)

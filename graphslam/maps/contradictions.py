@@ -64,7 +64,7 @@ class Contradictions:
         return float(self.denied.sum()) / self.points if self.points >= FEW else None
 
     @property
-    def doubted(self) -> npt.NDArray[np.int64]:
+    def contradicted_submaps(self) -> npt.NDArray[np.int64]:
         """Rows of the pairs that contradict each other, the worst first."""
         n = self.seen + self.denied
         share = self.denied / np.maximum(n, 1)
@@ -72,9 +72,9 @@ class Contradictions:
         return rows[np.argsort(-share[rows], kind="stable")]
 
     @property
-    def denies(self) -> bool:
+    def is_contradictory(self) -> bool:
         """Do passes deny each other, so that another graph may show one place where this one shows two?"""
-        return (self.share is not None and self.share > LOOK) or len(self.doubted) > 1
+        return (self.share is not None and self.share > LOOK) or len(self.contradicted_submaps) > 1
 
     def agrees_better(self, other: Contradictions) -> bool:
         """Is a smaller share denied here, of at least half as many points that were told of?"""
@@ -87,7 +87,7 @@ class Contradictions:
             "pairs": len(self.pairs),
             "points": self.points,
             "share": self.share,
-            "doubted": self.pairs[self.doubted].tolist(),
+            "doubted": self.pairs[self.contradicted_submaps].tolist(),
         }
 
 
@@ -95,7 +95,7 @@ NOTHING = Contradictions(np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.z
 """No submap came to the place of another."""
 
 
-def contradictions(
+def find_contradictions(
     pieces: Mapping[PieceId, Piece], at: Mapping[PieceId, Array], model: BeamModel | None = None
 ) -> Contradictions:
     """Look for the solid voxels of every piece in those that came to the same place by another way.

@@ -21,12 +21,12 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, STEP
 from graphslam.evidence.scan import pose_row
 from graphslam.maps.compare_kernels import compare_pieces
-from graphslam.maps.fuse import FusedMap, fuse
+from graphslam.maps.fuse import FusedMap, fuse_pieces
 from graphslam.maps.pieces import Piece, PieceId, checked_poses
 
 
 @dataclass(frozen=True, slots=True)
-class Clarity:
+class MapEntropy:
     """How clear a map is.
 
     Parameters
@@ -47,16 +47,16 @@ class Clarity:
         return self.entropy / self.volume if self.volume > 0 else float("nan")
 
 
-def clarity_of(maps: Iterable[EvidenceGrid | FusedMap]) -> Clarity:
+def mean_map_entropy(maps: Iterable[EvidenceGrid | FusedMap]) -> MapEntropy:
     """Mean entropy and known volume of some maps."""
     found = [(m.entropy(), m.known_volume()) for m in maps]
     if not found:
         raise DataError("there is no map whose entropy could be taken", wanted="one at least")
     entropy, volume = np.mean(found, axis=0)
-    return Clarity(entropy=float(entropy), volume=float(volume))
+    return MapEntropy(entropy=float(entropy), volume=float(volume))
 
 
-def placements(count: int, voxel_size: float, dim: int) -> Array:
+def grid_placements(count: int, voxel_size: float, dim: int) -> Array:
     """Poses ``(count, 7)`` or ``(count, 3)`` of a path's frame in a grid, none of them favoured.
 
     Headings over a quarter turn, and positions, heights foremost, over a voxel, both spread evenly. A single one is the
@@ -76,9 +76,9 @@ def placements(count: int, voxel_size: float, dim: int) -> Array:
     return poses
 
 
-def clarity(
+def map_entropy(
     pieces: Mapping[PieceId, Piece], poses: Mapping[PieceId, Any], *, model: BeamModel | None = None, count: int = 1
-) -> Clarity:
+) -> MapEntropy:
     """Entropy of pieces fused at ``T_world_node``, in grids that stand in ``count`` different ways.
 
     Where the voxels lie counts: a floor in the middle of its layer is clear, one between two layers is not.
@@ -87,14 +87,14 @@ def clarity(
         raise DataError("the entropy of no pieces", wanted="one at least")
     first = next(iter(pieces.values()))
     group = SE3 if first.dim == 3 else SE2
-    fused = fuse(pieces, poses, model=model, tolerance=0.0)
+    fused = fuse_pieces(pieces, poses, model=model, tolerance=0.0)
     at = {name: checked_poses(poses[name], first.dim) for name in pieces}
     found = []
-    for T in placements(count, first.voxel_size, first.dim):
+    for T in grid_placements(count, first.voxel_size, first.dim):
         if count > 1:
             fused.move({name: group.compose(T, pose) for name, pose in at.items()})
-        found.append(clarity_of([fused]))
-    return Clarity(float(np.mean([c.entropy for c in found])), float(np.mean([c.volume for c in found])))
+        found.append(mean_map_entropy([fused]))
+    return MapEntropy(float(np.mean([c.entropy for c in found])), float(np.mean([c.volume for c in found])))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class Disagreement:
         return self.contradicting / self.overlap if self.overlap else float("nan")
 
 
-def disagreement(
+def measure_disagreement(
     piece_a: Piece,
     T_a: Any,
     piece_b: Piece,

@@ -16,7 +16,7 @@ from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.map_server import save_map_server
 from graphslam.evidence.octomap import write_octomap
 from graphslam.evidence.pool import GridPool
-from graphslam.maps.coarse import drawable, within_octomap
+from graphslam.maps.coarse import drawable_map, fit_octomap
 
 STOREY_GAP = 1.5
 """Heights of a path that lie farther apart than this are of different storeys [m]."""
@@ -147,11 +147,11 @@ def save_maps(
     target.mkdir(parents=True, exist_ok=True)
     made = [save_ply(grid, target / f"{name}.ply")]
     if grid.dim == 2:
-        return made + list(save_map_server(drawable(grid), target / f"{name}.yaml"))
-    write_octomap(within_octomap(grid), target / f"{name}.bt")
+        return made + list(save_map_server(drawable_map(grid), target / f"{name}.yaml"))
+    write_octomap(fit_octomap(grid), target / f"{name}.bt")
     made.append(target / f"{name}.bt")
     for band, (low, high) in (bands or {}).items():
         plan = floor_plan(grid, low, high)
         if plan.voxel_counts().known:
-            made += save_map_server(drawable(plan), target / f"{name}-{band}.yaml")
+            made += save_map_server(drawable_map(plan), target / f"{name}-{band}.yaml")
     return made

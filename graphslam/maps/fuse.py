@@ -21,20 +21,20 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GridError
 from graphslam.core.geometry import Array
-from graphslam.core.interrupt import deferred_interrupts
+from graphslam.core.interrupt import defer_interrupts
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.batch import write_packed
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.contents import entropy_of_counts
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, MAX_LEVELS, half_edge
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import pose_rows
-from graphslam.maps.coarse import levels_for
+from graphslam.maps.coarse import pool_levels
 from graphslam.maps.fuse_kernels import count_changes, find_bricks
 from graphslam.maps.pieces import MARGIN, Piece, PieceId, checked_poses
-from graphslam.maps.posed import Posed, Poser
+from graphslam.maps.transformed_piece import PieceTransformer, TransformedPiece
 
 Ints = npt.NDArray[np.int64]
 Names = Iterable[PieceId]
@@ -45,7 +45,7 @@ _NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class MapChange:
     """What a change of a fused map came to.
 
     Parameters
@@ -91,12 +91,12 @@ class FusedMap:
     --------
     >>> import numpy as np
     >>> from graphslam.evidence.grid import EvidenceGrid
-    >>> from graphslam.maps.pieces import whole
+    >>> from graphslam.maps.pieces import piece_of_grid
     >>> grid = EvidenceGrid(0.1)
     >>> _ = grid.insert_scan([[2.0, 0.0, 0.0], [2.0, 0.5, 0.0]])
     >>> fused = FusedMap(0.1)
     >>> at = np.array([0.0, 0, 0, 0, 0, 0, 1])
-    >>> _ = fused.add({"a": whole(grid)}, {"a": at})
+    >>> _ = fused.add({"a": piece_of_grid(grid)}, {"a": at})
     >>> fused.move({"a": at + [1.0, 0, 0, 0, 0, 0, 0]}).moved
     1
     """
@@ -118,9 +118,9 @@ class FusedMap:
         self.tolerance = float(tolerance)
         if not (isinstance(threads, int) and threads >= 1):
             raise ConfigError(f"a fused map of {threads} threads; wanted ≥ 1")
-        self._posers = [Poser(self._grid.voxel_size, dim, self._grid.pool.half) for _ in range(threads)]
+        self._posers = [PieceTransformer(self._grid.voxel_size, dim, self._grid.pool.half) for _ in range(threads)]
         self._pieces: dict[PieceId, Piece] = {}
-        self._posed: dict[PieceId, Posed] = {}
+        self._posed: dict[PieceId, TransformedPiece] = {}
         self._wanted: dict[PieceId, Array] = {}
         # voxels by value of the map as it was when they were last asked for, and what was written since
         self._counts = np.zeros(65536, np.int64)
@@ -188,7 +188,7 @@ class FusedMap:
         twin = FusedMap.__new__(FusedMap)
         twin._grid, twin._grows = self._grid.copy(), self._grows
         twin.tolerance = self.tolerance
-        twin._posers = [Poser(self.voxel_size, self.dim, self._grid.pool.half) for _ in self._posers]
+        twin._posers = [PieceTransformer(self.voxel_size, self.dim, self._grid.pool.half) for _ in self._posers]
         twin._pieces, twin._posed, twin._wanted = dict(self._pieces), dict(self._posed), dict(self._wanted)
         twin._counts, twin._counted = self._counts, self._counted.copy()
         twin._uncounted, twin._empty = list(self._uncounted), self._empty
@@ -201,15 +201,15 @@ class FusedMap:
 
     # --- changing --------------------------------------------------------------------------------------------
 
-    def add(self, pieces: Mapping[PieceId, Piece], poses: Mapping[PieceId, Any]) -> Change:
+    def add(self, pieces: Mapping[PieceId, Piece], poses: Mapping[PieceId, Any]) -> MapChange:
         """Add pieces at ``T_world_node``; see :meth:`update`."""
         return self.update(add=pieces, poses=poses)
 
-    def remove(self, names: Names) -> Change:
+    def remove(self, names: Names) -> MapChange:
         """Take pieces out; see :meth:`update`."""
         return self.update(remove=names)
 
-    def move(self, poses: Mapping[PieceId, Any], *, tolerance: float | None = None) -> Change:
+    def move(self, poses: Mapping[PieceId, Any], *, tolerance: float | None = None) -> MapChange:
         """Move pieces to ``T_world_node``; see :meth:`update`. Pieces that are not named stay."""
         return self.update(poses=poses, tolerance=tolerance)
 
@@ -220,7 +220,7 @@ class FusedMap:
         remove: Names = (),
         poses: Mapping[PieceId, Any] | None = None,
         tolerance: float | None = None,
-    ) -> Change:
+    ) -> MapChange:
         """Add, remove and move pieces at once: the map is made anew once, or, after an error, not at all.
 
         Parameters
@@ -260,8 +260,8 @@ class FusedMap:
                 written.append(some)
                 empty += gone_empty
             changed = np.concatenate(written)
-            with deferred_interrupts():
-                self._grid.take(work)
+            with defer_interrupts():
+                self._grid.replace_contents(work)
                 self._posed = posed
                 for name in gone:
                     del self._pieces[name], self._wanted[name]
@@ -269,7 +269,7 @@ class FusedMap:
                 self._wanted |= wanted
                 self._uncounted.append(changed)
         self._tidy(empty)
-        return Change(len(add), len(gone), len(moved), len(movers) - len(moved), len(keys), len(changed))
+        return MapChange(len(add), len(gone), len(moved), len(movers) - len(moved), len(keys), len(changed))
 
     # --- inside ----------------------------------------------------------------------------------------------
 
@@ -320,7 +320,7 @@ class FusedMap:
     def _make_room(self, add: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]) -> None:
         """Begin anew in a pool of more levels where pieces would reach out of this one."""
         reach = max((reach_of(add.get(n) or self._pieces[n], T) for n, T in wanted.items()), default=0.0)
-        levels = levels_for(reach)
+        levels = pool_levels(reach)
         if not self._grows or levels <= self._grid.pool.levels or reach > half_edge(MAX_LEVELS):
             return
         larger = FusedMap(
@@ -331,7 +331,9 @@ class FusedMap:
         self._counts, self._counted = larger._counts, larger._counted
         self._uncounted, self._empty = larger._uncounted, 0
 
-    def _pose(self, pieces: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]) -> dict[PieceId, Posed]:
+    def _pose(
+        self, pieces: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]
+    ) -> dict[PieceId, TransformedPiece]:
         """Pieces on the lattice of the world."""
         if not pieces:
             return {}
@@ -346,7 +348,7 @@ class FusedMap:
         by_size = sorted(range(len(work)), key=lambda k: -work[k][0][1].known)
         shares = [by_size[i :: len(self._posers)] for i in range(len(self._posers))]
 
-        def run(poser: Poser, share: list[int]) -> list[Posed]:
+        def run(poser: PieceTransformer, share: list[int]) -> list[TransformedPiece]:
             return [poser.pose(work[k][0][1], work[k][1], work[k][2]) for k in share]
 
         with ThreadPoolExecutor(len(self._posers)) as executor:
@@ -358,7 +360,7 @@ class FusedMap:
         """Now and then drop the bricks in which nothing is known any more, and what was noted of changes twice."""
         self._empty += empty
         if self._empty > 1000 and 2 * self._empty > len(self._grid.brick_coordinates()):
-            compact(self._grid)
+            compact_grids(self._grid)
             self._empty = 0
         if sum(map(len, self._uncounted[1:])) > 2 * len(self._uncounted[0]) + 100_000:
             self._uncounted = [np.unique(np.concatenate(self._uncounted))]
@@ -387,7 +389,7 @@ def reach_of(piece: Piece, T_world_node: Array) -> float:
     return float(far) / piece.voxel_size + MARGIN * BRICK_EDGE
 
 
-def fuse(
+def fuse_pieces(
     pieces: Mapping[PieceId, Piece],
     poses: Mapping[PieceId, Any],
     *,

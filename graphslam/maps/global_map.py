@@ -69,7 +69,7 @@ class GlobalMap:
         return self.node_times if self.base_nodes is None else self.node_times[self.base_nodes]
 
 
-def make_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], confirmed: int) -> GlobalMap:
+def make_global_map(solution: Solution, submaps: list[Submap], hits: dict[int, int], confirmed: int) -> GlobalMap:
     """Trajectory at full rate, nodes, and the landmarks seen at least ``confirmed`` times."""
     n = np.array([hits.get(int(i), 0) for i in solution.landmark_ids], dtype=np.int64)
     keep = n >= confirmed

@@ -19,13 +19,13 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.beams import BeamModel
-from graphslam.maps.entropy import Clarity, clarity_of, placements
-from graphslam.maps.fuse import FusedMap, fuse
+from graphslam.maps.entropy import MapEntropy, grid_placements, mean_map_entropy
+from graphslam.maps.fuse import FusedMap, fuse_pieces
 from graphslam.maps.pieces import Piece, PieceId, checked_poses
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class MapHypothesis:
     """A hypothesis of the map.
 
     Parameters
@@ -43,14 +43,14 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Ranked:
+class RankedMap:
     """A candidate's figures.
 
     Parameters
     ----------
     index : int
         Of the candidate as given.
-    clarity : Clarity
+    clarity : MapEntropy
         Its entropy, by which the order is, and known volume beside it.
     changed : int
         Pieces that were moved, added or removed to come to it, over all placements.
@@ -60,34 +60,34 @@ class Ranked:
 
     index: int
     name: str
-    clarity: Clarity
+    clarity: MapEntropy
     changed: int
     summed: int
 
 
 @dataclass(frozen=True, slots=True)
-class Ranking:
+class EntropyRanking:
     """Candidates in the order of their entropy.
 
     Parameters
     ----------
-    order : tuple of Ranked
+    order : tuple of RankedMap
         The clearest first; of equal ones that which was given first.
     best : FusedMap
         The map of the first.
     """
 
-    order: tuple[Ranked, ...]
+    order: tuple[RankedMap, ...]
     best: FusedMap
 
 
 def rank_by_entropy(
-    candidates: Sequence[Candidate],
+    candidates: Sequence[MapHypothesis],
     *,
     model: BeamModel | None = None,
     count: int = 1,
     progress: bool = False,
-) -> Ranking:
+) -> EntropyRanking:
     """Fuse every candidate, and put them in the order of their entropy.
 
     Parameters
@@ -109,7 +109,7 @@ def rank_by_entropy(
     size = next(iter(candidates[0].pieces.values())).voxel_size
     poses = [{n: checked_poses(c.poses[n], dim) for n in c.pieces} for c in candidates]
     way = visiting_order([_signature(c, p) for c, p in zip(candidates, poses)])
-    stands = placements(count, size, dim)
+    stands = grid_placements(count, size, dim)
     entropies, volumes = np.zeros((len(candidates), count)), np.zeros((len(candidates), count))
     work = np.zeros((len(candidates), 2), np.int64)
     best: tuple[float, int] | None = None
@@ -119,7 +119,7 @@ def rank_by_entropy(
             fused: FusedMap | None = None
             for k in way:
                 fused = _follow(fused, candidates[k], _placed(poses[k], T, dim, count), model, work[k])
-                found = clarity_of([fused])
+                found = mean_map_entropy([fused])
                 entropies[k, s], volumes[k, s] = found.entropy, found.volume
                 if count == 1 and (best is None or (found.entropy, k) < best):
                     best, best_map = (found.entropy, k), fused.copy()
@@ -127,14 +127,18 @@ def rank_by_entropy(
     means = entropies.mean(axis=1)
     ranked = sorted(range(len(candidates)), key=lambda k: (means[k], k))
     order = tuple(
-        Ranked(
-            k, candidates[k].name, Clarity(float(means[k]), float(volumes[k].mean())), int(work[k, 0]), int(work[k, 1])
+        RankedMap(
+            k,
+            candidates[k].name,
+            MapEntropy(float(means[k]), float(volumes[k].mean())),
+            int(work[k, 0]),
+            int(work[k, 1]),
         )
         for k in ranked
     )
     if best_map is None:
-        best_map = fuse(candidates[ranked[0]].pieces, poses[ranked[0]], model=model)
-    return Ranking(order, best_map)
+        best_map = fuse_pieces(candidates[ranked[0]].pieces, poses[ranked[0]], model=model)
+    return EntropyRanking(order, best_map)
 
 
 def visiting_order(signatures: Sequence[frozenset[Any]]) -> list[int]:
@@ -148,7 +152,7 @@ def visiting_order(signatures: Sequence[frozenset[Any]]) -> list[int]:
     return way
 
 
-def _signature(c: Candidate, poses: Mapping[PieceId, Array]) -> frozenset[Any]:
+def _signature(c: MapHypothesis, poses: Mapping[PieceId, Array]) -> frozenset[Any]:
     return frozenset((name, id(piece), poses[name].tobytes()) for name, piece in c.pieces.items())
 
 
@@ -159,7 +163,7 @@ def _placed(poses: Mapping[PieceId, Array], T: Array, dim: int, count: int) -> M
 
 
 def _follow(
-    fused: FusedMap | None, c: Candidate, poses: Mapping[PieceId, Array], model: BeamModel | None, work: Any
+    fused: FusedMap | None, c: MapHypothesis, poses: Mapping[PieceId, Array], model: BeamModel | None, work: Any
 ) -> FusedMap:
     """The map of a candidate, made from that of another."""
     if fused is None:

@@ -5,9 +5,9 @@ through. A point is on something that moved where at least two neighbours know i
 beside, and more of them than support it; and where it has company. The ground is left alone: rows of it that are grazed
 by beams to farther ground look the same. What moves away and never lets its place be seen stays.
 
-Without clouds, :func:`outvoted` asks moments instead of submaps: evidence adds up beam by beam, so a person who stands
-for a second before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them. Where every
-moment has one vote, they do.
+Without clouds, :func:`seen_through_voxels` asks moments instead of submaps: evidence adds up beam by beam, so a person
+who stands for a second before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them.
+Where every moment has one vote, they do.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.shelved import shelved
+from graphslam.evidence.spilled_grid import spill_grid
 
 Mask = npt.NDArray[np.bool_]
 
@@ -107,7 +107,7 @@ def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig 
     return out
 
 
-class MovedThings:
+class MovedObjects:
     """The things that points are on which are known to have moved, in other scans of the same time.
 
     :func:`moving_points` knows some points of a thing, and not its foot, which looks like the ground. What belongs to
@@ -179,11 +179,11 @@ def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Su
             points = cloud.points[(cloud.scan == k) & ~gone]
             if len(points):
                 drawn.insert_scan(points, np.broadcast_to(origin, points.shape))
-        out.append(replace(s, cloud=left, grid=shelved(drawn), report={**s.report, "points_moved": int(gone.sum())}))
+        out.append(replace(s, cloud=left, grid=spill_grid(drawn), report={**s.report, "points_moved": int(gone.sum())}))
     return out
 
 
-def outvoted(
+def seen_through_voxels(
     grid: EvidenceGrid, moments: Iterable[EvidenceGrid], config: MovingConfig | None = None
 ) -> tuple[Array, Mask]:
     """Occupied voxels of a map that more moments saw through than were stopped by.

@@ -87,7 +87,7 @@ def count_owned(owners, counts):
 
 
 @kernel()
-def deal_out(owners, values, starts, places, dealt):
+def distribute_voxels(owners, values, starts, places, dealt):
     """Copy each voxel to its owner's bricks.
 
     ``dealt (total, 512)`` is all unknown; the bricks of node m are its rows from ``starts[m]`` on, in the order of the

@@ -11,8 +11,8 @@ node whose stretch of the path saw it most plausibly, and moves with that node.
   owns. Voxels there hold the evidence of both visits, added up, and cannot be divided; the nearest place would deal a
   wall out by centimetres, and the graph could then tear it into dust. So the whole wall goes with one.
 * *Maps that were entered again.* A segment that enters an older map begins with a copy of it. What lies farther from
-  its path than its sensor reaches (`DivisionConfig.reach`) it cannot have seen; :mod:`graphslam.maps.added` takes the
-  rest of the older evidence out.
+  its path than its sensor reaches (`DivisionConfig.reach`) it cannot have seen; :mod:`graphslam.maps.increment` takes
+  the rest of the older evidence out.
 
 Stretches meet half-way between nodes, measured along the path, so that no voxel is led by a node that is farther along
 than another.
@@ -32,14 +32,14 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, GridError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import SE2, SE3
-from graphslam.core.shelf import SHELF, Arrays
+from graphslam.core.spill_cache import SPILL_CACHE, Arrays
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import BRICK_EDGE, BRICK_VOXELS, UNKNOWN
-from graphslam.evidence.shelved import packed_values, unpacked_values
-from graphslam.evidence.views import view_of
-from graphslam.maps.piece_kernels import count_owned, deal_out, known_extents, own_voxels
+from graphslam.evidence.spilled_grid import packed_values, unpacked_values
+from graphslam.evidence.views import dense_view
+from graphslam.maps.piece_kernels import count_owned, distribute_voxels, known_extents, own_voxels
 
 Ints = npt.NDArray[np.int64]
 Steps = npt.NDArray[np.int16]
@@ -109,7 +109,8 @@ class _Bricks:
 class Piece:
     """Voxels that move with one node: a value that does not change, in the lattice of the frame of its submap's base.
 
-    Its bricks lie on the shelf of the process (:mod:`graphslam.core.shelf`): take an array of them once, and use it.
+    Its bricks lie on the shelf of the process (:mod:`graphslam.core.spill_cache`): take an array of them once, and use
+    it.
 
     Parameters
     ----------
@@ -172,7 +173,7 @@ class Piece:
         which = np.stack(np.meshgrid(*[[0, 1]] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
         base = ends[which, np.arange(dim)] if self.known else np.zeros((0, dim))
         self.corners = group.transform(group.inverse(np.broadcast_to(T, (len(base), group.size))), base)
-        self._bricks = SHELF.put(bricks, bricks.nbytes, _Bricks.packed, partial(_Bricks.unpacked, first, size))
+        self._bricks = SPILL_CACHE.put(bricks, bricks.nbytes, _Bricks.packed, partial(_Bricks.unpacked, first, size))
 
     @property
     def coordinates(self) -> Ints:
@@ -216,7 +217,7 @@ def checked_poses(poses: Any, dim: int) -> Array:
     return T
 
 
-def whole(grid: EvidenceGrid, T_base_node: Any = None) -> Piece:
+def piece_of_grid(grid: EvidenceGrid, T_base_node: Any = None) -> Piece:
     """A grid in one piece.
 
     Parameters
@@ -233,7 +234,7 @@ def whole(grid: EvidenceGrid, T_base_node: Any = None) -> Piece:
     )
 
 
-def divide(
+def divide_grid(
     grid: EvidenceGrid,
     path: Trajectory,
     node_times: Any,
@@ -285,7 +286,7 @@ def divide(
     ends = np.cumsum(counts)
     dealt = np.full((int(ends[-1]), BRICK_VOXELS), UNKNOWN, np.int16)
     rows = np.empty(int(ends[-1]), np.int64)
-    deal_out(owners, values, ends - counts, rows, dealt)
+    distribute_voxels(owners, values, ends - counts, rows, dealt)
     return [
         Piece(grid.voxel_size, grid.dim, coordinates[rows[a:b]], dealt[a:b], T)
         for a, b, T in zip((ends - counts).tolist(), ends.tolist(), T_nodes)
@@ -348,13 +349,13 @@ def pieces_of_submap(
     names : sequence, optional
         Default ``(key, 0)``, ``(key, 1)`` …
     """
-    grid = view_of(submap).evidence()
+    grid = dense_view(submap).evidence()
     if node_times is None:
-        pieces = [whole(grid)]
+        pieces = [piece_of_grid(grid)]
     elif submap.trajectory is None:
         raise DataError(f"submap {submap.key} has no path to divide it along", wanted="a trajectory")
     else:
-        pieces = divide(grid, submap.trajectory, node_times, T_base_nodes=T_base_nodes, config=config)
+        pieces = divide_grid(grid, submap.trajectory, node_times, T_base_nodes=T_base_nodes, config=config)
     called: Sequence[PieceId] = [(submap.key, k) for k in range(len(pieces))] if names is None else names
     if len(called) != len(pieces) or len(set(called)) != len(called):
         raise DataError("names of pieces differ in number, or are repeated", got=called, wanted=f"{len(pieces)} names")

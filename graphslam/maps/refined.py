@@ -11,13 +11,13 @@ import numpy.typing as npt
 from graphslam.core.dense import CloudMap
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.points import transform
-from graphslam.core.poses import group_of, level
+from graphslam.core.points import transform_points
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.shelved import shelved
+from graphslam.evidence.spilled_grid import spill_grid
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.refine import Refinement
 from graphslam.refine.scans import Scans
@@ -114,8 +114,8 @@ def base_frames(m: GlobalMap) -> Array:
     if m.dim == 2:
         return bases
     g = group_of(bases)
-    lean = np.linalg.norm(g.log(g.between(level(bases), bases))[:, :2], axis=1)
-    return level(bases) if np.all(lean < MOST_TILT) else bases
+    lean = np.linalg.norm(g.log(g.between(remove_roll_pitch(bases), bases))[:, :2], axis=1)
+    return remove_roll_pitch(bases) if np.all(lean < MOST_TILT) else bases
 
 
 def map_of_frames(m: GlobalMap) -> GlobalMap:
@@ -162,7 +162,7 @@ def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> Evid
         points, origins, returns = scans.scan(k)
         if len(points):
             drawn.insert_scan(points, origins, pose=T, max_range=scans.max_range, returns=returns)
-    return shelved(drawn)
+    return spill_grid(drawn)
 
 
 def _seen(cloud: CloudMap, scans: Scans, steps: Index, poses: Array) -> CloudMap | None:
@@ -172,8 +172,8 @@ def _seen(cloud: CloudMap, scans: Scans, steps: Index, poses: Array) -> CloudMap
     for k, T in zip(steps.tolist(), poses):
         p, o, met = scans.scan(k)
         if met.any():
-            points.append(transform(T, p[met]))
-            origins.append(transform(T, o[met][:1]))
+            points.append(transform_points(T, p[met]))
+            origins.append(transform_points(T, o[met][:1]))
             scan.append(np.full(int(met.sum()), len(scan), np.int64))
     if not points:
         return None

@@ -12,16 +12,16 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import MAX_LEVELS, half_edge
-from graphslam.evidence.views import has_view, view_of
+from graphslam.evidence.views import dense_view, has_dense_view
 from graphslam.maps.clouds import fused_points
 from graphslam.maps.coarse import coarse_piece
-from graphslam.maps.contradictions import NOTHING, Contradictions, contradictions
+from graphslam.maps.contradictions import NOTHING, Contradictions, find_contradictions
 from graphslam.maps.export import storeys
-from graphslam.maps.fuse import FusedMap, fuse, reach_of
+from graphslam.maps.fuse import FusedMap, fuse_pieces, reach_of
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
@@ -145,7 +145,7 @@ class RunMap:
 
 def has_maps(submaps: Sequence[Submap]) -> bool:
     """Has every submap a dense map, an evidence grid or a cloud?"""
-    return bool(submaps) and all(has_view(s) for s in submaps)
+    return bool(submaps) and all(has_dense_view(s) for s in submaps)
 
 
 def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
@@ -168,7 +168,7 @@ def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array
     for name in divided.pieces:
         assert isinstance(name, tuple)
         T = nodes[name[0]][1][name[1]]
-        out[name] = level(T) if divided.level_nodes else T
+        out[name] = remove_roll_pitch(T) if divided.level_nodes else T
     return out
 
 
@@ -196,7 +196,7 @@ def make_run_map(
     """
     config = MapConfig() if config is None else config
     if not has_maps(submaps):
-        bare = [s.key for s in submaps if not has_view(s)]
+        bare = [s.key for s in submaps if not has_dense_view(s)]
         raise MissingDataError(
             "submaps have no evidence grids or clouds to make a map of",
             got=f"{len(bare)} of {len(submaps)} without",
@@ -218,7 +218,7 @@ def make_run_map(
     model = grid.model if isinstance(grid, EvidenceGrid) else None
     at = solved_poses(divided, nodes)
     divided, coarsened = _held(divided, at)
-    fused = fuse(divided.pieces, divided.poses, model=model, threads=config.threads)
+    fused = fuse_pieces(divided.pieces, divided.poses, model=model, threads=config.threads)
     fuse_s = time.perf_counter() - begin
     open_entropy, open_volume = fused.entropy(), fused.known_volume()
     begin = time.perf_counter()
@@ -226,7 +226,7 @@ def make_run_map(
     fused.release_scratch()
     points = fused_points(submaps, nodes, level_nodes=level_nodes, config=division)
     move_s = time.perf_counter() - begin
-    knows_space = all(view_of(s).knows_space for s in submaps)
+    knows_space = all(dense_view(s).knows_space for s in submaps)
     bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
     return RunMap(
         fused,
@@ -240,7 +240,7 @@ def make_run_map(
         points,
         knows_space,
         coarsened,
-        contradictions(divided.pieces, at, model),
+        find_contradictions(divided.pieces, at, model),
     )
 
 
@@ -268,5 +268,5 @@ def _one_piece(s: Submap, nodes: Mapping[int, tuple[Array, Array]]) -> Submap:
 def _levelled(bases: Array) -> bool:
     """Do all bases ``(k, 7)`` stand about level?"""
     group = group_of(bases)
-    lean = group.log(group.between(level(bases), bases))[:, :2]
+    lean = group.log(group.between(remove_roll_pitch(bases), bases))[:, :2]
     return bool(np.all(np.linalg.norm(lean, axis=1) < MOST_TILT))

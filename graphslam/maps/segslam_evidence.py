@@ -16,9 +16,9 @@ import numpy.typing as npt
 from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.added import added, grid_of, own_evidence
+from graphslam.maps.increment import evidence_grid_of, map_increment, own_evidence
 from graphslam_frontends.segslam.segmap import NEW, SegMap
-from graphslam_frontends.segslam.submaps import base_of
+from graphslam_frontends.segslam.submaps import segment_base
 
 
 def own_evidence_of(
@@ -43,14 +43,14 @@ def own_evidence_of(
     for i, s in zip(np.asarray(chain, dtype=np.int64).tolist(), submaps):
         source = int(t.source[i])
         if t.kind[i] == NEW:
-            out[s.key] = grid_of(s)
+            out[s.key] = evidence_grid_of(s)
             continue
         if not t.alive[source] or not np.array_equal(t.T_map[i], t.T_map[source]):
             unknown = True
             continue
         grid, T_map = segmap.map_of(i)
-        found = added(grid, segmap.map_of(source)[0])
-        T_base_map = g.inverse(g.compose(T_map, base_of(segmap, segmap[i].T_entry)))
+        found = map_increment(grid, segmap.map_of(source)[0])
+        T_base_map = g.inverse(g.compose(T_map, segment_base(segmap, segmap[i].T_entry)))
         moved = grid.empty()
         moved.merge(found.grid, T_base_map)
         out[s.key] = moved

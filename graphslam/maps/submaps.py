@@ -9,11 +9,11 @@ import numpy as np
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import SE2, SE3, group_of, level
+from graphslam.core.poses import SE2, SE3, group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.added import own_evidence
+from graphslam.maps.increment import own_evidence
 from graphslam.maps.pieces import DivisionConfig, Piece, PieceId, node_times_every, pieces_of_submap
 
 
@@ -44,7 +44,7 @@ class DividedSubmaps:
     def along(self, path: Trajectory) -> dict[PieceId, Array]:
         """``T_world_node`` where a path ``T_world_body(t)`` has the body at the times of the nodes."""
         poses = path.interpolate(np.array(list(self.times.values())))
-        return dict(zip(self.times, level(poses) if self.level_nodes else poses))
+        return dict(zip(self.times, remove_roll_pitch(poses) if self.level_nodes else poses))
 
     def from_bases(self, bases: dict[int, Array]) -> dict[PieceId, Array]:
         """``T_world_node`` from ``T_world_base`` by key: submaps that stay rigid."""
@@ -76,7 +76,7 @@ def divide_submaps(
     config : DivisionConfig, optional
         Give its ``reach``: the sensor's.
     own : bool
-        Take out of a submap that entered an older map what it had from there (:mod:`graphslam.maps.added`).
+        Take out of a submap that entered an older map what it had from there (:mod:`graphslam.maps.increment`).
     grids : mapping of key to EvidenceGrid, optional
         What each submap saw itself, where that is known exactly (:mod:`graphslam.maps.segslam_evidence`).
     level_nodes : bool
@@ -138,4 +138,4 @@ def _clipped(path: Trajectory, times: Array) -> Array:
 
 def _poses(path: Trajectory, times: Array, level_nodes: bool) -> Array:
     poses = path.interpolate(times)
-    return level(poses) if level_nodes else poses
+    return remove_roll_pitch(poses) if level_nodes else poses

@@ -1,8 +1,8 @@
 """Layer 8: figures: data in, matplotlib axes out."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "comparison": "comparison_figure plot_comparison",
     "consistency": "plot_consistency",
     "evidence": "plot_heights plot_section plot_sharing",
@@ -26,6 +26,6 @@ _FACE = {
     "surface": "plot_surface",
     "terrain": "plot_bands plot_terrain",
     "trajectory": "plot_gps_residuals",
-    "without_truth": "plot_innovations plot_loop_matrix",
+    "residual_consistency": "plot_innovations plot_loop_matrix",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -27,7 +27,9 @@ def voxel_bounds(grid: EvidenceGrid) -> tuple[npt.NDArray[np.int64], npt.NDArray
     return BRICK_EDGE * c.min(axis=0), BRICK_EDGE * (c.max(axis=0) + 1)
 
 
-def section(grid: EvidenceGrid, axis: str = "z", at: float = 0.0) -> tuple[Array, tuple[float, float, float, float]]:
+def grid_section(
+    grid: EvidenceGrid, axis: str = "z", at: float = 0.0
+) -> tuple[Array, tuple[float, float, float, float]]:
     """Probabilities of the voxels a plane cuts, ``(rows, columns)``, NaN where nothing is known, and their extent [m].
 
     Columns and rows are the other two axes in the order x, y, z.
@@ -68,7 +70,7 @@ def plot_section(
         Where the plane lies on that axis [m].
     """
     ax = style.new_axes(ax)
-    p, extent = section(grid, axis, at)
+    p, extent = grid_section(grid, axis, at)
     ax.set_facecolor("0.72")
     if p.size:
         ax.imshow(p, cmap="gray_r", vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="nearest")

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 
 from graphslam.core.geometry import Array
 from graphslam.evaluate.gps import GpsResiduals
-from graphslam.evaluate.gps_floor import fix_segments
+from graphslam.evaluate.gps_repeatability import fix_segments
 from graphslam.plots import style
 
 

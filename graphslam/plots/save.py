@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from graphslam.plots import style
 
 
-def save(ax: Axes, path: Path) -> Path:
+def save_figure(ax: Axes, path: Path) -> Path:
     """Write the figure of ``ax`` as PNG and close it; the same data give the same bytes (no date, no version)."""
     figure = ax.figure
     assert isinstance(figure, Figure)
@@ -21,8 +21,8 @@ def save(ax: Axes, path: Path) -> Path:
     return path
 
 
-def png(ax: Axes) -> bytes:
-    """The figure of ``ax`` as the bytes of a PNG, as :func:`save` would write them; closes it."""
+def figure_png(ax: Axes) -> bytes:
+    """The figure of ``ax`` as the bytes of a PNG, as :func:`save_figure` would write them; closes it."""
     figure = ax.figure
     assert isinstance(figure, Figure)
     out = io.BytesIO()

@@ -15,7 +15,7 @@ from graphslam.core.submap import Submap
 from graphslam.plots import style
 from graphslam.plots.exit_points import draw_exits
 from graphslam.plots.paths import position_covariances
-from graphslam_frontends.segslam.covariance import Nees
+from graphslam_frontends.segslam.covariance import ExitNees
 
 _COLOURS = (style.ESTIMATE, style.PURPLE, style.GREEN)
 
@@ -67,7 +67,7 @@ def plot_segment_exit(
 
 
 def plot_exit_nees(
-    ax: Axes | None, scores: Mapping[str, Nees], *, confidence: float = 0.95, title: str | None = None
+    ax: Axes | None, scores: Mapping[str, ExitNees], *, confidence: float = 0.95, title: str | None = None
 ) -> Axes:
     """Squared error of every segment's exit in units of its covariance, for several covariances (log scale).
 
@@ -75,7 +75,7 @@ def plot_exit_nees(
 
     Parameters
     ----------
-    scores : mapping of label to Nees
+    scores : mapping of label to ExitNees
         Of the same segments, in order.
     confidence : float
         Of the band.

@@ -24,7 +24,7 @@ _REASON_STYLES = ("-", "--", ":", "-.")
 
 
 @dataclass(frozen=True, slots=True)
-class Tie:
+class DrawnMatch:
     """A re-entry, drawn between where a segment began and where the entered one passed.
 
     Parameters
@@ -104,7 +104,7 @@ def plot_segments(
     ax: Axes | None,
     paths: Sequence[Path],
     *,
-    ties: Sequence[Tie] = (),
+    ties: Sequence[DrawnMatch] = (),
     labels: Sequence[str] | None = None,
     truth: Path | None = None,
     plane: str = "xy",
@@ -116,7 +116,7 @@ def plot_segments(
     ----------
     paths : sequence of Trajectory or (n, dim)
         In one frame and in the order of time; :func:`sample_paths` makes them from a map sample.
-    ties : sequence of Tie
+    ties : sequence of DrawnMatch
         Matches.
     labels : sequence of str, optional
         What is written where each begins; default its number.
@@ -154,7 +154,7 @@ def plot_segments(
 
 def sample_paths(
     segmap: SegMap, sample: MapSample, *, frame: Literal["root", "first"] = "root"
-) -> tuple[list[Array], list[Tie], list[str]]:
+) -> tuple[list[Array], list[DrawnMatch], list[str]]:
     """Paths of the closed segments of a map sample, in the order of time, for :func:`plot_segments`; the matches
     between them; and their labels.
 
@@ -166,7 +166,7 @@ def sample_paths(
     Returns
     -------
     paths : list of (n, dim)
-    ties : list of Tie
+    ties : list of DrawnMatch
         Of segments that entered a map which the sample holds.
     labels : list of str
         Number in time, with "m" where an older map was entered.
@@ -180,7 +180,7 @@ def sample_paths(
         poses = g.compose(np.broadcast_to(first, poses.shape), poses)
     place = {int(i): k for k, i in enumerate(sample.segments.tolist()) if i != OPEN}
     paths: list[Array] = []
-    ties: list[Tie] = []
+    ties: list[DrawnMatch] = []
     labels: list[str] = []
     for k in sample.in_time.tolist():
         i = int(sample.segments[k])
@@ -195,7 +195,7 @@ def sample_paths(
         seen = g.compose(g.inverse(t.link[i]), s.T_entry)  # the body in the frame of the entered segment
         at = poses[place[s.source]]
         nearest = source.path[nearest_step(segmap, s.source, seen) - source.interval[0]]
-        ties.append(Tie(paths[-1][0], _placed(at, nearest[None])[0]))
+        ties.append(DrawnMatch(paths[-1][0], _placed(at, nearest[None])[0]))
     return paths, ties, labels
 
 

@@ -19,7 +19,7 @@ _LIGHT = np.array([0.35, -0.45, 0.82])  # a little aslant, so that neighbouring 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class ViewDirection:
     """Where one looks from.
 
     Parameters
@@ -55,7 +55,7 @@ def plot_solid(
     ax: Axes | None = None,
     *,
     below: float,
-    view: View | None = None,
+    view: ViewDirection | None = None,
     margin: float = 6.0,
     pixels: int = 900,
     way: bool = True,
@@ -79,7 +79,7 @@ def plot_solid(
     DataError
         Nothing of the world is below the cut.
     """
-    view = View() if view is None else view
+    view = ViewDirection() if view is None else view
     ax = style.new_axes(ax, (8.0, 5.0))
     p = world.route().positions(world.route().every(0.25))
     floor = max(float(world.vertices[:, 2].min()), float(p[:, 2].min()) - 1.0)
@@ -111,7 +111,7 @@ def plot_cloud(
     points: npt.ArrayLike,
     ax: Axes | None = None,
     *,
-    view: View | None = None,
+    view: ViewDirection | None = None,
     size: float = 1.5,
     path: npt.ArrayLike | None = None,
     colours: npt.ArrayLike | None = None,
@@ -144,7 +144,7 @@ def plot_cloud(
     own = None if colours is None else np.asarray(colours, dtype=np.float64)
     if own is not None and own.shape != (len(p), 4):
         raise DataError("colours do not belong to the points", got=own.shape, wanted=f"({len(p)}, 4)")
-    view = View() if view is None else view
+    view = ViewDirection() if view is None else view
     ax = style.new_axes(ax, (8.0, 5.0))
     order = np.argsort(p @ view.axes[2])  # the nearest last, on top
     xy = view.project(p[order])
@@ -166,14 +166,16 @@ def _ends(x: Array, margin: float) -> tuple[Array, Array]:
     return x.min(axis=-1) - margin, x.max(axis=-1) + margin
 
 
-def _visible(caster: RayCaster, view: View, points: Array, below: float) -> npt.NDArray[np.bool_]:
+def _visible(caster: RayCaster, view: ViewDirection, points: Array, below: float) -> npt.NDArray[np.bool_]:
     """Is there nothing between points ``(n, 3)`` and the cut, towards the viewer?"""
     back = view.axes[2]
     ranges = caster.ranges(np.concatenate([points, np.broadcast_to(back, points.shape)], axis=-1))
     return np.asarray(~(ranges < (below - points[:, 2]) / back[2]))
 
 
-def _shaded(caster: RayCaster, view: View, u: Array, v: Array, below: float, sides: tuple[Array, Array]) -> Array:
+def _shaded(
+    caster: RayCaster, view: ViewDirection, u: Array, v: Array, below: float, sides: tuple[Array, Array]
+) -> Array:
     """Colours ``(rows, columns, 4)`` of what rays meet that begin at the cut: grey by slope, blue-green by height."""
     right, up, back = view.axes
     grid = u[None, :, None] * right + v[:, None, None] * up

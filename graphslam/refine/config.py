@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam.registration.surfaces import SurfaceConfig
+from graphslam.registration.surfaces import SurfaceFitConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class RefineConfig:
     """Of so many beams in the log at most surfaces are made; more are thinned evenly, which bounds the memory."""
     knot: float = 30.0
     """Time between the knots of the yaw bias [s]."""
-    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
     """What counts as a surface."""
 
     def __post_init__(self) -> None:

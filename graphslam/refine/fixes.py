@@ -19,8 +19,8 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.graph.gps import GpsConfig, arm_jacobian, spread, start_datum
-from graphslam.refine.motion import MotionModel, States, Terms
+from graphslam.graph.gps import GpsConfig, arm_jacobian, greatest_distance, start_datum
+from graphslam.refine.motion import MotionModel, MotionTerms, States
 
 Index = npt.NDArray[np.int64]
 
@@ -116,7 +116,7 @@ class FixModel:
         d = self.group.dim
         if len(self.times) < 3:
             return False
-        return min(spread(self.positions[:, :2]), spread(poses[self.k, :d][:, :2])) >= baseline
+        return min(greatest_distance(self.positions[:, :2]), greatest_distance(poses[self.k, :d][:, :2])) >= baseline
 
     def _biases(self, config: GpsConfig, uneven: bool) -> None:
         """Which bias each fix carries, and how each bias follows from the one before."""
@@ -187,7 +187,7 @@ class FixModel:
         e = self.group.transform(states[-2], self.antennas(poses)) - self.positions
         return np.asarray(e + states[-1][self.bias] if len(self.keep) else e)
 
-    def terms(self, poses: Array, states: States) -> list[Terms]:
+    def terms(self, poses: Array, states: States) -> list[MotionTerms]:
         """Fixes under their kernel, what biases are beforehand, and up where gravity tells it."""
         g, d = self.group, self.group.dim
         datum, biases = states[-2:]
@@ -207,7 +207,7 @@ class FixModel:
         e = np.einsum("kij,kj->ki", self.whiteners, self.residuals(poses, states))
         W = np.sqrt(self.robust.weight(np.sum(e**2, axis=1)))
         out = [
-            Terms(
+            MotionTerms(
                 W[:, None] * e,
                 W[:, None, None] * (self.whiteners @ np.concatenate(J, axis=2)),
                 self.nodes,
@@ -220,15 +220,15 @@ class FixModel:
             r = np.einsum("kij,kj->ki", self.bias_whiteners, biases - self.keep[:, None] * before)
             B = np.concatenate([self.bias_whiteners, -self.keep[:, None, None] * self.bias_whiteners], axis=2)
             one = self._chain[:, 0] == self._chain[:, 1]
-            first = Terms(r[one], B[one][:, :, :d], self._chain[one][:, :1], (d,), "biases of fixes")
-            out += [first, Terms(r[~one], B[~one], self._chain[~one], (d, d), "biases of fixes")]
+            first = MotionTerms(r[one], B[one][:, :, :d], self._chain[one][:, :1], (d,), "biases of fixes")
+            out += [first, MotionTerms(r[~one], B[~one], self._chain[~one], (d, d), "biases of fixes")]
         if d == 3:
             up = se3.quat_to_matrix(datum[3:])[2]  # the fixes' up in the frame of the path
             # d/dξ of Rᵀ e_z = [Rᵀ e_z]× ξ
             J_up = np.zeros((2, 6))
             J_up[:, :3] = se3.skew(up)[:2]
             s = UPRIGHT if self.gravity else LEANING
-            out.append(Terms((up[:2] / s)[None], (J_up / s)[None], self._datum_nodes, (6,), "up of fixes"))
+            out.append(MotionTerms((up[:2] / s)[None], (J_up / s)[None], self._datum_nodes, (6,), "up of fixes"))
         return out
 
     def report(self, poses: Array, states: States) -> FixReport:

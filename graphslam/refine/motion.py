@@ -40,7 +40,7 @@ second, fourth and the last two."""
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class MotionTerms:
     """Whitened residuals of one kind of factor, with what they depend on.
 
     Parameters
@@ -205,7 +205,7 @@ class MotionModel:
         a = self.nodes[:, 2] - len(self.steps)
         return np.column_stack([bias[a], bias[a + 1], np.tile(constants, (len(a), 1))])
 
-    def terms(self, poses: Array, states: States) -> list[Terms]:
+    def terms(self, poses: Array, states: States) -> list[MotionTerms]:
         """All factors at a path ``(n, 7|3)`` and states (yaw bias at the knots ``(k,)``, constants ``(c,)``)."""
         out = [self._odometry(poses, states), *self._priors(states)]
         if self.gravity:
@@ -222,7 +222,7 @@ class MotionModel:
         J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr, -self.B], axis=2)
         return e[:, self.keep], J[:, self.keep]
 
-    def _odometry(self, poses: Array, states: States) -> Terms:
+    def _odometry(self, poses: Array, states: States) -> MotionTerms:
         e, J = self._increments(poses, states)
         W = self.whiteners()
         if self.group.dim == 2:
@@ -230,16 +230,18 @@ class MotionModel:
             r = np.einsum("kij,kj->ki", W, e)
             W = W * np.sqrt(np.minimum(1.0, SLIPPED / np.maximum(np.sum(r**2, axis=1), 1e-12)))[:, None, None]
         dof = self.group.dof
-        return Terms(np.einsum("kij,kj->ki", W, e), W @ J, self.nodes, (dof, dof, 1, 1, self.constants), "odometry")
+        return MotionTerms(
+            np.einsum("kij,kj->ki", W, e), W @ J, self.nodes, (dof, dof, 1, 1, self.constants), "odometry"
+        )
 
-    def _priors(self, states: States) -> list[Terms]:
+    def _priors(self, states: States) -> list[MotionTerms]:
         bias, constants = states[:2]
         s, n, K = self.sigmas, len(self.steps), len(self.knots)
-        first = Terms(
+        first = MotionTerms(
             np.array([[bias[0] / s.yaw_bias]]), np.array([[[1.0 / s.yaw_bias]]]), np.array([[n]]), (1,), "yaw bias"
         )
         q = np.maximum(self.walk * s.yaw_walk * np.sqrt(np.diff(self.knots)), 1e-12)
-        walk = Terms(
+        walk = MotionTerms(
             (np.diff(bias) / q)[:, None],
             np.stack([-1.0 / q, 1.0 / q], axis=1)[:, None, :],
             np.column_stack([n + np.arange(K - 1), n + np.arange(1, K)]),
@@ -247,19 +249,19 @@ class MotionModel:
             "yaw bias walk",
         )
         sigma = self.constant_sigmas()
-        fixed = Terms(
+        fixed = MotionTerms(
             (constants / sigma)[None], np.diag(1.0 / sigma)[None], np.array([[n + K]]), (self.constants,), "constants"
         )
         return [first, walk, fixed]
 
-    def _gravity(self, poses: Array, states: States) -> list[Terms]:
+    def _gravity(self, poses: Array, states: States) -> list[MotionTerms]:
         """Errors of roll and pitch are an Ornstein–Uhlenbeck process: each is new only in so far as it is not the last.
 
         So every reading is spent once, be it as an absolute one or as the change since the one before.
         """
         steps, n = self.steps, len(self.steps)
         assert steps.tilt is not None
-        seen, D = se3.roll_pitch(poses)
+        seen, D = se3.roll_pitch_jacobian(poses)
         e = steps.tilt - seen - states[1][[ROLL, PITCH]]
         sigma = max(steps.tilt_sigma, 1e-5)
         phi = np.exp(-self.dt / max(steps.tilt_time, 1e-6))
@@ -268,12 +270,12 @@ class MotionModel:
         E = np.zeros((2, self.constants))
         E[0, ROLL] = E[1, PITCH] = 1.0
         D0 = np.concatenate([-D[:1], -E[None]], axis=2) / sigma
-        first = Terms(e[:1] / sigma, D0, np.array([[0, const]]), (6, self.constants), "gravity")
+        first = MotionTerms(e[:1] / sigma, D0, np.array([[0, const]]), (6, self.constants), "gravity")
         J = (
             np.concatenate([phi[:, None, None] * D[:-1], -D[1:], -(1.0 - phi)[:, None, None] * E[None]], axis=2)
             / new[:, None, None]
         )
-        later = Terms(
+        later = MotionTerms(
             (e[1:] - phi[:, None] * e[:-1]) / new[:, None],
             J,
             np.column_stack([np.arange(n - 1), np.arange(1, n), np.full(n - 1, const)]),
@@ -282,7 +284,7 @@ class MotionModel:
         )
         return [first, later]
 
-    def gauge(self, poses: Array, held: Array) -> Terms:
+    def gauge(self, poses: Array, held: Array) -> MotionTerms:
         """Position and heading of the first pose held at ``held``; with gravity its roll and pitch are free."""
         g = self.group
         e = g.log(g.between(held, poses[0]))
@@ -294,7 +296,7 @@ class MotionModel:
             r = np.concatenate([[up @ e[:3]], e[3:]])
         else:
             J, r = np.eye(g.dof), e
-        return Terms((r / HELD)[None], (J / HELD)[None], np.array([[0]]), (g.dof,), "gauge")
+        return MotionTerms((r / HELD)[None], (J / HELD)[None], np.array([[0]]), (g.dof,), "gauge")
 
 
 SLIPPED = 16.3

@@ -47,7 +47,7 @@ def scans_at(steps: Scans, nodes: Index) -> Scans:
     """The scans of some steps, with the motion between them."""
     g, o = steps.group, steps.odometry
     increments, covariances = o.increments[nodes].copy(), o.covariances[nodes].copy()
-    U, P = chained(steps, nodes)
+    U, P = motion_from_node(steps, nodes)
     last = nodes[1:] - 1
     increments[1:] = g.compose(U[last], o.increments[nodes[1:]])
     back = g.adjoint(g.inverse(o.increments[nodes[1:]]))
@@ -68,7 +68,7 @@ def scans_at(steps: Scans, nodes: Index) -> Scans:
     )
 
 
-def thinned(steps: Scans, most: int) -> Scans:
+def thin_beams(steps: Scans, most: int) -> Scans:
     """The same steps with so many beams at most, spread evenly over all there are."""
     q = len(steps.points)
     if q <= most:
@@ -84,7 +84,7 @@ def thinned(steps: Scans, most: int) -> Scans:
     )
 
 
-def chained(steps: Scans, nodes: Index) -> tuple[Array, Array]:
+def motion_from_node(steps: Scans, nodes: Index) -> tuple[Array, Array]:
     """Motion ``(n, 7|3)`` from the last node to each step, and its covariance ``(n, d, d)``, right tangent."""
     g, o, n = steps.group, steps.odometry, len(steps)
     first = np.zeros(n, bool)
@@ -99,7 +99,7 @@ def chained(steps: Scans, nodes: Index) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True)
-class Between:
+class StepsBetweenNodes:
     """Steps along the path of the nodes, each between two of them.
 
     Parameters
@@ -119,7 +119,7 @@ class Between:
     own: Array
 
     @classmethod
-    def at_nodes(cls, n: int, dof: int) -> Between:
+    def at_nodes(cls, n: int, dof: int) -> StepsBetweenNodes:
         """All steps are nodes."""
         every = np.arange(n, dtype=np.int64)
         none = np.zeros((n, dof, dof))
@@ -128,7 +128,7 @@ class Between:
 
 def path_between(
     steps: Scans, nodes: Index, poses: Array, covariances: Array, scales: Array
-) -> tuple[Array, Array, Between]:
+) -> tuple[Array, Array, StepsBetweenNodes]:
     """All steps along the refined path of the nodes.
 
     The odometry from node to node is off by what the path tells; how much of that had come about at a step is told by
@@ -148,7 +148,7 @@ def path_between(
     poses : (n, 7|3)
     covariances : (n, d, d)
         Errors of two nodes in a row are taken to be as alike as they can be.
-    between : Between
+    between : StepsBetweenNodes
         What steps between nodes do not share with a node holds, where wheels slipped on the way, the jump itself: a
         step at the share s of the way lies before it with the probability 1 - s, and its mean is off by the variance
         s (1 - s) of that.
@@ -156,7 +156,7 @@ def path_between(
     g, n = steps.group, len(steps)
     wide = scales[:, None] * scales[None, :]
     steps = replace(steps, odometry=replace(steps.odometry, covariances=steps.odometry.covariances * wide))
-    U, P = chained(steps, nodes)
+    U, P = motion_from_node(steps, nodes)
     a = np.clip(np.searchsorted(nodes, np.arange(n), side="right") - 1, 0, len(nodes) - 2)
     b = a + 1
     whole = scans_at(steps, nodes).odometry
@@ -183,4 +183,4 @@ def path_between(
     last = nodes[-1]
     by_a[nodes], by_b[nodes] = np.eye(g.dof), 0.0
     by_a[last], by_b[last] = 0.0, np.eye(g.dof)
-    return out, 0.5 * (C + np.swapaxes(C, 1, 2)), Between(a, b, by_a, by_b, own)
+    return out, 0.5 * (C + np.swapaxes(C, 1, 2)), StepsBetweenNodes(a, b, by_a, by_b, own)

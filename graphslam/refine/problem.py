@@ -12,13 +12,13 @@ from graphslam.core.geometry import Array
 from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
 from graphslam.refine.fixes import FixModel
-from graphslam.refine.motion import MotionModel, States, Terms
-from graphslam.refine.surfaces import Association, Cloud, Surfaces, blocks
+from graphslam.refine.motion import MotionModel, MotionTerms, States
+from graphslam.refine.surfaces import ScanReturns, SurfacePairs, Surfaces, row_blocks
 from graphslam.registration.plane_kernels import (
-    Held,
-    Pairs,
+    GroupInformation,
+    PlanePairs,
     group_information,
-    nothing_feigned,
+    no_noise_correction,
     plane_blocks,
     plane_residuals,
 )
@@ -27,7 +27,7 @@ from graphslam.registration.surfaces import rotations
 Index = npt.NDArray[np.int64]
 
 
-class Pattern:
+class BlockStructure:
     """Which nodes of a refinement share a block, and where the blocks stand in one flat array.
 
     Parameters
@@ -62,12 +62,12 @@ class Pattern:
     def at(self, a: Index, b: Index) -> Index:
         """Where blocks begin; the rows are those of the node that is eliminated first."""
         out = np.empty(len(a), np.int64)
-        for s in blocks(len(a)):
+        for s in row_blocks(len(a)):
             rows, columns = self._sorted(a[s], b[s])
             out[s] = self.offset[np.searchsorted(self.keys, rows * self.N + columns)]
         return out
 
-    def add(self, terms: Terms, H: Array, g: Array) -> float:
+    def add(self, terms: MotionTerms, H: Array, g: Array) -> float:
         """Add the blocks of a kind of factor to ``H`` and ``Jᵀ r`` to ``g``; the sum of squares."""
         first = np.cumsum((0, *terms.widths))
         JtJ = np.swapaxes(terms.J, 1, 2) @ terms.J
@@ -86,7 +86,7 @@ class Pattern:
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
+class LinearisedProblem:
     """One linearisation, factorised.
 
     Parameters
@@ -95,7 +95,7 @@ class Solved:
         Objective by kind of factor, ``Σ rᵀ Λ r`` at the point of linearisation.
     """
 
-    pattern: Pattern
+    pattern: BlockStructure
     factor: BlockFactor
     parts: dict[str, float]
 
@@ -108,7 +108,7 @@ MOTION = 0.25
 """Greatest share of the motion within a step in the spread of residuals that shall tell other noise."""
 
 
-def pair_noise(pairs: Association, residuals: Array) -> Array:
+def pair_noise(pairs: SurfacePairs, residuals: Array) -> Array:
     """Variances ``(3,)`` of a range and of the surfaces themselves [m²], from the residuals; 1 for the motion.
 
     A beam that grazes a floor misses it by far less than its range is wrong, so the spread of residuals follows the
@@ -141,7 +141,7 @@ LEAST_SPREAD = 1e-3
 """No surface is known better [m]."""
 
 
-def point_information(pairs: Association, residuals: Array, noise: Array, least: float = 0.0) -> Array:
+def point_information(pairs: SurfacePairs, residuals: Array, noise: Array, least: float = 0.0) -> Array:
     """Information of each pair: Geman–McClure weight over the variance of what it newly spends.
 
     Parameters
@@ -163,7 +163,7 @@ FEWEST_SUMS = 50
 """Sums of residuals below which it is not told whether errors are alike."""
 
 
-def alike(found: Association, cloud: Cloud, residuals: Array, noise: Array) -> float:
+def correlation_factor(found: SurfacePairs, cloud: ScanReturns, residuals: Array, noise: Array) -> float:
     """By how much the variance of sums of residuals is larger than if the errors of points were independent, ≥ 1.
 
     Beams of one scan share errors: of a line of the scanner, of the material and the slant of a wall, of a sweep that
@@ -199,7 +199,7 @@ def alike(found: Association, cloud: Cloud, residuals: Array, noise: Array) -> f
     return out
 
 
-def residuals(pairs: Pairs, cloud: Cloud, surfaces: Surfaces, poses: Array) -> Array:
+def surface_residuals(pairs: PlanePairs, cloud: ScanReturns, surfaces: Surfaces, poses: Array) -> Array:
     """Distances of source points from their surfaces ``(k,)`` at a path ``(n, 7|3)`` [m]."""
     out = np.empty(len(pairs.source))
     t = np.ascontiguousarray(poses[:, : cloud.points.shape[1]])
@@ -211,7 +211,9 @@ FEIGNED = 1.5
 """Of what noise of the normals feigns so many times as much is taken off: groups scatter about the average."""
 
 
-def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, information: Array) -> Held:
+def chunk_information(
+    found: SurfacePairs, cloud: ScanReturns, surfaces: Surfaces, poses: Array, information: Array
+) -> GroupInformation:
     """What each two chunks hold of each other, without what the noise of normals feigns.
 
     Normals of a smooth wall are tilted along it at random. Squared and added up over thousands of pairs they look as if
@@ -224,11 +226,11 @@ def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, inf
     pairs, group = found.pairs, found.whose
     d = cloud.points.shape[1]
     if not len(group):
-        return nothing_feigned(d)
+        return no_noise_correction(d)
     w, G = (6 if d == 3 else 3), int(group.max()) + 1
     R, t = rotations(poses), np.ascontiguousarray(poses[:, :d])
     centre = np.zeros((G, d))
-    for s in blocks(len(group)):
+    for s in row_blocks(len(group)):
         x = np.einsum("kij,kj->ki", R[pairs.j[s]], cloud.points[pairs.target[s]]) + t[pairs.j[s]]
         np.add.at(centre, group[s], x)
     centre /= np.maximum(np.bincount(group, minlength=G), 1)[:, None]
@@ -240,10 +242,10 @@ def held(found: Association, cloud: Cloud, surfaces: Surfaces, poses: Array, inf
     values, U = np.linalg.eigh(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, H), 1, 2)))
     share = np.maximum(1.0 - FEIGNED / np.maximum(values, 1e-12), 0.0)
     back = np.swapaxes(np.linalg.solve(np.swapaxes(L, 1, 2), U), 1, 2)  # Uᵀ L⁻¹
-    return Held(group, centre, np.ascontiguousarray((L @ (U * share[:, None, :])) @ back), surfaces.tilts)
+    return GroupInformation(group, centre, np.ascontiguousarray((L @ (U * share[:, None, :])) @ back), surfaces.tilts)
 
 
-class Problem:
+class RefinementProblem:
     """Scans, motion, gravity and fixes on the nodes of a path.
 
     Parameters
@@ -252,13 +254,13 @@ class Problem:
         Where the first pose is held.
     """
 
-    def __init__(self, motion: MotionModel, cloud: Cloud, held: Array, fixes: FixModel | None = None) -> None:
+    def __init__(self, motion: MotionModel, cloud: ScanReturns, held: Array, fixes: FixModel | None = None) -> None:
         self.motion, self.cloud, self.held, self.fixes = motion, cloud, held, fixes
         self.widths = motion.widths if fixes is None else np.concatenate([motion.widths, fixes.widths])
         self._key: object = None
-        self._pattern: Pattern | None = None
+        self._pattern: BlockStructure | None = None
 
-    def _pattern_of(self, pairs: Pairs, extra: list[Terms]) -> Pattern:
+    def _pattern_of(self, pairs: PlanePairs, extra: list[MotionTerms]) -> BlockStructure:
         key = (id(pairs.source), *(id(t.nodes) for t in extra))
         if self._key != key:
             n = self.motion.steps_count
@@ -277,7 +279,7 @@ class Problem:
                     for v in range(u):
                         a.append(t.nodes[:, u])
                         b.append(t.nodes[:, v])
-            self._pattern = Pattern(self.widths, np.concatenate(a), np.concatenate(b))
+            self._pattern = BlockStructure(self.widths, np.concatenate(a), np.concatenate(b))
             self._key, self._held = key, (pairs.source, extra)  # held: an address is a name while it lives
         assert self._pattern is not None
         return self._pattern
@@ -286,12 +288,12 @@ class Problem:
         self,
         poses: Array,
         states: States,
-        pairs: Pairs,
+        pairs: PlanePairs,
         surfaces: Surfaces,
         information: Array,
-        extra: list[Terms] | None = None,
-        holds: Held | None = None,
-    ) -> tuple[Solved, Array]:
+        extra: list[MotionTerms] | None = None,
+        holds: GroupInformation | None = None,
+    ) -> tuple[LinearisedProblem, Array]:
         """Factorised Gauss–Newton matrix at a path, and the step ``(N scalars,)``; None: pairs hold all they say."""
         more = [*(extra or []), *([] if self.fixes is None else self.fixes.terms(poses, states))]
         pattern, motion = self._pattern_of(pairs, more), self.motion
@@ -304,14 +306,14 @@ class Problem:
             "scans": plane_blocks(
                 pairs, (R, t), (self.cloud.points, surfaces.normals), information,
                 (pattern.at(own, own), pattern.at(pairs.i, pairs.j), pattern.rank),
-                holds or nothing_feigned(motion.group.dim), H, gp,
+                holds or no_noise_correction(motion.group.dim), H, gp,
             )
         }  # fmt: skip
         g[: n * w] = gp.ravel()
         for terms in [*motion.terms(poses, states), motion.gauge(poses, self.held), *more]:
             parts[terms.name] = parts.get(terms.name, 0.0) + pattern.add(terms, H, g)
         factor = pattern.symbolic.factor(pattern.offset, H)
-        return Solved(pattern, factor, parts), -factor.solve(g)
+        return LinearisedProblem(pattern, factor, parts), -factor.solve(g)
 
     def moved(self, poses: Array, states: States, step: Array) -> tuple[Array, States]:
         """Path and states after a step."""

@@ -17,21 +17,37 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.core.shelf import Slot
+from graphslam.core.spill_cache import CacheEntry
 from graphslam.graph.gps import GpsConfig
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.fixes import FixModel, FixReport
-from graphslam.refine.guides import ACCEPTED, Guides, find_guides
 from graphslam.refine.motion import MotionModel, States
-from graphslam.refine.nodes import Between, find_nodes, path_between, scans_at, thinned
-from graphslam.refine.problem import Problem, Solved, alike, held, pair_noise, point_information, residuals
+from graphslam.refine.nodes import StepsBetweenNodes, find_nodes, path_between, scans_at, thin_beams
+from graphslam.refine.problem import (
+    LinearisedProblem,
+    RefinementProblem,
+    chunk_information,
+    correlation_factor,
+    pair_noise,
+    point_information,
+    surface_residuals,
+)
+from graphslam.refine.revisit_constraints import ACCEPTED, RevisitConstraints, find_revisit_constraints
 from graphslam.refine.scans import Scans
-from graphslam.refine.surfaces import Association, ChunkPairs, Cloud, Surfaces, associate, chunk_pairs, find_surfaces
-from graphslam.registration.plane_kernels import Pairs
-from graphslam_frontends.odometry.recorded import chain
+from graphslam.refine.surfaces import (
+    ChunkPairs,
+    ScanReturns,
+    SurfacePairs,
+    Surfaces,
+    chunk_pairs,
+    find_surfaces,
+    match_surfaces,
+)
+from graphslam.registration.plane_kernels import PlanePairs
+from graphslam_frontends.odometry.recorded import chain_odometry
 
 log = logging.getLogger(__name__)
 Index = npt.NDArray[np.int64]
@@ -55,7 +71,7 @@ KEPT = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Round:
+class RefinementRound:
     """One association and what followed.
 
     Parameters
@@ -82,7 +98,7 @@ class Round:
 
 
 @dataclass(frozen=True, slots=True)
-class Other:
+class AttemptComparison:
     """Two attempts, from the start and from the odometry alone.
 
     Parameters
@@ -125,7 +141,7 @@ class Refinement:
         Share of the points of passes and neighbours that lie on the surfaces of the others, at both paths.
     reckoned : float
         The same share at the path of the odometry alone.
-    other : Other or None
+    other : AttemptComparison or None
         The second attempt, from the odometry, where the start contradicts the scans or the odometry agrees better.
     scales : (c,)
         By which the σ of the odometry's components were widened, since the scans show more.
@@ -134,11 +150,11 @@ class Refinement:
     motion : float
         χ² of the walk of the yaw bias by its degrees of freedom: far above 1 where the scans of passes and the motion
         contradict each other.
-    solved : Solved
+    solved : LinearisedProblem
         The last linearisation, for joint covariances.
     nodes : (m,)
         Steps that are nodes of the problem; between them the path follows the odometry.
-    between : Between
+    between : StepsBetweenNodes
         How the steps lie between nodes, and what they do not share with any.
     fixes : FixReport or None
         What fixes did; None: there were none, or their way is too short to say where north is.
@@ -155,18 +171,18 @@ class Refinement:
     start: Array
     yaw_bias: Array
     constants: dict[str, tuple[float, float]]
-    rounds: tuple[Round, ...]
+    rounds: tuple[RefinementRound, ...]
     parts: dict[str, float]
     refused: Index
     agreement: tuple[float, float]
     reckoned: float
-    other: Other | None
+    other: AttemptComparison | None
     scales: Array
     walk: float
     motion: float
-    solved: Solved
+    solved: LinearisedProblem
     nodes: Index
-    between: Between
+    between: StepsBetweenNodes
     fixes: FixReport | None = None
     alike: float = 1.0
     left: float | None = None
@@ -197,7 +213,7 @@ class Refinement:
         return np.asarray(C.reshape(len(k) * d, -1))
 
 
-def refine(
+def refine_by_scans(
     steps: Scans,
     start: Array,
     config: RefineConfig | None = None,
@@ -228,8 +244,8 @@ def refine(
     few = 3 <= len(nodes) < len(steps)
     if not few:
         nodes = np.arange(len(steps), dtype=np.int64)
-    some = thinned(scans_at(steps, nodes) if few else steps, config.most_beams)
-    work = _Work(some, start[nodes], config, gps, progress or (lambda _: None))
+    some = thin_beams(scans_at(steps, nodes) if few else steps, config.most_beams)
+    work = _Refiner(some, start[nodes], config, gps, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
     if work.cloud.chunks < 2:
@@ -259,12 +275,12 @@ def refine(
 class _Attempt:
     poses: Array
     states: States
-    cloud: Cloud
+    cloud: ScanReturns
     surfaces: Surfaces
     chunks: ChunkPairs
-    found: Association
+    found: SurfacePairs
     noise: Array
-    rounds: list[Round]
+    rounds: list[RefinementRound]
     scales: Array
     walk: float
 
@@ -277,11 +293,13 @@ def _reach(steps: Scans) -> float:
     return float(np.clip(np.quantile(np.linalg.norm(points[:: 1 + len(points) // 100_000], axis=1), 0.75), *REACH))
 
 
-NOTHING = Association(Pairs(*np.zeros((4, 0), np.int64)), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+NOTHING = SurfacePairs(
+    PlanePairs(*np.zeros((4, 0), np.int64)), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))
+)
 """No pairs."""
 
 
-class _Work:
+class _Refiner:
     """A refinement while it goes on."""
 
     def __init__(
@@ -295,21 +313,21 @@ class _Work:
         self.steps, self.start, self.config, self.tell = steps, start, config, tell
         self.group = group_of(start)
         turn = config.chunk_turn if steps.group.dim == 2 else np.inf
-        self.raw = self.cloud = Cloud.of(
+        self.raw = self.cloud = ScanReturns.of(
             steps, chunk_length=config.chunk_length, chunk_time=config.chunk_time, chunk_turn=turn
         )
         self.motion = MotionModel(steps, knot=config.knot, bridge=self.cloud.bridge())
         self.every = max(config.every, int(np.ceil(len(self.cloud.points) / config.most_points)))
         fixes = None if gps is None else FixModel(*gps, self.motion, start)
         self.fixes = fixes if fixes is not None and gps is not None and fixes.ready(gps[1].baseline, start) else None
-        self.problem = Problem(self.motion, self.cloud, start[0].copy(), self.fixes)
+        self.problem = RefinementProblem(self.motion, self.cloud, start[0].copy(), self.fixes)
         self.poses = start.copy()
         self.states = self.first_states()
-        self.rounds: list[Round] = []
+        self.rounds: list[RefinementRound] = []
         self.alike = 1.0
         self.found = NOTHING
         self.surfaces: Surfaces | None = None
-        self.first: Slot[Surfaces] | None = None
+        self.first: CacheEntry[Surfaces] | None = None
         self.length = float(steps.path_length[-1])
         self.reach = config.reach if config.reach is not None else _reach(steps)
         self.most = max(FEWEST, round(self.reach / config.chunk_length))
@@ -326,7 +344,7 @@ class _Work:
         self.all_passes(self.config.distances)
         other = None
         assert self.surfaces is not None
-        odometry = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
+        odometry = self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
         self.reckoned = self.agreement_along(odometry)
         contradicted = np.any(~taken & guides.far(self.poses))
         if contradicted or self.reckoned > self.agreement(self.cloud, self.surfaces, self.poses, self.noise):
@@ -339,9 +357,9 @@ class _Work:
         if not found.input_better or self.fixes is not None:  # fixes hold a path, and odometry knows none of them
             return found
         self.tell("the odometry alone agrees better than all that was made of it: its path is taken")
-        return self.as_it_came(found, odometry)
+        return self.initial_result(found, odometry)
 
-    def as_it_came(self, found: Refinement, odometry: Array) -> Refinement:
+    def initial_result(self, found: Refinement, odometry: Array) -> Refinement:
         """The path of the odometry, as sure as motion and gravity say without any scan."""
         assert self.surfaces is not None
         self.poses, self.states = odometry, self.first_states()
@@ -364,18 +382,18 @@ class _Work:
             solved=solved,
         )
 
-    def marginals(self, solved: Solved) -> Array:
+    def marginals(self, solved: LinearisedProblem) -> Array:
         """Covariances ``(n, d, d)`` of the poses."""
         n, w = len(self.steps), self.group.dof
         return solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
 
-    def from_odometry(self) -> Other:
+    def from_odometry(self) -> AttemptComparison:
         """Once more without the start, whose wrong loops may have pulled its right ones along or bent it too far.
 
         The path at which the scans agree better is kept.
         """
         first = self.attempt()
-        self.poses = self.group.compose(self.start[0], chain(self.steps.odometry).poses)
+        self.poses = self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
         self.states = self.first_states()
         self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
         self.cloud = self.problem.cloud = self.raw
@@ -390,7 +408,7 @@ class _Work:
         d = self.group.dim
         apart = float(np.sqrt(np.mean(np.sum((first.poses[:, :d] - second.poses[:, :d]) ** 2, axis=1))))
         self.take_up(second if b > a else first)
-        return Other(apart, max(a, b), min(a, b), b > a)
+        return AttemptComparison(apart, max(a, b), min(a, b), b > a)
 
     def attempt(self) -> _Attempt:
         """Where the refinement stands."""
@@ -435,14 +453,14 @@ class _Work:
         if passes:
             self.cloud = self.problem.cloud = self.raw
             self.cloud = self.problem.cloud = self.raw.corrected(self.motion.corrections(self.poses))
-        give_back()
+        trim_heap()
         if again or self.surfaces is None:
             self.surfaces = None
             self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
             if self.first is None:
                 self.first = self.surfaces.put_aside()
         self.chunks = chunk_pairs(self.cloud, self.poses, self.reach, self.most, passes=passes)
-        self.found = associate(
+        self.found = match_surfaces(
             self.cloud,
             self.surfaces,
             self.poses,
@@ -452,14 +470,14 @@ class _Work:
             within=self.motion.within if sigma is None else None,
         )
         before = self.poses
-        solved: Solved | None = None
+        solved: LinearisedProblem | None = None
         for _ in range(steps):
             solved = None  # a factor of a long path is the largest thing here: never two of them
-            r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
+            r = surface_residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
             noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
             information = point_information(self.found, r, noise, DOUBTED * distance)
             if sigma is None:
-                self.alike = alike(self.found, self.cloud, r, noise)
+                self.alike = correlation_factor(self.found, self.cloud, r, noise)
                 information /= self.alike
             solved = self.step(information)
         if passes and distance <= self.config.distances[0] and solved is not None:
@@ -469,31 +487,33 @@ class _Work:
         moved = float(np.sqrt(np.mean(np.sum((self.poses[:, :d] - before[:, :d]) ** 2, axis=1))))
         spread = 1.4826 * float(np.median(np.abs(r))) if len(r) else 0.0
         a, b, _ = np.sqrt(noise).tolist()
-        found = Round(distance, a, b, len(r), int(np.sum(self.chunks.passes[self.found.whose])), spread, moved)
+        found = RefinementRound(
+            distance, a, b, len(r), int(np.sum(self.chunks.passes[self.found.whose])), spread, moved
+        )
         self.rounds.append(found)
         self.tell(f"round {len(self.rounds)}: {found.pairs} pairs within {distance:g} m, moved by {moved:.3f} m")
         log.info("refine: %s", found)
 
-    def step(self, information: Array, extra: list[Any] | None = None) -> Solved:
+    def step(self, information: Array, extra: list[Any] | None = None) -> LinearisedProblem:
         """One Gauss–Newton step."""
         assert self.surfaces is not None
-        holds = held(self.found, self.cloud, self.surfaces, self.poses, information)
+        holds = chunk_information(self.found, self.cloud, self.surfaces, self.poses, information)
         solved, step = self.problem.linearise(
             self.poses, self.states, self.found.pairs, self.surfaces, information, extra or [], holds
         )
         self.poses, self.states = self.problem.moved(self.poses, self.states, step)
         return solved
 
-    def follow_guides(self) -> tuple[Guides, npt.NDArray[np.bool_]]:
+    def follow_guides(self) -> tuple[RevisitConstraints, npt.NDArray[np.bool_]]:
         """Bring passes together as the start has them where the scans between allow it; which of the guides they do."""
-        guides = find_guides(self.cloud, self.start, 0.5 * self.reach)
+        guides = find_revisit_constraints(self.cloud, self.start, 0.5 * self.reach)
         if not len(guides):
             return guides, np.zeros(0, bool)
         assert self.surfaces is not None
-        r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
+        r = surface_residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         information = point_information(self.found, r, np.array([0.0, NEAR[-1][1] ** 2, 0.0]))
         taken = np.zeros(len(guides), bool)
-        solved: Solved | None = None
+        solved: LinearisedProblem | None = None
         for _ in range(MOST_GATES):
             for _ in range(1 + 2 * int(taken.any())):
                 solved = None  # see `round`
@@ -507,12 +527,12 @@ class _Work:
         self.tell(f"{len(guides)} guides, {int(taken.sum())} of them agree with the scans between")
         return guides, taken
 
-    def agreement(self, cloud: Cloud, surfaces: Surfaces, poses: Array, noise: Array) -> float:
+    def agreement(self, cloud: ScanReturns, surfaces: Surfaces, poses: Array, noise: Array) -> float:
         """Share of the source points with a surface within reach that lie on it, to three times their σ.
 
         The pairs are found anew at this path, among surfaces made there: nothing is kept of how it came about.
         """
-        found = associate(
+        found = match_surfaces(
             cloud,
             surfaces,
             poses,
@@ -522,7 +542,7 @@ class _Work:
             within=self.motion.within,
             least_share=0.0,
         )
-        r = residuals(found.pairs, cloud, surfaces, poses)
+        r = surface_residuals(found.pairs, cloud, surfaces, poses)
         near = np.maximum(1.0 - r**2 / (9.0 * found.once @ noise), 0.0)
         weight = 1.0 / found.spent[:, 1]
         return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
@@ -531,14 +551,14 @@ class _Work:
         """The same of the raw scans at another path, with surfaces made there."""
         return self.agreement(self.raw, find_surfaces(self.raw, poses, self.config.surface), poses, self.noise)
 
-    def result(self, refused: Index, other: Other | None) -> Refinement:
+    def result(self, refused: Index, other: AttemptComparison | None) -> Refinement:
         """Covariances at the end, and all that was found."""
         assert self.surfaces is not None
         assert self.first is not None
-        give_back()
+        trim_heap()
         before = self.agreement(self.raw, self.first.get(), self.start, self.noise)
-        r = residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
-        self.alike = alike(self.found, self.cloud, r, self.noise)
+        r = surface_residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
+        self.alike = correlation_factor(self.found, self.cloud, r, self.noise)
         information = point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1])
         solved = self.step(information / self.alike)
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
@@ -567,7 +587,7 @@ class _Work:
             motion=solved.parts["yaw bias walk"] / max(K - 1, 1),
             solved=solved,
             nodes=np.arange(n, dtype=np.int64),
-            between=Between.at_nodes(n, w),
+            between=StepsBetweenNodes.at_nodes(n, w),
             alike=self.alike,
             fixes=None if self.fixes is None else self.fixes.report(self.poses, self.states),
         )

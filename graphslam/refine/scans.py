@@ -16,7 +16,7 @@ from graphslam.core.npz import Field, flags, floats, ints
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.poses import Group, group_of
 from graphslam.core.records import Odometry, check_times
-from graphslam_frontends.odometry.lasting import LastingSigmas, lasting_sigmas
+from graphslam_frontends.odometry.bias_sigmas import BiasSigmas, bias_sigmas
 from graphslam_frontends.odometry.steps import Steps
 
 SCANS_FORMAT = "graphslam.scans/1"
@@ -67,7 +67,7 @@ class Scans:
     origins: npt.NDArray[np.float32]
     returns: npt.NDArray[np.bool_]
     max_range: float
-    lasting: LastingSigmas
+    lasting: BiasSigmas
     ages: npt.NDArray[np.float32] | None = None
     tilt: Array | None = None
     tilt_sigma: float = 0.0
@@ -77,7 +77,7 @@ class Scans:
     @classmethod
     def of(cls, steps: Steps) -> Scans:
         """Those of steps, with σ of the lasting errors that their motion states, never less
-        than :data:`~graphslam_frontends.odometry.lasting.LEAST`."""
+        than :data:`~graphslam_frontends.odometry.bias_sigmas.LEAST`."""
         odometry = steps.odometry
         if steps.recorded is not None:  # scans mended it: they may not be counted in its σ as well as by themselves
             odometry = replace(odometry, covariances=steps.recorded.covariances)
@@ -90,7 +90,7 @@ class Scans:
             returns=steps.returns,
             ages=None if steps.ages is None else steps.ages.astype(np.float32),
             max_range=steps.max_range,
-            lasting=lasting_sigmas(steps),
+            lasting=bias_sigmas(steps),
             tilt=steps.tilt,
             tilt_sigma=steps.tilt_sigma,
             tilt_time=steps.tilt_time,
@@ -162,7 +162,7 @@ class Scans:
                 tilt=a.get("tilt"),
                 tilt_sigma=float(s[1]),
                 tilt_time=float(s[2]),
-                lasting=LastingSigmas(
+                lasting=BiasSigmas(
                     yaw_bias=float(s[3]),
                     yaw_walk=float(s[4]),
                     scale=float(s[5]),

@@ -10,10 +10,10 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
-from graphslam.core.shelf import SHELF, Slot
+from graphslam.core.spill_cache import SPILL_CACHE, CacheEntry
 from graphslam.refine.scans import Scans
-from graphslam.registration.plane_kernels import Pairs
-from graphslam.registration.surfaces import SurfaceConfig, fit_places, rotations, thin_places
+from graphslam.registration.plane_kernels import PlanePairs
+from graphslam.registration.surfaces import SurfaceFitConfig, fit_places, rotations, thin_places
 
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -23,21 +23,21 @@ BLOCK = 1 << 16
 """Rows that are worked on together: a matrix for each point of a long log would take gigabytes."""
 
 
-def blocks(n: int) -> Iterator[slice]:
+def row_blocks(n: int) -> Iterator[slice]:
     """Rows ``0 … n`` a block at a time."""
     return (slice(k, min(k + BLOCK, n)) for k in range(0, n, BLOCK))
 
 
-def turned(R: Array, step: Index, x: Array) -> Array:
+def rotate_by_step(R: Array, step: Index, x: Array) -> Array:
     """``R_step x`` of vectors ``(q, d)``, each by the rotation ``(n, d, d)`` of its own step."""
     out = np.empty(x.shape)
-    for s in blocks(len(x)):
+    for s in row_blocks(len(x)):
         np.einsum("kij,kj->ki", R[step[s]], x[s], out=out[s])
     return out
 
 
 @dataclass(frozen=True, slots=True)
-class Cloud:
+class ScanReturns:
     """Returns of all steps, and the chunks of the path in which neighbours are searched.
 
     Parameters
@@ -63,7 +63,7 @@ class Cloud:
     rows: Index
 
     @classmethod
-    def of(cls, steps: Scans, *, chunk_length: float, chunk_time: float, chunk_turn: float = np.inf) -> Cloud:
+    def of(cls, steps: Scans, *, chunk_length: float, chunk_time: float, chunk_turn: float = np.inf) -> ScanReturns:
         """The returns of steps in chunks of a length [m], at most of a time [s] and of a turn of the heading [rad]."""
         n = len(steps)
         step = np.repeat(np.arange(n), np.diff(steps.offsets))
@@ -90,7 +90,7 @@ class Cloud:
             rows,
         )
 
-    def corrected(self, corrections: Array) -> Cloud:
+    def corrected(self, corrections: Array) -> ScanReturns:
         """The cloud with beams placed anew in their steps, whose increments were wrong by ``(n, dof)``.
 
         An error of the increment grew evenly over the time of the step: a beam of age α was placed by the share α of
@@ -102,7 +102,7 @@ class Cloud:
 
         def moved(x: Array) -> Array:
             out = np.empty(x.shape)
-            for s in blocks(len(x)):
+            for s in row_blocks(len(x)):
                 c = -self.age[s, None] * corrections[self.step[s]]  # small: to first order
                 y = x[s]
                 if x.shape[1] == 3:
@@ -127,9 +127,9 @@ class Cloud:
     def world(self, poses: Array) -> tuple[Array, Array]:
         """Points and origins ``(q, d)`` in the world, at a path ``(n, 7|3)``."""
         R, t = rotations(poses), poses[:, : self.points.shape[1]]
-        W, O = turned(R, self.step, self.points), turned(R, self.step, self.origins)
+        W, O = rotate_by_step(R, self.step, self.points), rotate_by_step(R, self.step, self.origins)
         for x in (W, O):
-            for s in blocks(len(x)):
+            for s in row_blocks(len(x)):
                 x[s] += t[self.step[s]]
         return W, O
 
@@ -155,14 +155,14 @@ class Surfaces:
     stands: Index
     tilts: npt.NDArray[np.float32]
 
-    def put_aside(self) -> Slot[Surfaces]:
+    def put_aside(self) -> CacheEntry[Surfaces]:
         """On the shelf of the process: surfaces that are asked for once more at the end."""
         parts = [self.normals, self.flat, self.stands, self.tilts]
         size = sum(a.nbytes for a in parts)
-        return SHELF.put(self, size, lambda s: [s.normals, s.flat, s.stands, s.tilts], lambda a: Surfaces(*a))
+        return SPILL_CACHE.put(self, size, lambda s: [s.normals, s.flat, s.stands, s.tilts], lambda a: Surfaces(*a))
 
 
-def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces:
+def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) -> Surfaces:
     """Surfaces of all places among those of their own and the two neighbouring chunks, at a path.
 
     Neighbours in time only: points of other passes lie beside these ones before the passes agree, and would turn the
@@ -182,8 +182,8 @@ def find_surfaces(cloud: Cloud, poses: Array, config: SurfaceConfig) -> Surfaces
         normals[own], tilts[own], flat[own] = fit_places(W, O, own, near, config)
     back = np.swapaxes(rotations(poses), 1, 2)
     for a in range(d - 1):
-        tilts[:, a] = turned(back, cloud.step, tilts[:, a])
-    return Surfaces(turned(back, cloud.step, normals), flat, stands, tilts)
+        tilts[:, a] = rotate_by_step(back, cloud.step, tilts[:, a])
+    return Surfaces(rotate_by_step(back, cloud.step, normals), flat, stands, tilts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +216,7 @@ PASSES = 2
 """A chunk is compared with as many chunks as so many passes before it have."""
 
 
-def chunk_pairs(cloud: Cloud, poses: Array, reach: float, most: int, *, passes: bool) -> ChunkPairs:
+def chunk_pairs(cloud: ScanReturns, poses: Array, reach: float, most: int, *, passes: bool) -> ChunkPairs:
     """Chunks next to each other on the way; with ``passes`` also those whose centres are within ``reach`` [m].
 
     Of one pass, no more than ``most`` chunks are paired with a chunk, and of all passes before it no more than
@@ -251,7 +251,7 @@ def _nearest(pairs: Index, centres: Array, most: int) -> Index:
 
 
 @dataclass(frozen=True, slots=True)
-class Association:
+class SurfacePairs:
     """Pairs of points on surfaces, and what is known of their errors.
 
     Parameters
@@ -268,14 +268,14 @@ class Association:
         spent twice.
     """
 
-    pairs: Pairs
+    pairs: PlanePairs
     whose: Index
     once: Array
     spent: Array
 
 
-def associate(
-    cloud: Cloud,
+def match_surfaces(
+    cloud: ScanReturns,
     surfaces: Surfaces,
     poses: Array,
     chunks: ChunkPairs,
@@ -285,7 +285,7 @@ def associate(
     within: Array | None = None,
     alike: float = 0.85,
     least_share: float = 0.10,
-) -> Association:
+) -> SurfacePairs:
     """Nearest surface in each chunk for every ``every``-th point of its partner.
 
     Parameters
@@ -302,7 +302,7 @@ def associate(
     """
     W, O = cloud.world(poses)
     R = rotations(poses)
-    N = turned(R, cloud.step, surfaces.normals)
+    N = rotate_by_step(R, cloud.step, surfaces.normals)
     p, q, w = _nearest_surfaces(cloud, surfaces, W, N, chunks, distance, every, alike, least_share)
     O -= W
     beam = np.linalg.norm(O, axis=1)
@@ -312,7 +312,7 @@ def associate(
     i, j = cloud.step[p], cloud.step[q]
     shared = None if within is None else [ALIKE * np.bincount(k, minlength=len(within)) for k in (i, j)]
     once, spent = np.zeros((len(p), 3)), np.zeros((len(p), 3))
-    for s in blocks(len(p)):
+    for s in row_blocks(len(p)):
         a, b, n = p[s], q[s], N[q[s]]
         cp, cq = (np.asarray((np.einsum("ki,ki->k", n, O[rows]) / beam[rows]) ** 2) for rows in (a, b))
         once[s, 0], once[s, 1] = cp + cq, 1.0
@@ -325,11 +325,11 @@ def associate(
             v = np.einsum("ki,kij,kj->k", lever, within[k], lever)
             once[s, 2] += v
             spent[s, 2] += v * np.maximum(times, alike_steps[k])
-    return Association(Pairs(p, q, i, j), w, once, spent)
+    return SurfacePairs(PlanePairs(p, q, i, j), w, once, spent)
 
 
 def _nearest_surfaces(
-    cloud: Cloud,
+    cloud: ScanReturns,
     surfaces: Surfaces,
     W: Array,
     N: Array,

@@ -20,7 +20,7 @@ def _check(config: Any, *, zero: tuple[str, ...] = ()) -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Gates:
+class RegistrationGates:
     """What a match must have to be accepted. A false one does more harm than ten right ones do good.
 
     Parameters
@@ -97,7 +97,7 @@ class RegistrationConfig:
     covariance_scale_planar: float = 5.0
     floor_sigma: float = 0.01
     floor_turn: float = 0.001
-    gates: Gates = field(default_factory=Gates)
+    gates: RegistrationGates = field(default_factory=RegistrationGates)
 
     def __post_init__(self) -> None:
         _check(self)

@@ -53,7 +53,7 @@ def translational_degeneracy(hessian: Array, dim: int) -> Degeneracy:
     return Degeneracy(ratio, values, vectors)
 
 
-def feigned_information(
+def noise_induced_information(
     source: Array, rotation: Array, normals: tuple[Array, Array], noise: tuple[Array, Array]
 ) -> Array:
     """The part of a Hessian that holds nothing, though it looks as if it did.

@@ -1,8 +1,8 @@
 """The gates of a match between two maps, in one place: front ends and loop closures ask the same questions.
 
-:class:`~graphslam.registration.config.Gates` are those of a registration by itself. Here are the ones that need to know
-more: where the match was expected, and what else was found in the same map. A false match does more harm than ten
-right ones do good; so a match that fails any of them is refused, and the words say which and by how much.
+:class:`~graphslam.registration.config.RegistrationGates` are those of a registration by itself. Here are the ones that
+need to know more: where the match was expected, and what else was found in the same map. A false match does more harm
+than ten right ones do good; so a match that fails any of them is refused, and the words say which and by how much.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.poses import group_of
 from graphslam.registration.config import RegistrationConfig
-from graphslam.registration.register import Registration, gate
+from graphslam.registration.register import Registration, failed_gates
 
 
 class MatchLimits(Protocol):
@@ -104,7 +104,7 @@ def tilt_between(T: ArrayLike, T_prior: ArrayLike) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(here, there))), float(here @ there))
 
 
-def match_fails(
+def failed_match_gates(
     found: Registration,
     T_prior: ArrayLike,
     limits: MatchLimits,
@@ -127,7 +127,7 @@ def match_fails(
     sigma : float
         σ of the prediction, horizontally [m].
     margin : float
-        See :func:`second_modes`.
+        See :func:`match_margins`.
     rise : float
         What heights may be off by besides ``limits.height`` [m].
     T : (7,) or (3,), optional
@@ -140,7 +140,7 @@ def match_fails(
     if not found.converged or not np.all(np.isfinite(at)):
         return ["nothing: " + (found.why or "the result is not finite").replace("; ", ", ")]
     tilted = replace(found, tilt=tilt_between(at, T_prior))
-    fails = [text] if (text := gate(tilted, rules)) else []
+    fails = [text] if (text := failed_gates(tilted, rules)) else []
     fitness = found.best_fitness
     if fitness < limits.fitness and not any("fitness" in f for f in fails):
         fails.append(f"fitness {fitness:.3f} < {limits.fitness:g}")
@@ -160,7 +160,7 @@ def match_fails(
     return fails
 
 
-def second_modes(found: Sequence[Registration], maps: npt.ArrayLike, apart: float) -> Array:
+def match_margins(found: Sequence[Registration], maps: npt.ArrayLike, apart: float) -> Array:
     """Fitness of each match less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``.
 
     1 where there is no other. Results that are no results do not compete.

@@ -6,14 +6,14 @@ import math
 from dataclasses import dataclass, field, fields
 
 from graphslam.core.errors import ConfigError
-from graphslam.registration.config import Gates, RegistrationConfig
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
 from graphslam.registration.gates import MatchGates
 
 # Maps of submaps are bent by what drifts inside them, and their surroundings reach out of each other's.
 _RULES = RegistrationConfig(
     floor_sigma=0.05,
     floor_turn=0.01,
-    gates=Gates(fitness_known=0.78, known_share=0.4, fitness_upright=0.78),
+    gates=RegistrationGates(fitness_known=0.78, known_share=0.4, fitness_upright=0.78),
 )
 
 

@@ -20,10 +20,10 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from graphslam.core.dense import MapView
+from graphslam.core.dense import DenseMapView
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 
 Ints = npt.NDArray[np.int64]
 
@@ -61,7 +61,7 @@ class DescriptorConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Descriptors:
+class PlaceDescriptors:
     """Of many places.
 
     Parameters
@@ -86,7 +86,9 @@ class Descriptors:
         return np.asarray(self.values.sum(axis=2) / np.maximum(some, 1e-9) * np.sqrt(some / self.known.shape[2]))
 
 
-def describe(view: MapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None) -> Descriptors:
+def describe_places(
+    view: DenseMapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None
+) -> PlaceDescriptors:
     """Descriptors of places of one map.
 
     Parameters
@@ -95,7 +97,7 @@ def describe(view: MapView, T_base_place: ArrayLike, config: DescriptorConfig | 
         In the frame of the map. Roll and pitch are left out: only the heading turns the sectors.
     """
     c = DescriptorConfig() if config is None else config
-    T = level(np.asarray(T_base_place, dtype=np.float64))
+    T = remove_roll_pitch(np.asarray(T_base_place, dtype=np.float64))
     g = group_of(T)
     if T.ndim != 2 or g.dim != view.dim:
         raise GeometryError("places do not fit the map", got=T.shape, wanted=f"(n, {7 if view.dim == 3 else 3})")
@@ -126,17 +128,19 @@ def describe(view: MapView, T_base_place: ArrayLike, config: DescriptorConfig | 
             values = gaussian_filter1d(values, c.blur, axis=axis, mode=mode)
             known = gaussian_filter1d(known, c.blur, axis=axis, mode=mode)
     known = np.where(known > 0.5, 1.0, 0.0)
-    return Descriptors(values * known, known, c)
+    return PlaceDescriptors(values * known, known, c)
 
 
-def join(parts: list[Descriptors]) -> Descriptors:
+def concatenate_descriptors(parts: list[PlaceDescriptors]) -> PlaceDescriptors:
     """Descriptors of several maps, one after the other."""
-    return Descriptors(
+    return PlaceDescriptors(
         np.concatenate([d.values for d in parts]), np.concatenate([d.known for d in parts]), parts[0].config
     )
 
 
-def similarity(query: Descriptors, which: int, others: Descriptors, rows: Ints) -> tuple[Array, Array]:
+def descriptor_similarity(
+    query: PlaceDescriptors, which: int, others: PlaceDescriptors, rows: Ints
+) -> tuple[Array, Array]:
     """Correlation of one place with others at the turn that suits each best, −1 … 1, and that turn [rad].
 
     Parameters

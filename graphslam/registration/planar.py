@@ -16,7 +16,7 @@ from graphslam.registration.target import Target
 
 
 @dataclass(frozen=True, slots=True)
-class Aligned:
+class PlanarAlignment:
     """How an iterative matcher ended.
 
     Parameters
@@ -37,7 +37,7 @@ class Aligned:
     pairs: int
 
 
-def linearise(source: Target, target: Target, T: Array, radius: float) -> tuple[Array, Array, float, int]:
+def linearise_alignment(source: Target, target: Target, T: Array, radius: float) -> tuple[Array, Array, float, int]:
     """Hessian ``(3, 3)``, gradient ``(3,)``, half squared error and number of pairs nearer than ``radius`` at ``T``.
 
     ``e = ½ Σ dᵀ M d`` with ``d = T p - q`` and ``M = (C_q + R C_p Rᵀ)⁻¹``; ``M`` is held fixed.
@@ -68,16 +68,16 @@ def align_planar(
     iterations: int,
     rotation_epsilon: float,
     translation_epsilon: float,
-) -> Aligned:
+) -> PlanarAlignment:
     """Gauss-Newton steps from ``T (3,)``, pairs found anew at each; a matrix that is singular ends it."""
-    H, b, error, pairs = linearise(source, target, T, radius)
+    H, b, error, pairs = linearise_alignment(source, target, T, radius)
     for _ in range(iterations):
         if not pairs:
             break
         # a little damping, so that a direction that is not held at all stays where it is
         step = -np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(3), b)
         T = se2.se2_compose(T, se2.se2_exp(step))
-        H, b, error, pairs = linearise(source, target, T, radius)
+        H, b, error, pairs = linearise_alignment(source, target, T, radius)
         if np.hypot(step[0], step[1]) < translation_epsilon and abs(step[2]) < rotation_epsilon:
             break
-    return Aligned(T, H, error, pairs)
+    return PlanarAlignment(T, H, error, pairs)

@@ -14,7 +14,7 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 
-class Pairs(NamedTuple):
+class PlanePairs(NamedTuple):
     """Source points on surfaces of other steps.
 
     Parameters
@@ -87,7 +87,7 @@ def fit_surfaces(
 
 
 @njit(fastmath={"contract"})
-def plane_residuals(pairs: Pairs, R: Array, t: Array, points: Array, normals: Array, out: Array) -> None:
+def plane_residuals(pairs: PlanePairs, R: Array, t: Array, points: Array, normals: Array, out: Array) -> None:
     """``n_jᵀ (T_j⁻¹ T_i p - q)`` of every pair.
 
     Parameters
@@ -115,7 +115,7 @@ def plane_residuals(pairs: Pairs, R: Array, t: Array, points: Array, normals: Ar
         out[k] = r
 
 
-class Held(NamedTuple):
+class GroupInformation(NamedTuple):
     """What groups of pairs hold of the motion between their two sides.
 
     Parameters
@@ -137,14 +137,16 @@ class Held(NamedTuple):
     tilts: npt.NDArray[np.float32]
 
 
-def nothing_feigned(dim: int) -> Held:
+def no_noise_correction(dim: int) -> GroupInformation:
     """Pairs that hold all that they say."""
     w = 6 if dim == 3 else 3
-    return Held(np.zeros(0, np.int64), np.zeros((0, dim)), np.zeros((0, w, w)), np.zeros((0, dim - 1, dim), np.float32))
+    return GroupInformation(
+        np.zeros(0, np.int64), np.zeros((0, dim)), np.zeros((0, w, w)), np.zeros((0, dim - 1, dim), np.float32)
+    )
 
 
 @njit(fastmath={"contract"})
-def wrench(x: Array, n: Array, out: Array) -> None:
+def normal_jacobian(x: Array, n: Array, out: Array) -> None:
     """Derivative of ``nᵀ y`` by a motion about the origin of a point that is at ``x``, in the order of a tangent."""
     if len(x) == 3:
         out[0] = x[1] * n[2] - x[2] * n[1]
@@ -157,7 +159,7 @@ def wrench(x: Array, n: Array, out: Array) -> None:
 
 @njit(fastmath={"contract"})
 def group_information(
-    pairs: Pairs,
+    pairs: PlanePairs,
     poses: tuple[Array, Array],
     surfaces: tuple[Array, Array, npt.NDArray[np.floating]],
     information: Array,
@@ -174,7 +176,7 @@ def group_information(
         ``tilts`` of :func:`fit_surfaces`, in the frame of the step.
     information : (k,)
     groups : (group, centre)
-        See :class:`Held`.
+        See :class:`GroupInformation`.
     H, F : (m, w, w)
         ``Σ L J Jᵀ`` and ``Σ L E[δJ δJᵀ]``, about the centre, world.
     """
@@ -198,7 +200,7 @@ def group_information(
                 n[u] = 0.0
                 for v in range(d):
                     n[u] += R[j, u, v] * (normals[q, v] if a == 0 else tilts[q, a - 1, v])
-            wrench(x, n, J)
+            normal_jacobian(x, n, J)
             for u in range(w):
                 for v in range(w):
                     if a == 0:
@@ -227,12 +229,12 @@ def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array)
 
 @njit(fastmath={"contract"})
 def plane_blocks(
-    pairs: Pairs,
+    pairs: PlanePairs,
     poses: tuple[Array, Array],
     surfaces: tuple[Array, Array],
     information: Array,
     slots: tuple[Index, Index, Index],
-    held: Held,
+    held: GroupInformation,
     H: Array,
     g: Array,
 ) -> float:
@@ -247,7 +249,7 @@ def plane_blocks(
     slots : (first, offset, rank)
         ``first[n]`` is where the diagonal block of step n begins in ``H``, ``offset[k]`` where the block of the two
         steps of pair k does; its rows are those of the step with the lower ``rank``.
-    held : Held
+    held : GroupInformation
         Without groups pairs hold all that they say.
     H : flat
         Blocks ``(w, w)``, row-major.
@@ -290,7 +292,7 @@ def plane_blocks(
             m = held.group[k]
             for u in range(d):
                 x[u] += t[j, u] - held.centre[m, u]
-            wrench(x, nw, J)
+            normal_jacobian(x, nw, J)
             for u in range(w):
                 pull[u] = J[u] * r
             for a in range(d - 1):
@@ -300,7 +302,7 @@ def plane_blocks(
                     nw[u] = 0.0
                     for v in range(d):
                         nw[u] += R[j, u, v] * held.tilts[q, a, v]
-                wrench(x, nw, K)
+                normal_jacobian(x, nw, K)
                 for u in range(w):
                     pull[u] -= K[u] * e
             for u in range(w):
@@ -316,8 +318,8 @@ def plane_blocks(
             _moved(K, R[i], t[i], held.centre[m], 1.0, gi)
             _moved(K, R[j], t[j], held.centre[m], -1.0, gj)
         else:
-            wrench(pi, ni, Ji)
-            wrench(y, nj, Jj)
+            normal_jacobian(pi, ni, Ji)
+            normal_jacobian(y, nj, Jj)
             for v in range(w):
                 Jj[v] = -Jj[v]
                 gi[v] = Ji[v] * r

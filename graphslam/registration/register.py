@@ -20,10 +20,10 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.points import check_pose, transform
+from graphslam.core.points import check_pose, transform_points
 from graphslam.registration.config import RegistrationConfig
-from graphslam.registration.degeneracy import calibrated_covariance, feigned_information, translational_degeneracy
-from graphslam.registration.planar import Aligned, align_planar
+from graphslam.registration.degeneracy import calibrated_covariance, noise_induced_information, translational_degeneracy
+from graphslam.registration.planar import PlanarAlignment, align_planar
 from graphslam.registration.target import Target
 
 _LEAST_NOISE = 1e-4  # clouds that are copies of each other show none
@@ -129,14 +129,14 @@ def register(
     -----
     Generalised ICP (Segal, Haehnel and Thrun 2009, eq. 2) in two radii: pairs up to 2 m, then up to 0.5 m. The
     covariance is ``k s² (H - F)⁻¹`` and a floor: s² the noise that the pairs show, F what of the Hessian is feigned
-    (:func:`~graphslam.registration.degeneracy.feigned_information`), k calibrated; directions that are not held at all
-    are as unknown as ``max_shift`` lets them be.
+    (:func:`~graphslam.registration.degeneracy.noise_induced_information`), k calibrated; directions that are not held
+    at all are as unknown as ``max_shift`` lets them be.
 
     Capture, measured in simulated halls of 60 m with pillars every 8 m, bare and with parked cars (share of 20 starts
     that end within 0.3 m and 2°, the worse of the halls and directions): 0.5 m and 5° off 1.0 in three dimensions and
     in two, 1 m and 10° 0.9 and 0.95, 2 m and 10° 0.6 and 0.75, 4 m 0. Farther off, search first
     (:func:`~graphslam.registration.search.correlative_search`). One pillar period off it ends there, sometimes with a
-    fitness that no gate tells from the right one: match several starts, and look at :func:`margin`.
+    fitness that no gate tells from the right one: match several starts, and look at :func:`fitness_margin`.
     """
     config = RegistrationConfig() if config is None else config
     start = check_pose(T_target_source, target.dim, what="start of a registration")
@@ -162,7 +162,7 @@ def register(
         why += f"{config.max_turn:g}"
         return dataclasses.replace(_no_result(start, why), inliers=found.pairs, shift=shift, turn=turn)
     result = _measure(cloud, target, found, shift, turn, config, known)
-    return dataclasses.replace(result, why=gate(result, config))
+    return dataclasses.replace(result, why=failed_gates(result, config))
 
 
 def register_starts(
@@ -190,10 +190,12 @@ def register_starts(
         Those with a result, accepted or not; equal fitness in the order of the starts.
     """
     cloud = source if isinstance(source, Target) else Target(source, neighbours=target.neighbours)
-    return distinct((register(cloud, target, T, config, known=known) for T in starts), apart)
+    return distinct_registrations((register(cloud, target, T, config, known=known) for T in starts), apart)
 
 
-def distinct(results: Iterable[Registration], apart: tuple[float, float] = (0.5, 0.1)) -> list[Registration]:
+def distinct_registrations(
+    results: Iterable[Registration], apart: tuple[float, float] = (0.5, 0.1)
+) -> list[Registration]:
     """Registrations with a result, best fitness first, without those next to a better one.
 
     Parameters
@@ -209,7 +211,7 @@ def distinct(results: Iterable[Registration], apart: tuple[float, float] = (0.5,
     return kept
 
 
-def margin(results: list[Registration], *, apart: float = 1.5) -> float:
+def fitness_margin(results: list[Registration], *, apart: float = 1.5) -> float:
     """Fitness of the best of :func:`register_starts` less that of the next at another place, ``apart`` [m] or more.
 
     1 where there is no other; NaN where there is none at all.
@@ -221,7 +223,7 @@ def margin(results: list[Registration], *, apart: float = 1.5) -> float:
     return best.best_fitness - max((r.best_fitness for r in others), default=best.best_fitness - 1.0)
 
 
-def gate(result: Registration, config: RegistrationConfig) -> str:
+def failed_gates(result: Registration, config: RegistrationConfig) -> str:
     """The gates that a result fails, in words; empty if none."""
     g, planar = config.gates, len(result.T_target_source) == 3
     fails = []
@@ -244,11 +246,11 @@ def gate(result: Registration, config: RegistrationConfig) -> str:
     return "; ".join(fails)
 
 
-def _align(source: Target, target: Target, T: Array, config: RegistrationConfig) -> Aligned:
+def _align(source: Target, target: Target, T: Array, config: RegistrationConfig) -> PlanarAlignment:
     """Both radii."""
     limits = (config.iterations, config.rotation_epsilon, config.translation_epsilon)
     if target.dim == 2:
-        found = Aligned(T, np.zeros((3, 3)), 0.0, 0)
+        found = PlanarAlignment(T, np.zeros((3, 3)), 0.0, 0)
         for radius in config.radii:
             found = align_planar(source, target, found.T, radius, *limits)
         return found
@@ -269,15 +271,15 @@ def _align(source: Target, target: Target, T: Array, config: RegistrationConfig)
         )
         matrix = np.asarray(result.T_target_source)
         if not np.all(np.isfinite(matrix)):
-            return Aligned(np.full(7, np.nan), np.full((6, 6), np.nan), float("nan"), int(result.num_inliers))
+            return PlanarAlignment(np.full(7, np.nan), np.full((6, 6), np.nan), float("nan"), int(result.num_inliers))
     pose = np.concatenate([matrix[:3, 3], se3.matrix_to_quat(matrix[:3, :3])])
-    return Aligned(pose, np.asarray(result.H), float(result.error), int(result.num_inliers))
+    return PlanarAlignment(pose, np.asarray(result.H), float(result.error), int(result.num_inliers))
 
 
 def _measure(
     source: Target,
     target: Target,
-    found: Aligned,
+    found: PlanarAlignment,
     shift: float,
     turn: float,
     config: RegistrationConfig,
@@ -285,7 +287,7 @@ def _measure(
 ) -> Registration:
     """Everything about a result but the verdict."""
     dim, planar = target.dim, target.dim == 2
-    moved = transform(found.T, source.points)
+    moved = transform_points(found.T, source.points)
     reach = max(config.near, config.radii[-1])
     distance, which = target.tree.query(moved, distance_upper_bound=reach)
     near = distance < config.near
@@ -304,7 +306,7 @@ def _measure(
             upright = float(np.mean(near[steep]))
     own, partner = source.normals(paired), target.normals(which[paired])
     rotation = se2.rotation2(found.T[2]) if planar else se3.quat_to_matrix(found.T[3:])
-    feigned = feigned_information(source.points[paired], rotation, (own[0], partner[0]), (own[1], partner[1]))
+    feigned = noise_induced_information(source.points[paired], rotation, (own[0], partner[0]), (own[1], partner[1]))
     information = found.hessian - feigned
     held = translational_degeneracy(information, dim)
     # the noise that the pairs show: 1 where the variances of the shapes are right
@@ -333,7 +335,7 @@ def _measure(
         degeneracy=held.ratio,
         weakest=held.weakest,
         weakest_sigma=sigma,
-        tilt=0.0 if planar else tilt_of(found.T),
+        tilt=0.0 if planar else tilt_angle(found.T),
         shift=shift,
         turn=turn,
         converged=True,
@@ -341,7 +343,7 @@ def _measure(
     )
 
 
-def tilt_of(T: Array) -> float:
+def tilt_angle(T: Array) -> float:
     """Angle between the z axes of the two frames of a pose ``(7,)`` [rad]."""
     x, y = T[3], T[4]
     return float(2.0 * np.arctan2(np.hypot(x, y), np.hypot(T[5], T[6])))

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
-from graphslam.core.points import check_pose, finite_points, spread, thin, transform
+from graphslam.core.points import check_pose, evenly_spaced, finite_points, transform_points, voxel_downsample
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima, score_block
 
@@ -29,7 +29,7 @@ MOST_STARTS = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class SearchStart:
     """A place to start an iterative matcher from.
 
     Parameters
@@ -86,7 +86,7 @@ class SearchConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Lattice:
+class SearchLattice:
     """Offsets searched, symmetric about zero; each ``(n,)``."""
 
     x: Array
@@ -110,7 +110,9 @@ class Lattice:
         return np.stack([self.x[index[:, 3]], self.y[index[:, 2]], self.z[index[:, 1]], self.yaw[index[:, 0]]], 1)
 
 
-def make_lattice(field: SearchField, half_widths: Sequence[float], steps: Sequence[float], reach: float) -> Lattice:
+def make_lattice(
+    field: SearchField, half_widths: Sequence[float], steps: Sequence[float], reach: float
+) -> SearchLattice:
     """The offsets within ``half_widths``; arguments as for :func:`correlative_search`, ``reach`` for a heading step of
     0 [m].
     """
@@ -132,10 +134,10 @@ def make_lattice(field: SearchField, half_widths: Sequence[float], steps: Sequen
         raise ConfigError(f"search: {np.prod(2 * counts + 1):.3g} starts; wanted at most {MOST_STARTS}")
     axes = [np.arange(-c, c + 1) * s for c, s in zip(counts, step)]
     whole = [int(c) for c in cells] + [1]
-    return Lattice(axes[0], axes[1], axes[2] if n == 4 else np.zeros(1), axes[-1], (whole[0], whole[1], whole[2]))
+    return SearchLattice(axes[0], axes[1], axes[2] if n == 4 else np.zeros(1), axes[-1], (whole[0], whole[1], whole[2]))
 
 
-def score_lattice(points: Array, field: SearchField, around: Array, lattice: Lattice) -> npt.NDArray[np.uint32]:
+def score_lattice(points: Array, field: SearchField, around: Array, lattice: SearchLattice) -> npt.NDArray[np.uint32]:
     """Sum of the field, in 255ths, under all points at every offset of a lattice.
 
     Parameters
@@ -156,7 +158,7 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Lat
     back = np.rint(first / field.cell).astype(np.int64)
     still = np.zeros_like(lattice.yaw)
     turned = offset_pose(around, np.stack([still, still, still, lattice.yaw], -1))
-    cells = field._cells(transform(turned[:, None], points).reshape(-1, field.dim)) + back
+    cells = field._cells(transform_points(turned[:, None], points).reshape(-1, field.dim)) + back
     score_block(cells.reshape(len(turned), -1, 3), counts, steps, phases, scores)
     return scores
 
@@ -194,7 +196,7 @@ def correlative_search(
     prior: Sequence[float] | None = None,
     coarse: SearchField | None = None,
     config: SearchConfig | None = None,
-) -> list[Start]:
+) -> list[SearchStart]:
     """Distinct places where the source may lie in the map, best first.
 
     Parameters
@@ -220,7 +222,7 @@ def correlative_search(
 
     Returns
     -------
-    list of Start
+    list of SearchStart
         Local maxima of the lattice, of which none is near a better one. Empty without points, and where nothing of
         the map lies under any point.
 
@@ -235,7 +237,7 @@ def correlative_search(
         raise GeometryError("source and field differ in dimension", got=p.shape[1], wanted=field.dim)
     if keep < 1:
         raise ConfigError(f"search: {keep} modes wanted; wanted at least 1")
-    p = spread(thin(p, field.cell), config.most_points)
+    p = evenly_spaced(voxel_downsample(p, field.cell), config.most_points)
     step = (*[2.0 * (coarse or field).cell] * field.dim, 0.0) if steps is None else steps
     reach = float(np.quantile(np.hypot(p[:, 0], p[:, 1]), 0.9)) if len(p) else 1.0
     lattice = make_lattice(field, half_widths, step, reach)
@@ -246,7 +248,7 @@ def correlative_search(
         few, seen, modes = p, lattice, 4 * keep
         sums = score_lattice(p, field, T, lattice)
     else:
-        few, modes = spread(p, config.coarse_points), max(config.coarse_modes, keep)
+        few, modes = evenly_spaced(p, config.coarse_points), max(config.coarse_modes, keep)
         seen = make_lattice(coarse, half_widths, step, reach)
         sums = score_lattice(few, coarse, T, seen)
     weights, scores = _weigh(sums, len(few), seen, sigmas, config)
@@ -260,14 +262,18 @@ def correlative_search(
     for s in _distinct(places, weight, keep, config):
         x, y, z, yaw = (float(v) for v in places[s])
         shown = (x, y, z, yaw) if field.dim == 3 else (x, y, yaw)
-        starts.append(Start(offset_pose(T, places[s]), float(score[s]), float(weight[s]), shown))
+        starts.append(SearchStart(offset_pose(T, places[s]), float(score[s]), float(weight[s]), shown))
     return starts
 
 
 def _weigh(
-    sums: npt.NDArray[np.uint32], points: int, lattice: Lattice, sigmas: tuple[float, ...] | None, config: SearchConfig
+    sums: npt.NDArray[np.uint32],
+    points: int,
+    lattice: SearchLattice,
+    sigmas: tuple[float, ...] | None,
+    config: SearchConfig,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Weights and scores of a lattice; see :class:`Start`. The weight is -inf where nothing is met."""
+    """Weights and scores of a lattice; see :class:`SearchStart`. The weight is -inf where nothing is met."""
     scores = sums.astype(np.float32) / np.float32(255.0 * points)
     weights = -0.5 * ((1.0 - scores) / np.float32(config.score_sigma)) ** 2
     if sigmas is not None:
@@ -282,7 +288,7 @@ def _refine(
     points: Array,
     field: SearchField,
     around: Array,
-    lattice: Lattice,
+    lattice: SearchLattice,
     places: Array,
     sigmas: tuple[float, ...] | None,
     config: SearchConfig,
@@ -295,9 +301,9 @@ def _refine(
     headings = np.arange(-2, 3) * 0.25 * turn if turn else np.zeros(1)
     found, weight, score = places.copy(), np.empty(len(places)), np.empty(len(places))
     for k, at in enumerate(places):
-        near = Lattice(half[0], half[1], half[2], headings)
+        near = SearchLattice(half[0], half[1], half[2], headings)
         sums = score_lattice(points, field, offset_pose(around, at), near)
-        whole = Lattice(half[0] + at[0], half[1] + at[1], half[2] + at[2], headings + at[3])
+        whole = SearchLattice(half[0] + at[0], half[1] + at[1], half[2] + at[2], headings + at[3])
         weights, scores = _weigh(sums, len(points), whole, sigmas, config)
         best = np.unravel_index(int(np.argmax(weights)), weights.shape)
         found[k], weight[k], score[k] = whole.places(np.array([best]))[0], weights[best], scores[best]

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from graphslam.core.dense import MapView
+from graphslam.core.dense import DenseMapView
 from graphslam.core.errors import GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.points import check_pose, spread
+from graphslam.core.points import check_pose, evenly_spaced
 from graphslam.core.poses import Group, group_of
-from graphslam.registration.gates import match_fails, second_modes
+from graphslam.registration.gates import failed_match_gates, match_margins
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.register import Registration, distinct, register_starts
+from graphslam.registration.register import Registration, distinct_registrations, register_starts
 from graphslam.registration.search import SearchConfig, correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
@@ -36,11 +36,11 @@ class PreparedMap:
 
     Parameters
     ----------
-    view : MapView
+    view : DenseMapView
         In the frame of the submap's base.
     """
 
-    def __init__(self, view: MapView, config: PairConfig) -> None:
+    def __init__(self, view: DenseMapView, config: PairConfig) -> None:
         self.view, self.config = view, config
 
     @cached_property
@@ -78,7 +78,7 @@ class PreparedMap:
         near = np.hypot(*(p[:, :2] - T[:2]).T) <= self.config.radius
         if g.dim == 3:
             near &= np.abs(p[:, 2] - T[2]) <= self.config.height
-        chosen = spread(p[near], self.config.source_points)
+        chosen = evenly_spaced(p[near], self.config.source_points)
         return g.transform(np.broadcast_to(g.inverse(T), (len(chosen), g.size)), chosen)
 
 
@@ -207,7 +207,7 @@ def half_widths(T: Array, P: Array, config: PairConfig) -> list[float]:
     """Half widths of the search for a prediction: x, y[, z] [m] along the target's axes, heading [rad]."""
     g = group_of(T)
     at = g.position
-    R = axes_of(T, g)
+    R = rotation_matrix_of(T, g)
     s = config.sigmas * np.sqrt(np.diag(R @ P[at, at] @ R.T))
     # heading about the vertical of the target, of a body that may be tilted
     up = R.T[:, 2] if g.dim == 3 else None
@@ -219,7 +219,7 @@ def half_widths(T: Array, P: Array, config: PairConfig) -> list[float]:
     return [*out, float(np.clip(turn, low[2], high[2]))]
 
 
-def axes_of(T: Array, g: Group) -> Array:
+def rotation_matrix_of(T: Array, g: Group) -> Array:
     """Rotation matrix ``(dim, dim)`` of a pose."""
     corner = g.transform(np.broadcast_to(T, (g.dim, g.size)), np.eye(g.dim))
     return np.asarray((corner - T[: g.dim]).T)
@@ -238,7 +238,7 @@ def _judge(
 ) -> PairMatch:
     """The best of the modes that the prediction allows, and whether it is to be believed."""
     g = group_of(T)
-    modes = distinct(results)
+    modes = distinct_registrations(results)
     if not modes:
         return _nothing(T, "nothing: no start led to a result", len(points), half)
     own = [_covariance(r, P, c) for r in modes]
@@ -250,7 +250,7 @@ def _judge(
     k = int(allowed[0]) if len(allowed) else int(np.argmin(chi2))
     best, (covariance, loose) = modes[k], own[k]
     T_found = best.T_target_source
-    clash = contradiction(source, T_base_place, target, T_found, points)
+    clash = contradiction_share(source, T_base_place, target, T_found, points)
     out = PairMatch(
         T_target_source=T_found, covariance=covariance, why="", registration=best, chi2=float(chi2[k]),
         contradiction=clash, modes=len(allowed), points=len(points), loose=loose, half_widths=half,
@@ -261,15 +261,15 @@ def _judge(
     rules = c.registration
     if loose:  # known to be so, and said in the covariance
         rules = replace(rules, gates=replace(rules.gates, degeneracy=0.0, degeneracy_planar=0.0))
-    R = axes_of(T, g)
+    R = rotation_matrix_of(T, g)
     rise = c.sigmas * math.sqrt(float((R @ P[g.position, g.position] @ R.T)[-1, -1])) if g.dim == 3 else 0.0
-    fails = match_fails(best, T, c.gates, rules, sigma=1.0, margin=margin, rise=rise, ask_vague=not loose)
+    fails = failed_match_gates(best, T, c.gates, rules, sigma=1.0, margin=margin, rise=rise, ask_vague=not loose)
     if clash > c.contradiction:
         fails.append(f"contradiction {clash:.3f} > {c.contradiction:g}")
     return replace(out, why="; ".join(fails), margin=margin)
 
 
-def contradiction(
+def contradiction_share(
     source: PreparedMap, T_base_place: Array, target: PreparedMap, T_target_place: Array, points: Array,
     *, firm: float = 1.0, near: float = 0.5,
 ) -> float:  # fmt: skip
@@ -314,7 +314,7 @@ def _upright_in_known(r: Registration, cloud: Target, target: PreparedMap, c: Pa
         return r
     T, rules = r.T_target_source, c.registration
     normals, _ = cloud.normals(np.arange(len(cloud)))
-    up = axes_of(T, group_of(T))[2]  # the target's vertical in the frame of the place
+    up = rotation_matrix_of(T, group_of(T))[2]  # the target's vertical in the frame of the place
     steep = (np.abs(normals @ up) < math.sqrt(0.5)) & np.any(normals != 0.0, axis=1)
     moved = group_of(T).transform(np.broadcast_to(T, (len(cloud), 7)), cloud.points)
     steep &= target.view.known_at(moved)
@@ -371,11 +371,11 @@ def _margin(modes: list[Registration], loose: bool, c: PairConfig) -> float:
     best = modes[0]
     if loose:
         g = group_of(best.T_target_source)
-        v = axes_of(best.T_target_source, g) @ best.weakest
+        v = rotation_matrix_of(best.T_target_source, g) @ best.weakest
         d = np.stack([m.T_target_source[: g.dim] - best.T_target_source[: g.dim] for m in modes])
         across = np.linalg.norm(d - np.outer(d @ v, v), axis=1)
         modes = [best, *(m for m, a in zip(modes[1:], across[1:]) if a >= c.gates.mode_distance)]
-    return float(second_modes(modes, np.zeros(len(modes)), c.gates.mode_distance)[0])
+    return float(match_margins(modes, np.zeros(len(modes)), c.gates.mode_distance)[0])
 
 
 def _nothing(T: Array, why: str, points: int, half: tuple[float, ...] = ()) -> PairMatch:

@@ -22,7 +22,7 @@ def rotations(poses: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SurfaceConfig:
+class SurfaceFitConfig:
     """What counts as a surface."""
 
     radius: float = 0.8
@@ -54,7 +54,7 @@ def thin_places(W: Array, a: int, b: int, spacing: float, stands: Index) -> Inde
     return np.sort(a + first)
 
 
-def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceConfig) -> tuple[Array, Array, Flags]:
+def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceFitConfig) -> tuple[Array, Array, Flags]:
     """Planes of places among their neighbours.
 
     Parameters

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
-from graphslam.core.points import finite_points, thin
+from graphslam.core.points import finite_points, voxel_downsample
 
 FLATNESS = 1e-3
 """Variance across a surface over that along it, of the covariance that stands for a point (Segal 2009)."""
@@ -50,7 +50,7 @@ class Target:
             raise ConfigError(f"target: {neighbours} neighbours; wanted at least 3")
         p = finite_points(points, what="points to register", drops=drops)
         self.dropped = len(points) - len(p)
-        self.points: Array = p if voxel is None else thin(p, voxel)
+        self.points: Array = p if voxel is None else voxel_downsample(p, voxel)
         self.neighbours = neighbours
 
     @property

@@ -1,9 +1,9 @@
 """Layer 6: simulated worlds, vehicles and sensors with known noise and ground truth."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
+_EXPORTS = {
     "mesh_worlds": "mesh_world",
     "crawler": "simulate_crawler",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from graphslam.core.random import SeedTree
-from graphslam.sim.clutter import KeepClear, scatter
+from graphslam.sim.clutter import KeepClear, scatter_obstacles
 from graphslam.sim.mesh import MeshBuilder, Rectangle
 from graphslam.sim.route import plan_route
 from graphslam.sim.world import World, describe_route, layout_number
@@ -263,7 +263,7 @@ def _clutter(mesh: MeshBuilder, clear: KeepClear, tree: SeedTree) -> int:
     for level in range(_LEVELS):
         rng = tree.child("hall", level).generator()
         inner = _HALL - 0.6
-        count += scatter(mesh, (-inner, -inner, inner, inner), level * STOREY, 10, clear, rng)
+        count += scatter_obstacles(mesh, (-inner, -inner, inner, inner), level * STOREY, 10, clear, rng)
     for leg in _LEGS:
         rng = tree.child("corridor", leg.level, leg.turns).generator()
         floor, back = leg.level * STOREY, _CORRIDOR + _ROOM_DEPTH - 0.5
@@ -275,5 +275,5 @@ def _clutter(mesh: MeshBuilder, clear: KeepClear, tree: SeedTree) -> int:
             ]
         areas.append((leg.rectangle(leg.end + 0.6, 0.6 - _END_HALF, leg.end + _END_LENGTH - 0.6, _END_HALF - 0.6), 8))
         for area, tries in areas:
-            count += scatter(mesh, area, floor, tries, clear, rng, tallest=1.9)
+            count += scatter_obstacles(mesh, area, floor, tries, clear, rng, tallest=1.9)
     return count

@@ -24,10 +24,10 @@ from graphslam.sim.campus_world import campus
 from graphslam.sim.crawler import start_frame
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import cast_scans, measure_imu, measure_wheels, ornstein_uhlenbeck
-from graphslam.sim.drive import DriveConfig, Motion, Way, sample_way, smooth_way
-from graphslam.sim.movers import Mover, Passers, draw_movers
+from graphslam.sim.drive import DriveConfig, RouteMotion, SampledRoute, sample_route, smooth_route
+from graphslam.sim.gps_shadowing import measure_gps
+from graphslam.sim.movers import Mover, MovingObjects, draw_movers
 from graphslam.sim.raycast import RayCaster
-from graphslam.sim.sky import measure_gps
 from graphslam.sim.world import World
 
 _LEANS = 4  # waves that the pitch is made of
@@ -39,12 +39,12 @@ VERTICAL_MIDDLE = np.deg2rad(20.0)
 """Elevation of the middle beam of the vertical laser, to the left [rad]: so it sees kerbs, façades and ceilings."""
 
 
-class Balancing(Motion):
+class Balancing(RouteMotion):
     """A drive whose base pitches to keep its balance: the sum of some waves, never more than the greatest lean.
 
     Parameters
     ----------
-    way : Way
+    way : SampledRoute
         Of the base: the middle of the axle.
     lean : float
         Greatest pitch [rad].
@@ -54,7 +54,9 @@ class Balancing(Motion):
         Draws the waves.
     """
 
-    def __init__(self, way: Way, speed: float, config: DriveConfig, lean: float, rate: float, tree: SeedTree) -> None:
+    def __init__(
+        self, way: SampledRoute, speed: float, config: DriveConfig, lean: float, rate: float, tree: SeedTree
+    ) -> None:
         super().__init__(way, speed, config)
         rng = tree.generator()
         share = rng.dirichlet(np.ones(_LEANS))
@@ -80,7 +82,7 @@ class Balancing(Motion):
 def campus_motion(world: World, config: CampusConfig, tree: SeedTree) -> Balancing:
     """The true motion of the robot's base, the middle of its axle, in the frame of the world."""
     drive = DriveConfig(rate=config.imu_rate, wheelbase=0.6)
-    way = smooth_way(sample_way(world.route()), drive.wheelbase)
+    way = smooth_route(sample_route(world.route()), drive.wheelbase)
     way = replace(way, positions=way.positions + [0.0, 0.0, config.axle])
     return Balancing(way, world.speed, drive, config.lean, config.lean_rate, tree.child("balance"))
 
@@ -148,7 +150,7 @@ def empty_scans(config: CampusConfig, duration: float, sigma: float) -> dict[str
     return out
 
 
-def movers_of(world: World, config: CampusConfig, motion: Motion, seed: int, tree: SeedTree) -> list[Mover]:
+def movers_of(world: World, config: CampusConfig, motion: RouteMotion, seed: int, tree: SeedTree) -> list[Mover]:
     """Cars on the streets, people beside them and in the corridors that the robot drives."""
     plan = plan_campus(config, seed)
     lines: list[tuple[str, Array, Array, float]] = []
@@ -171,7 +173,7 @@ def movers_of(world: World, config: CampusConfig, motion: Motion, seed: int, tre
     return draw_movers(lines, config.movers, times, motion.poses(times)[:, :3], tree.generator())
 
 
-def slipped(wheels: VelocityControls, sigma: float, time: float, scale: float, tree: SeedTree) -> VelocityControls:
+def slip_wheels(wheels: VelocityControls, sigma: float, time: float, scale: float, tree: SeedTree) -> VelocityControls:
     """Wheels that slip: the speed has a relative error that comes and goes."""
     step = float(np.median(np.diff(wheels.times)))
     slip = ornstein_uhlenbeck(tree.generator(), (len(wheels.times), 1), sigma, time, step)[:, 0]
@@ -213,7 +215,7 @@ def simulate_campus(
     streams: dict[str, Stream] = {}
     moving = {}
     for name, scans in empty_scans(c, motion.duration, drawn["range_sigma"]).items():
-        passers = Passers(movers, scans.ranges.shape, c.max_range)
+        passers = MovingObjects(movers, scans.ranges.shape, c.max_range)
         cast = cast_scans(scans, motion, caster, sensors, seeds.child(name), nearer=passers, progress=progress)
         assert cast.spin is not None
         told = cast.spin + c.encoder_offset if name == "panning" else cast.spin
@@ -223,7 +225,7 @@ def simulate_campus(
     bias = drawn["gyro_bias"] * float(seeds.child("yaw bias").generator().standard_normal())
     streams["imu"], constants = measure_imu(motion, sensors, bias, drawn["gyro_bias"], seeds.child("imu"))
     wheels, scales = measure_wheels(motion, sensors, seeds.child("wheels"))
-    streams["wheels"] = slipped(wheels, drawn["slip"], c.slip_time, c.noise_scale, seeds.child("slip"))
+    streams["wheels"] = slip_wheels(wheels, drawn["slip"], c.slip_time, c.noise_scale, seeds.child("slip"))
     fixes = measure_gps(motion, caster, c, drawn, seeds.child("gps"))
     streams["gps"] = Gps(
         times=fixes.times,
@@ -250,7 +252,7 @@ def simulate_campus(
         "noise": drawn,
         "drawn": {**constants, "wheel_scale": scales.speed, "turn_scale": scales.turn},
         "movers": [{"kind": m.kind, "speed": m.speed} for m in movers],
-        "indoor": intervals(truth.times, plan_campus(c, place).inside(truth.poses)),
+        "indoor": true_intervals(truth.times, plan_campus(c, place).inside(truth.poses)),
         "corridors": [
             {**corridor, "legs": legs_of(corridor, truth.times, truth.poses)} for corridor in world.meta["corridors"]
         ],
@@ -261,7 +263,7 @@ def simulate_campus(
     return SensorLog(name=world.name, streams=streams, truth=Truth(path, moving=moving), read=read, meta=meta)
 
 
-def intervals(times: Array, inside: Array) -> list[list[float]]:
+def true_intervals(times: Array, inside: Array) -> list[list[float]]:
     """Stretches of time ``[from, to]`` in which a condition holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(int), [0]])))
     return [[float(times[a]), float(times[b - 1])] for a, b in zip(edges[::2], edges[1::2])]
@@ -276,5 +278,5 @@ def legs_of(corridor: dict[str, Any], times: Array, poses: Array) -> list[list[l
         u = (end - corner) / length
         d = poses[:, :2] - corner
         along, across = d @ u, d @ np.array([-u[1], u[0]])
-        out.append(intervals(times, (along > 2.0) & (along < length - 2.0) & (np.abs(across) < 1.0)))
+        out.append(true_intervals(times, (along > 2.0) & (along < length - 2.0) & (np.abs(across) < 1.0)))
     return out

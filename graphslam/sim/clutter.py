@@ -69,7 +69,7 @@ def park_cars(
     return count
 
 
-def scatter(
+def scatter_obstacles(
     mesh: MeshBuilder,
     area: Rectangle,
     floor: float,

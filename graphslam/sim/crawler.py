@@ -19,7 +19,7 @@ from graphslam.core.records import Stream
 from graphslam.core.se3 import se3_inverse
 from graphslam.sim.crawler_config import DEFAULTS, PRESETS, CrawlerConfig, crawler_preset
 from graphslam.sim.crawler_sensors import end_error, measure_imu, measure_wheels, scan_world, yaw_bias_for
-from graphslam.sim.drive import DriveConfig, Motion, drive_motion, euler_to_quat
+from graphslam.sim.drive import DriveConfig, RouteMotion, drive_motion, euler_to_quat
 from graphslam.sim.raycast import RayCaster
 
 if TYPE_CHECKING:
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 __all__ = ["PRESETS", "CrawlerConfig", "crawler_motion", "crawler_preset", "simulate_crawler", "start_frame"]
 
 
-def crawler_motion(world: World, config: CrawlerConfig = DEFAULTS, caster: RayCaster | None = None) -> Motion:
+def crawler_motion(world: World, config: CrawlerConfig = DEFAULTS, caster: RayCaster | None = None) -> RouteMotion:
     """The true motion of the crawler in the frame of the world, without any sensor."""
     wanted = {f.name: getattr(config, f.name) for f in dataclasses.fields(DriveConfig) if f.name != "rate"}
     return drive_motion(world, DriveConfig(rate=config.imu_rate, **wanted), caster)
 
 
-def start_frame(motion: Motion) -> Array:
+def start_frame(motion: RouteMotion) -> Array:
     """``T_world_frame`` (7,): position and heading of the base at the start, z up."""
     first = motion.poses(np.zeros(1))[0]
     x, y, z, w = first[3:]

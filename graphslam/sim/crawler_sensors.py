@@ -18,14 +18,14 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import VelocityControls
 from graphslam.core.se3 import quat_multiply, quat_rotate, se3_transform
 from graphslam.sim.crawler_config import CrawlerConfig, Pose
-from graphslam.sim.drive import Motion
+from graphslam.sim.drive import RouteMotion
 from graphslam.sim.raycast import RayCaster
 
 _BEAMS_AT_ONCE = 1 << 18
 Nearer: TypeAlias = Callable[[int, Array, Array, Array], Array]
 
 
-class Posed(Protocol):
+class PoseSource(Protocol):
     """Something whose pose in the world is known at every time."""
 
     def poses(self, t: ArrayLike) -> Array:
@@ -34,7 +34,13 @@ class Posed(Protocol):
 
 
 def scan_world(
-    motion: Motion, caster: RayCaster, config: CrawlerConfig, mount: Pose, seeds: SeedTree, *, progress: bool = False
+    motion: RouteMotion,
+    caster: RayCaster,
+    config: CrawlerConfig,
+    mount: Pose,
+    seeds: SeedTree,
+    *,
+    progress: bool = False,
 ) -> RangeScans:
     """Scans of a spinning head: each beam leaves from where the robot is at its own time.
 
@@ -66,7 +72,7 @@ def scan_world(
 
 def cast_scans(
     scans: RangeScans,
-    motion: Posed,
+    motion: PoseSource,
     caster: RayCaster,
     config: CrawlerConfig,
     seeds: SeedTree,
@@ -110,7 +116,7 @@ def cast_scans(
     return dataclasses.replace(scans, ranges=ranges)
 
 
-def scan_rays(scans: RangeScans, motion: Posed, part: slice = slice(None)) -> Array:
+def scan_rays(scans: RangeScans, motion: PoseSource, part: slice = slice(None)) -> Array:
     """Beams of scans in the world ``(k · m, 6)``: origins [m] and unit directions, each at its own time."""
     origin, directions = scans.head_rays(part)
     flat = directions.reshape(-1, 3)
@@ -120,7 +126,7 @@ def scan_rays(scans: RangeScans, motion: Posed, part: slice = slice(None)) -> Ar
 
 
 def measure_imu(
-    motion: Motion, config: CrawlerConfig, yaw_bias: float, nominal_bias: float, seeds: SeedTree
+    motion: RouteMotion, config: CrawlerConfig, yaw_bias: float, nominal_bias: float, seeds: SeedTree
 ) -> tuple[Imu, dict[str, list[float]]]:
     """Rates, forces, roll and pitch, with bias, walk and noise.
 
@@ -176,7 +182,7 @@ def measure_imu(
     return imu, {k: v.tolist() for k, v in drawn.items()}
 
 
-def true_inertia(motion: Motion, times: Array, mount: ArrayLike) -> tuple[Array, Array, Array]:
+def true_inertia(motion: RouteMotion, times: Array, mount: ArrayLike) -> tuple[Array, Array, Array]:
     """Angular rate ``(n, 3)`` [rad/s], specific force ``(n, 3)`` [m/s²], roll and pitch ``(n, 2)`` of a unit.
 
     Parameters
@@ -193,10 +199,10 @@ def true_inertia(motion: Motion, times: Array, mount: ArrayLike) -> tuple[Array,
     world = motion.accelerations(times) + [0.0, 0.0, GRAVITY]
     felt = quat_rotate(q * [-1.0, -1.0, -1.0, 1.0], world)
     felt = felt + np.cross(alpha, lever) + np.cross(omega, np.cross(omega, lever))
-    return quat_rotate(to_unit, omega), quat_rotate(to_unit, felt), roll_pitch(quat_multiply(q, T[3:]))
+    return quat_rotate(to_unit, omega), quat_rotate(to_unit, felt), roll_pitch_angles(quat_multiply(q, T[3:]))
 
 
-def roll_pitch(q: Array) -> Array:
+def roll_pitch_angles(q: Array) -> Array:
     """Roll and pitch ``(n, 2)`` [rad] of ``R_z(yaw) R_y(pitch) R_x(roll)`` from unit quaternions ``(n, 4)``."""
     x, y, z, w = np.moveaxis(q, -1, 0)
     return np.stack(
@@ -224,7 +230,7 @@ class WheelErrors:
     turn: float
 
 
-def measure_wheels(motion: Motion, config: CrawlerConfig, seeds: SeedTree) -> tuple[VelocityControls, WheelErrors]:
+def measure_wheels(motion: RouteMotion, config: CrawlerConfig, seeds: SeedTree) -> tuple[VelocityControls, WheelErrors]:
     """Mean speed and yaw rate from each stamp to the next, with scale errors and noise."""
     c, rng = config, seeds.generator()
     n = int(np.floor(motion.duration * c.wheel_rate + 1e-9)) + 1
@@ -249,7 +255,7 @@ def measure_wheels(motion: Motion, config: CrawlerConfig, seeds: SeedTree) -> tu
     return controls, WheelErrors(float(scales[0]), float(scales[1]))
 
 
-def end_error(motion: Motion, yaw_bias: ArrayLike, *, step: float = 0.2) -> Array:
+def end_error(motion: RouteMotion, yaw_bias: ArrayLike, *, step: float = 0.2) -> Array:
     """Distance [m] by which dead reckoning misses the end if a constant yaw bias is its only error.
 
     Parameters
@@ -267,7 +273,7 @@ def end_error(motion: Motion, yaw_bias: ArrayLike, *, step: float = 0.2) -> Arra
     return np.asarray(np.abs(np.sum((np.exp(1j * b * middle) - 1.0) * moved, axis=-1)))
 
 
-def yaw_bias_for(motion: Motion, error: float, sign: float, most: float) -> float:
+def yaw_bias_for(motion: RouteMotion, error: float, sign: float, most: float) -> float:
     """The least yaw bias [rad/s] that makes dead reckoning miss the end by ``error`` [m], at most ``most``.
 
     A way that comes back to its middle hides any bias: then it is ``most``, or what comes nearest below it.

@@ -50,7 +50,7 @@ class DriveConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Way:
+class SampledRoute:
     """A way over the floor, sampled evenly along its length.
 
     Parameters
@@ -70,12 +70,12 @@ class Way:
     roll: Array
 
 
-def sample_way(route: Route) -> Way:
+def sample_route(route: Route) -> SampledRoute:
     """Samples of a route; pitch is its slope, roll is 0."""
     s = route.every(min(_STEP, route.length / 16.0))  # a spline wants some samples of the shortest way, too
     positions = route.positions(s)
     rise = np.gradient(positions[:, 2], s)  # central: a slope that jumps at a sample would be half a sample late
-    return Way(
+    return SampledRoute(
         step=float(s[1]),
         positions=positions,
         yaw=np.unwrap(route.headings(s)),
@@ -84,7 +84,7 @@ def sample_way(route: Route) -> Way:
     )
 
 
-def smooth_way(way: Way, width: float) -> Way:
+def smooth_route(way: SampledRoute, width: float) -> SampledRoute:
     """The same way without corners in slope or curvature: everything is averaged over ``width`` metres.
 
     A robot stands on the floor with a wheelbase: where the slope changes, its pitch changes over that length. The
@@ -105,7 +105,7 @@ def smooth_way(way: Way, width: float) -> Way:
             wide = uniform_filter1d(wide, half, axis=0, mode="nearest")
         return np.asarray(wide[pad:-pad], dtype=np.float64)
 
-    return Way(
+    return SampledRoute(
         step=way.step,
         positions=smooth(way.positions, straight=True),
         yaw=smooth(way.yaw),
@@ -114,18 +114,18 @@ def smooth_way(way: Way, width: float) -> Way:
     )
 
 
-class Motion:
+class RouteMotion:
     """Position, attitude and their derivatives along a way of ``length`` [m], at any time from 0 to ``duration`` [s].
 
     Parameters
     ----------
-    way : Way
-        Smooth (:func:`smooth_way`).
+    way : SampledRoute
+        Smooth (:func:`smooth_route`).
     speed : float
         Cruise [m/s].
     """
 
-    def __init__(self, way: Way, speed: float, config: DriveConfig) -> None:
+    def __init__(self, way: SampledRoute, speed: float, config: DriveConfig) -> None:
         if not (np.isfinite(speed) and speed > 0):
             raise DataError("speed is impossible", got=speed, wanted="> 0 m/s")
         self.config = config
@@ -234,7 +234,7 @@ def euler_to_quat(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Array:
     return quat_normalize(quat_multiply(quat_multiply(parts[0], parts[1]), parts[2]))
 
 
-def roll_by_floor(way: Way, caster: RayCaster, track: float) -> Way:
+def roll_by_floor(way: SampledRoute, caster: RayCaster, track: float) -> SampledRoute:
     """The way with the roll of the floor under the wheels of a robot ``track`` metres wide.
 
     Rays go down on either side of the way. Where one of them meets no floor near the height of the way, the roll stays
@@ -253,15 +253,17 @@ def roll_by_floor(way: Way, caster: RayCaster, track: float) -> Way:
     return replace(way, roll=roll)
 
 
-def drive_motion(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> Motion:
-    """The motion of a robot that drives through a world on its way; see :func:`drive`."""
-    way = sample_way(world.route())
+def drive_motion(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> RouteMotion:
+    """The motion of a robot that drives through a world on its way; see :func:`drive_through_world`."""
+    way = sample_route(world.route())
     if caster is not None:
         way = roll_by_floor(way, caster, config.track)
-    return Motion(smooth_way(way, config.wheelbase), world.speed, config)
+    return RouteMotion(smooth_route(way, config.wheelbase), world.speed, config)
 
 
-def drive(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> Trajectory:
+def drive_through_world(
+    world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None
+) -> Trajectory:
     """Drive through a world: ``T_world_base(t)``, the base on the floor between the wheels.
 
     Straight lines and arcs over the waypoints, smoothed over the wheelbase; from rest to rest, more slowly where the

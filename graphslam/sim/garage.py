@@ -10,7 +10,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.sim.clutter import KeepClear, park_cars, scatter
+from graphslam.sim.clutter import KeepClear, park_cars, scatter_obstacles
 from graphslam.sim.garage_layouts import CORNER_RADIUS, SLAB, STOREY, GarageLayout, garage_layout
 from graphslam.sim.mesh import MeshBuilder, Rectangle
 from graphslam.sim.route import plan_route
@@ -206,7 +206,7 @@ def _clutter(mesh: MeshBuilder, g: GarageLayout, clear: KeepClear, tree: SeedTre
             (0.4, g.width - 1.0, g.length - 0.4, g.width - 0.4),
         ):
             floor = level * STOREY
-            count += scatter(mesh, strip, floor, 6, clear, rng, forbidden=[hole, *g.cores])
+            count += scatter_obstacles(mesh, strip, floor, 6, clear, rng, forbidden=[hole, *g.cores])
     rng = tree.child("clutter", "yard").generator()
-    count += scatter(mesh, (g.road - 9.0, g.yard - 4.0, 14.0, -0.6), 0.0, 8, clear, rng)
+    count += scatter_obstacles(mesh, (g.road - 9.0, g.yard - 4.0, 14.0, -0.6), 0.0, 8, clear, rng)
     return count

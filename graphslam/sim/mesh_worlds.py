@@ -44,7 +44,7 @@ MESH_WORLDS: dict[str, MeshWorld] = {
     "garage": MeshWorld("graphslam.sim.garage", "garage", ("A", "B", "C", "D")),
     "mine": MeshWorld("graphslam.sim.mine", "mine", ("once", "twice")),
     "building": MeshWorld("graphslam.sim.building", "building", ("usual",)),
-    "court": MeshWorld("graphslam.sim.court", "court"),
+    "court": MeshWorld("graphslam.sim.ring_hall", "ring_hall"),
 }
 
 

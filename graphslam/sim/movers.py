@@ -159,7 +159,7 @@ def _away(p: Array, a: Array, b: Array) -> float:
     return float(np.linalg.norm(p - a - s * (b - a)))
 
 
-class Passers:
+class MovingObjects:
     """Beams cut short by movers, and which mover each of them met.
 
     Parameters

@@ -1,9 +1,9 @@
 """Layer 4: skeleton networks: landmarks are integrated out, the pose network is relaxed (urban GraphSLAM)."""
 
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
-_FACE = {
-    "preconditioner": "Levels",
+_EXPORTS = {
+    "preconditioner": "PreconditionerLevels",
     "relax": "RelaxConfig",
 }
-__getattr__, __dir__, __all__ = face(__name__, _FACE)
+__getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -22,8 +22,8 @@ from graphslam.skeleton import segment_kernels as kernels
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.preconditioner import KeyframePattern
 from graphslam.skeleton.problem import inverse_covariance
-from graphslam.skeleton.schur import moved
-from graphslam.skeleton.segment_kernels import Links
+from graphslam.skeleton.schur import step_poses
+from graphslam.skeleton.segment_kernels import SegmentLinks
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class ChainGraph:
             inverse_covariance(self.loop_covariance, "loop_covariance"),
         )
 
-    def links(self, stay: npt.ArrayLike = ()) -> tuple[Links, Links]:
+    def links(self, stay: npt.ArrayLike = ()) -> tuple[SegmentLinks, SegmentLinks]:
         """Odometry, in segments between poses that are kept, and loops, as the kernels take them.
 
         Kept are the ends of loops, the first and the last pose, and those of ``stay``.
@@ -100,8 +100,8 @@ class ChainGraph:
         kept = np.unique(np.concatenate([k[[0, -1]], self.ends.ravel(), np.asarray(stay, dtype=np.int64)]))
         steps = np.column_stack([k[:-1], k[1:]])
         return (
-            Links(steps, kept, self.rotation, self.translation, self.covariance, info[0]),
-            Links(
+            SegmentLinks(steps, kept, self.rotation, self.translation, self.covariance, info[0]),
+            SegmentLinks(
                 self.ends, np.arange(L + 1), self.loop_rotation, self.loop_translation, self.loop_covariance, info[1]
             ),
         )
@@ -110,11 +110,11 @@ class ChainGraph:
         """Poses from the odometry alone."""
         R, p = np.empty((self.poses, 3, 3)), np.empty((self.poses, 3))
         R[0], p[0] = np.eye(3), 0.0
-        chains.reckon(self.rotation, self.translation, R, p)
+        chains.compose_odometry(self.rotation, self.translation, R, p)
         return Poses(R, p)
 
 
-class KeptNetwork:
+class ReducedChain:
     """What is left of a chain with loops when the poses between kept ones are eliminated.
 
     Attributes
@@ -135,22 +135,22 @@ class KeptNetwork:
         self.keys, place = block_keys(self._ends, K)
         self._place = place[:K], place[K:]
 
-    def join(self, poses: Poses) -> Joined:
+    def join(self, poses: Poses) -> JoinedLinks:
         """All links, joined at some poses."""
         S, n = len(self.kept) - 1, len(self._ends)
         covariance, misfit = np.empty((n, 6, 6)), np.empty((n, 6))
         total = kernels.join_links(self._odometry, poses, covariance[:S], misfit[:S])
         total += kernels.join_links(self._loops, poses, covariance[S:], misfit[S:])
         blocks, g = np.zeros((len(self.keys), 6, 6)), np.zeros((S + 1, 6))
-        energy, bad = kernels.tie_ends(
+        energy, bad = kernels.add_end_blocks(
             self._ends, poses.position[self.kept], covariance, misfit, self._place, blocks, g
         )
         if bad >= 0:
             i, j = self.kept[self._ends[bad]]
             raise IndeterminateError(f"nothing ties pose {i} of the chain to pose {j}", (f"x{i}", f"x{j}"))
-        return Joined(poses, float(total), float(energy), blocks, g, covariance, misfit)
+        return JoinedLinks(poses, float(total), float(energy), blocks, g, covariance, misfit)
 
-    def follow(self, joined: Joined, solved: Array) -> Array:
+    def follow(self, joined: JoinedLinks, solved: Array) -> Array:
         """Steps ``(N, 6)`` of all poses from those ``(K, 6)`` of the kept ones."""
         S = len(self.kept) - 1
         x = np.empty((self.poses, 6))
@@ -159,7 +159,7 @@ class KeptNetwork:
         return x
 
 
-class Joined(NamedTuple):
+class JoinedLinks(NamedTuple):
     """Links joined at some poses."""
 
     poses: Poses
@@ -231,7 +231,7 @@ def relax_chain(
     progress : callable, optional
         Called with the objective after every step.
     """
-    network = KeptNetwork(graph)
+    network = ReducedChain(graph)
     K = len(network.kept)
     pattern = KeyframePattern(network.keys, K)
     joined = network.join(graph.dead_reckoning() if poses is None else poses)
@@ -245,7 +245,7 @@ def relax_chain(
         x = network.follow(joined, solved)
         scale = 1.0
         while True:
-            there = network.join(moved(joined.poses, x, scale))
+            there = network.join(step_poses(joined.poses, x, scale))
             if there.total <= joined.total * (1.0 + 1e-12) or scale < 1e-4:
                 break
             scale *= 0.5

@@ -16,7 +16,7 @@ from graphslam.core.jit import njit
 Array = npt.NDArray[np.float64]
 
 
-class Chain(NamedTuple):
+class ChainArrays(NamedTuple):
     """Odometry and tilt of all poses."""
 
     rotation: Array
@@ -46,7 +46,7 @@ def _log(R, r):
 
 
 @njit(nogil=True)
-def exp(w, R):
+def write_se3_exp(w, R):
     """Write ``Exp(w)`` to ``R (3, 3)``."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if t2 < 1e-8:
@@ -61,7 +61,7 @@ def exp(w, R):
 
 
 @njit(nogil=True)
-def move(rotation, position, step, scale, rotation_out, position_out):
+def move_chain(rotation, position, step, scale, rotation_out, position_out):
     """Move every pose by ``scale * step`` (N, 6); rotations are made orthonormal again to second order."""
     E = np.empty((3, 3))
     w = np.empty(3)
@@ -70,7 +70,7 @@ def move(rotation, position, step, scale, rotation_out, position_out):
         for k in range(3):
             w[k] = scale * step[i, k]
             position_out[i, k] = position[i, k] + scale * step[i, 3 + k]
-        exp(w, E)
+        write_se3_exp(w, E)
         for r in range(3):
             for c in range(3):
                 A[r, c] = E[r, 0] * rotation[i, 0, c] + E[r, 1] * rotation[i, 1, c] + E[r, 2] * rotation[i, 2, c]
@@ -84,7 +84,7 @@ def move(rotation, position, step, scale, rotation_out, position_out):
 
 
 @njit(nogil=True)
-def reckon(rotation, translation, R, p):
+def compose_odometry(rotation, translation, R, p):
     """Fill ``R (N, 3, 3)`` and ``p (N, 3)`` from their first pose by the chain's increments."""
     for i in range(len(translation)):
         for r in range(3):
@@ -100,7 +100,7 @@ def reckon(rotation, translation, R, p):
 def odometry_residual(chain, poses, k, r, J):
     """Residual (6,) of odometry k and the left half (6, 6) of its Jacobian with respect to pose k + 1.
 
-    By pose k it is minus the same, plus ``Rᵀ (p' - p) ×`` on the turn of pose k; see :func:`linearise`.
+    By pose k it is minus the same, plus ``Rᵀ (p' - p) ×`` on the turn of pose k; see :func:`linearise_chain`.
     """
     Ra, Rb = poses.rotation[k], poses.rotation[k + 1]
     A = np.empty((3, 3))
@@ -147,7 +147,7 @@ def _sandwich(X, P, Y, M, row, column):
 
 
 @njit(nogil=True)
-def linearise(chain, poses, span, blocks, diagonal, upper, g):
+def linearise_chain(chain, poses, span, blocks, diagonal, upper, g):
     """Add half the gradient of odometry and tilt to ``g (N, 6)`` and, if asked for, their blocks. Returns Σ rᵀ Ω r.
 
     Of the poses ``begin … end - 1`` of the span: their tilt, and the odometry from them on.
@@ -217,7 +217,7 @@ def linearise(chain, poses, span, blocks, diagonal, upper, g):
 
 
 @njit(nogil=True)
-def product(diagonal, upper, v, begin, end, out):
+def chain_product(diagonal, upper, v, begin, end, out):
     """Write the product of a chain of blocks with ``v (N, 6)`` to the rows ``begin … end - 1`` of ``out``."""
     N = len(diagonal)
     for i in range(begin, end):
@@ -337,7 +337,7 @@ def multiply_blocks(blocks, v, begin, end, out):
 
 
 @njit(nogil=True)
-def forward_pass(sightings, chain_poses, span, rules, start_seen, D, b, out):
+def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, out):
     """One walk along the poses: each is tied to the landmarks that were seen long before, then adds its sightings.
 
     Parameters
@@ -472,7 +472,7 @@ def forward_pass(sightings, chain_poses, span, rules, start_seen, D, b, out):
                 for k in range(3):
                     w[k] = x[k]
                     p[k] += x[3 + k]
-                exp(w, E)
+                write_se3_exp(w, E)
                 for r in range(3):
                     for k in range(3):
                         T[r, k] = E[r, 0] * R[0, k] + E[r, 1] * R[1, k] + E[r, 2] * R[2, k]

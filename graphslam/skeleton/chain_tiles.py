@@ -24,18 +24,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from graphslam.core.atomic import read_json, sweep_parts, write_json
-from graphslam.core.cluster import hands
+from graphslam.core.cluster import task_runner
 from graphslam.core.errors import ConfigError, DataError, FormatError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import segment_kernels as kernels
-from graphslam.skeleton.chain_graph import HELD, ChainGraph, Joined, KeptNetwork, block_keys
+from graphslam.skeleton.chain_graph import HELD, ChainGraph, JoinedLinks, ReducedChain, block_keys
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.preconditioner import KeyframePattern
 from graphslam.skeleton.problem import inverse_covariance
-from graphslam.skeleton.schur import moved
-from graphslam.skeleton.segment_kernels import Links
-from graphslam.skeleton.tile_store import put_arrays, take_arrays
+from graphslam.skeleton.schur import step_poses
+from graphslam.skeleton.segment_kernels import SegmentLinks
+from graphslam.skeleton.tile_store import store_arrays, stored_arrays
 
 TASK_SECONDS = 1.0
 """CPU time from which a task is worth being handed out."""
@@ -95,17 +95,17 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
         ties.append({name: loops[name][~inner] for name in _LOOPS})
         here = Poses(np.empty((n, 3, 3)), np.empty((n, 3)))
         here.rotation[0], here.position[0] = R, p
-        chains.reckon(checked.rotation, checked.translation, here.rotation, here.position)
+        chains.compose_odometry(checked.rotation, checked.translation, here.rotation, here.position)
         R, p = here.rotation[-1], here.position[-1]
-        start = put_arrays(out, {"rotation": here.rotation, "position": here.position})
-        tiles.append({"file": put_arrays(out, arrays), "poses": start, "begin": begin, "end": end})
+        start = store_arrays(out, {"rotation": here.rotation, "position": here.position})
+        tiles.append({"file": store_arrays(out, arrays), "poses": start, "begin": begin, "end": end})
         begin = end
-    between = put_arrays(out, {name: np.concatenate([t[name] for t in ties]) for name in ties[0]})
+    between = store_arrays(out, {name: np.concatenate([t[name] for t in ties]) for name in ties[0]})
     write_json(out / _INDEX, {"format": FORMAT, "ties": between, "tiles": tiles})
     return out
 
 
-def pieces_of(graph: ChainGraph, size: int) -> Iterator[ChainPiece]:
+def cut_chain(graph: ChainGraph, size: int) -> Iterator[ChainPiece]:
     """A chain in memory, cut for :func:`chain_to_disk` into pieces of ``size`` links."""
     if size < 1:
         raise ConfigError(f"tiles of {size} links; wanted 1 or more")
@@ -182,15 +182,15 @@ def relax_tiles(
     where = Path(folder).resolve()
     index = read_json(where / _INDEX, fmt=FORMAT, shape=_SHAPE)
     tiles = index["tiles"]
-    separator = _Separator(take_arrays(where, index["ties"]), [(int(t["begin"]), int(t["end"])) for t in tiles])
+    separator = _Separator(stored_arrays(where, index["ties"]), [(int(t["begin"]), int(t["end"])) for t in tiles])
     seconds = [POSE_SECONDS * (int(t["end"]) - int(t["begin"])) for t in tiles]
     spent: list[float] = []
     known: list[bool] = []
     given = {index["ties"], *(t["file"] for t in tiles), *(t["poses"] for t in tiles)}
 
-    with hands(workers, cluster) as run:
+    with task_runner(workers, cluster) as run:
 
-        def step(names: list[str], x: Array | None, scale: float = 1.0) -> list[Done]:
+        def step(names: list[str], x: Array | None, scale: float = 1.0) -> list[TaskResult]:
             work = [
                 (str(where), t["file"], name, stay, None if x is None else x[a:b], scale)
                 for t, name, stay, (a, b) in zip(tiles, names, separator.stay, separator.rows)
@@ -205,7 +205,7 @@ def relax_tiles(
                 known.append(True)
             return done
 
-        def keep(done: list[Done]) -> None:
+        def keep(done: list[TaskResult]) -> None:
             """Remove what earlier steps wrote."""
             needed = given | {d.poses for d in done}
             for path in where.glob("*.arrays"):
@@ -244,7 +244,7 @@ def relax_tiles(
     return RelaxedTiles(where, names, left.total, history, predicted, far, converged, separator.size, spent)
 
 
-class Done(NamedTuple):
+class TaskResult(NamedTuple):
     """What a task hands back: names of files, and a few figures."""
 
     poses: str
@@ -276,12 +276,12 @@ def tasks_of(seconds: Sequence[float], least: float) -> list[slice]:
     return out
 
 
-def work_on_tiles(work: Sequence[tuple[Any, ...]]) -> list[Done]:
+def work_on_tiles(work: Sequence[tuple[Any, ...]]) -> list[TaskResult]:
     """:func:`work_on_tile` of each, one in memory at a time."""
     return [work_on_tile(*one) for one in work]
 
 
-def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | None, scale: float) -> Done:
+def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | None, scale: float) -> TaskResult:
     """Move the poses of a tile, and eliminate what is not of the separator.
 
     Parameters
@@ -296,14 +296,14 @@ def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | Non
         Share of the step that is taken.
     """
     where, began = Path(folder), process_time()
-    network = KeptNetwork(ChainGraph(**take_arrays(where, tile)), stay)
+    network = ReducedChain(ChainGraph(**stored_arrays(where, tile)), stay)
     inner = _Inner(network, stay)
     here, far = _poses(where, poses), 0.0
     if x is not None:
         joined = network.join(here)
         full = network.follow(joined, inner.solve(inner.eliminate(joined), x))
-        here = moved(here, full, scale)
-        poses = put_arrays(where, {"rotation": here.rotation, "position": here.position})
+        here = step_poses(here, full, scale)
+        poses = store_arrays(where, {"rotation": here.rotation, "position": here.position})
         far = float(np.sqrt(np.max(np.sum(full[:, 3:] ** 2, axis=1)))) * scale
     joined = network.join(here)
     left = inner.eliminate(joined)
@@ -314,17 +314,17 @@ def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | Non
         "rotation": here.rotation[stay],
         "position": here.position[stay],
     }
-    name = put_arrays(where, arrays)
+    name = store_arrays(where, arrays)
     spent = process_time() - began
-    return Done(poses, name, joined.total, joined.total - joined.energy + left.gain, far, spent)
+    return TaskResult(poses, name, joined.total, joined.total - joined.energy + left.gain, far, spent)
 
 
 def _poses(folder: Path, name: str) -> Poses:
-    arrays = take_arrays(folder, name)
+    arrays = stored_arrays(folder, name)
     return Poses(arrays["rotation"], arrays["position"])
 
 
-class Left(NamedTuple):
+class EliminationResult(NamedTuple):
     """What the elimination of the inner poses leaves to those that stay."""
 
     keys: Index
@@ -339,7 +339,7 @@ class Left(NamedTuple):
 class _Inner:
     """Kept poses of a tile that are not of the separator: ends of loops inside it."""
 
-    def __init__(self, network: KeptNetwork, stay: Index) -> None:
+    def __init__(self, network: ReducedChain, stay: Index) -> None:
         K = len(network.kept)
         self._stay = np.searchsorted(network.kept, stay)
         self._number = np.full(K, -1, np.int64)
@@ -364,7 +364,7 @@ class _Inner:
         a, b = np.searchsorted(nodes, i[inner]), np.searchsorted(nodes, j[inner])
         return nodes, beside, KeyframePattern(a * len(nodes) + b, len(nodes)), edges[inner], edges[~inner]
 
-    def eliminate(self, joined: Joined) -> Left:
+    def eliminate(self, joined: JoinedLinks) -> EliminationResult:
         """What is left for the poses that stay."""
         s = len(self._stay)
         numbers, blocks = [], [joined.blocks[self._outside]]
@@ -393,9 +393,9 @@ class _Inner:
         keys, place = np.unique(i * s + j, return_inverse=True)
         out = np.zeros((len(keys), 6, 6))
         np.add.at(out, place, np.concatenate(blocks))
-        return Left(keys, out, g, gain, parts)
+        return EliminationResult(keys, out, g, gain, parts)
 
-    def solve(self, left: Left, x: Array) -> Array:
+    def solve(self, left: EliminationResult, x: Array) -> Array:
         """Steps of all kept poses from those ``(s, 6)`` of the ones that stay."""
         out = np.empty((len(self._number), 6))
         out[self._stay] = x
@@ -430,16 +430,16 @@ class _Separator:
         covariance = ties["loop_covariance"].reshape(-1, 6, 6)
         info = inverse_covariance(covariance, "loop_covariance") if len(covariance) else covariance
         first = np.arange(len(ends) + 1)
-        self._links = Links(self._ends, first, ties["loop_rotation"], ties["loop_translation"], covariance, info)
+        self._links = SegmentLinks(self._ends, first, ties["loop_rotation"], ties["loop_translation"], covariance, info)
         self._pattern: KeyframePattern | None = None
 
-    def gather(self, folder: Path, done: list[Done]) -> _Together:
+    def gather(self, folder: Path, done: list[TaskResult]) -> _Together:
         """What the tiles left, and the loops between them."""
         K = self.size
         keys, blocks, g = [], [], np.zeros((K, 6))
         poses = Poses(np.empty((K, 3, 3)), np.empty((K, 3)))
         for d, (a, b) in zip(done, self.rows):
-            left = take_arrays(folder, d.left)
+            left = stored_arrays(folder, d.left)
             i, j = np.divmod(left["keys"].astype(np.int64), b - a)
             keys.append((a + i) * K + a + j)
             blocks.append(left["blocks"])
@@ -449,7 +449,7 @@ class _Separator:
         covariance, misfit = np.empty((len(self._ends), 6, 6)), np.empty((len(self._ends), 6))
         total = float(kernels.join_links(self._links, poses, covariance, misfit))
         between = np.zeros((len(own), 6, 6))
-        kernels.tie_ends(self._ends, poses.position, covariance, misfit, (where[:K], where[K:]), between, g)
+        kernels.add_end_blocks(self._ends, poses.position, covariance, misfit, (where[:K], where[K:]), between, g)
         every, place = np.unique(np.concatenate([*keys, own]), return_inverse=True)
         out = np.zeros((len(every), 6, 6))
         np.add.at(out, place, np.concatenate([*blocks, between]))

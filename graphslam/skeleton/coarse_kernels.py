@@ -18,8 +18,8 @@ from graphslam.skeleton.landmark_kernels import _nine, _seen
 Array = npt.NDArray[np.float64]
 
 
-class Table(NamedTuple):
-    """Blocks (row, column), row ≤ column, by open addressing; made by :func:`make_table`."""
+class BlockTable(NamedTuple):
+    """Blocks (row, column), row ≤ column, by open addressing; made by :func:`make_block_table`."""
 
     key: npt.NDArray[np.int64]
     """(2^b,): row · keyframes + column, -1 where free."""
@@ -31,8 +31,8 @@ class Table(NamedTuple):
     """(1,): blocks so far."""
 
 
-class Waiting(NamedTuple):
-    """Landmarks that have not been seen for the last time; made by :func:`make_waiting`."""
+class PendingLandmarks(NamedTuple):
+    """Landmarks that have not been seen for the last time; made by :func:`make_pending`."""
 
     slot: npt.NDArray[np.int32]
     """(L,): zero between two intervals."""
@@ -49,11 +49,11 @@ class Waiting(NamedTuple):
 
 
 @njit(nogil=True)
-def make_waiting(landmarks):
+def make_pending(landmarks):
     """Nothing waits."""
     ends = np.zeros(2, np.int64)
     ends[1] = -1
-    return Waiting(
+    return PendingLandmarks(
         np.zeros(landmarks, np.int32),
         np.full(landmarks, -1, np.int32),
         np.empty(16, np.int32),
@@ -64,12 +64,12 @@ def make_waiting(landmarks):
 
 
 @njit(nogil=True)
-def make_table(capacity):
+def make_block_table(capacity):
     """An empty table for ``capacity`` blocks."""
     size = 16
     while size < 2 * capacity:
         size *= 2
-    return Table(
+    return BlockTable(
         np.full(size, -1, np.int64),
         np.zeros(size, np.int32),
         np.zeros((capacity, 6, 6)),
@@ -96,7 +96,7 @@ def _find(table, key):
 def _grown(table):
     """The same table with twice the room."""
     n = table.filled[0]
-    big = make_table(2 * len(table.block))
+    big = make_block_table(2 * len(table.block))
     big.block[:n] = table.block[:n]
     keys = np.empty(n, np.int64)
     for at in range(len(table.key)):
@@ -108,7 +108,7 @@ def _grown(table):
 
 
 @njit(nogil=True)
-def keys_of(table):
+def sorted_block_keys(table):
     """Keys in the order of the blocks."""
     keys = np.empty(table.filled[0], np.int64)
     for at in range(len(table.key)):
@@ -421,7 +421,7 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
         table.block[_find(table, np.int64(c) * K + c + 1)] += B01
         table.block[_find(table, np.int64(c + 1) * K + c + 1)] += B11
     ends[0], ends[1] = used, free
-    return Waiting(slot, head, frame, after, kept, ends), table
+    return PendingLandmarks(slot, head, frame, after, kept, ends), table
 
 
 @njit(nogil=True)
@@ -510,7 +510,7 @@ def _both(T, B):
 
 
 @njit(nogil=True)
-def restrict(position, k, r, out):
+def restrict_residual(position, k, r, out):
     """Write ``Pᵀ r`` to ``out (K, 6)``."""
     N, K = len(position), len(out)
     out[:] = 0.0
@@ -536,7 +536,7 @@ def restrict(position, k, r, out):
 
 
 @njit(nogil=True)
-def prolong(position, k, x, out):
+def prolong_step(position, k, x, out):
     """Add ``P x`` of ``x (K, 6)`` to ``out (N, 6)``."""
     N, K = len(position), len(x)
     for c in range(K - 1):

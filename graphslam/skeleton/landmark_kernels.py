@@ -117,7 +117,7 @@ def solve_landmarks(D, b, begin, end):
 
 
 @njit(nogil=True, error_model="numpy")
-def gradient(sightings, poses, l, begin, end, g, objective):
+def pose_gradients(sightings, poses, l, begin, end, g, objective):
     """Write half the objective's gradient of each pose to ``g (N, 6)`` and ``Σ eᵀ W e`` to ``objective (N,)``."""
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
@@ -145,7 +145,7 @@ def gradient(sightings, poses, l, begin, end, g, objective):
 
 
 @njit(nogil=True, error_model="numpy")
-def landmark_chi2(sightings, poses, l, begin, end, out, count):
+def landmark_chi2_kernel(sightings, poses, l, begin, end, out, count):
     """Add ``eᵀ W e`` of each measurement to its landmark in ``out (L,)``, and one to ``count (L,)``."""
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
@@ -163,7 +163,7 @@ def landmark_chi2(sightings, poses, l, begin, end, out, count):
 
 
 @njit(nogil=True, error_model="numpy")
-def diagonal(sightings, poses, landmarks, begin, end, blocks):
+def schur_diagonal(sightings, poses, landmarks, begin, end, blocks):
     """Add the measurements' diagonal blocks of the Schur complement to ``blocks (N, 6, 6)``.
 
     Exact where a pose sees each landmark once; otherwise the block is smaller by what the two share.
@@ -216,7 +216,7 @@ def diagonal(sightings, poses, landmarks, begin, end, blocks):
 
 
 @njit(nogil=True, error_model="numpy")
-def gather(sightings, poses, l, v, begin, end, t):
+def gather_landmarks(sightings, poses, l, v, begin, end, t):
     """First pass of the product: add ``Σ W (q × w - u)`` to ``t (L, 3)``."""
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
@@ -239,7 +239,7 @@ def gather(sightings, poses, l, v, begin, end, t):
 
 
 @njit(nogil=True)
-def settle(Di, t, begin, end):
+def solve_landmark_sums(Di, t, begin, end):
     """``t ← D⁻¹ t`` for landmarks ``begin … end - 1``."""
     for j in range(begin, end):
         x, y, z = t[j, 0], t[j, 1], t[j, 2]
@@ -249,7 +249,7 @@ def settle(Di, t, begin, end):
 
 
 @njit(nogil=True, error_model="numpy")
-def scatter(sightings, poses, landmarks, v, begin, end, out):
+def scatter_to_poses(sightings, poses, landmarks, v, begin, end, out):
     """Second pass: add ``f × q`` and ``-f``, f = W (q × w - u - t), to ``out (N, 6)``.
 
     Parameters

@@ -20,7 +20,7 @@ Index = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Levels:
+class PreconditionerLevels:
     """Which keyframes the preconditioner has.
 
     Parameters
@@ -35,13 +35,13 @@ class Levels:
     factored: int = 0
 
 
-def levels_for(poses: int) -> Levels:
+def preconditioner_levels(poses: int) -> PreconditionerLevels:
     """Levels by size: one factored network up to 2·10⁴ poses, beyond it a sparser one and block Jacobi between."""
     if poses < 40:
-        return Levels()
+        return PreconditionerLevels()
     if poses <= 20_000:
-        return Levels(0, 20)
-    return Levels(10, 80)
+        return PreconditionerLevels(0, 20)
+    return PreconditionerLevels(10, 80)
 
 
 class KeyframePattern:
@@ -79,16 +79,16 @@ class KeyframeNetwork:
 
     def __init__(self, network: Network, k: int, pattern: KeyframePattern | None = None) -> None:
         problem, poses = network.layout.problem, network.poses
-        self.k, self.frames, self.position = k, frames_of(problem.poses, k), poses.position
+        self.k, self.frames, self.position = k, keyframes_of(problem.poses, k), poses.position
         count = network.layout.counts.copy()
-        table = kernels.make_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
-        landmarks, waiting = (network.landmarks, network.inverse), kernels.make_waiting(problem.landmarks)
+        table = kernels.make_block_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
+        landmarks, waiting = (network.landmarks, network.inverse), kernels.make_pending(problem.landmarks)
         for a, b in _interval_chunks(network, k, 0, self.frames - 1):
             sight = problem.sightings_of(*_poses_of(problem.poses, k, a, b))
             waiting, table = kernels.keyframe_network(sight, poses, landmarks, k, (a, b), count, waiting, table)
-        keys = kernels.keys_of(table)
+        keys = kernels.sorted_block_keys(table)
         self.blocks = table.block[: len(keys)]
-        diagonal, upper = chain_of(network, k)
+        diagonal, upper = keyframe_chain_blocks(network, k)
         c = np.arange(self.frames, dtype=np.int64)
         order = np.argsort(keys)
         at = order[np.searchsorted(keys, c * self.frames + c, sorter=order)]
@@ -115,11 +115,11 @@ class KeyframeNetwork:
     def apply(self, r: Array, out: Array) -> None:
         """Add ``P (Pᵀ S P)⁻¹ Pᵀ r`` to ``out (N, 6)``."""
         x = np.empty((self.frames, 6))
-        kernels.restrict(self.position, self.k, r, x)
-        kernels.prolong(self.position, self.k, self.solve(x), out)
+        kernels.restrict_residual(self.position, self.k, r, x)
+        kernels.prolong_step(self.position, self.k, self.solve(x), out)
 
 
-def frames_of(poses: int, k: int) -> int:
+def keyframes_of(poses: int, k: int) -> int:
     """Keyframes: poses 0, k, 2k … and the last one."""
     return (poses - 2) // k + 2
 
@@ -139,9 +139,9 @@ def _interval_chunks(network: Network, k: int, begin: int, end: int) -> Iterator
         yield a, min(a + size, end)
 
 
-def chain_of(network: Network, k: int) -> tuple[Array, Array]:
+def keyframe_chain_blocks(network: Network, k: int) -> tuple[Array, Array]:
     """Blocks of ``Pᵀ A P`` of what ties a pose alone or to the next: diagonal and upper."""
-    K = frames_of(network.layout.problem.poses, k)
+    K = keyframes_of(network.layout.problem.poses, k)
     diagonal, upper = np.zeros((K, 6, 6)), np.zeros((K - 1, 6, 6))
     kernels.keyframe_chain(network.poses.position, *network.chain_blocks(), k, diagonal, upper)
     return diagonal, upper
@@ -156,14 +156,14 @@ class Preconditioner:
         Of an earlier one.
     """
 
-    def __init__(self, network: Network, levels: Levels, pattern: KeyframePattern | None = None) -> None:
+    def __init__(self, network: Network, levels: PreconditionerLevels, pattern: KeyframePattern | None = None) -> None:
         self.layout, self.levels, self.position = network.layout, levels, network.poses.position
         workers = self.layout.workers
         self.inverse = inverse_of(network.diagonal(), self.layout.over_poses, "pose")
         self.keyframes: Array | None = None
         self.network: KeyframeNetwork | None = None
         if levels.jacobi:
-            blocks = chain_of(network, levels.jacobi)[0]
+            blocks = keyframe_chain_blocks(network, levels.jacobi)[0]
             half, k = len(blocks) // 2, levels.jacobi
             ranges = [(0, half), (half, len(blocks))]
             landmarks = (network.landmarks, network.inverse)
@@ -191,9 +191,9 @@ class Preconditioner:
         if self.keyframes is not None:
             k, n = self.levels.jacobi, len(self.keyframes)
             x, y = np.empty((n, 6)), np.empty((n, 6))
-            kernels.restrict(self.position, k, r, x)
+            kernels.restrict_residual(self.position, k, r, x)
             chains.multiply_blocks(self.keyframes, x, 0, n, y)
-            kernels.prolong(self.position, k, y, out)
+            kernels.prolong_step(self.position, k, y, out)
         if self.network is not None:
             self.network.apply(r, out)
         return out

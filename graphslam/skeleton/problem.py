@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import Array
-from graphslam.skeleton.chain_kernels import Chain, reckon
+from graphslam.skeleton.chain_kernels import ChainArrays, compose_odometry
 from graphslam.skeleton.landmark_kernels import Poses, Sightings
 from graphslam.skeleton.tile_store import Tiles
 
@@ -46,7 +46,8 @@ class SkeletonProblem:
         Which poses have a fix, and where [m]; of the body's origin.
     gps_covariance : (3, 3) or (G, 3, 3)
     tiles : Tiles, optional
-        Measurements on disk; ``points`` and ``landmark`` are empty then (:func:`~graphslam.skeleton.tiles.to_disk`).
+        Measurements on disk; ``points`` and ``landmark`` are empty then
+        (:func:`~graphslam.skeleton.tiles.write_tiled_problem`).
 
     Raises
     ------
@@ -213,13 +214,13 @@ class SkeletonProblem:
             yield a, min(a + step, count)
 
     @cached_property
-    def chain(self) -> Chain:
+    def chain(self) -> ChainArrays:
         """Odometry and tilt, as the kernels take them."""
         if self.up is None:
             up, weight = np.zeros((self.poses, 3)), np.zeros(1)
         else:
             up, weight = self.up, np.atleast_1d(np.asarray(self.up_sigma, dtype=np.float64)) ** -2.0
-        return Chain(self.odometry_rotation, self.odometry_translation, self.odometry_information, up, weight)
+        return ChainArrays(self.odometry_rotation, self.odometry_translation, self.odometry_information, up, weight)
 
     @property
     def freedom(self) -> int:
@@ -233,7 +234,7 @@ class SkeletonProblem:
         """Poses from the prior of the first one and the odometry alone."""
         R, p = np.empty((self.poses, 3, 3)), np.empty((self.poses, 3))
         R[0], p[0] = self.start_rotation, self.start_position
-        reckon(self.odometry_rotation, self.odometry_translation, R, p)
+        compose_odometry(self.odometry_rotation, self.odometry_translation, R, p)
         return Poses(R, p)
 
     def relabelled(self, landmark: npt.NDArray[np.int32]) -> SkeletonProblem:

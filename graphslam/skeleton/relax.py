@@ -13,14 +13,19 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array
+from graphslam.skeleton.false_correspondences import split_false_correspondences
 from graphslam.skeleton.landmark_kernels import Poses
-from graphslam.skeleton.preconditioner import KeyframePattern, Levels, Preconditioner, levels_for
+from graphslam.skeleton.preconditioner import (
+    KeyframePattern,
+    Preconditioner,
+    PreconditionerLevels,
+    preconditioner_levels,
+)
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.schur import Layout, Network, Workers, moved
-from graphslam.skeleton.soft import SoftMode, softest_modes
+from graphslam.skeleton.reduced_network import ReducedNetwork
+from graphslam.skeleton.schur import Network, Workers, WorkRanges, step_poses
 from graphslam.skeleton.start import chain_start, forward_pass
-from graphslam.skeleton.thinning import ThinnedNetwork
-from graphslam.skeleton.unions import split_wrong_unions
+from graphslam.skeleton.weak_modes import WeakMode, weakest_modes
 
 logger = logging.getLogger(__name__)
 Method = Literal["gn", "cg", "blocks", "levels"]
@@ -49,8 +54,8 @@ class RelaxConfig:
         pose by more than ``move`` [m]; if one does, ``converged`` is ``"objective"``: long modes are soft.
     enough : float
         It also ends when a step is predicted to gain less than this.
-    levels : Levels, optional
-        Of the preconditioner. Default: by size. ``Levels(-1, 0)`` with ``cg``: no preconditioner at all.
+    levels : PreconditionerLevels, optional
+        Of the preconditioner. Default: by size. ``PreconditionerLevels(-1, 0)`` with ``cg``: no preconditioner at all.
     rebuild : int
         Gradients between two preconditioners of ``cg``; 0: the first one is kept.
     inner : int
@@ -73,7 +78,7 @@ class RelaxConfig:
     gain: float = 1e-2
     move: float = 1e-4
     enough: float = 0.0
-    levels: Levels | None = None
+    levels: PreconditionerLevels | None = None
     rebuild: int = 10
     inner: int = 400
     limit: float = 4e9
@@ -121,7 +126,7 @@ class Iteration:
 
 
 @dataclass(frozen=True, eq=False)
-class Relaxed:
+class RelaxationResult:
     """A relaxed skeleton network.
 
     Parameters
@@ -134,7 +139,7 @@ class Relaxed:
     gradient : float
         Length of half the gradient.
     converged : {"poses", "objective", ""}
-    soft : list of SoftMode
+    soft : list of WeakMode
         Approximate.
     split, refused : int
         Landmarks that were wrong unions; sightings that the forward pass did not believe.
@@ -153,7 +158,7 @@ class Relaxed:
     gradient: float
     converged: str
     history: list[Iteration]
-    soft: list[SoftMode] = field(default_factory=list)
+    soft: list[WeakMode] = field(default_factory=list)
     split: int = 0
     refused: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
@@ -180,7 +185,7 @@ class Relaxed:
         return self.history[-1].predicted if self.history else 0.0
 
 
-class Stages:
+class StageTimes:
     """CPU seconds by stage."""
 
     def __init__(self) -> None:
@@ -204,7 +209,7 @@ def relax_skeleton(
     config: RelaxConfig | None = None,
     poses: Poses | None = None,
     progress: Callable[[Iteration], None] | None = None,
-) -> Relaxed:
+) -> RelaxationResult:
     """Move the poses of a skeleton network to where all its measurements fit best.
 
     Parameters
@@ -241,7 +246,7 @@ def relax_skeleton(
             "measurements are on disk; wanted split=False (wrong unions are found in memory) and another method than "
             "'blocks'"
         )
-    stages = Stages()
+    stages = StageTimes()
     refused = 0
     if poses is None:
         poses = problem.dead_reckoning() if c.start == "odometry" else chain_start(problem)
@@ -258,10 +263,10 @@ def relax_skeleton(
             descent.run()
         soft = []
         if c.soft:
-            soft = softest_modes(descent.network, c.soft)
+            soft = weakest_modes(descent.network, c.soft)
             stages("softest modes")
         network = descent.network
-        return Relaxed(
+        return RelaxationResult(
             method=c.method,
             poses=network.poses,
             landmarks=network.landmarks,
@@ -290,11 +295,11 @@ class _Descent:
         config: RelaxConfig,
         workers: Workers,
         poses: Poses,
-        stages: Stages,
+        stages: StageTimes,
         progress: Callable[[Iteration], None] | None,
     ) -> None:
         self.problem, self.config, self.workers, self.stages = problem, config, workers, stages
-        self.levels = config.levels or levels_for(problem.poses)
+        self.levels = config.levels or preconditioner_levels(problem.poses)
         self.history: list[Iteration] = []
         self.converged = ""
         self.found = 0
@@ -305,7 +310,7 @@ class _Descent:
 
     def _begin(self, problem: SkeletonProblem, poses: Poses) -> None:
         self.problem = problem
-        self.layout = Layout(problem, self.workers)
+        self.layout = WorkRanges(problem, self.workers)
         self.network = self._network(poses)
         self._pattern = None
 
@@ -322,7 +327,7 @@ class _Descent:
 
     def split(self) -> int:
         """Split wrong unions at the present poses; how many there were."""
-        landmark, found = split_wrong_unions(self.network)
+        landmark, found = split_false_correspondences(self.network)
         self.stages("wrong unions")
         self.found += found
         if found:
@@ -362,7 +367,7 @@ class _Descent:
             gain = 0.0 if self._finishing else 1e-3 * c.gain
             product = self.network.product
             if c.method == "blocks":
-                product = ThinnedNetwork(self.network, c.limit).product
+                product = ReducedNetwork(self.network, c.limit).product
                 self.stages("thinning")
             step, predicted, products = conjugate_gradients(
                 product, M, -self.network.gradient, tolerance, c.inner, gain
@@ -391,7 +396,7 @@ class _Descent:
         c, before = self.config, self.network
         scale = 1.0
         while True:
-            there = self._network(moved(before.poses, step, scale))
+            there = self._network(step_poses(before.poses, step, scale))
             gained = before.objective - there.objective
             # what rounding makes of the sum of all residuals counts as nothing
             if not c.halve or gained >= -1e-12 * before.objective * np.sqrt(self.problem.measurements):

@@ -43,7 +43,7 @@ class Workers:
             self._pool.shutdown()
 
 
-class Layout:
+class WorkRanges:
     """Ranges of poses and of landmarks, and the arrays into which each range of poses sums.
 
     Landmarks are numbered by first observation, so the first range of poses sees the first landmarks only.
@@ -112,7 +112,7 @@ class Network:
         Half its derivative by the poses (turn, then way, in the world frame), with the landmarks following.
     """
 
-    def __init__(self, layout: Layout, poses: Poses) -> None:
+    def __init__(self, layout: WorkRanges, poses: Poses) -> None:
         self.layout, self.poses = layout, poses
         problem = layout.problem
         D, b = layout.sums(6), layout.sums(3)
@@ -121,7 +121,7 @@ class Network:
         layout.over_landmarks(lambda a, e: kernels.solve_landmarks(self.inverse, self.landmarks, a, e))
         N = problem.poses
         g, each = np.empty((N, 6)), np.empty(N)
-        layout.over(lambda k, sight, a, e: kernels.gradient(sight, poses, self.landmarks, a, e, g, each))
+        layout.over(lambda k, sight, a, e: kernels.pose_gradients(sight, poses, self.landmarks, a, e, g, each))
         self.objective = float(np.sum(each)) + self._add_chain(g, None, None)
         self.gradient = g
         self._blocks: tuple[Array, Array] | None = None
@@ -132,7 +132,7 @@ class Network:
         none = np.empty((0, 6, 6))
         total = 0.0
         for span in [(0, problem.poses)] if diagonal is None else problem.pieces(problem.poses):
-            total += chains.linearise(
+            total += chains.linearise_chain(
                 problem.chain,
                 poses,
                 span,
@@ -160,7 +160,7 @@ class Network:
 
         def fill(_: int, sight: Sightings, a: int, e: int) -> None:
             blocks[a:e] = chain[a:e]
-            kernels.diagonal(sight, self.poses, landmarks, a, e, blocks)
+            kernels.schur_diagonal(sight, self.poses, landmarks, a, e, blocks)
 
         layout.over(fill)
         return blocks
@@ -169,15 +169,17 @@ class Network:
         """Schur complement times ``v (N, 6)``."""
         layout = self.layout
         parts = layout.sums(3)
-        layout.over(lambda k, sight, a, e: kernels.gather(sight, self.poses, self.landmarks, v, a, e, parts[k]))
+        layout.over(
+            lambda k, sight, a, e: kernels.gather_landmarks(sight, self.poses, self.landmarks, v, a, e, parts[k])
+        )
         t = layout.total(parts)
-        layout.over_landmarks(lambda a, e: kernels.settle(self.inverse, t, a, e))
+        layout.over_landmarks(lambda a, e: kernels.solve_landmark_sums(self.inverse, t, a, e))
         diagonal, upper = self.chain_blocks()
         out = np.empty_like(v)
 
         def spread(_: int, sight: Sightings, a: int, e: int) -> None:
-            chains.product(diagonal, upper, v, a, e, out)
-            kernels.scatter(sight, self.poses, (self.landmarks, t), v, a, e, out)
+            chains.chain_product(diagonal, upper, v, a, e, out)
+            kernels.scatter_to_poses(sight, self.poses, (self.landmarks, t), v, a, e, out)
 
         layout.over(spread)
         return out
@@ -214,10 +216,10 @@ def add_start(problem: SkeletonProblem, poses: Poses, g: Array, diagonal: Array 
     return float(r @ f)
 
 
-def moved(poses: Poses, step: Array, scale: float = 1.0) -> Poses:
+def step_poses(poses: Poses, step: Array, scale: float = 1.0) -> Poses:
     """Poses after a step ``(N, 6)``."""
     R, p = np.empty_like(poses.rotation), np.empty_like(poses.position)
-    chains.move(poses.rotation, poses.position, step, scale, R, p)
+    chains.move_chain(poses.rotation, poses.position, step, scale, R, p)
     return Poses(R, p)
 
 

@@ -22,7 +22,7 @@ from graphslam.skeleton.landmark_kernels import _nine
 Index = npt.NDArray[np.int64]
 
 
-class Links(NamedTuple):
+class SegmentLinks(NamedTuple):
     """Relative poses, and the segments they form."""
 
     ends: Index
@@ -86,7 +86,7 @@ def join_links(links, poses, covariance, misfit):
 
     Parameters
     ----------
-    links : Links
+    links : SegmentLinks
     poses : Poses
     covariance, misfit : (S, 6, 6), (S, 6)
         Out: of ``y = (w_b - w_a, u_b - u_a - w_b × (p_b - p_a))`` for the ends a and b of each segment, and ``Σ G r``.
@@ -183,7 +183,7 @@ def join_links(links, poses, covariance, misfit):
 
 
 @njit(nogil=True)
-def tie_ends(ends, position, covariance, misfit, place, blocks, g):
+def add_end_blocks(ends, position, covariance, misfit, place, blocks, g):
     """Add joined links to the matrix and half the gradient of the poses at their ends.
 
     Parameters
@@ -267,10 +267,10 @@ def follow_links(links, poses, information, misfit, x):
 
     Parameters
     ----------
-    links : Links
+    links : SegmentLinks
     poses : Poses
     information, misfit : (S, 6, 6), (S, 6)
-        From :func:`join_links` and :func:`tie_ends`, at the same poses.
+        From :func:`join_links` and :func:`add_end_blocks`, at the same poses.
     x : (N, 6)
         In: the steps of the poses at the ends of segments.
     """

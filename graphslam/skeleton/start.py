@@ -11,7 +11,7 @@ from graphslam.core.geometry import Array
 from graphslam.skeleton import chain_kernels as kernels
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.schur import add_fixes, add_start, moved
+from graphslam.skeleton.schur import add_fixes, add_start, step_poses
 
 
 def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
@@ -32,7 +32,7 @@ def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
             raise IndeterminateError(f"pose {bad} of the chain is not constrained", (f"x{bad}",))
         scale = 1.0
         while True:
-            there = moved(poses, step, scale)
+            there = step_poses(poses, step, scale)
             after, g = _linearised(problem, there, *blocks)
             if after <= objective or scale < 1e-3:
                 break
@@ -50,13 +50,13 @@ def _linearised(problem: SkeletonProblem, poses: Poses, diagonal: Array, upper: 
     g = np.zeros((problem.poses, 6))
     diagonal[:] = 0.0
     upper[:] = 0.0
-    total = kernels.linearise(problem.chain, poses, (0, problem.poses), True, diagonal, upper, g)
+    total = kernels.linearise_chain(problem.chain, poses, (0, problem.poses), True, diagonal, upper, g)
     total += add_fixes(problem, poses, g, diagonal) + add_start(problem, poses, g, diagonal)
     return float(total), g
 
 
 @dataclass(frozen=True)
-class Walk:
+class ForwardPass:
     """What :func:`forward_pass` did.
 
     Parameters
@@ -80,7 +80,7 @@ def forward_pass(
     turn_sigma: float = 2e-3,
     way_sigma: float = 0.03,
     gate: float = 16.27,
-) -> Walk:
+) -> ForwardPass:
     """Walk once along the poses and tie each to the landmarks that were first seen more than ``ago`` poses before.
 
     A pose is predicted by the chain's increment. Where three old landmarks or more are in view, three Gauss-Newton
@@ -101,6 +101,6 @@ def forward_pass(
     rules = (int(ago), float(turn_sigma) ** -2, float(way_sigma) ** -2, float(gate))
     tied = refused = 0
     for span in problem.chunks(0, N):
-        t, r = kernels.forward_pass(problem.sightings_of(*span), chain, span, rules, seen, D, b, out)
+        t, r = kernels.forward_pass_kernel(problem.sightings_of(*span), chain, span, rules, seen, D, b, out)
         tied, refused = tied + int(t), refused + int(r)
-    return Walk(out, tied, refused)
+    return ForwardPass(out, tied, refused)

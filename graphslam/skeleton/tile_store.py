@@ -173,7 +173,7 @@ def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points
     return Tiles(out)
 
 
-def put_arrays(folder: Path, arrays: Mapping[str, npt.ArrayLike]) -> str:
+def store_arrays(folder: Path, arrays: Mapping[str, npt.ArrayLike]) -> str:
     """Write arrays to a file that is named by the digest of its bytes, if it is not there; its name."""
     stream = io.BytesIO()
     np.savez(stream, **{name: np.ascontiguousarray(value) for name, value in arrays.items()})  # type: ignore[arg-type]
@@ -185,7 +185,7 @@ def put_arrays(folder: Path, arrays: Mapping[str, npt.ArrayLike]) -> str:
     return name
 
 
-def take_arrays(folder: Path, name: str) -> dict[str, npt.NDArray[Any]]:
+def stored_arrays(folder: Path, name: str) -> dict[str, npt.NDArray[Any]]:
     """The arrays of such a file."""
     path = folder / name
     if path.name != name or path.suffix != ".arrays":

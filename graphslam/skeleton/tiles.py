@@ -14,7 +14,7 @@ from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.tile_store import Labels, Points, Tiles, write_tiles
 
 
-def to_disk(problem: SkeletonProblem, folder: str | Path, size: int = 20_000) -> SkeletonProblem:
+def write_tiled_problem(problem: SkeletonProblem, folder: str | Path, size: int = 20_000) -> SkeletonProblem:
     """The same network with its measurements in tiles of ``size`` poses; every kernel gives the same bytes on both.
 
     Odometry, tilt, GPS and poses stay in memory.
@@ -28,10 +28,10 @@ def to_disk(problem: SkeletonProblem, folder: str | Path, size: int = 20_000) ->
             lo, hi = problem.first[a], problem.first[b]
             yield np.diff(problem.first[a : b + 1]), problem.points[lo:hi], problem.landmark[lo:hi]
 
-    return from_disk(problem, write_tiles(folder, blocks()))
+    return load_tiled_problem(problem, write_tiles(folder, blocks()))
 
 
-def from_disk(problem: SkeletonProblem, tiles: Tiles) -> SkeletonProblem:
+def load_tiled_problem(problem: SkeletonProblem, tiles: Tiles) -> SkeletonProblem:
     """The network with the measurements of some tiles in place of its own."""
     nothing = np.empty((0, 3), np.float32), np.empty(0, np.int32)
     return replace(problem, points=nothing[0], landmark=nothing[1], first=tiles.first, tiles=tiles)

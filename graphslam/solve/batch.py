@@ -12,7 +12,7 @@ from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.network import network_of
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import Limits, Optimum, polish
+from graphslam.solve.descent import DescentLimits, Optimum, descend_to_minimum
 from graphslam.solve.solution import Solution, make_solution
 from graphslam.solve.sparse import PcgProblem, SparseProblem
 
@@ -141,7 +141,7 @@ class PcgSolver(BatchSolver):
         return PcgProblem(self.graph.flat())
 
 
-def optimise(problem: SparseProblem, values: Values, config: LevenbergConfig | None = None) -> Optimum:
+def optimise_problem(problem: SparseProblem, values: Values, config: LevenbergConfig | None = None) -> Optimum:
     """Minimise a problem from ``values``: Gauss–Newton steps while they help, damped ones when they do not."""
     cfg = config or LevenbergConfig()
     initial = problem.objective(values)
@@ -149,8 +149,8 @@ def optimise(problem: SparseProblem, values: Values, config: LevenbergConfig | N
         raise SolverError(f"objective is {initial} at the initial values; a factor or a value is not finite")
     if problem.flat.layout.size == 0:
         return Optimum(values, initial, initial, 0.0, 0, "converged")
-    limits = Limits(cfg.tolerance, cfg.tolerance, patience=1)
-    found = polish(problem, values, max_iterations=cfg.max_iterations, limits=limits)
+    limits = DescentLimits(cfg.tolerance, cfg.tolerance, patience=1)
+    found = descend_to_minimum(problem, values, max_iterations=cfg.max_iterations, limits=limits)
     if not np.isfinite(found.decrement):
         raise IndeterminateError("the Gauss-Newton matrix is singular")
     return found
@@ -167,7 +167,7 @@ def optimise_graph(
         How its steps are made; by direct solves if not given.
     """
     try:
-        return optimise(problem or SparseProblem(graph.flat()), graph.values, config)
+        return optimise_problem(problem or SparseProblem(graph.flat()), graph.values, config)
     except IndeterminateError:
         graph.diagnose().raise_if_bad()
         raise

@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from graphslam.core.errors import IndeterminateError
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import Values
 
 log = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ class Optimum:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class DescentLimits:
     """When a descent has converged, and how long Gauss-Newton may climb.
 
     Parameters
@@ -89,10 +89,10 @@ class Limits:
         return bool(decrement <= self.relative * objective + self.absolute)
 
 
-class Problem(Protocol):
+class LeastSquaresProblem(Protocol):
     """A least-squares problem with a way to make its steps; ``values`` are whatever that makes of them."""
 
-    flat: FlatGraph
+    flat: FactorArrays
     factorization: str
 
     def pack(self, values: Values) -> Any: ...
@@ -108,19 +108,19 @@ class Problem(Protocol):
     def damped(self, values: Any, objective: float, budget: int) -> tuple[Any, list[float], int]: ...
 
 
-def limits_of(measurements: int) -> Limits:
+def limits_of(measurements: int) -> DescentLimits:
     """A decrement is negligible at 1e-9 of the objective, or 1e-14 per residual."""
-    return Limits(RELATIVE, ABSOLUTE * measurements)
+    return DescentLimits(RELATIVE, ABSOLUTE * measurements)
 
 
-def polish(
-    problem: Problem,
+def descend_to_minimum(
+    problem: LeastSquaresProblem,
     values: Any,
     *,
     best_known: float = np.inf,
     max_iterations: int = 200,
     foretell: bool = False,
-    limits: Limits | None = None,
+    limits: DescentLimits | None = None,
 ) -> Optimum:
     """Descend from ``values`` to the local minimum, or give up early if it cannot compete.
 
@@ -133,7 +133,7 @@ def polish(
         Gauss-Newton and damped steps together.
     foretell : bool
         Save the last step where the rate of convergence foretells that it changes nothing that counts.
-    limits : Limits, optional
+    limits : DescentLimits, optional
         By default :func:`limits_of` the measurements.
 
     Returns
@@ -155,7 +155,9 @@ def polish(
     return best
 
 
-def _descend(problem: Problem, values: Any, best_known: float, budget: int, foretell: bool, limits: Limits) -> Optimum:
+def _descend(
+    problem: LeastSquaresProblem, values: Any, best_known: float, budget: int, foretell: bool, limits: DescentLimits
+) -> Optimum:
     objective, used, attempts = problem.objective(values), 0, 0
     history = [objective]
 
@@ -189,7 +191,13 @@ def _descend(problem: Problem, values: Any, best_known: float, budget: int, fore
 
 
 def _newton(
-    problem: Problem, values: Any, objective: float, budget: int, patience: int, foretell: bool, limits: Limits
+    problem: LeastSquaresProblem,
+    values: Any,
+    objective: float,
+    budget: int,
+    patience: int,
+    foretell: bool,
+    limits: DescentLimits,
 ) -> Optimum:
     """Full Gauss-Newton steps, allowed to climb for a while.
 

@@ -20,11 +20,11 @@ from scipy.stats import chi2
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.factors.batch import Record, batch_of
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factors.batch import FactorRecord, batch_of
 from graphslam.graph.noise import NO_KERNEL
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.solve.batch import BatchSolver, LevenbergConfig, optimise
+from graphslam.solve.batch import BatchSolver, LevenbergConfig, optimise_problem
 from graphslam.solve.solution import Solution
 from graphslam.solve.sparse import SparseProblem
 
@@ -74,8 +74,8 @@ class GncSolver(BatchSolver):
         """Find the outliers, take them out, and solve until nothing is left to gain."""
         t0 = time.perf_counter()
         if self.graph.revision != self._searched:
-            for record, d2, limit in outliers(self.graph, self.gnc, self.config):
-                self.graph.note(
+            for record, d2, limit in find_outliers(self.graph, self.gnc, self.config):
+                self.graph.log_event(
                     "outlier", factor_id=record.factor_id, factor=record.label(), group=record.group,
                     chi2=d2, limit=limit,
                 )  # fmt: skip
@@ -95,9 +95,9 @@ class GncSolver(BatchSolver):
         return super().solution(gap=gap)
 
 
-def outliers(
+def find_outliers(
     graph: PoseGraph, config: GncConfig | None = None, solver: LevenbergConfig | None = None
-) -> list[tuple[Record, float, float]]:
+) -> list[tuple[FactorRecord, float, float]]:
     """Doubtful factors whose final weight is less than a half, with their χ² at the end and its limit.
 
     The graph is not changed.
@@ -108,7 +108,7 @@ def outliers(
     if not np.any(doubtful):
         return []
     plain = [replace(r, robust=NO_KERNEL) if d and hasattr(r, "robust") else r for r, d in zip(records, doubtful)]
-    flat, values = FlatGraph(plain, graph.values.layout()), graph.values
+    flat, values = FactorArrays(plain, graph.values.layout()), graph.values
     limit = chi2.ppf(cfg.confidence, [r.rows for r in records])
     w = np.ones(len(records))
     d2 = flat.evaluate(values, hessian=False).chi2
@@ -119,7 +119,7 @@ def outliers(
     for _ in range(cfg.max_rounds):
         w[doubtful] = truncation_weights(d2[doubtful] / limit[doubtful], mu)
         try:
-            optimum = optimise(SparseProblem(flat, w), values, solver)
+            optimum = optimise_problem(SparseProblem(flat, w), values, solver)
         except IndeterminateError:  # so much is doubted that the rest does not hold together
             break
         values, d2 = optimum.values, flat.evaluate(optimum.values, hessian=False).chi2

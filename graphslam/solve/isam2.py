@@ -26,9 +26,9 @@ import scipy.sparse as sp
 from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.factors.batch import Record, gtsam_factor, pose_array
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factors.batch import FactorRecord, gtsam_factor, pose_array
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gtsam_values import from_gtsam, insert_values, value_of
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values, gtsam_key, split_name, thresholds
@@ -91,7 +91,7 @@ class Isam2Solver:
         self.rebuilds = 0
         self.seconds = 0.0
         self._isam: Any  # gtsam.ISAM2, or None before the first update
-        self._held: dict[int, tuple[Record, int]]  # factor id -> (record, slot)
+        self._held: dict[int, tuple[FactorRecord, int]]  # factor id -> (record, slot)
         self._known: set[str]
         self._read: int  # entries of the graph's journal that were taken in
         self._since_pull = 0
@@ -176,13 +176,13 @@ class Isam2Solver:
                 self.updates += 1
         self._read = len(self.graph.records.journal)
 
-    def _check_fresh(self, new: list[Record]) -> None:
+    def _check_fresh(self, new: list[FactorRecord]) -> None:
         """Variables that iSAM2 is to hear of start at numbers."""
         for name in {n for r in new for n in r.variables()} - self._known - {"x0"}:
             if not np.all(np.isfinite(value_of(self.graph.structure, name, self.graph.landmark_rows))):
                 raise SolverError(f"{name} starts at a value that is not finite; iSAM2 is not touched")
 
-    def _difference(self) -> tuple[list[Record], list[int]]:
+    def _difference(self) -> tuple[list[FactorRecord], list[int]]:
         """Records to add, and factor ids that iSAM2 holds and the graph does not (or no longer in that form)."""
         records, new, gone = self.graph.records, [], []
         for i in dict.fromkeys(self.graph.records.journal[self._read :]):
@@ -193,7 +193,7 @@ class Isam2Solver:
                 new.append(now)
         return new, gone
 
-    def _feed(self, new: list[Record], gone: list[int]) -> None:
+    def _feed(self, new: list[FactorRecord], gone: list[int]) -> None:
         """One update of GTSAM's."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         fresh: dict[str, None] = {}
@@ -238,7 +238,7 @@ class Isam2Solver:
         """Is that variable in iSAM2?"""
         return name in self._known
 
-    def _promise(self, new: list[Record]) -> None:
+    def _promise(self, new: list[FactorRecord]) -> None:
         """The graph's values are those of iSAM2 from now on; they are read when somebody asks for them.
 
         A residual that is not finite spreads over all variables of its factor, so that one of each new factor tells.
@@ -260,7 +260,7 @@ class Isam2Solver:
             raise SolverError("iSAM2 returned values that are not finite")
         return estimate
 
-    def _rebuild(self, new: list[Record], gone: list[int], cause: Exception | None = None) -> None:
+    def _rebuild(self, new: list[FactorRecord], gone: list[int], cause: Exception | None = None) -> None:
         """Make iSAM2 again from the graph's record, linearised at the graph's values.
 
         ``cause`` is what an update step by step failed with.
@@ -286,11 +286,11 @@ class Isam2Solver:
         self.rebuilds += 1
         self.updates += 1
 
-    def _check_finite(self, new: list[Record]) -> None:
+    def _check_finite(self, new: list[FactorRecord]) -> None:
         """Refuse a factor whose residual is not finite (GTSAM's own message would mislead)."""
         if not self.graph.values.is_finite():
             raise SolverError("the graph holds values that are not finite; iSAM2 is not touched")
-        chi2 = FlatGraph(new, self.graph.values.layout()).evaluate(self.graph.values, hessian=False).chi2
+        chi2 = FactorArrays(new, self.graph.values.layout()).evaluate(self.graph.values, hessian=False).chi2
         for record, value in zip(new, chi2):
             if not np.isfinite(value):
                 self._reject(record, f"its residual is {value}")
@@ -301,7 +301,7 @@ class Isam2Solver:
         if not np.all(np.isfinite(A.data if sp.issparse(A) else A)):
             raise SolverError("the squares of its Jacobian overflow")
 
-    def _blame(self, new: list[Record], gone: list[int], error: Exception) -> None:
+    def _blame(self, new: list[FactorRecord], gone: list[int], error: Exception) -> None:
         """The whole graph fails, too: find out why, and say it."""
         if gone:
             self._forget()
@@ -321,7 +321,7 @@ class Isam2Solver:
         self.graph.diagnose().raise_if_bad()
         raise SolverError(f"iSAM2 update failed ({_in_words(error)}); the solver is as it was before") from error
 
-    def _restore(self, records: list[Record]) -> None:
+    def _restore(self, records: list[FactorRecord]) -> None:
         """Hold these records and no others, as far as they can be solved."""
         self._forget()
         try:
@@ -330,7 +330,7 @@ class Isam2Solver:
         except _FAILURES:  # then the next update makes it anew
             self._forget()
 
-    def _reject(self, record: Record, why: str) -> None:
+    def _reject(self, record: FactorRecord, why: str) -> None:
         self.graph.remove(record.factor_id, reason=f"rejected by iSAM2: {why}")
         log.warning("%s rejected: %s", record.label(), why)
         raise FactorRejectedError(

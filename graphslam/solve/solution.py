@@ -13,17 +13,17 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GeometryError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import Markup, element, join
+from graphslam.core.markup import Markup, html_element, join_parts
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.factors.lasting import errors_at, names_of
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factors.sensor_biases import bias_variable_names, sensor_biases_at
 from graphslam.graph.network import network_of
 from graphslam.graph.pose_graph import PoseGraph, SubmapNode
-from graphslam.graph.score import Score, score
+from graphslam.graph.score import GraphScore, score_graph
 from graphslam.graph.variables import Values, vector_form
 from graphslam.solve.descent import Optimum
 
@@ -37,7 +37,7 @@ class Solution:
 
     Parameters
     ----------
-    score : Score
+    score : GraphScore
         χ² and dof per class of factor.
     iterations : int
         Of the solver so far (updates for an incremental one).
@@ -53,14 +53,14 @@ class Solution:
 
     solver: str
     values: Values
-    score: Score
+    score: GraphScore
     iterations: int
     converged: bool
     decrement: float
     gap: float | None
     seconds: float
     gps_origin: Array | None
-    _flat: FlatGraph = field(repr=False)
+    _flat: FactorArrays = field(repr=False)
     _submaps: Sequence[SubmapNode] = field(repr=False)
 
     @property
@@ -199,8 +199,8 @@ class Solution:
         is surer than a long arm.
 
         A submap with inner nodes is bent by them: between two nodes the path is what both say of it together
-        (:class:`~graphslam.graph.submap_node.Bridge`), so it runs through them without a jump, and its covariance is
-        that of the two nodes jointly and of the way between them.
+        (:class:`~graphslam.graph.submap_node.PathBridge`), so it runs through them without a jump, and its covariance
+        is that of the two nodes jointly and of the way between them.
 
         Parameters
         ----------
@@ -233,7 +233,7 @@ class Solution:
             T, P_local = s.local_rows(keep, at)
             if s.lasting is not None:
                 S = s.lasting.path[keep]
-                T = group.compose(T, group.exp(S @ errors_at(self.values, s.robot)))
+                T = group.compose(T, group.exp(S @ sensor_biases_at(self.values, s.robot)))
                 if P_local is not None and P_nodes is not None:
                     P_local = P_local + S @ P_lasting[s.robot] @ np.swapaxes(S, 1, 2)
             poses.append(group.compose(self.values.poses[node], T))
@@ -250,7 +250,7 @@ class Solution:
     def _lasting_covariances(self) -> dict[int, Array]:
         """Of the constant errors of each robot ``(6, 6)``."""
         robots = range(self.values.count("wheels"))
-        return {k: self.covariance.joint(names_of(k)) for k in robots}
+        return {k: self.covariance.joint(bias_variable_names(k)) for k in robots}
 
     def _bent(self, s: SubmapNode, rows: npt.NDArray[np.bool_], P_nodes: Array | None) -> tuple[Array, Array]:
         """Poses and covariances of a path between the nodes of its submap, given both neighbours of each instant."""
@@ -287,7 +287,7 @@ class Solution:
             f" ({self.solver}) {len(self.poses)} nodes, {len(self.landmarks)} landmarks, objective "
             f"{self.objective:.4f}, {verdict}{gap}, {self.iterations} iterations, {self.seconds:.2f} s"
         )
-        return join([element("b", "Solution"), said, Markup(self.score._repr_html_())])
+        return join_parts([html_element("b", "Solution"), said, Markup(self.score._repr_html_())])
 
 
 # The decrement at which a solution counts as the optimum, relative to max(1, objective): far below what any figure
@@ -303,7 +303,7 @@ def make_solution(
     return Solution(
         solver=solver,
         values=optimum.values.copy(),
-        score=score(flat, flat.evaluate(optimum.values, hessian=False).chi2),
+        score=score_graph(flat, flat.evaluate(optimum.values, hessian=False).chi2),
         iterations=iterations,
         converged=optimum.decrement <= CONVERGED * max(1.0, optimum.objective),
         decrement=optimum.decrement,

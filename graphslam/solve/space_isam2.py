@@ -11,18 +11,18 @@ from tqdm.auto import tqdm
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
 from graphslam.core.se3 import se3_compose, se3_transform
-from graphslam.graph.factors.space_map import gtsam_pose, pose_of, space_factor
-from graphslam.linear.space_maps import Placed
+from graphslam.graph.factors.space_map import gtsam_pose3, pose_of_gtsam, space_factor
+from graphslam.linear.space_maps import PlacedMap
 
 
-def incremental(
-    placed: Sequence[Placed], poses: Array, points: Array, *, progress: bool = False
+def run_space_isam2(
+    placed: Sequence[PlacedMap], poses: Array, points: Array, *, progress: bool = False
 ) -> tuple[Array, Array, int]:
     """Values of iSAM2 after the last submap, and the number of its updates.
 
     Parameters
     ----------
-    placed : sequence of Placed
+    placed : sequence of PlacedMap
         Submap k speaks of pose k, seen from pose k - 1.
     poses, points : (m, 7), (n, 3)
         Give the shapes; a new variable begins where its submap puts it from where iSAM2 has its base.
@@ -38,8 +38,8 @@ def incremental(
     for k, one in enumerate(tqdm(placed, desc="iSAM2", unit="submap", disable=not progress)):
         graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
         graph.push_back(space_factor(one))
-        base = SE3.identity if k == 0 else pose_of(here.atPose3(gtsam.symbol("x", k)))
-        new.insert(gtsam.symbol("x", k + 1), gtsam_pose(se3_compose(base, one.map.poses[0])))
+        base = SE3.identity if k == 0 else pose_of_gtsam(here.atPose3(gtsam.symbol("x", k)))
+        new.insert(gtsam.symbol("x", k + 1), gtsam_pose3(se3_compose(base, one.map.poses[0])))
         for j, point in zip(one.points.tolist(), se3_transform(base, one.map.points)):
             if j not in known:
                 known.add(j)
@@ -49,5 +49,5 @@ def incremental(
         here = solver.calculateEstimate()
     at = [gtsam.symbol("x", k + 1) for k in range(len(poses))]
     marks = [gtsam.symbol("l", j) for j in range(len(points))]
-    ends = np.array([pose_of(here.atPose3(k)) for k in at]).reshape(-1, 7)
+    ends = np.array([pose_of_gtsam(here.atPose3(k)) for k in at]).reshape(-1, 7)
     return ends, np.array([here.atPoint3(k) for k in marks]).reshape(-1, 3), updates

@@ -18,7 +18,7 @@ from scipy.linalg import lapack
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import skew
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import FAILED
 
@@ -36,7 +36,7 @@ DENSE_SOLVE_LIMIT = 600
 SINGULAR = "the Gauss-Newton matrix is singular to working precision"
 
 
-def factor(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
+def factorise_sparse(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
     """Sparse symmetric factorisation; ``ordered``: rows and columns are in a good order of elimination already."""
     return spla.splu(
         sp.csc_matrix(H),
@@ -101,7 +101,7 @@ class SparseProblem:
 
     factorization = "LU"
 
-    def __init__(self, flat: FlatGraph, weights: Array | None = None) -> None:
+    def __init__(self, flat: FactorArrays, weights: Array | None = None) -> None:
         self.flat, self.weights = flat, weights
         layout = flat.layout
         # many poses and nothing else: compiled block elimination, which begins with half a second of loading
@@ -134,7 +134,7 @@ class SparseProblem:
         if self._dense:
             return _dense_solve(H, b)
         try:
-            lu = self._blocks(H) if self._by_block else factor(H, ordered=self.flat.layout.ordered)
+            lu = self._blocks(H) if self._by_block else factorise_sparse(H, ordered=self.flat.layout.ordered)
         except RuntimeError:
             raise IndeterminateError(SINGULAR) from None
         x = lu.solve(b)
@@ -240,7 +240,7 @@ class PcgProblem(SparseProblem):
     factorization = "PCG"
 
     def __init__(
-        self, flat: FlatGraph, *, tolerance: float = 1e-4, max_iterations: int = 2000, group: int = 10
+        self, flat: FactorArrays, *, tolerance: float = 1e-4, max_iterations: int = 2000, group: int = 10
     ) -> None:
         super().__init__(flat)
         self._dense = False
@@ -266,13 +266,15 @@ class PcgProblem(SparseProblem):
         """``H⁻¹ b`` by preconditioned conjugate gradients."""
         entries = H.tocoo()
         inside = self._owner[entries.row] == self._owner[entries.col]
-        fine = factor(sp.csc_matrix((entries.data[inside], (entries.row[inside], entries.col[inside])), shape=H.shape))
+        fine = factorise_sparse(
+            sp.csc_matrix((entries.data[inside], (entries.row[inside], entries.col[inside])), shape=H.shape)
+        )
         Z = self._rigid_motions(values)
         HZ = sp.csc_matrix(H @ Z)
         E = sp.csc_matrix(Z.T @ HZ)
         # a group that holds only an anchor moves nothing: give it a unit of its own
         diagonal = E.diagonal()
-        coarse = factor(E + sp.diags(np.where(diagonal > 0.0, 1e-13 * diagonal, 1.0), format="csc"))
+        coarse = factorise_sparse(E + sp.diags(np.where(diagonal > 0.0, 1e-13 * diagonal, 1.0), format="csc"))
 
         def precondition(r: Array) -> Array:
             z = Z @ coarse.solve(Z.T @ r)

@@ -11,7 +11,7 @@ from graphslam.app.compare import DEFAULT_METHODS
 from graphslam.core.geometry import se2_compose
 from graphslam.core.submap import Submap
 from graphslam.io.slsjf import read_slsjf_local_maps
-from graphslam.join.registry import join
+from graphslam.join.registry import join_by_method
 from graphslam.join.submap_solver import SubmapEstimate
 from tests.reference.submap_chain import submap_chain
 
@@ -23,12 +23,12 @@ def difference(a: SubmapEstimate, b: SubmapEstimate) -> float:
 
 def test_known_headings_make_all_methods_one(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=20, landmarks=50, known_heading=True)
-    batch = join(submaps, "batch")
+    batch = join_by_method(submaps, "batch")
     moved = batch.poses[1:, :2] - submaps_chained(submaps)
     assert np.abs(moved).max() > 0.01  # the loop did correct something
     P = batch.joint_covariance()
     for method in DEFAULT_METHODS:
-        own = join(submaps, method)  # before any polish
+        own = join_by_method(submaps, method)  # before any polish
         assert difference(batch, own) < 1e-6, method
         assert own.objective == pytest.approx(batch.objective, rel=1e-6)
         if method != "isam2":
@@ -46,16 +46,16 @@ def submaps_chained(submaps: list[Submap]) -> np.ndarray:
 def test_without_noise_every_method_finds_the_truth(rng: np.random.Generator) -> None:
     submaps, truth = submap_chain(rng, submaps=10, sigma=1e-9, sigma_heading=1e-10)
     for method in DEFAULT_METHODS:
-        found = join(submaps, method)
+        found = join_by_method(submaps, method)
         assert np.abs(found.poses[1:, :2] - truth.exit_poses[:, :2]).max() < 1e-6, method
 
 
 def test_polish_leads_to_one_optimum(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=25, landmarks=60, sigma=0.15, sigma_heading=0.02)
-    batch = join(submaps, "batch")
+    batch = join_by_method(submaps, "batch")
     gaps = {}
     for method in DEFAULT_METHODS:
-        polished = join(submaps, method, polish=True)
+        polished = join_by_method(submaps, method, polish=True)
         assert polished.objective_polished == pytest.approx(batch.objective, rel=1e-7), method
         assert difference(batch, polished) < 1e-4, method
         gaps[method] = polished.objective / batch.objective - 1.0
@@ -68,7 +68,7 @@ def test_the_published_local_maps(data_dir: Path) -> None:
     submaps = read_slsjf_local_maps(data_dir / "victoria_park_processed")
     objectives = {}
     for method in DEFAULT_METHODS:
-        found = join(submaps, method, polish=True)
+        found = join_by_method(submaps, method, polish=True)
         assert found.objective_polished == pytest.approx(3643.43, rel=1e-3), method
         assert found.states == 1198
         objectives[method] = found.objective

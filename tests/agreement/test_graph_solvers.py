@@ -10,7 +10,7 @@ from graphslam.core.geometry import se2_between
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key
 from graphslam.io.slsjf import read_slsjf_local_maps
@@ -22,7 +22,7 @@ from tests.reference.graph_chain import make_chain, make_gps
 from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 
-def build(rng, *, gps: bool, robust: Robust, update=lambda g: None) -> PoseGraph:
+def build(rng, *, gps: bool, robust: RobustKernel, update=lambda g: None) -> PoseGraph:
     chain = make_chain(rng, m=14, landmarks=20, laps=1.6)
     g = PoseGraph()
     if gps:
@@ -39,7 +39,9 @@ def build(rng, *, gps: bool, robust: Robust, update=lambda g: None) -> PoseGraph
 
 
 @pytest.mark.parametrize("gps", [False, True])
-@pytest.mark.parametrize("robust", [Robust(), Robust("huber", 1.0), Robust("cauchy", 1.0)], ids=lambda r: r.kind)
+@pytest.mark.parametrize(
+    "robust", [RobustKernel(), RobustKernel("huber", 1.0), RobustKernel("cauchy", 1.0)], ids=lambda r: r.kind
+)
 def test_isam2_batch_and_gtsam_agree(rng, gps, robust):
     seed = rng.integers(1 << 30)
     solvers: dict[int, Isam2Solver] = {}
@@ -67,7 +69,7 @@ def test_isam2_batch_and_gtsam_agree(rng, gps, robust):
 
 
 def test_objective_and_marginals_are_gtsams(rng):
-    g = build(rng, gps=True, robust=Robust("huber", 1.0))
+    g = build(rng, gps=True, robust=RobustKernel("huber", 1.0))
     factors = gtsam.NonlinearFactorGraph()
     for r in g.records.values():
         factors.push_back(gtsam_factor(r, g.origin))
@@ -84,7 +86,7 @@ def test_objective_and_marginals_are_gtsams(rng):
 
 
 def test_isam2_marginals_are_ours_at_the_optimum(rng):
-    g = build(rng, gps=False, robust=Robust())
+    g = build(rng, gps=False, robust=RobustKernel())
     solver = Isam2Solver(g)
     solver.solve_to_optimum()
     for name in ("x5", "x14", f"l{g.values.landmark_ids[2]}"):

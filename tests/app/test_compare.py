@@ -11,7 +11,7 @@ import pytest
 from graphslam.app.compare import (
     DEFAULT_METHODS,
     JSON_COLUMNS,
-    compare,
+    compare_methods,
     comparison_rows,
     join_json,
     map_nees,
@@ -22,15 +22,15 @@ from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.map_truth import MapTruth
-from graphslam.join.association import Association
-from graphslam.join.registry import join
+from graphslam.join.association import MapAssociationConfig
+from graphslam.join.registry import join_by_method
 from graphslam.plots.comparison import AFTER, BEFORE, comparison_figure
 from tests.reference.submap_chain import submap_chain
 
 
 def test_one_row_per_method_and_one_optimum(rng: np.random.Generator) -> None:
     submaps, truth = submap_chain(rng)
-    table = compare(submaps, truth=truth, memory=False)
+    table = compare_methods(submaps, truth=truth, memory=False)
     assert list(table["method"]) == list(DEFAULT_METHODS)
     np.testing.assert_allclose(table["objective_polished"], table["objective_polished"][1], rtol=1e-7)
     assert (table["objective"] >= table["objective_polished"] * (1 - 1e-7)).all()
@@ -47,14 +47,14 @@ def test_one_row_per_method_and_one_optimum(rng: np.random.Generator) -> None:
 
 def test_json_is_what_the_command_line_promises(rng: np.random.Generator) -> None:
     submaps, truth = submap_chain(rng, submaps=5)
-    found = methods_json(compare(submaps, ["eif-tree", "batch"], polish=False, memory=False))
+    found = methods_json(compare_methods(submaps, ["eif-tree", "batch"], polish=False, memory=False))
     text = json.dumps(found, allow_nan=False)
     rows = json.loads(text)["methods"]
     assert [tuple(r) for r in rows] == [(*JSON_COLUMNS, "before", "after")] * 2
     assert rows[0]["objective_polished"] is None
     assert rows[1]["objective_polished"] == rows[1]["objective"]
     assert rows[0]["nees"] is rows[0]["nees_dof"] is rows[0]["ci"] is rows[0]["peak_mb"] is None
-    one = join_json(submaps, "ekf", join(submaps, "ekf"), truth=truth)["methods"][0]
+    one = join_json(submaps, "ekf", join_by_method(submaps, "ekf"), truth=truth)["methods"][0]
     assert tuple(one) == (*JSON_COLUMNS, "before", "after")
     assert isinstance(one["nees_dof"], int)
 
@@ -62,7 +62,7 @@ def test_json_is_what_the_command_line_promises(rng: np.random.Generator) -> Non
 def test_figures_before_and_after_refinement_stand_side_by_side(rng: np.random.Generator) -> None:
     """For all five methods; the filters' own figures are not those of the optimum."""
     submaps, truth = submap_chain(rng, submaps=8)
-    found = compare(submaps, truth=truth, memory=False)
+    found = compare_methods(submaps, truth=truth, memory=False)
     rows = methods_json(found)["methods"]
     shown = {r["method"]: r for r in comparison_rows(rows)}
     assert list(shown) == list(DEFAULT_METHODS)
@@ -73,11 +73,11 @@ def test_figures_before_and_after_refinement_stand_side_by_side(rng: np.random.G
         assert (line["CI before"], line["CI after"]) == (r["ci_unpolished"], r["ci"])
     assert shown["eif-tree"]["NEES/n before"] != pytest.approx(shown["eif-tree"]["NEES/n after"], rel=1e-9)
     assert shown["batch"]["NEES/n before"] == pytest.approx(shown["batch"]["NEES/n after"], rel=1e-4)
-    alone = methods_json(compare(submaps, ["eif-tree"], truth=truth, polish=False, memory=False))["methods"]
+    alone = methods_json(compare_methods(submaps, ["eif-tree"], truth=truth, polish=False, memory=False))["methods"]
     (own,) = comparison_rows(alone)
     assert own["NEES/n before"] == pytest.approx(shown["eif-tree"]["NEES/n before"])
     assert (own["NEES/n after"], own["objective after"], own["CI after"]) == (None, None, None)
-    unknown = comparison_rows(methods_json(compare(submaps, ["ekf"], memory=False))["methods"])
+    unknown = comparison_rows(methods_json(compare_methods(submaps, ["ekf"], memory=False))["methods"])
     assert not [k for k in unknown[0] if "NEES" in k]
     ax = comparison_figure(found)
     assert [a.get_xlabel()[:6] for a in ax.figure.axes] == ["χ² abo", "NEES/n", "consis"]
@@ -88,7 +88,7 @@ def test_figures_before_and_after_refinement_stand_side_by_side(rng: np.random.G
 
 def test_nees_is_eq_18(rng: np.random.Generator) -> None:
     submaps, truth = submap_chain(rng)
-    best = join(submaps, "batch")
+    best = join_by_method(submaps, "batch")
     at = {int(j): p for j, p in zip(truth.landmark_ids, truth.landmarks)}
     e = best.poses[1:] - truth.exit_poses
     e[:, 2] = wrap_angle(e[:, 2])
@@ -116,20 +116,20 @@ def test_nees_is_eq_18(rng: np.random.Generator) -> None:
 def test_association_gives_all_methods_the_same_landmarks(rng: np.random.Generator) -> None:
     submaps, truth = submap_chain(rng, submaps=14, landmarks=50)
     lost = [s.with_ids(np.full(len(s.landmarks), -1)) for s in submaps]
-    options = Association(rule="joint", sensor_range=14.0)
-    table = compare(lost, ["batch", "eif-tree"], truth=truth, associate=options, memory=False)
+    options = MapAssociationConfig(rule="joint", sensor_range=14.0)
+    table = compare_methods(lost, ["batch", "eif-tree"], truth=truth, associate=options, memory=False)
     assert table["landmarks"].nunique() == 1
     np.testing.assert_allclose(table["objective_polished"], table["objective_polished"][0], rtol=1e-8)
     assert (table["nees_dof"] == 3 * 14).all()  # recognised landmarks have no names the truth knows
     assert 0.2 < table["nees"][0] / 42 < 3.0
     with pytest.raises(DataError, match="identity"):
-        join(lost, "eif-tree")
+        join_by_method(lost, "eif-tree")
 
 
 def test_covariance_scale_reaches_every_method(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=6)
     for method in DEFAULT_METHODS:
-        plain, wide = join(submaps, method), join(submaps, method, covariance_scale=4.0)
+        plain, wide = join_by_method(submaps, method), join_by_method(submaps, method, covariance_scale=4.0)
         if method in ("batch", "ekf"):
             assert wide.objective == pytest.approx(plain.objective / 4.0, rel=1e-2)
         P, Q = plain.pose_covariance(6), wide.pose_covariance(6)
@@ -139,19 +139,19 @@ def test_covariance_scale_reaches_every_method(rng: np.random.Generator) -> None
 def test_unknown_names_are_refused_with_those_known(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=2)
     with pytest.raises(UnknownNameError, match=r"'eif'.*eif-sequential"):
-        join(submaps, "eif")
+        join_by_method(submaps, "eif")
     with pytest.raises(UnknownNameError, match="'magic'"):
-        compare(submaps, ["batch", "magic"])
+        compare_methods(submaps, ["batch", "magic"])
     with pytest.raises(ConfigError, match="association"):
-        join(submaps, "eif-tree", associate="guess")
+        join_by_method(submaps, "eif-tree", associate="guess")
     with pytest.raises(DataError, match="no submaps"):
-        compare([], ["batch"], memory=False)
+        compare_methods([], ["batch"], memory=False)
 
 
 def test_peak_memory_grows_with_what_is_joined(rng: np.random.Generator) -> None:
     """The dense filter's covariance must show: at 1,500 scalars it is 18 MB, and its work space as much again."""
     submaps, _ = submap_chain(rng, submaps=40, landmarks=700, radius=100.0, reach=14.0)
-    states = join(submaps, "eif-tree").states
+    states = join_by_method(submaps, "eif-tree").states
     assert states > 1400
     with MemoryProbe(submaps) as probe:
         (dense,) = probe.measure(["ekf"], polish=False)
@@ -163,6 +163,6 @@ def test_peak_memory_grows_with_what_is_joined(rng: np.random.Generator) -> None
 
 def test_the_table_is_a_frame(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=3)
-    table = compare(submaps, ["batch"], memory=False)
+    table = compare_methods(submaps, ["batch"], memory=False)
     assert isinstance(table, pd.DataFrame)
     assert {"rmse_poses", "rmse_landmarks", "iterations", "converged", "nees_unpolished"} <= set(table.columns)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from graphslam.app.demo import DemoProgress, demo_log
-from graphslam.app.run.front_ends import make_front_end, recommended
-from graphslam.core.config import merge
+from graphslam.app.run.front_ends import make_front_end, recommended_options
+from graphslam.core.config import merge_options
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.segslam.progress import Progress
+from graphslam_frontends.segslam.progress import SegSlamProgress
 from graphslam_frontends.segslam.segslam import run_segslam
 from tests.app.cli.test_cli import graphslam, refused
 
@@ -42,13 +42,13 @@ def test_quick_demo_from_the_command_line(tmp_path: Path) -> None:
 
 def test_watching_changes_nothing_and_sees_the_chain() -> None:
     log = demo_log("quick", 3)
-    options = recommended(log, "segslam")["frontend"]
-    options = merge(options, {"filter": {"particles": 2}})
+    options = recommended_options(log, "segslam")["frontend"]
+    options = merge_options(options, {"filter": {"particles": 2}})
     config = make_front_end("segslam", options).config
     steps = make_steps(log, config.steps)
     seen: list[tuple[int, int, list[np.ndarray]]] = []
 
-    def watch(at: Progress) -> None:
+    def watch(at: SegSlamProgress) -> None:
         seen.append((at.step, at.segments, at.paths() if at.step % 40 == 0 or at.step == at.steps else []))
 
     watched = run_segslam(steps, config.filter, config.segslam, SeedTree(1), watch=watch)

@@ -21,8 +21,8 @@ import pytest
 import graphslam
 import graphslam_studies
 from graphslam.app.report.report import Report
+from graphslam.app.run.residual_consistency import ResidualConsistency
 from graphslam.app.run.run import Run
-from graphslam.app.run.without_truth import WithoutTruth
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import VelocityControls
@@ -30,11 +30,11 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import Consistency
 from graphslam.evaluate.metrics import FigureTable
-from graphslam.evaluate.without_truth import ClassConsistency
+from graphslam.evaluate.residual_consistency import ClassConsistency
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.ledger import Ledger
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.score import ClassScore, Score
+from graphslam.graph.score import ClassScore, GraphScore
 from graphslam.io.cards import list_cards
 from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.maps.global_map import GlobalMap
@@ -134,7 +134,7 @@ def a_solution(_: Path) -> Any:
     solver.update()
     found = solver.solution()
     object.__setattr__(found, "solver", EVIL)
-    object.__setattr__(found, "score", Score({EVIL: ClassScore(1.0, 1, 1, 1)}))
+    object.__setattr__(found, "score", GraphScore({EVIL: ClassScore(1.0, 1, 1, 1)}))
     return found
 
 
@@ -175,14 +175,14 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
         quantity="x", nees=[[1.0]], dof=1, gauge="g", unit="value"
     ),
     "graphslam.graph.ledger.Ledger": a_ledger,
-    "graphslam.graph.score.Score": lambda _: Score({"class": ClassScore(1.0, 1, 1, 1)}),
-    "graphslam.graph.graph_record.GraphRecord": a_graph,
+    "graphslam.graph.score.GraphScore": lambda _: GraphScore({"class": ClassScore(1.0, 1, 1, 1)}),
+    "graphslam.graph.factor_graph_state.FactorGraphState": a_graph,
     "graphslam.join.submap_solver.SubmapEstimate": lambda _: SubmapEstimate(
         np.zeros((1, 3)), NOTHING, np.zeros((0, 2)), None, 0.0, None, 1, True, 0.0, np.zeros((0, 0))
     ),
     "graphslam.solve.solution.Solution": a_solution,
     "graphslam.evidence.grid.EvidenceGrid": lambda _: EvidenceGrid(0.1),
-    "graphslam.app.run.without_truth.WithoutTruth": lambda _: WithoutTruth(
+    "graphslam.app.run.residual_consistency.ResidualConsistency": lambda _: ResidualConsistency(
         {"c": ClassConsistency(**CLASS)}, None, None
     ),
     "graphslam_studies.montecarlo.study.Study": a_study,
@@ -192,7 +192,7 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
 }
 # texts of these stand in the code, not in a file: their HTML has no place for a foreign one
 OWN_WORDS = {
-    "graphslam.graph.graph_record.GraphRecord",
+    "graphslam.graph.factor_graph_state.FactorGraphState",
     "graphslam.join.submap_solver.SubmapEstimate",
     "graphslam.evidence.grid.EvidenceGrid",
 }

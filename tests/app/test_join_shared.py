@@ -14,7 +14,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.io.joined_map import read_joined
 from graphslam.io.submap_store import write_submaps
-from graphslam.join.registry import join
+from graphslam.join.registry import join_by_method
 from graphslam.sim.local_maps import simulate_local_maps
 
 
@@ -50,6 +50,6 @@ def test_cluster_and_workers_join_the_same_map(store: tuple[Path, list[Submap]],
 def test_what_cannot_be_shared_is_refused(store: tuple[Path, list[Submap]]) -> None:
     _, submaps = store
     with pytest.raises(ConfigError, match="only eif-tree"):
-        join(submaps, "ekf", workers=2)
+        join_by_method(submaps, "ekf", workers=2)
     with pytest.raises(ConfigError, match="either a number of workers or the address"):
-        join(submaps, workers=2, cluster="tcp://here:1")
+        join_by_method(submaps, workers=2, cluster="tcp://here:1")

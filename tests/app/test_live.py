@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 
 import graphslam as gs
 from graphslam.app.cli import app
-from graphslam.app.live import LiveView, in_space, shown_points
+from graphslam.app.live import LiveView, pose_in_space, shown_points
 from graphslam.backend.back_end import Observer
 from graphslam.core import se3
 from graphslam.core.errors import MissingDataError
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.log import SensorLog
 from graphslam.io.log_store import save_log
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 
 PLANE: dict[str, Any] = {"calibrate": {"use": "none"}}
 SUBMAPS = {"length": 1.5, "points": 300, "reach": 15.0}
@@ -47,14 +47,14 @@ class Seen(Observer):
         self.paths: list[Array] = []
         self.landmarks: list[Array] = []
         self.bases: list[Array] = []
-        self.decisions: list[Decision] = []
+        self.decisions: list[LoopDecision] = []
 
     def submap_added(self, submap: Any, graph: Any) -> None:
         self.paths.append(graph.values.poses.copy())
         self.landmarks.append(graph.values.landmarks.copy())
         self.bases.append(graph.values.poses[[s.node for s in graph.submaps]])
 
-    def loop_decided(self, decision: Decision, graph: Any) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: Any) -> None:
         self.decisions.append(decision)
 
     def solved(self, solution: Any) -> None:
@@ -110,7 +110,7 @@ def test_clouds_and_loops_are_where_the_graph_has_them(tmp_path: Path) -> None:
 
 def test_a_pose_in_the_plane_is_the_same_in_space() -> None:
     pose, points = np.array([1.0, -2.0, 2.5]), np.random.default_rng(0).normal(size=(5, 2))
-    x, q = in_space(pose)
+    x, q = pose_in_space(pose)
     there = se3.se3_transform(np.concatenate([x, q]), np.column_stack([points, np.zeros(5)]))
     np.testing.assert_allclose(there[:, :2], se2_transform(pose, points), atol=1e-12)
 

@@ -8,8 +8,8 @@ from scipy import stats
 
 from graphslam.association.clique import maximum_clique
 from graphslam.association.consistent_set import (
-    Chain,
     LoopArrays,
+    OdometryChain,
     chain_chi2,
     consistent_loops,
     largest_consistent_set,
@@ -52,7 +52,7 @@ ENDS = np.array([[1, 14], [3, 15], [16, 4], [0, 9], [6, 18], [4, 2], [1, 14]])
 def test_cycles_equal_the_brute_force_twin_in_every_order_of_ends(rng: np.random.Generator, dim: int) -> None:
     poses, z, Q = drive(rng, dim, 20, 0.01)
     T, P = loops_of(rng, poses, ENDS, 0.02)
-    chain = Chain.of(z, Q)
+    chain = OdometryChain.of(z, Q)
     loops = LoopArrays.of(chain, ENDS, T, P)
     # turned loops are the same measurements
     one_way = [
@@ -89,11 +89,11 @@ def test_chi2_of_right_loops_is_honest_both_ways(rng: np.random.Generator, dim: 
         poses, z, Q = drive(rng, dim, 30, 0.004)
         ends = np.array([[1, 22], [27, 6]])
         T, P = loops_of(rng, poses, ends, 0.01)
-        chain = Chain.of(z, Q)
+        chain = OdometryChain.of(z, Q)
         loops = LoopArrays.of(chain, ends, T, P)
         pairs.append(pair_chi2(chain, loops, [0], [1])[0])
         singles.append(chain_chi2(chain, loops)[0])
-        twice = Chain.of(z, 2 * Q)
+        twice = OdometryChain.of(z, 2 * Q)
         doubled.append(pair_chi2(twice, LoopArrays.of(twice, ends, T, 2 * P), [0], [1])[0])
     low, high = stats.chi2.ppf([0.0005, 0.9995], d * runs) / runs
     for value in (pairs, singles):
@@ -184,7 +184,7 @@ def test_a_cut_chain_compares_nothing_across_the_cut(rng: np.random.Generator) -
     known = np.ones(59, dtype=bool)
     known[30] = False
     z[30] = np.nan
-    chain = Chain.of(z, Q, known)
+    chain = OdometryChain.of(z, Q, known)
     ends = np.array([[2, 40], [3, 41], [1, 20]])
     T, P = loops_of(rng, poses, ends, 0.01)
     loops = LoopArrays.of(chain, ends, T, P)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.association.identity import doubtful_identities, identity_statistics
+from graphslam.association.identity import find_association_outliers, identity_statistics
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig
 from graphslam.core.errors import DataError
@@ -93,4 +93,4 @@ def test_impossible_splits_are_refused(rng):
         g.split_landmark(record.factor_id, lone)
     with pytest.raises(DataError, match="no such observation"):
         g.split_landmark(record.factor_id, 999)
-    assert doubtful_identities(g, 1e9) == []
+    assert find_association_outliers(g, 1e9) == []

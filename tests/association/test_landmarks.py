@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.association.compatibility import search
-from graphslam.association.landmarks import AssociationConfig, Pairings, associate, pairings
+from graphslam.association.compatibility import search_compatible_sets
+from graphslam.association.landmarks import AssociationConfig, CompatiblePairings, associate_landmarks, find_pairings
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import LandmarkMap, Submap
@@ -26,7 +26,7 @@ def test_whole_chain_is_identified(rng, config):
     name: dict[int, int] = {}  # ours -> true
     wrong = split = 0
     for s in chain.submaps:
-        ids = associate(g, anonymous(s), config)
+        ids = associate_landmarks(g, anonymous(s), config)
         assert len(set(ids[ids >= 0].tolist())) == np.sum(ids >= 0)
         g.add_submap(anonymous(s), landmark_ids=ids)
         solver.update()
@@ -56,8 +56,8 @@ def test_joint_test_closes_a_loop_that_nearest_neighbour_gets_wrong(rng):
     points = np.stack([x.ravel(), y.ravel()], -1) + rng.uniform(-0.8, 0.8, (15, 2))
     g, submap = drifted_graph(rng, np.array([2.5, 0.3, 0.03]), points)
     truth = np.arange(15)
-    np.testing.assert_array_equal(associate(g, submap, JC), truth)
-    nearest = associate(g, submap, NN)
+    np.testing.assert_array_equal(associate_landmarks(g, submap, JC), truth)
+    nearest = associate_landmarks(g, submap, NN)
     assert np.sum((nearest >= 0) & (nearest != truth)) >= 3
 
 
@@ -71,7 +71,7 @@ def test_gate_covers_what_it_should(rng):
             g.add_submap(s)
         BatchSolver(g).update()
         wide = AssociationConfig(gate=1e9, max_distance=100.0)
-        p = pairings(g, anonymous(chain.submaps[2]), np.arange(6), wide)
+        p = find_pairings(g, anonymous(chain.submaps[2]), np.arange(6), wide)
         true = np.flatnonzero(g.values.landmark_ids[p.target] == chain.submaps[2].landmarks.ids[p.observed])
         c = (2 * true[:, None] + np.arange(2)).ravel()
         nu = p.innovation[true].ravel()
@@ -82,7 +82,7 @@ def test_gate_covers_what_it_should(rng):
 
 
 def slow_search(
-    p: Pairings, seed: int, gate: float, limit: np.ndarray, *, persistent: bool
+    p: CompatiblePairings, seed: int, gate: float, limit: np.ndarray, *, persistent: bool
 ) -> tuple[list[int], float, float]:
     """The greedy search by explicit conditioning with inverses: pairings, score, cost."""
 
@@ -117,7 +117,7 @@ def slow_search(
         pick = best[1]
 
 
-def random_pairings(rng: np.random.Generator, observed: int, known: int) -> Pairings:
+def random_pairings(rng: np.random.Generator, observed: int, known: int) -> CompatiblePairings:
     """Every pair of some observations and landmarks, with covariances of very different sizes."""
     i, j = (a.ravel() for a in np.meshgrid(np.arange(observed), np.arange(known), indexing="ij"))
     n = 2 * len(i)
@@ -126,7 +126,7 @@ def random_pairings(rng: np.random.Generator, observed: int, known: int) -> Pair
     )
     C = A @ A.T
     nu = 0.6 * np.linalg.cholesky(C) @ rng.standard_normal(n)
-    return Pairings(i.astype(np.int64), j.astype(np.int64), nu.reshape(-1, 2), C)
+    return CompatiblePairings(i.astype(np.int64), j.astype(np.int64), nu.reshape(-1, 2), C)
 
 
 @pytest.mark.parametrize("persistent", [False, True])
@@ -136,13 +136,15 @@ def test_search_is_its_slow_twin(rng, persistent):
         x, y = np.meshgrid(np.arange(4) * 2.0, np.arange(2) * 2.0)
         points = np.stack([x.ravel(), y.ravel()], -1) + rng.uniform(-0.5, 0.5, (8, 2))
         g, submap = drifted_graph(rng, np.array([1.2, -0.4, 0.02]), points)
-        cases.append(pairings(g, submap, np.arange(8), JC))
+        cases.append(find_pairings(g, submap, np.arange(8), JC))
     differ = 0
     for p in cases:
         assert len(p.observed) > 15
         limit = np.array([np.inf, 11.8, *np.linspace(1.5, 3.0, 7)])
         seeds = np.arange(len(p.observed))
-        found = search(p.observed, p.target, p.innovation, p.covariance, seeds, 11.8, limit, persistent=persistent)
+        found = search_compatible_sets(
+            p.observed, p.target, p.innovation, p.covariance, seeds, 11.8, limit, persistent=persistent
+        )
         for s in seeds:
             taken, value, cost = slow_search(p, int(s), 11.8, limit, persistent=persistent)
             assert found.of(s).tolist() == taken
@@ -155,7 +157,7 @@ def test_search_is_its_slow_twin(rng, persistent):
 def test_nothing_is_matched_where_nothing_is(rng):
     chain = make_chain(rng, m=2, landmarks=10, reach=50.0)
     g = PoseGraph()
-    assert np.all(associate(g, anonymous(chain.submaps[0])) == -1)  # an empty graph
+    assert np.all(associate_landmarks(g, anonymous(chain.submaps[0])) == -1)  # an empty graph
     g.add_submap(chain.submaps[0])
     s = anonymous(chain.submaps[1])
     far = LandmarkMap(
@@ -164,8 +166,8 @@ def test_nothing_is_matched_where_nothing_is(rng):
         positions=s.landmarks.positions + 200.0,
         covariance=s.landmarks.covariance,
     )
-    assert np.all(associate(g, Submap.from_landmarks(1, far)) == -1)
-    assert len(associate(g, dense_submap(1, np.zeros(3), np.eye(3)))) == 0
+    assert np.all(associate_landmarks(g, Submap.from_landmarks(1, far)) == -1)
+    assert len(associate_landmarks(g, dense_submap(1, np.zeros(3), np.eye(3)))) == 0
 
 
 def test_known_ids_stay_and_are_not_given_again(rng):
@@ -174,7 +176,7 @@ def test_known_ids_stay_and_are_not_given_again(rng):
     g.add_submap(chain.submaps[0])
     ids = np.full(10, -1)
     ids[3] = 7  # the front end is (wrongly) sure of this one
-    got = associate(g, chain.submaps[1].with_ids(ids))
+    got = associate_landmarks(g, chain.submaps[1].with_ids(ids))
     assert got[3] == 7
     assert np.sum(got == 7) == 1
 

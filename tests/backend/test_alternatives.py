@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.hypotheses import Clearest, write_clearest
+from graphslam.app.hypotheses import MinimumEntropyMap, write_minimum_entropy
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.hypotheses import LOOP, choices_of_matches, solve_choice
@@ -17,10 +17,10 @@ from graphslam.core.errors import DataError
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
-from graphslam.graph.noise import Robust
-from graphslam.loops.ledger import Decision, ledger_of_events
-from graphslam.maps.alternatives import Alternative, chi2_of, choose, noise_scale
-from graphslam.maps.minimum_entropy import Candidate
+from graphslam.graph.noise import RobustKernel
+from graphslam.loops.ledger import LoopDecision, ledger_of_events
+from graphslam.maps.alternatives import Alternative, chi2_of, noise_scale, rank_alternatives
+from graphslam.maps.minimum_entropy import MapHypothesis
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
 from tests.app.run.test_loops import there_and_back
@@ -29,7 +29,7 @@ OPTIONS = BackEndConfig()
 
 
 @pytest.fixture(scope="module")
-def run() -> tuple[list[Submap], BackEnd, list[Decision], DividedSubmaps]:
+def run() -> tuple[list[Submap], BackEnd, list[LoopDecision], DividedSubmaps]:
     """Along a hall and back, its back end with the loops that it found, and the pieces of its map."""
     submaps, _ = there_and_back()
     back = BackEnd(BackEndConfig(loops=True), "batch")
@@ -44,10 +44,10 @@ def run() -> tuple[list[Submap], BackEnd, list[Decision], DividedSubmaps]:
 def alternative(name: str, back: BackEnd, divided: DividedSubmaps) -> Alternative:
     solution = back.finish()
     poses = divided.along(solution.trajectory())
-    return Alternative(name, back.graph, solution, Candidate(divided.pieces, poses, name))
+    return Alternative(name, back.graph, solution, MapHypothesis(divided.pieces, poses, name))
 
 
-def fold(back: BackEnd, robust: Robust) -> None:
+def fold(back: BackEnd, robust: RobustKernel) -> None:
     """Two ties that press the first stretch of the way together."""
     first, second = back.graph.submaps[:2]
     for j in (first.nodes[6], second.nodes[0]):
@@ -83,8 +83,8 @@ def test_a_match_undone_by_hand_is_not_as_the_run(run: tuple) -> None:
     assert key in choices["support ≥ 0.9"]
 
 
-@pytest.mark.parametrize("robust", [Robust(), Robust("cauchy", 2.385)])
-def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Robust, tmp_path: Path) -> None:
+@pytest.mark.parametrize("robust", [RobustKernel(), RobustKernel("cauchy", 2.385)])
+def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: RobustKernel, tmp_path: Path) -> None:
     """A kernel does not hide that: what is judged are the ties without it."""
     submaps, _, loops, divided = run
     choices = choices_of_matches(submaps, 0.5, loops=loops)
@@ -92,7 +92,7 @@ def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Rob
     folded = solve_choice(submaps, frozenset(), OPTIONS)
     fold(folded, robust)
     made.append(alternative("folded", folded, divided))
-    choice = choose(made)
+    choice = rank_alternatives(made)
     assert choice.scale == 1.0
     by_name = {j.alternative.name: j for j in choice.order}
     assert choice.order[-1] is by_name["folded"]
@@ -109,20 +109,20 @@ def test_a_folded_map_has_less_entropy_and_is_not_chosen(run: tuple, robust: Rob
 
     (tmp_path / "alternatives").mkdir()
     (tmp_path / "alternatives" / "99.tum").write_text("of an earlier choice")
-    files = write_clearest(tmp_path, Clearest(choice, 3))
+    files = write_minimum_entropy(tmp_path, MinimumEntropyMap(choice, 3))
     assert all(p.is_file() for p in files)
     assert not (tmp_path / "alternatives" / "99.tum").exists()
     kept = json.loads((tmp_path / "clearest.json").read_text())
     assert (kept["left_out"], kept["why"], len(kept["candidates"])) == (3, choice.why(), len(made))
-    only = choose(made[-1:])
+    only = rank_alternatives(made[-1:])
     assert only.best.contradicted
     assert "only one" in only.why()
-    both = choose([made[-1], alternative("folded again", _folded_more(submaps, robust), divided)])
+    both = rank_alternatives([made[-1], alternative("folded again", _folded_more(submaps, robust), divided)])
     assert both.best.chi2_per_dof == min(j.chi2_per_dof for j in both.order)
     assert f"every graph contradicts itself, {both.best.alternative.name} least" in both.why()
 
 
-def _folded_more(submaps: list[Submap], robust: Robust) -> BackEnd:
+def _folded_more(submaps: list[Submap], robust: RobustKernel) -> BackEnd:
     back = solve_choice(submaps, frozenset(), OPTIONS)
     fold(back, robust)
     last = back.graph.submaps[-1].exit_node
@@ -136,7 +136,7 @@ def _folded_more(submaps: list[Submap], robust: Robust) -> BackEnd:
 def test_chi2_of_a_graph_without_kernels_is_its_objective(run: tuple) -> None:
     submaps = run[0]
     back = solve_choice(submaps, frozenset(), OPTIONS)
-    fold(back, Robust())
+    fold(back, RobustKernel())
     back.finish()
     assert chi2_of(back.graph) == pytest.approx(back.graph.objective().total, rel=1e-12)
 
@@ -158,12 +158,12 @@ def test_ties_of_one_pair_of_submaps_count_once(run: tuple) -> None:
     again = alternative("as the run", solve_choice(submaps, _all(loops), OPTIONS, loops=loops), divided)
     assert again.ties == len({(d.submap_i, d.submap_j) for d in loops})
     folded = solve_choice(submaps, _all(loops), OPTIONS, loops=loops)
-    fold(folded, Robust())  # within the first submap, and from it to the second
+    fold(folded, RobustKernel())  # within the first submap, and from it to the second
     assert alternative("folded", folded, divided).ties == again.ties + 2
     assert alternative("open", solve_choice(submaps, frozenset(), OPTIONS), divided).ties == 0
 
 
-def _all(loops: list[Decision]) -> frozenset[tuple[int, int]]:
+def _all(loops: list[LoopDecision]) -> frozenset[tuple[int, int]]:
     return frozenset((LOOP, d.loop) for d in loops)
 
 
@@ -186,4 +186,4 @@ def test_fixes_of_a_run_are_in_every_choice(run: tuple) -> None:
 
 def test_nothing_to_choose_from() -> None:
     with pytest.raises(DataError, match="no graphs"):
-        choose([])
+        rank_alternatives([])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.backend.fix_errors import GATE, LEAST, _Innovations, fit_fix_errors, spread_out
+from graphslam.backend.fix_errors import GATE, LEAST, _Innovations, fit_fix_errors, spread_fixes
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_transform
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -13,14 +13,14 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies.trust_worlds import lasting
 
 STEP = np.array([0.06, 0.04, np.deg2rad(0.15)])
 """σ of the odometry in a second."""
-CAUCHY = Robust("cauchy", 2.385)
+CAUCHY = RobustKernel("cauchy", 2.385)
 
 
 def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tuple[PoseGraph, np.ndarray, Gps]:
@@ -46,7 +46,7 @@ def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tu
     return graph, true, fixes
 
 
-def solved(graph: PoseGraph, fixes: Gps, robust: Robust = CAUCHY) -> PoseGraph:
+def solved(graph: PoseGraph, fixes: Gps, robust: RobustKernel = CAUCHY) -> PoseGraph:
     graph.add_gps(fixes, config=GpsConfig(robust=robust))
     graph.finish_gps()
     BatchSolver(graph).solve_to_optimum()
@@ -139,7 +139,7 @@ def test_the_likelihood_equals_the_dense_one(rng):
 def test_innovations_are_those_of_a_map_without_fixes(rng):
     """The slow twin: the fixes against a graph that holds them with no weight."""
     graph, _, fixes = drive(rng, 0.05 * rng.standard_normal((40, 2)))
-    solved(graph, fixes, Robust())
+    solved(graph, fixes, RobustKernel())
     seen = _Innovations.of(graph, sorted((r for r in graph.records.values() if isinstance(r, GpsRecord)),
                                          key=lambda r: r.time))  # fmt: skip
     D = graph.values.datum
@@ -189,10 +189,10 @@ def test_withheld_fixes_are_foretold_with_the_bias_between_the_used_ones(rng):
 
 
 def test_stretches_are_spread_over_the_log():
-    k = spread_out(3000, 200)
+    k = spread_fixes(3000, 200)
     assert 190 <= len(k) <= 200
     assert k[0] == 0
     assert k[-1] >= 2990
     assert np.sum(np.diff(k) == 3) > 180  # stretches of two minutes, and long times between them
-    assert np.array_equal(spread_out(20, 200), np.arange(20))
-    assert np.array_equal(spread_out(600, 200), np.arange(0, 600, 3))
+    assert np.array_equal(spread_fixes(20, 200), np.arange(20))
+    assert np.array_equal(spread_fixes(600, 200), np.arange(0, 600, 3))

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from graphslam.backend.config import BackEndConfig
-from graphslam.backend.hypotheses import Hypothesis, hypotheses_of, solve_hypotheses, topologies, topology
+from graphslam.backend.hypotheses import TopologyHypothesis, hypotheses_of, solve_hypotheses, topologies, topology
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.maps.alternatives import Alternative, choose
+from graphslam.maps.alternatives import Alternative, rank_alternatives
 from graphslam.maps.pieces import DivisionConfig
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segmap import MATCH, NEW
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_frontends.segslam.submaps import sampled_chain, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, sampled_chain
 from graphslam_studies.segslam_trial import QUICK, GridTrial
 
 COURT = FilterDrift(heading_walk=0.02, position_walk=0.03)
@@ -31,7 +31,7 @@ CONFIG = BackEndConfig(node_spacing=1.5, level_sigma=0.006, loops=True)
 DIVISION = DivisionConfig(reach=8.5)
 
 
-def solved(result: SegSlamResult, most: int = 5, **options: Any) -> tuple[list[Hypothesis], list[Alternative]]:
+def solved(result: SegSlamResult, most: int = 5, **options: Any) -> tuple[list[TopologyHypothesis], list[Alternative]]:
     told, _ = hypotheses_of(result, most, drift=COURT, **options)
     return told, solve_hypotheses(told, CONFIG, division=DIVISION)
 
@@ -72,7 +72,7 @@ def test_particles_are_grouped_by_what_they_tell(result: SegSlamResult, divided:
         assert all(a[1] == b[0] for a, b in pairwise(told))  # each goes on where the one before ended
         same = [
             k for k in range(8)
-            if topology(divided.segmap, settled_chain(divided.segmap, int(divided.closed[k]))) == told
+            if topology(divided.segmap, common_ancestor_chain(divided.segmap, int(divided.closed[k]))) == told
         ]  # fmt: skip
         assert support == pytest.approx(divided.weights[same].sum())
         assert p == max(same, key=lambda k: divided.weights[k])
@@ -81,7 +81,7 @@ def test_particles_are_grouped_by_what_they_tell(result: SegSlamResult, divided:
 def test_the_loop_and_what_would_be_without_it(trial: GridTrial, result: SegSlamResult) -> None:
     told, graphs = solved(result)
     assert len(told) == len(graphs) == 2
-    choice = choose(graphs)
+    choice = rank_alternatives(graphs)
     assert [j.alternative.name for j in choice.order] == ["hypothesis 0", "hypothesis 1"]
     assert choice.best_map.entropy() == pytest.approx(choice.best.clarity.entropy)
     closed, open_chain = told
@@ -103,7 +103,7 @@ def test_the_loop_and_what_would_be_without_it(trial: GridTrial, result: SegSlam
     np.testing.assert_array_equal(again[0].solution.poses, graphs[0].solution.poses)
     one, alone = solved(result, 1)
     assert len(one) == 1
-    assert "only one" in choose(alone).why()
+    assert "only one" in rank_alternatives(alone).why()
 
 
 def test_map_samples_become_graphs_too(trial: GridTrial, result: SegSlamResult) -> None:

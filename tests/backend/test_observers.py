@@ -14,7 +14,7 @@ from graphslam.backend.back_end import Observer
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.solve.solution import Solution
 from tests.app.run.test_pipeline_space import Ring, ring
 
@@ -31,7 +31,7 @@ class Listener(Observer):
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         self.told.append(("submap", (submap.key, len(graph.submaps))))
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         self.told.append(("loop", decision.loop))
 
     def solved(self, solution: Solution) -> None:
@@ -50,7 +50,7 @@ class Watched(Ring):
 def test_submaps_steps_and_the_solution_are_told_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     log, front = ring(2)
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: Watched(front.made))
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     heard = Listener()
     r = gs.run(log, frontend="ring", progress=False, observers=[heard, Observer()], out=tmp_path / "run")
     n = len(front.made)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.backend.rivals import two_maps
+from graphslam.backend.ambiguous_maps import ambiguous_maps
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.loops.disputes import AMBIGUOUS
+from graphslam.loops.conflicting_groups import AMBIGUOUS
 from graphslam.loops.graph_loops import GraphLoops, chain_of_graph
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop
@@ -53,7 +53,7 @@ def test_both_maps_are_kept_where_nothing_decides(dim: int) -> None:
     ((a, b),) = closer.undecided
     assert sorted([sorted(a), sorted(b)]) == [[0, 1, 2], [3, 4, 5]]
     before, factors, written = ours.graph.values.poses.copy(), set(ours.graph.records), len(closer.ledger)
-    found = two_maps(ours.graph, ours.solver, closer)
+    found = ambiguous_maps(ours.graph, ours.solver, closer)
     assert found is not None
     # the result is as it was, and nothing was decided
     np.testing.assert_allclose(ours.graph.values.poses, before, atol=1e-6)
@@ -77,7 +77,7 @@ def test_both_maps_are_kept_where_nothing_decides(dim: int) -> None:
 
 
 def test_the_same_numbers_give_the_same_maps() -> None:
-    first, second = (two_maps(o.graph, o.solver, c) for o, c, _ in (torn(3), torn(3)))
+    first, second = (ambiguous_maps(o.graph, o.solver, c) for o, c, _ in (torn(3), torn(3)))
     assert first is not None
     assert second is not None
     assert first.facts() == second.facts()
@@ -93,4 +93,4 @@ def test_what_is_decided_later_is_in_dispute_no_more() -> None:
     closer.propose(more)
     assert {0, 1, 2} <= set(closer.accepted)
     assert closer.undecided == []
-    assert two_maps(ours.graph, ours.solver, closer) is None
+    assert ambiguous_maps(ours.graph, ours.solver, closer) is None

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from graphslam.app.compare import compare
+from graphslam.app.compare import compare_methods
 from graphslam.app.run.pipeline import run
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import simulate
@@ -31,7 +31,7 @@ def trial(world: str, seed: int) -> tuple[pd.DataFrame, dict[str, float]]:
     log = simulate("landmark-field", seed=seed, preset=world, layout_seed=1)
     result = run(log, seed=seed, progress=False)
     source = submap_source(result)
-    table = compare(source.submaps, truth=source.truth, memory=False)
+    table = compare_methods(source.submaps, truth=source.truth, memory=False)
     local = [submap_nees(s, log.truth) for s in result.submaps]
     spread = table["objective_polished"]
     facts = {

@@ -34,7 +34,7 @@ from graphslam.core.se3 import quat_rotate, se3_compose, se3_exp, se3_transform
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
-from graphslam.evidence.queries import HIT, INSIDE, cast
+from graphslam.evidence.queries import HIT, INSIDE, cast_beams
 from tests.benchmarks import evidence_filter, evidence_octomap, evidence_scenes
 from tests.benchmarks.evidence_scenes import Scene
 
@@ -174,7 +174,7 @@ def casting(scenes: list[Scene], maps: dict[str, Maps], repetitions: int, number
             for _ in range(2):
                 start = time.process_time()
                 for pose, beams in jobs:
-                    cast(grid, np.zeros(3), beams, scene.max_range, pose=pose)
+                    cast_beams(grid, np.zeros(3), beams, scene.max_range, pose=pose)
                 seconds = time.process_time() - start
             ours.append(seconds)
             for _ in range(2):
@@ -183,7 +183,7 @@ def casting(scenes: list[Scene], maps: dict[str, Maps], repetitions: int, number
             calls.append(evidence_octomap.call_overhead(tree, origins, directions, scene.max_range))
         t, c, o = (float(np.median(v)) for v in (theirs, calls, ours))
         ratios.append(median_ratio(theirs, calls, ours))
-        found = [cast(grid, np.zeros(3), b, scene.max_range, pose=p, voxels=True) for p, b in jobs]
+        found = [cast_beams(grid, np.zeros(3), b, scene.max_range, pose=p, voxels=True) for p, b in jobs]
         met = np.isin(np.concatenate([c.status for c in found]), (HIT, INSIDE))
         theirs_ends = np.floor(ends / scene.voxel_size).astype(np.int64)
         same = (met == hit) & (~hit | np.all(np.concatenate([c.voxels for c in found]) == theirs_ends, axis=1))

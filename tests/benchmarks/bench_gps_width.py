@@ -22,7 +22,7 @@ from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Gps
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 
@@ -31,7 +31,7 @@ from tests.reference.space_chain import DenseChain, dense_chain
 
 DATUM = {2: np.array([120.0, -40.0, 2.3]), 3: level_datum_pose(np.array([120.0, -40.0, 310.0, 2.3]))}
 LEVER = np.array([0.4, -0.2, 1.5])
-KERNELS = (NO_KERNEL, *(Robust("cauchy", k) for k in (1.0, 1.5, 2.385)), Robust("huber", 1.345))
+KERNELS = (NO_KERNEL, *(RobustKernel("cauchy", k) for k in (1.0, 1.5, 2.385)), RobustKernel("huber", 1.345))
 JUMPS = {"clean": 0.0, "30 m": 30.0, "2 m": 2.0}
 
 
@@ -58,7 +58,7 @@ def spoilt(gps: Gps, rng: np.random.Generator, jump: float) -> Gps:
     return Gps(times=gps.times, positions=p, sigma=gps.sigma, lever=gps.lever)
 
 
-def error(chain: DenseChain, gps: Gps, kernel: Robust) -> float:
+def error(chain: DenseChain, gps: Gps, kernel: RobustKernel) -> float:
     """Mean squared error at the ends of the submaps [m²]."""
     dim = group_of(chain.poses).dim
     g = PoseGraph(dim)
@@ -80,7 +80,7 @@ def main() -> None:
     rings = 1 if args.quick else args.rings
     for dim in (2, 3):
         rng = np.random.default_rng(4 + dim)
-        found: dict[tuple[str, Robust], list[float]] = {}
+        found: dict[tuple[str, RobustKernel], list[float]] = {}
         for _ in range(rings):
             chain = dense_chain(rng, dim, m=10, steps=20, noise=1.0)
             clean = fixes(chain, rng, dim)

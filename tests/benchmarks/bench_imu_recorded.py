@@ -22,7 +22,7 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.without_truth import class_consistency
+from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.preintegration import preintegrate

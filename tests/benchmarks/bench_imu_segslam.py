@@ -19,16 +19,16 @@ from graphslam.app.run import pipeline
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
 from graphslam.core.records import Odometry
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 
 PERIOD, TILT, TILT_TIME = 0.1, 0.003, 10.0
 
 
 def court_log(seed: int, kind: str) -> SensorLog:
     """The court's log with recorded odometry in place of the wheels."""
-    log = simulate_crawler(court(seed=seed), seed, CrawlerConfig(drift=0.08, max_range=8.0))
+    log = simulate_crawler(ring_hall(seed=seed), seed, CrawlerConfig(drift=0.08, max_range=8.0))
     assert log.truth is not None
     rng, path = np.random.default_rng(seed), log.truth.trajectory
     t = np.arange(path.times[0], path.times[-1], PERIOD)

@@ -26,16 +26,16 @@ from typing import Any
 
 from graphslam.core.submap import Submap
 from graphslam.io.slsjf import read_slsjf_local_maps
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import RelinearisationPolicy, join_online
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.polish import polish
 from graphslam.join.submap_solver import solve_submaps
 from graphslam.sim.local_maps import simulate_local_maps
 
-NEAREST = Association(rule="nearest")
+NEAREST = MapAssociationConfig(rule="nearest")
 
 
 def least(call: Callable[[], Any], repetitions: int) -> tuple[float, Any]:
@@ -68,7 +68,7 @@ class Table:
         if name in ("eif-tree", "eif-sequential"):
             # Without the problem that the joiner made for its objective, so that all of the polish is in its time.
             alone = replace(joined, problem=None)
-            extra, best = least(lambda: polish(maps, alone), repetitions)
+            extra, best = least(lambda: optimise_from_join(maps, alone), repetitions)
             self.times[f"polish of {name}", len(maps)] = extra
             print(
                 f" {extra:>8.3f} {best.iterations:>3} {joined.objective:>13.3f} {best.objective_polished:>13.3f}",
@@ -189,7 +189,7 @@ def published(table: Table, *, recognised: bool, repetitions: int) -> None:
     if recognised:
         for rule in ("nearest", "joint"):
             for name, join in {"eif-tree": join_tree, "eif-sequential": join_sequential, "ekf": join_ekf}.items():
-                options = Association(rule=rule)  # type: ignore[arg-type]
+                options = MapAssociationConfig(rule=rule)  # type: ignore[arg-type]
                 joined = join(every, association=options)
                 parts = ", ".join(f"{k} {v:.2f} s" for k, v in joined.times.items())
                 print(f"  {rule:<8} {name:<16} {len(joined.landmark_ids)} landmarks, {parts}", flush=True)
@@ -205,7 +205,7 @@ def main(arguments: list[str] | None = None) -> int:
     sizes = [126, 252] if options.quick else [126, 252, 504]
     small, _ = simulate_local_maps(16, 0)
     for warm in (join_tree, join_sequential, join_online, join_ekf):  # compiled kernels are loaded on first use
-        polish(small, warm(small))
+        optimise_from_join(small, warm(small))
     join_sequential(small, association=NEAREST)
     table = Table()
     simulated(table, sizes, [] if options.quick else [126, 252] if options.full else [126], repetitions)

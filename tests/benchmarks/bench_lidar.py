@@ -29,10 +29,10 @@ from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
 from graphslam.core.point_clouds import PointClouds
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam_frontends.lidar_odometry.front_end import odometry_of
+from graphslam_frontends.lidar_odometry.front_end import start_odometry
 from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
-from graphslam_frontends.odometry.recorded import chain
-from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.odometry.recorded import chain_odometry
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
 from graphslam_studies.sim.lidar import drawn_imu, drawn_lidar, simulate_lidar
 
 PACKS = ("lidar3d-hku1", "lidar3d-hku-mb", "lidar3d-balm-hall", "lidar3d-kitti-0005")
@@ -45,7 +45,7 @@ def followed(
 ) -> tuple[Array, list[float], str]:
     """Path ``(n, 7)``, NEES/6 of its pieces, and a line of figures."""
     clouds.cloud(0)  # decoded
-    odometry = odometry_of(clouds, LidarOdometryConfig(), imu)
+    odometry = start_odometry(clouds, LidarOdometryConfig(), imu)
     poses, states, nees, begin, way, spent = [], Counter[str](), [], 0, 0.0, 0.0
     for k in range(min(len(clouds), scans)):
         cloud, ages = clouds.cloud(k), clouds.ages(k)
@@ -107,7 +107,7 @@ def recorded(scans: int) -> None:
             print(f"{name}: not here ({error})")
             continue
         clouds = log["clouds"]
-        truth = chain(log["odometry"]).poses if "odometry" in log.streams else None
+        truth = chain_odometry(log["odometry"]).poses if "odometry" in log.streams else None
         path, _, said = followed(clouds, truth, scans)
         errors = []
         if truth is not None:

@@ -25,19 +25,19 @@ from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.formats import load_npz
-from graphslam.evidence.views import view_of
+from graphslam.evidence.views import dense_view
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
-from graphslam.loops.judge import settled_loops
+from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
+from graphslam.loops.map_overlap_test import Witness
 from graphslam.loops.measure import Loop, LoopMeasurer
-from graphslam.loops.places import ChainRelative, Places, places_of
-from graphslam.loops.witness import Witness
-from graphslam.registration.place_descriptor import describe, join, similarity
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam.loops.places import ChainRelativePoses, Places, loop_places
+from graphslam.registration.place_descriptor import concatenate_descriptors, describe_places, descriptor_similarity
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_frontends.segslam.submaps import drift_by_path, settle, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, submaps_of_segments
 from graphslam_studies import segslam_building, segslam_garage, segslam_mine
 from graphslam_studies.segslam_trial import GridTrial
 from tests.reference.loop_network import LoopNetwork
@@ -60,8 +60,8 @@ def submaps_of(world: str, seed: int, cache: Path | None) -> tuple[list[Submap],
     filter = replace(config.segslam_filter, particles=5)
     segmap = run_segslam(trial.steps, filter, blind, SeedTree(seed).child("filter", "segslam")).segmap
     last = int(segmap.alive[np.argmax(segmap.table.end[segmap.alive])])
-    chain = settled_chain(segmap, last)
-    submaps = settle(segmap, chain, drift_by_path(segmap, chain, FilterDrift()), blind.handover)
+    chain = common_ancestor_chain(segmap, last)
+    submaps = submaps_of_segments(segmap, chain, drift_by_path(segmap, chain, FilterDrift()), blind.handover)
     if folder is not None:
         write_submaps(folder, submaps)
         arrays = {"format": FORMAT, "times": trial.steps.times, "poses": trial.truth}
@@ -107,14 +107,18 @@ def nees(net: LoopNetwork, truth: Array) -> float:
     return float(np.mean(np.einsum("ki,kij,kj->k", e, np.linalg.inv(S), e)) / 6)
 
 
-def closed(chain: ChainRelative, loops: list[Loop], witness: Witness | None = None) -> tuple[LoopNetwork, LoopCloser]:
+def closed(
+    chain: ChainRelativePoses, loops: list[Loop], witness: Witness | None = None
+) -> tuple[LoopNetwork, LoopCloser]:
     net = LoopNetwork(chain.increments, chain.covariances)
-    closer = LoopCloser(net, chain.increments, chain.covariances, judge=settled_loops, witness=witness)
+    closer = LoopCloser(
+        net, chain.increments, chain.covariances, judge=truncated_least_squares_inliers, witness=witness
+    )
     closer.propose(loops)
     return net, closer
 
 
-def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: range, witness: Witness) -> None:
+def wrong_table(chain: ChainRelativePoses, loops: list[Loop], truth: Array, seeds: range, witness: Witness) -> None:
     """Precision and recall of decisions, and the ATE against that of the clean run."""
     clean = ate(closed(chain, loops, witness)[0].poses[: len(truth)], truth)
     for kind in KINDS:
@@ -138,7 +142,9 @@ def wrong_table(chain: ChainRelative, loops: list[Loop], truth: Array, seeds: ra
 def appearance_table(submaps: list[Submap], places: Places, truth: Array) -> None:
     """Recall of descriptors at 1, 5, 10, 20, and precision of candidates."""
     begin = time.perf_counter()
-    D = join([describe(view_of(s), places.T_base_node[places.of_submap(k)]) for k, s in enumerate(submaps)])
+    D = concatenate_descriptors(
+        [describe_places(dense_view(s), places.T_base_node[places.of_submap(k)]) for k, s in enumerate(submaps)]
+    )
     apart = np.linalg.norm(truth[:, None, :3] - truth[None, :, :3], axis=2)
     hits, visits = np.zeros(4), 0
     for j in range(len(places)):
@@ -146,7 +152,7 @@ def appearance_table(submaps: list[Submap], places: Places, truth: Array) -> Non
         if not len(rows) or not np.any(apart[j, rows] < 3.0):
             continue
         visits += 1
-        order = rows[np.argsort(-similarity(D, j, D, rows)[0])]
+        order = rows[np.argsort(-descriptor_similarity(D, j, D, rows)[0])]
         hits += [np.any(apart[j, order[:k]] < 4.0) for k in (1, 5, 10, 20)]
     seconds = time.perf_counter() - begin
     recall = ", ".join(f"{h / max(visits, 1):.2f}" for h in hits)
@@ -169,8 +175,8 @@ def main() -> None:
     for name in ["garage-A:3"] if args.quick else args.worlds:
         world, seed = name.split(":")
         submaps, times, path = submaps_of(world, int(seed), args.cache)
-        places = places_of(submaps)
-        truth, chain = true_places(submaps, places, times, path), ChainRelative(submaps, places)
+        places = loop_places(submaps)
+        truth, chain = true_places(submaps, places, times, path), ChainRelativePoses(submaps, places)
         begin = time.perf_counter()
         config = CandidateConfig(height=2.0 if world == "mine" else 1.0)
         candidates = proximity_candidates(places, chain, config)

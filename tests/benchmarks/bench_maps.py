@@ -28,28 +28,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.app.run.front_ends import recommended_options
+from graphslam.core.config import build_config
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.evidence.compact import pieces_of
+from graphslam.evidence.compact import grid_pieces
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.io.catalog import load
-from graphslam.maps.fuse import FusedMap, fuse
+from graphslam.io.catalog import load_recording
+from graphslam.maps.fuse import FusedMap, fuse_pieces
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import divide_submaps
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam.sim.garage import garage
+from graphslam.sim.ring_hall import ring_hall
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig, settled
+from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig, submaps_of_best_particle
 from graphslam_frontends.segslam.segslam import run_segslam
 
 ALL_POINTS = 1_000_000
@@ -69,12 +69,12 @@ class Scene(NamedTuple):
 def scene(name: str, points: int = ALL_POINTS) -> Scene:
     """A scene by name, with so many beams of a step at most."""
     if name not in ("court", "garage", "garage-full"):
-        log = load(name)
-        config: Any = build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+        log = load_recording(name)
+        config: Any = build_config(SegSlamFrontEndConfig, recommended_options(log, "segslam")["frontend"])
         config = dataclasses.replace(config, filter=dataclasses.replace(config.filter, map_beams=0))
     else:
         crawler = crawler_preset("full" if name == "garage-full" else "light")
-        log = simulate_crawler(court(seed=9) if name == "court" else garage("A"), seed=9, config=crawler)
+        log = simulate_crawler(ring_hall(seed=9) if name == "court" else garage("A"), seed=9, config=crawler)
         reach = 8.0 if name == "court" else 25.0
         config = SegSlamFrontEndConfig(
             steps=StepConfig(max_range=reach, level_floors=True), filter=GridFilterConfig(walk_scale=0.5)
@@ -87,7 +87,7 @@ def submaps_of(s: Scene, steps: Steps) -> list[Submap]:
     """The settled chain of one particle."""
     filter = dataclasses.replace(s.config.filter, particles=1)
     result = run_segslam(steps, filter, s.config.segslam, SeedTree(9))
-    return settled(result, s.config.drift, s.config.segslam)
+    return submaps_of_best_particle(result, s.config.drift, s.config.segslam)
 
 
 def bodies_of(submaps: Sequence[Submap], steps: Steps) -> Any:
@@ -134,7 +134,7 @@ def seconds(work: Callable[[], Any]) -> tuple[float, Any]:
 
 def same(a: FusedMap, b: FusedMap) -> bool:
     """Whether two maps are the same to the last bit."""
-    x, y = pieces_of(a.grid), pieces_of(b.grid)
+    x, y = grid_pieces(a.grid), grid_pieces(b.grid)
     return all(np.array_equal(getattr(x, n), getattr(y, n)) for n in ("bricks", "values", "cubes", "cube_values"))
 
 
@@ -148,20 +148,20 @@ def measure(s: Scene, turns: int) -> dict[str, float]:
     divided = divide_submaps(submaps, every=NODE_EVERY, config=reach)
     pieces, poses, bodies = divided.pieces, divided.poses, bodies_of(submaps, steps)
     loops = {"third": corrected(poses, 1 / 3), "all": corrected(poses, 1.0)}
-    work = fuse(pieces, poses, model=model)
+    work = fuse_pieces(pieces, poses, model=model)
     work.move(loops["all"])  # compiled and warm
     found: dict[str, list[float]] = {}
     for _ in range(turns):
         made, fresh = seconds(partial(make_steps, s.log, s.config.steps))
         inserted, _ = seconds(partial(insert, fresh, bodies, size, model))
-        fused, scratch = seconds(partial(fuse, pieces, poses, model=model))
+        fused, scratch = seconds(partial(fuse_pieces, pieces, poses, model=model))
         turn = {"log": made + inserted, "scans": inserted, "pieces": fused}
         for name, loop in loops.items():
             work.move(poses, tolerance=0.0)
             turn[name], change = seconds(partial(work.move, loop))
             turn[f"{name} moved"] = change.moved
             turn[f"{name} summed"] = change.summed
-            again = fuse(pieces, work.poses, model=model)
+            again = fuse_pieces(pieces, work.poses, model=model)
             if not same(work, again) or work.entropy() != again.entropy():
                 raise AssertionError(f"{s.name}: the map re-posed ({name}) is not the map from scratch")
         for name, value in turn.items():

@@ -29,7 +29,7 @@ import graphslam as gs
 from graphslam.app.run import front_to_back, outputs, pipeline
 from graphslam.backend import refining
 from graphslam.backend.back_end import BackEnd
-from graphslam.core.shelf import SHELF
+from graphslam.core.spill_cache import SPILL_CACHE
 from graphslam.maps import run_map
 from graphslam.sim.campus_config import campus_preset
 from graphslam.sim.campus_world import campus
@@ -37,7 +37,7 @@ from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 STAGES: list[tuple[Any, str, str]] = [
     (pipeline, "load_log_source", "log opened"),
-    (front_to_back.FrontToBack, "step", "front end, back end"),
+    (front_to_back.SubmapPipeline, "step", "front end, back end"),
     (pipeline, "at_rest", "scans for the refinement"),
     (BackEnd, "finish", "loops, solved"),
     (refining, "refine", "refinement"),
@@ -137,7 +137,7 @@ def main() -> None:
         spent, peak = time.process_time() - start, max(peaks.peak, resident()[1])
         way = run.map.trajectory.length()
         facts = f"{len(run.submaps)} submaps, {way:.0f} m: peak {peak / 1e3:.2f} GB, {spent:.0f} CPU s"
-        print(f"{facts}; {SHELF.filed / 1e6:.0f} MB on disk")
+        print(f"{facts}; {SPILL_CACHE.filed / 1e6:.0f} MB on disk")
         print(run.headline.text)
     raise SystemExit(peak > 1e3 * a.limit)
 

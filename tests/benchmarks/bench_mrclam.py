@@ -33,7 +33,7 @@ from graphslam.core.geometry import se2_between, se2_inverse, se2_transform
 from graphslam.core.log import Truth
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.plots.map import plot_map
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 
 UNKNOWN: Mapping[str, Any] = {
     "frontend": {
@@ -96,7 +96,7 @@ def picture(r: Run, path: Path) -> None:
     T = se2_inverse(fit.T_ref_est)
     truth = Truth(r.truth_path.transformed(T), r.truth.landmark_ids, se2_transform(T, r.truth.landmarks))
     title = f"{r.name}: path RMSE {fit.statistics.rmse:.3f} m; truth aligned"
-    save(plot_map(trajectory=r.map.trajectory, landmarks=r.map.landmarks, truth=truth, title=title), path)
+    save_figure(plot_map(trajectory=r.map.trajectory, landmarks=r.map.landmarks, truth=truth, title=title), path)
 
 
 def together(runs: Sequence[Run], by: Any, out: Path | None) -> None:

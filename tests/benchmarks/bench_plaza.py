@@ -22,9 +22,9 @@ from graphslam.core.geometry import align_se2, se2_between, se2_compose, se2_inv
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam_frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig, StoppingConfig
-from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem
+from graphslam_frontends.landmarks.prepare import prepare_log
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
-from graphslam_frontends.landmarks.rivals import SubmapProblem
 from graphslam_frontends.odometry.motion import MotionNoise
 
 FLOORS = {"floor_position": 1e-3, "floor_heading": 1e-4}
@@ -68,7 +68,7 @@ class Evidence:
         self.beacons = dict(zip(start.landmarks.ids.tolist(), start.landmarks.positions))
 
     def __call__(self, model: Model) -> float:
-        d = prepare(self.log, model.config(), DropCounter())
+        d = prepare_log(self.log, model.config(), DropCounter())
         obs, rows, T = d.observations, d.rows, len(d)
         scan = np.searchsorted(obs.offsets, np.arange(len(rows)), side="right") - 1
         ids, first, rank = np.unique(obs.ids, return_index=True, return_inverse=True)
@@ -76,7 +76,7 @@ class Evidence:
         beacon = np.argsort(order)[rank]
         start = np.array([self.beacons[int(i)] for i in ids[order]])
         increments, covariances = d.odometry.increments, d.odometry.covariances
-        problem = SubmapProblem(increments, covariances, scan, beacon, rows, obs.T_base_sensor, 0.0, 1)
+        problem = SmoothingProblem(increments, covariances, scan, beacon, rows, obs.T_base_sensor, 0.0, 1)
         s = problem.smooth(self.poses[:T], start)
         L = np.linalg.cholesky(covariances)
         sigma = np.sqrt(rows[:, 2])

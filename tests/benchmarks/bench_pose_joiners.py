@@ -21,7 +21,7 @@ import numpy as np
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.evaluate.consistency import joint_nees, pose_error
 from graphslam.io.network_file import read_network
-from graphslam.join.pose_estimate import PoseEstimate, polish_poses
+from graphslam.join.pose_estimate import PoseEstimate, optimise_poses
 from graphslam.join.pose_join import join_poses_sequential, join_poses_tree
 from graphslam.join.pose_problem import PoseProblem
 from tests.reference.best_known import BEST_KNOWN
@@ -45,7 +45,7 @@ def graphs(root: Path, names: list[str]) -> bool:
         for way, join in WAYS.items():
             join(problem.part(0, 2))
             own = join(problem)
-            best = polish_poses(problem, own)
+            best = optimise_poses(problem, own)
             t = best.times
             parts = f"{t['leaves']:7.2f} {t['update'] + t['recovery']:6.2f} {t['polish']:7.2f} {best.iterations:3d}"
             value = f"{own.objective:10.6g} {best.objective_polished:11.7g}"
@@ -67,7 +67,7 @@ def ramps(trials: int, noises: tuple[tuple[float, float], ...]) -> None:
             problem, truth = pose_ramp(
                 seed, submaps=24, steps=15, around=90, loops=45, metres=metres, radians=np.radians(degrees)
             )
-            best = polish_poses(problem, join_poses_sequential(problem))
+            best = optimise_poses(problem, join_poses_sequential(problem))
             assert best.objective_polished is not None
             n = best.states
             for row in rows:

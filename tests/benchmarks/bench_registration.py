@@ -16,7 +16,7 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.io.lidar_pack import read_lidar_pack
-from graphslam.registration.config import Gates, RegistrationConfig
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
 from graphslam.registration.register import Registration, register, register_starts
 from graphslam.registration.search import SearchConfig, correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField
@@ -227,7 +227,7 @@ def times() -> None:
 
 def recorded() -> None:
     """Consecutive scans from a start disturbed by 0.1 m and 0.02 rad an axis, against the odometry."""
-    config = RegistrationConfig(gates=Gates(tilt=np.pi, fitness=0.0, fitness_upright=0.0))
+    config = RegistrationConfig(gates=RegistrationGates(tilt=np.pi, fitness=0.0, fitness_upright=0.0))
     for name, step, every in (
         ("lidar3d_balm_hall", 0.002, 4),
         ("lidar3d_hku1", 0.005, 3),

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
-from graphslam.graph.network import values_of
+from graphslam.graph.network import network_values
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.factors import to_graph
 from graphslam.solve.network.solve import solve_network
@@ -54,7 +54,7 @@ def gtsam_gnc(network: PoseNetwork, limit: float) -> tuple[np.ndarray, np.ndarra
     params.setLossType(gtsam.GncLossType.TLS)
     a = len(network.anchors)
     params.setKnownInliers([*range(a), *(a + np.flatnonzero(is_odometry(network.edges))).tolist()])
-    start = values_of(network, odometry_start(network))
+    start = network_values(network, odometry_start(network))
     optimizer = gtsam.GncLMOptimizer(to_graph(network), to_gtsam(start, held=True), params)
     optimizer.setInlierCostThresholds(0.5 * limit)
     found = optimizer.optimize()

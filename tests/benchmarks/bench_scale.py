@@ -57,13 +57,13 @@ def rms(a: np.ndarray, b: np.ndarray) -> float:
 def ours(poses: int, threads: int) -> dict[str, Any]:
     """Draw, collapse, relax, then the unit costs."""
     from graphslam.skeleton.collapse import Collapse
-    from graphslam.skeleton.preconditioner import Levels, Preconditioner
+    from graphslam.skeleton.preconditioner import Preconditioner, PreconditionerLevels
     from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
-    from graphslam.skeleton.schur import Layout, Network, Workers
+    from graphslam.skeleton.schur import Network, Workers, WorkRanges
     from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
     config = RelaxConfig(threads=threads)
-    for levels in (Levels(0, 20), Levels(10, 80)):
+    for levels in (PreconditionerLevels(0, 20), PreconditionerLevels(10, 80)):
         relax_skeleton(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels, threads=threads))
     world = draw_laps(LapsConfig(poses=poses))
     collapse = Collapse(int(world.first[-1]))
@@ -88,7 +88,7 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
     top = peak()
 
     workers = Workers(threads)
-    layout = Layout(problem, workers)
+    layout = WorkRanges(problem, workers)
     costs = {"collapse": seconds}
     begin = time.process_time()
     network = Network(layout, found.poses)
@@ -100,7 +100,7 @@ def ours(poses: int, threads: int) -> dict[str, Any]:
         network.product(v)
     costs["product"] = (time.process_time() - begin) / 3
     begin = time.process_time()
-    M = Preconditioner(network, Levels(10, 80))
+    M = Preconditioner(network, PreconditionerLevels(10, 80))
     costs["preconditioner"] = time.process_time() - begin
     begin = time.process_time()
     M(v)
@@ -144,13 +144,13 @@ def draw_tiles(poses: int, folder: str) -> dict[str, Any]:
 
 def from_tiles(poses: int, folder: str, iterations: int, start: str, threads: int) -> dict[str, Any]:
     """Relax a network whose measurements stay on disk."""
-    from graphslam.skeleton.preconditioner import Levels
+    from graphslam.skeleton.preconditioner import PreconditionerLevels
     from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
-    from graphslam.skeleton.schur import moved
+    from graphslam.skeleton.schur import step_poses
     from graphslam.skeleton.tile_store import Tiles
     from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
-    for levels in (Levels(0, 20), Levels(10, 80)):
+    for levels in (PreconditionerLevels(0, 20), PreconditionerLevels(10, 80)):
         relax_skeleton(draw_laps(LapsConfig(poses=600)).problem(), RelaxConfig(levels=levels))
     world = draw_laps(LapsConfig(poses=poses))
     problem = world.problem(tiles=Tiles(folder))
@@ -158,7 +158,7 @@ def from_tiles(poses: int, folder: str, iterations: int, start: str, threads: in
     if start == "truth":
         drift, at = np.zeros((poses, 6)), 2 * np.pi * np.arange(poses) / poses
         drift[:, 3:] = 0.3 * np.sin(np.outer(at, [7, 5, 3]))
-        given = moved(world.truth, drift)
+        given = step_poses(world.truth, drift)
         del drift, at
     del world
     wall = time.perf_counter()
@@ -181,13 +181,13 @@ def theirs(poses: int, solver: str, ordering: str, start: str, gigabytes: float)
 
     from graphslam.core.se3 import matrix_to_quat
     from graphslam.skeleton.landmark_kernels import Poses
-    from graphslam.skeleton.schur import Layout, Network, Workers
+    from graphslam.skeleton.schur import Network, Workers, WorkRanges
     from graphslam.skeleton.start import chain_start, forward_pass
     from graphslam_studies.sim.laps import LapsConfig, draw_laps
 
     problem = (world := draw_laps(LapsConfig(poses=poses))).problem()
     at = problem.dead_reckoning() if start == "odometry" else forward_pass(problem, chain_start(problem)).poses
-    layout = Layout(problem, Workers(1))
+    layout = WorkRanges(problem, Workers(1))
     landmarks = Network(layout, at).landmarks
     limit = int(gigabytes * 1e9)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -303,11 +303,11 @@ def our_chain(poses: int, share: float, file: str) -> dict[str, Any]:
 
 def draw_chain(poses: int, share: float, folder: str) -> dict[str, Any]:
     """Write a chain with loops to disk, in tiles of 2·10⁴ poses."""
-    from graphslam.skeleton.chain_tiles import chain_to_disk, pieces_of
+    from graphslam.skeleton.chain_tiles import chain_to_disk, cut_chain
 
     graph = chain_graph(poses, share)
     begin = time.process_time()
-    chain_to_disk(folder, pieces_of(graph, 20_000))
+    chain_to_disk(folder, cut_chain(graph, 20_000))
     return {"seconds": time.process_time() - begin}
 
 

@@ -17,16 +17,16 @@ from pathlib import Path
 import numpy as np
 
 import graphslam as gs
-from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.app.run.front_ends import recommended_options
+from graphslam.core.config import build_config
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import align_se3, se3_transform
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.scan_window.exits import relative_covariance
 from graphslam_frontends.scan_window.front_end import ScanWindowFrontEndConfig
-from graphslam_frontends.scan_window.tracker import track
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
+from graphslam_frontends.scan_window.tracker import track_steps
 
 LENGTH = 30.0
 """Way of the pieces whose exits are judged [m]."""
@@ -53,7 +53,7 @@ def odometry(steps: Steps, config: ScanWindowFrontEndConfig) -> list[float]:
     piece = np.floor(steps.path_length / LENGTH)
     starts = [0, *(np.flatnonzero(np.diff(piece) > 0) + 1).tolist()]
     begin = time.process_time()
-    made = track(steps, config.window, starts)
+    made = track_steps(steps, config.window, starts)
     cpu = (time.process_time() - begin) / len(steps)
     g, errors, nees = group_of(truth), [], []
     for a, b in zip(starts, [*starts[1:], len(steps) - 1]):
@@ -96,8 +96,8 @@ def main() -> None:
         runs: dict[str, list[list[float]]] = {}
         for seed in seeds:
             log = gs.simulate("garage", seed=seed, layout=layout)
-            options = recommended(log, "scan-window").get("frontend", {})
-            config: ScanWindowFrontEndConfig = build(ScanWindowFrontEndConfig, options, "frontend")
+            options = recommended_options(log, "scan-window").get("frontend", {})
+            config: ScanWindowFrontEndConfig = build_config(ScanWindowFrontEndConfig, options, "frontend")
             rows.append(odometry(make_steps(log, config.steps), config))
             print(f"  {layout} {seed}: {rows[-1][0]:.3f} m, {1e3 * rows[-1][1]:.1f} mrad", flush=True)
             if seed - args.first < args.runs:

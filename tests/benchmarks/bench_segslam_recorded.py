@@ -20,24 +20,24 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.app.run.front_ends import recommended_options
+from graphslam.core.config import build_config
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.plots.evidence import plot_heights, plot_section
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_frontends.grid.rbpf_grid import run_rbpf
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_studies.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
+from graphslam_studies.evaluate.relations import consecutive_pairs, covered_part, random_pairs, relation_error
 
 NAMES = (
     "radish-intel", "radish-fr079", "radish-mit-csail", "lidar3d-hku1", "lidar3d-balm-hall", "lidar3d-hku-mb",
@@ -50,13 +50,13 @@ RANDOM_PAIRS = 5000
 
 def settings(log: SensorLog, particles: int | None = None) -> SegSlamFrontEndConfig:
     """The preset of a log for the front end ``segslam``."""
-    c: SegSlamFrontEndConfig = build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    c: SegSlamFrontEndConfig = build_config(SegSlamFrontEndConfig, recommended_options(log, "segslam")["frontend"])
     return c if particles is None else dataclasses.replace(c, filter=dataclasses.replace(c.filter, particles=particles))
 
 
 def relations(path: Trajectory, reference: Trajectory) -> dict[str, float]:
     """Relation errors of neighbours and of pairs at random, the same pairs for every path of one log."""
-    part = covered(reference, path)
+    part = covered_part(reference, path)
     out: dict[str, float] = {}
     for what, pairs in (
         ("consecutive", consecutive_pairs(len(part))),
@@ -117,7 +117,7 @@ def figures_of(path: Trajectory, reference: Trajectory, closed: bool) -> dict[st
 
 def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path | None) -> list[Row]:
     """All methods on one log; maps are drawn for the seed 0."""
-    log = load(name)
+    log = load_recording(name)
     if quick:  # before anything is prepared, or most of the time goes into what is cut off
         begins = float(log["reference"].times[0])
         log = log.slice(begins, begins + QUICK_SECONDS)
@@ -127,9 +127,9 @@ def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path |
     recorded = float(steps.times[-1] - steps.times[0])
     closed = name in CLOSED and not quick
     raw = make_steps(log, dataclasses.replace(config.steps, match_scans=False, yaw_per_metre=0.0))
-    paths: dict[str, tuple[Trajectory, float]] = {"odometry": (chain(raw.odometry), 0.0)}
+    paths: dict[str, tuple[Trajectory, float]] = {"odometry": (chain_odometry(raw.odometry), 0.0)}
     if config.steps.match_scans:
-        paths["mended"] = (chain(steps.odometry), 0.0)
+        paths["mended"] = (chain_odometry(steps.odometry), 0.0)
     begin = time.process_time()
     rbpf = run_rbpf(steps, config.filter, SeedTree(seed))
     paths["rbpf-grid"] = (rbpf.trajectory(), time.process_time() - begin)
@@ -146,7 +146,7 @@ def run(name: str, seed: int, *, particles: int | None, quick: bool, out: Path |
         for method, (path, _) in reversed(paths.items()):
             grid = path_map(steps, path, config.filter.voxel_size)
             draw = plot_section if grid.dim == 2 else plot_heights
-            print(f"  {save(draw(grid, title=f'{name}, {method}'), out / f'{name}.{method}.png')}")
+            print(f"  {save_figure(draw(grid, title=f'{name}, {method}'), out / f'{name}.{method}.png')}")
     return rows
 
 
@@ -176,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     rows: list[Row] = []
     for name in options.names or (QUICK if options.quick else NAMES):
         try:
-            load(name)
+            load_recording(name)
         except MissingDataError:
             print(f"{name} left out: no recording (set GRAPHSLAM_DATA)")
             continue

@@ -35,11 +35,11 @@ QUICK = ("smallGrid3D", "kitti_07", "intel")
 
 def ours(path: str) -> dict[str, Any]:
     """Default options, from the file to the report."""
-    from graphslam.app.solve_file import solve_file
+    from graphslam.app.solve_file import solve_network_file
 
     importlib.import_module("graphslam.solve.network.batch")  # GTSAM, which is loaded when it is needed
     begin = time.process_time()
-    report = solve_file(path)
+    report = solve_network_file(path)
     return {
         "work": time.process_time() - begin,
         "objective": report["objective"],
@@ -101,7 +101,7 @@ def large(who: str, n: str, dim: str) -> dict[str, Any]:
     import numpy as np
 
     from graphslam.graph.gtsam_values import to_gtsam
-    from graphslam.graph.network import values_of
+    from graphslam.graph.network import network_values
     from graphslam.solve.network.batch import BatchProblem
     from graphslam.solve.network.solve import solve_network
     from graphslam.solve.network.start import chordal_start
@@ -114,7 +114,7 @@ def large(who: str, n: str, dim: str) -> dict[str, Any]:
         if network.dim == 3:
             start = gtsam.InitializePose3.initialize(graph)
         else:  # lago leads to a minimum 37 times as high with 10⁵ poses: our chordal start, whose time counts
-            start = to_gtsam(values_of(network, *chordal_start(network)), held=True)
+            start = to_gtsam(network_values(network, *chordal_start(network)), held=True)
         optimizer = gtsam.GaussNewtonOptimizer(graph, start, gtsam.GaussNewtonParams())
         objective, iterations = 2.0 * graph.error(optimizer.optimize()), optimizer.iterations()
     else:

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from graphslam.association.consistent_set import consistent_loops
 from graphslam.core.geometry import align_se2, se2_transform
 from graphslam.core.network import PoseNetwork
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.solve.network.solve import solve_network
 from tests.reference.huber import huber_least_squares
 
@@ -40,7 +40,7 @@ def main() -> None:
     if args.quick and not os.environ.get("GRAPHSLAM_DATA"):
         print("no recorded data here (GRAPHSLAM_DATA): nothing to do")
         return
-    log = load("tuc-slam-lecture-hall")
+    log = load_recording("tuc-slam-lecture-hall")
     network, times = log.to_network(min_similarity=args.similarity)
     truth = log.truth_at(times)
     n = len(network)

@@ -279,12 +279,12 @@ def hall(scans: int = 40) -> Scene | None:
 
 def _recorded(card: str):  # type: ignore[no-untyped-def]
     from graphslam.core.errors import MissingDataError
-    from graphslam.io.catalog import load
+    from graphslam.io.catalog import load_recording
 
     if not os.environ.get("GRAPHSLAM_DATA"):
         return None
     try:
-        return load(card)
+        return load_recording(card)
     except MissingDataError as error:
         _log.warning("%s", error)
         return None

@@ -22,9 +22,9 @@ from tqdm import tqdm
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import reference_labels
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.backend.back_end import BackEnd
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.geometry import Array, se2_compose
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -32,16 +32,16 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.association import pair_agreement
+from graphslam.evaluate.dead_reckoning_baseline import dead_reckoned_path
 from graphslam.evaluate.gps import gps_residuals
-from graphslam.evaluate.reckoning import dead_reckoning
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.polish import polish
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.plots import style
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_studies.plots.study_time import plot_cumulative_time
 from tests.reference.gps_maps import plot_gps_maps
 
@@ -120,7 +120,7 @@ class Clock:
 
 def front_end_options(log: SensorLog, name: str, **options: Any) -> dict[str, Any]:
     """The preset of a front end with some options changed."""
-    return merge(recommended(log, name)["frontend"], options)
+    return merge_options(recommended_options(log, name)["frontend"], options)
 
 
 def one_map(log: SensorLog, **options: Any) -> tuple[Submap, Array]:
@@ -161,7 +161,7 @@ def paper(log: SensorLog, *, seeds: int, figures: Path | None) -> None:
     few = log.slice(start, start + 60.0)
     _all_methods(few, judge_of(few, front), Results(), 0, progress=False)  # compiles
     results = Results()
-    reckoned = dead_reckoning(log, log["laser"].times)
+    reckoned = dead_reckoned_path(log, log["laser"].times)
     assert reckoned is not None
     results.add("dead reckoning", judge(reckoned))
     results.keep("dead reckoning", reckoned, np.zeros((0, 2)))
@@ -187,7 +187,7 @@ def judge_of(log: SensorLog, front: Any) -> Judge:
 def _all_methods(log: SensorLog, judge: Judge, out: Results, seed: int, *, progress: bool) -> None:
     """One run of everything; single maps draw nothing at random and run once."""
     bar = tqdm(desc=f"seed {seed}", unit="method", disable=not progress, leave=False)
-    settings: cfg.RunConfig = build(cfg.RunConfig, recommended(log, "rbpf-ekf"))
+    settings: cfg.RunConfig = build_config(cfg.RunConfig, recommended_options(log, "rbpf-ekf"))
     scale = settings.backend.covariance_scale
     moments, spent = local_maps(log, seed, handover="moments")
     ends = np.array([s.interval[1] for s in moments])
@@ -243,7 +243,7 @@ def _join(
     *,
     polished: bool,
 ) -> None:
-    association = Association(rule=rule)
+    association = MapAssociationConfig(rule=rule)
     clock = Clock()
     if join is join_tree:  # all at once: what the tree of the first k costs, built afresh
         joined = join(submaps, association=association)
@@ -262,7 +262,7 @@ def _join(
     out.add(f"{name}, with local maps", {}, (along[0], along[1] + spent[along[0]]))
     out.keep(name, path, joined.landmarks)
     if polished:
-        best = polish(submaps, joined)
+        best = optimise_from_join(submaps, joined)
         assert best.objective_polished is not None
         seconds = {"seconds_join": sum(best.times.values()), "seconds_local": spent[-1]}
         fit = best.objective_polished / dof if best.converged else np.nan
@@ -315,7 +315,7 @@ def print_table(table: pd.DataFrame) -> None:
 
 def levels(log: SensorLog, judge: Judge) -> None:
     """Where a tree of the paper's maps goes wrong: landmarks that mix trees after every level, by rule."""
-    scale = float(recommended(log, "rbpf-ekf")["backend"]["covariance_scale"])
+    scale = float(recommended_options(log, "rbpf-ekf")["backend"]["covariance_scale"])
     submaps = scale_covariances(local_maps(log, 0, handover="moments")[0], scale)
     print(f"\npaper × {scale:g}, tree, by level: submaps in a map | maps | landmarks that mix trees, nearest | joint")
     size = 2
@@ -323,7 +323,7 @@ def levels(log: SensorLog, judge: Judge) -> None:
         blocks = [submaps[k : k + size] for k in range(0, len(submaps), size)]
         mixed = {}
         for rule in ("nearest", "joint"):
-            joined = [join_tree(b, association=Association(rule=rule)) for b in blocks]  # type: ignore[arg-type]
+            joined = [join_tree(b, association=MapAssociationConfig(rule=rule)) for b in blocks]  # type: ignore[arg-type]
             found = [
                 pair_agreement(judge.labels(b, j.submap_ids), judge.reference).mixed for b, j in zip(blocks, joined)
             ]
@@ -355,7 +355,7 @@ def draw(table: pd.DataFrame, results: Results, gps: Gps, folder: Path) -> None:
         part = table[table["algorithm"].isin(names)].replace({"algorithm": names})
         plot_cumulative_time(ax, part, algorithms=list(names.values()), log=True, title=f"{title}, CPU time")
         style.legend(ax, outside=False, loc="lower right", fontsize="x-small")
-    save(left, folder / "victoria_park_time.png")
+    save_figure(left, folder / "victoria_park_time.png")
     shown = {
         "dead reckoning": "dead reckoning",
         "EKF, one map, nearest": "EKF, one map, nearest",
@@ -370,4 +370,4 @@ def draw(table: pd.DataFrame, results: Results, gps: Gps, folder: Path) -> None:
     paths = {label: results.maps[name][0] for name, label in shown.items()}
     marks = {label: results.maps[name][1] for name, label in shown.items() if len(results.maps[name][1])}
     axes = plot_gps_maps(paths, gps, landmarks=marks)
-    save(axes[0], folder / "victoria_park_maps.png")
+    save_figure(axes[0], folder / "victoria_park_maps.png")

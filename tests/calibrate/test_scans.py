@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import graphslam as gs
-from graphslam.calibrate.corrections import Corrections, calibrated
+from graphslam.calibrate.corrections import Corrections, apply_corrections
 from graphslam.calibrate.estimate import Calibration, Estimate
-from graphslam.calibrate.scans import BLOCK, Pairs, calibrate_scans, predicted, regress
-from graphslam.calibrate.sighted import QUICK
+from graphslam.calibrate.landmark_calibration import QUICK
+from graphslam.calibrate.scans import BLOCK, ScanPairs, calibrate_scans, cross_validate, regress_errors
 from graphslam.core.errors import DataError
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
@@ -52,7 +52,7 @@ def test_the_noise_of_wheels_is_widened_by_scans_and_never_narrowed() -> None:
         log, _ = drive(bias=BIAS, noise=NOISE, stated=stated, seconds=80.0)
         found = calibrate_scans(make_steps(log, StepConfig(period=None)), QUICK).corrections
         before = log["odometry"].covariances[1:, 2, 2]
-        after = calibrated(log, found)["odometry"].covariances[1:, 2, 2]
+        after = apply_corrections(log, found)["odometry"].covariances[1:, 2, 2]
         assert np.all(after >= before)
         assert (np.median(after) > 2.0 * np.median(before)) == (stated < 0.01)
 
@@ -81,13 +81,13 @@ def test_regression_finds_noise_that_grows_and_is_not_led_by_outliers() -> None:
     d = rng.choice([0.4, 1.3], 600)
     e = 0.05 * d + np.sqrt(0.01**2 + 0.03**2 * d) * rng.standard_normal(600)
     e[::20] += 1.0
-    found = regress(e, d[:, None], d[:, None])
+    found = regress_errors(e, d[:, None], d[:, None])
     assert found.value[0] == pytest.approx(0.05, abs=4 * np.sqrt(found.covariance[0, 0]))
     assert found.sigmas[1] == pytest.approx(0.03, rel=0.25)
     assert not found.keep[::20].any()
 
 
-def drawn_pairs(bend, *, stated, seed=4) -> Pairs:
+def drawn_pairs(bend, *, stated, seed=4) -> ScanPairs:
     """Pairs of a robot whose heading errs by so much a metre, with 0.02 rad/√m and 0.03 m/√m of noise."""
     rng = np.random.default_rng(seed)
     d = np.tile([0.4, 4.0], 120)
@@ -96,13 +96,13 @@ def drawn_pairs(bend, *, stated, seed=4) -> Pairs:
     along = np.sqrt(0.01**2 + 0.03**2 * d) * rng.standard_normal(n)
     columns = {"apart": zero, "seconds": d, "metres": d, "turn": zero, "turned": zero, "chord": d, "side": zero}
     variances = {"stated_heading": stated**2 * 0.02**2 * d, "stated_along": stated**2 * 0.03**2 * d}
-    return Pairs(**columns, **variances, heading=heading, along=along)
+    return ScanPairs(**columns, **variances, heading=heading, along=along)
 
 
-def judged(p: Pairs) -> Calibration:
+def judged(p: ScanPairs) -> Calibration:
     bend = Estimate(name="turn_per_metre", value=0.1, sigma=0.01, gain=50.0, other=0.1, other_sigma=0.01)
     raw = Calibration(kind="scans", corrections=Corrections(turn_per_metre=0.1, along_metre=0.03), estimates=(bend,))
-    return raw.judged(predicted(p, raw, widen=True))
+    return raw.judged(cross_validate(p, raw, widen=True))
 
 
 def test_halves_that_contradict_each_other_refuse_what_the_whole_says() -> None:

@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 import graphslam as gs
 from graphslam.app.cli import app
 from graphslam.app.cli.run import join_note
-from graphslam.calibrate.corrections import Corrections, calibrated
+from graphslam.calibrate.corrections import Corrections, apply_corrections
 from graphslam.calibrate.estimate import Estimate
-from graphslam.calibrate.foretold import foretold
-from graphslam.calibrate.landmarks import fitted, sighted
-from graphslam.calibrate.sighted import LONG, QUICK, RAN_AWAY, SHORT, calibrate_sightings
+from graphslam.calibrate.landmark_calibration import LONG, QUICK, RAN_AWAY, SHORT, calibrate_sightings
+from graphslam.calibrate.landmarks import fit_noise, smooth_sightings
+from graphslam.calibrate.prediction_check import predict_withheld_sightings
 from graphslam.calibrate.smoothing import CONSTANTS
-from graphslam.calibrate.windows import Seen, stretches
+from graphslam.calibrate.windows import SightingLog, window_scans
 from graphslam.core.config import read_toml
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.io.log_store import save_log
@@ -39,7 +39,7 @@ def log():
 
 @pytest.fixture(scope="module")
 def found(log):
-    return calibrate_sightings(Seen.of(log, "landmarks", log["landmarks"]), QUICK)
+    return calibrate_sightings(SightingLog.of(log, "landmarks", log["landmarks"]), QUICK)
 
 
 def test_drawn_robot_is_found_again(found) -> None:
@@ -59,14 +59,16 @@ def test_drawn_robot_is_found_again(found) -> None:
 def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, found) -> None:
     assert found.prediction.taken == "all"
     assert found.prediction.gains["all"] > 100.0
-    seen = Seen.of(log, "landmarks", log["landmarks"]).holding()
+    seen = SightingLog.of(log, "landmarks", log["landmarks"]).holding()
     share = float(seen.withheld.mean())
     assert 0.0 < share < 0.2
-    scans = stretches(seen, LONG)
+    scans = window_scans(seen, LONG)
     bent = dataclasses.replace(found.corrections.without_constants(), yaw_bias=0.2)
     blunt = dataclasses.replace(bent, range_sigma=1e5, bearing_sigma=1e4)
     for c, taken in ((bent, "noise"), (blunt, "nothing")):
-        wrong = found.judged(foretold(seen, dataclasses.replace(found, corrections=c), scans, MotionNoise()))
+        wrong = found.judged(
+            predict_withheld_sightings(seen, dataclasses.replace(found, corrections=c), scans, MotionNoise())
+        )
         assert wrong.prediction.taken == taken
         assert not any(e.applied for e in wrong.estimates)
         assert "calibration-refused" in {f.code for f in wrong.findings()}
@@ -74,15 +76,15 @@ def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, fou
 
 
 def test_corrections_that_change_nothing_foretell_nothing_better(log, found) -> None:
-    seen = Seen.of(log, "landmarks", log["landmarks"]).holding()
+    seen = SightingLog.of(log, "landmarks", log["landmarks"]).holding()
     none = dataclasses.replace(found, corrections=Corrections())
-    gains = foretold(seen, none, stretches(seen, LONG), MotionNoise()).gains
+    gains = predict_withheld_sightings(seen, none, window_scans(seen, LONG), MotionNoise()).gains
     assert gains["all"] == pytest.approx(0.0, abs=0.01)
 
 
 def test_corrected_log_says_nothing_more_of_its_constants(log, found) -> None:
-    mended = calibrated(log, found.corrections)
-    again = calibrate_sightings(Seen.of(mended, "landmarks", mended["landmarks"]), QUICK)
+    mended = apply_corrections(log, found.corrections)
+    again = calibrate_sightings(SightingLog.of(mended, "landmarks", mended["landmarks"]), QUICK)
     before = {e.name: e for e in found.estimates if e.applied}
     for e in again.estimates:
         assert not e.applied or abs(e.value) < 0.3 * abs(before[e.name].value), e
@@ -90,7 +92,7 @@ def test_corrected_log_says_nothing_more_of_its_constants(log, found) -> None:
 
 def test_tracks_without_identities_tell_the_same(log, found) -> None:
     blind = dataclasses.replace(log["landmarks"], ids=None)
-    there = calibrate_sightings(Seen.of(log, "landmarks", blind), QUICK).corrections
+    there = calibrate_sightings(SightingLog.of(log, "landmarks", blind), QUICK).corrections
     assert there.distance_scale == pytest.approx(found.corrections.distance_scale, abs=0.01)
     assert there.clock == pytest.approx(found.corrections.clock, abs=0.1)
     assert there.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.3)
@@ -102,7 +104,7 @@ def test_wrong_identities_are_trimmed(log, found) -> None:
     wrong = rng.random(len(ids)) < 0.05
     ids[wrong] = rng.permutation(ids[wrong])
     spoilt = dataclasses.replace(log["landmarks"], ids=ids)
-    c = calibrate_sightings(Seen.of(log, "landmarks", spoilt), QUICK).corrections
+    c = calibrate_sightings(SightingLog.of(log, "landmarks", spoilt), QUICK).corrections
     assert c.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.2)
     assert c.bearing_sigma == pytest.approx(ROBOT.bearing_sigma, rel=0.2)
 
@@ -110,7 +112,7 @@ def test_wrong_identities_are_trimmed(log, found) -> None:
 def test_too_few_sightings_are_refused_with_a_count(log) -> None:
     short = log.slice(0.0, 1.5)
     with pytest.raises(DataError, match="sightings"):
-        calibrate_sightings(Seen.of(short, "landmarks", short["landmarks"].take(slice(0, 2))), QUICK)
+        calibrate_sightings(SightingLog.of(short, "landmarks", short["landmarks"].take(slice(0, 2))), QUICK)
 
 
 def test_run_of_an_unknown_log_is_calibrated_and_says_so(log, tmp_path) -> None:
@@ -168,7 +170,9 @@ def test_noise_of_the_wheels_does_not_make_their_distances_look_too_long() -> No
     robot = dataclasses.replace(ROBOT, speed=0.6, along_metre=0.12, clock=0.0, distance_scale=1.0, range_sigma=0.03)
     noisy = drive(robot, 5, 60.0)
     effort = dataclasses.replace(QUICK, clock=False)
-    e = {e.name: e for e in calibrate_sightings(Seen.of(noisy, "landmarks", noisy["landmarks"]), effort).estimates}
+    e = {
+        e.name: e for e in calibrate_sightings(SightingLog.of(noisy, "landmarks", noisy["landmarks"]), effort).estimates
+    }
     assert abs(e["distance_scale"].value) < 2.5 * e["distance_scale"].sigma
 
 
@@ -187,9 +191,9 @@ def test_a_scale_that_is_hardly_told_is_left() -> None:
 def test_a_scale_that_runs_away_is_held_and_the_noise_is_found(data_dir):
     """Sightings of MRCLAM are so sparse that wheels without any say are likelier than the right ones."""
     log = gs.load("mrclam-dataset7/robot1")
-    seen = Seen.of(log, "landmarks", log["landmarks"])
+    seen = SightingLog.of(log, "landmarks", log["landmarks"])
     free = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
-    wild, _ = fitted(sighted(seen, SHORT, 20, free))
+    wild, _ = fit_noise(smooth_sightings(seen, SHORT, 20, free))
     assert abs(wild.constants[CONSTANTS.index("distance_scale")]) > RAN_AWAY * 0.2
     found = calibrate_sightings(seen, dataclasses.replace(QUICK, clock=False))
     assert "distance_scale" not in {e.name for e in found.estimates}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, Window, at_a_time, numbered
+from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, SmoothingWindow, most_open_nuisances, renumber_slots
 from tests.reference.slow_smoothing import objective_and_step, residuals, states_of
 
 
@@ -30,12 +30,14 @@ def window(rng, n=7, landmarks=4, states=3, visits=2, bearings=True):
     seen = np.array(seen)
     if not bearings:
         seen[::2, 1] = np.nan
-    slots, order = numbered(np.array(slots, dtype=np.int64))
+    slots, order = renumber_slots(np.array(slots, dtype=np.int64))
     kinds = (order >= landmarks).astype(np.int64)
     nuisance = np.where(kinds[:, None] == 1, 0.02 * rng.standard_normal((len(order), 2)), 0.0)
     nuisance[kinds == 0] = places[order[kinds == 0]] + 0.1 * rng.standard_normal((int((kinds == 0).sum()), 2))
     rows = np.arange(len(seen))
-    return Window(np.arange(n) * 1.0, steps, np.array(first, dtype=np.int64), seen, slots, kinds, rows, poses, nuisance)
+    return SmoothingWindow(
+        np.arange(n) * 1.0, steps, np.array(first, dtype=np.int64), seen, slots, kinds, rows, poses, nuisance
+    )
 
 
 @pytest.mark.parametrize(("states", "visits", "bearings"), [(3, 0, True), (3, 2, False), (5, 2, True)])
@@ -59,7 +61,7 @@ def test_a_nuisance_that_goes_early_leaves_its_place_to_another(states):
     rng = np.random.default_rng(6)
     windows = [window(rng, n=20, landmarks=3, states=states, visits=7) for _ in range(2)]
     for w in windows:
-        assert at_a_time(w) <= 3 + 2 * 3 < len(w.nuisance) - 6
+        assert most_open_nuisances(w) <= 3 + 2 * 3 < len(w.nuisance) - 6
     s = Smoothing(windows, np.array([0.4, -0.1, 0.2]), CONSTANTS, ("range",))
     s.constants[:] = 0.02 * rng.standard_normal(7)
     wanted, step = objective_and_step(s)

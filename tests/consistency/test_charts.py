@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.app.compare import map_nees
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.join.registry import join
+from graphslam.join.registry import join_by_method
 from graphslam_studies.charts import ChartConfig, local_table, run_trial
 from tests.reference.submap_chain import submap_chain
 
@@ -25,7 +25,7 @@ def honesty() -> dict[str, tuple[float, int]]:
             np.random.default_rng(seed), submaps=16, landmarks=70, radius=30.0, sigma_heading=0.04, chart="group"
         )
         for method in ("eif-tree", "eif-tree-classical", "batch", "isam2"):
-            d2, dof = map_nees(join(chain, method), [s.key for s in chain], truth, chart="group")
+            d2, dof = map_nees(join_by_method(chain, method), [s.key for s in chain], truth, chart="group")
             before = found.get(method, (0.0, 0))
             found[method] = (before[0] + d2, before[1] + dof)
     return found

@@ -9,11 +9,11 @@ from graphslam.core import se3
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.garage import garage
-from graphslam_frontends.odometry.dead_reckoning import reckon
-from graphslam_frontends.odometry.drift import calibrate, fit_drift
-from graphslam_frontends.odometry.reckoned import Reckoned, level
+from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath, level_by_euler
+from graphslam_frontends.odometry.dead_reckoning import integrate_imu_and_wheels
+from graphslam_frontends.odometry.drift import calibrate_drift, fit_drift
 
-Drive = tuple[Reckoned, np.ndarray, np.ndarray]
+Drive = tuple[DeadReckonedPath, np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def drives() -> list[Drive]:
     for seed in range(100, 106):
         log = simulate_crawler(world, seed, config)
         times = np.arange(0.4, log["imu"].times[-1] - 0.5, 0.4)
-        r = reckon(log["imu"], log["wheels"], times)
+        r = integrate_imu_and_wheels(log["imu"], log["wheels"], times)
         length = np.cumsum(np.linalg.norm(r.odometry.increments[:, :3], axis=1))
         out.append((r, log.truth.trajectory.interpolate(times), length))
     return out
@@ -37,7 +37,7 @@ def segments(drive: Drive, metres: float) -> list[tuple[np.ndarray, np.ndarray]]
     for start in np.arange(0.0, length[-1] - metres, metres):
         i, j = (int(k) for k in np.searchsorted(length, [start, start + metres]))
         T, C = r.between(i, j, level_start=True, level_end=True)
-        true = se3.se3_between(level(truth[i]), level(truth[j]))
+        true = se3.se3_between(level_by_euler(truth[i]), level_by_euler(truth[j]))
         out.append((se3.se3_log(se3.se3_between(T, true)), C))
     return out
 
@@ -54,7 +54,7 @@ def test_segments_are_as_far_off_as_stated(drives: list[Drive]) -> None:
     squares = np.mean([e[2:] ** 2 / np.diag(C)[2:] for e, C in found], axis=0)
     assert np.all((squares > 0.5) & (squares < 1.6))
     # a model that knows the length alone is coarser, but no more than that
-    model = calibrate(drives[0][0], drives[0][2], level=True)
+    model = calibrate_drift(drives[0][0], drives[0][2], level=True)
     assert 0.4 < np.mean([nees(e, model.covariance(35.0)) for e, _ in found]) < 2.0
 
 

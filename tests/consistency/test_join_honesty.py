@@ -10,8 +10,8 @@ import pytest
 from graphslam.app.compare import map_nees
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.submap import Submap
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_tree
-from graphslam.join.polish import polish
 from graphslam.join.submap_solver import solve_submaps
 from tests.reference.submap_chain import submap_chain
 
@@ -23,7 +23,7 @@ def mean_nees(rng: np.random.Generator, *, claimed: float, **noise: float) -> tu
     d2 = []
     for _ in range(RUNS):
         submaps, truth = submap_chain(rng, submaps=10, landmarks=30, claimed=claimed, **noise)
-        joined = polish(submaps, join_tree(submaps))
+        joined = optimise_from_join(submaps, join_tree(submaps))
         assert joined.converged
         value, dof = map_nees(joined, [s.key for s in submaps], truth)
         d2.append(value / dof)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.core.charts import along_arc, arc_terms, check_chart, map_difference
+from graphslam.core.charts import apply_inverse_left_jacobian, check_chart, inverse_left_jacobian_terms, map_difference
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import rotation2
 
@@ -20,12 +20,15 @@ def mean_rotation(d: float) -> np.ndarray:
 
 @pytest.mark.parametrize("d", [-3.1, -1.0, -2e-3, -1e-3, -1e-9, 0.0, 1e-6, 1.9e-3, 2.1e-3, 0.3, 2.0, np.pi])
 def test_the_arc_is_the_inverse_of_the_mean_rotation(d: float) -> None:
-    a, b, slope = (float(v) for v in arc_terms(d))
+    a, b, slope = (float(v) for v in inverse_left_jacobian_terms(d))
     np.testing.assert_allclose(a * np.eye(2) - b * QUARTER, np.linalg.inv(mean_rotation(d)), atol=1e-8)
     e = np.array([2.0, -0.7])
-    np.testing.assert_allclose(along_arc(e, d), (a * np.eye(2) - b * QUARTER) @ e, atol=1e-14)
+    np.testing.assert_allclose(apply_inverse_left_jacobian(e, d), (a * np.eye(2) - b * QUARTER) @ e, atol=1e-14)
     h = 1e-6
-    assert slope == pytest.approx((float(arc_terms(d + h)[0]) - float(arc_terms(d - h)[0])) / (2 * h), abs=1e-8)
+    assert slope == pytest.approx(
+        (float(inverse_left_jacobian_terms(d + h)[0]) - float(inverse_left_jacobian_terms(d - h)[0])) / (2 * h),
+        abs=1e-8,
+    )
 
 
 def test_the_weighted_square_is_that_of_the_chart_as_it_is_defined(rng: np.random.Generator) -> None:

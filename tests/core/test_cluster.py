@@ -7,35 +7,35 @@ import os
 
 import pytest
 
-from graphslam.core.cluster import connect, hands
+from graphslam.core.cluster import connect_cluster, task_runner
 from graphslam.core.errors import ConfigError
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense://here"])
 def test_nobody_there_is_an_error_that_names_the_address(address: str) -> None:
     with pytest.raises(ConfigError, match=address):
-        connect(address, timeout=1.0)
+        connect_cluster(address, timeout=1.0)
 
 
 def test_a_cluster_is_found_and_not_made_the_default() -> None:
     distributed = pytest.importorskip("distributed")
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as local,
-        connect(local.scheduler_address) as client,
+        connect_cluster(local.scheduler_address) as client,
     ):
         assert client.submit(sum, [1, 2, 3]).result() == 6
         assert client not in distributed.client._global_clients.values()
 
 
 def test_tasks_run_here_or_in_processes_of_their_own() -> None:
-    with hands() as run:
+    with task_runner() as run:
         assert run(math.hypot, [(3, 4), (5, 12)]) == [5.0, 13.0]
         assert run(os.getpid, [()]) == [os.getpid()]
-    with hands(workers=1) as run:
+    with task_runner(workers=1) as run:
         assert run(math.hypot, [(3, 4), (5, 12)]) == [5.0, 13.0]
         assert run(os.getpid, [()]) != [os.getpid()]
         with pytest.raises(ValueError, match="domain"):
             run(math.sqrt, [(-1,)])
     for wrong in ({"workers": 0}, {"workers": 2, "address": "127.0.0.1:1"}):
-        with pytest.raises(ConfigError, match="at least 1 worker"), hands(**wrong):
+        with pytest.raises(ConfigError, match="at least 1 worker"), task_runner(**wrong):
             pass

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from graphslam.core.cluster import connect
+from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import GraphSlamError, MissingDataError
 from graphslam.core.extras import EXTRAS, import_extra
 
@@ -28,7 +28,7 @@ def test_a_missing_package_names_its_extra_in_one_line(extra: str, monkeypatch: 
 def test_a_cluster_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(GraphSlamError, match=r"graphslam-submaps\[cluster\]"):
-        connect("127.0.0.1:1")
+        connect_cluster("127.0.0.1:1")
 
 
 def test_the_distribution_offers_every_extra_and_all_of_them_together() -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import graphslam
-from graphslam.core.face import face
+from graphslam.core.lazy_exports import lazy_exports
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = sorted(
@@ -55,7 +55,7 @@ def test_what_a_face_offers_is_shown_somewhere() -> None:
 
 
 def test_a_face_knows_its_names_only() -> None:
-    get, names, listed = face("graphslam.core", {"gaussian": "chi2_quantile", "geometry": "wrap_angle"})
+    get, names, listed = lazy_exports("graphslam.core", {"gaussian": "chi2_quantile", "geometry": "wrap_angle"})
     assert names() == listed == ["chi2_quantile", "wrap_angle"]
     assert get("wrap_angle") is importlib.import_module("graphslam.core.geometry").wrap_angle
     with pytest.raises(AttributeError, match="no attribute 'rotation2'"):

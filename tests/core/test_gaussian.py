@@ -19,7 +19,7 @@ from graphslam.core.gaussian import (
     ellipse_rings,
     equal_tail_gate,
     first_no_covariance,
-    inverses,
+    information_matrices,
     largest_sigmas,
     moment_match,
 )
@@ -270,12 +270,12 @@ def random_covariances(rng: np.random.Generator, n: int, d: int) -> np.ndarray:
 
 def test_inverses_name_the_first_matrix_that_has_none(rng):
     P = random_covariances(rng, 5, 3)
-    np.testing.assert_allclose(inverses(P, "file") @ P, np.broadcast_to(np.eye(3), P.shape), atol=1e-9)
+    np.testing.assert_allclose(information_matrices(P, "file") @ P, np.broadcast_to(np.eye(3), P.shape), atol=1e-9)
     for k, bad in ((1, -np.eye(3)), (3, np.zeros((3, 3))), (4, np.full((3, 3), np.nan)), (2, 1e-320 * np.eye(3))):
         spoilt = P.copy()
         spoilt[k] = bad
         with pytest.raises(FormatError, match=rf"file: 1 covariances are not positive definite, first: number {k}"):
-            inverses(spoilt, "file")
+            information_matrices(spoilt, "file")
 
 
 def test_rings_lie_at_the_quantile_and_run_counter_clockwise(rng):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from graphslam.core.interrupt import deferred_interrupts, heeded_interrupts
+from graphslam.core.interrupt import defer_interrupts, watch_interrupts
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +35,7 @@ class Finalised:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_lost_interrupt_is_heard_at_the_next_check() -> None:
     done = []
-    with pytest.raises(KeyboardInterrupt), heeded_interrupts() as interrupt:
+    with pytest.raises(KeyboardInterrupt), watch_interrupts() as interrupt:
         victim = Finalised()
         interrupt.check()
         del victim
@@ -47,7 +47,7 @@ def test_a_lost_interrupt_is_heard_at_the_next_check() -> None:
 
 
 def test_an_interrupt_is_raised_where_it_falls() -> None:
-    with pytest.raises(KeyboardInterrupt), heeded_interrupts():
+    with pytest.raises(KeyboardInterrupt), watch_interrupts():
         press()
         raise AssertionError("not reached")
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -57,10 +57,10 @@ def test_a_handler_of_the_program_is_left_alone() -> None:
     heard = []
     before = signal.signal(signal.SIGINT, lambda *_: heard.append(1))
     try:
-        with heeded_interrupts() as interrupt:
+        with watch_interrupts() as interrupt:
             press()
             interrupt.check()
-        with deferred_interrupts():
+        with defer_interrupts():
             press()
             assert heard == [1]
         assert heard == [1, 1]
@@ -71,7 +71,7 @@ def test_a_handler_of_the_program_is_left_alone() -> None:
 def test_a_deferred_interrupt_comes_after_the_block() -> None:
     done = []
     with pytest.raises(KeyboardInterrupt):
-        with deferred_interrupts():
+        with defer_interrupts():
             press()
             done.append("whole")
         done.append("too late")
@@ -81,7 +81,7 @@ def test_a_deferred_interrupt_comes_after_the_block() -> None:
 
 
 def test_the_error_of_a_deferred_block_gets_out() -> None:
-    with pytest.raises(ValueError, match="mine"), deferred_interrupts():
+    with pytest.raises(ValueError, match="mine"), defer_interrupts():
         raise ValueError("mine")
 
 
@@ -89,7 +89,7 @@ def test_other_threads_are_unaffected() -> None:
     seen = []
 
     def work() -> None:
-        with heeded_interrupts() as interrupt, deferred_interrupts():
+        with watch_interrupts() as interrupt, defer_interrupts():
             interrupt.check()
             seen.append(1)
 

@@ -11,19 +11,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from graphslam.core.shelf import Shelf, Slot, as_it_is, the_only
+from graphslam.core.spill_cache import CacheEntry, SpillCache, pack_array, unpack_array
 
 
-def _put(shelf: Shelf, a: np.ndarray) -> Slot[np.ndarray]:
-    return shelf.put(a, a.nbytes, as_it_is, the_only)
+def _put(shelf: SpillCache, a: np.ndarray) -> CacheEntry[np.ndarray]:
+    return shelf.put(a, a.nbytes, pack_array, unpack_array)
 
 
-def _many(shelf: Shelf, count: int, size: int = 1000) -> list[Slot[np.ndarray]]:
+def _many(shelf: SpillCache, count: int, size: int = 1000) -> list[CacheEntry[np.ndarray]]:
     return [_put(shelf, np.random.default_rng(k).normal(size=(size, 3))) for k in range(count)]
 
 
 def test_values_come_back_as_they_were_and_no_more_than_the_room_is_held() -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 40)  # of 24,000 bytes
     assert shelf.nbytes <= shelf.room
     assert sum(s.resident for s in slots) == 4
@@ -35,14 +35,14 @@ def test_values_come_back_as_they_were_and_no_more_than_the_room_is_held() -> No
 
 
 def test_what_fits_is_never_written() -> None:
-    shelf = Shelf(room=10_000_000)
+    shelf = SpillCache(room=10_000_000)
     slots = _many(shelf, 40)
     assert all(s.resident for s in slots)
     assert shelf.filed == 0
 
 
 def test_the_least_recently_used_goes_first() -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 4)
     slots[0].get()
     more = _put(shelf, np.ones((1000, 3)))
@@ -50,7 +50,7 @@ def test_the_least_recently_used_goes_first() -> None:
 
 
 def test_rows_are_read_without_the_rest() -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 10)
     part = slots[0].rows(5, 9)
     assert not slots[0].resident
@@ -59,7 +59,7 @@ def test_rows_are_read_without_the_rest() -> None:
 
 
 def test_a_value_that_somebody_holds_is_not_made_twice() -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 10)
     held = slots[0].get()
     for s in slots[1:]:
@@ -69,7 +69,7 @@ def test_a_value_that_somebody_holds_is_not_made_twice() -> None:
 
 
 def test_what_nobody_holds_is_gone_and_its_place_is_used_again() -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 20)
     last = weakref.ref(slots[-1].get())
     length = shelf.filed
@@ -83,7 +83,7 @@ def test_what_nobody_holds_is_gone_and_its_place_is_used_again() -> None:
 
 
 def test_kinds_shapes_and_what_is_empty() -> None:
-    shelf = Shelf(room=1)
+    shelf = SpillCache(room=1)
     arrays = [np.arange(7, dtype=np.uint8), np.zeros((0, 3)), np.array([[True, False]]), np.float32([[1, 2], [3, 4]]).T]
     slot = shelf.put(object.__new__(_Value).of(arrays), 100, lambda v: v.arrays, lambda a: _Value().of(a))
     _put(shelf, np.ones(3))
@@ -101,7 +101,7 @@ class _Value:
 
 
 def test_threads_share_it() -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 30)
     wanted = [np.random.default_rng(k).normal(size=(1000, 3)) for k in range(30)]
 
@@ -125,7 +125,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.usefixtures("full_disk")
 def test_where_the_disk_is_full_values_stay_in_memory(caplog: pytest.LogCaptureFixture) -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 20)
     assert all(s.resident for s in slots)
     assert caplog.text.count("stays in memory") == 1
@@ -133,7 +133,7 @@ def test_where_the_disk_is_full_values_stay_in_memory(caplog: pytest.LogCaptureF
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_forked_process_reads_what_was_there_and_writes_elsewhere() -> None:
-    shelf = Shelf(room=100_000)
+    shelf = SpillCache(room=100_000)
     slots = _many(shelf, 10)
     child = os.fork()
     if child == 0:

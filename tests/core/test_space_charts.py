@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
-from graphslam.core.charts import arc_matrices, arc_slopes, map_difference
+from graphslam.core.charts import inverse_left_jacobian_slopes, inverse_left_jacobians, map_difference
 from graphslam.core.submap import LandmarkMap, Submap, turned_covariance
 
 
@@ -22,9 +22,9 @@ def test_slopes_are_those_of_finite_differences(angle: float) -> None:
     h = 1e-6
     columns = []
     for step in h * np.eye(3):
-        ahead, behind = (np.einsum("kij,kj->ki", arc_matrices(w + s), e) for s in (step, -step))
+        ahead, behind = (np.einsum("kij,kj->ki", inverse_left_jacobians(w + s), e) for s in (step, -step))
         columns.append((ahead - behind) / (2 * h))
-    np.testing.assert_allclose(arc_slopes(w, e), np.stack(columns, -1), atol=3e-9)
+    np.testing.assert_allclose(inverse_left_jacobian_slopes(w, e), np.stack(columns, -1), atol=3e-9)
 
 
 def test_a_pose_alone_is_gaussian_in_its_right_tangent() -> None:

@@ -10,7 +10,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_inverse
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.gps import gps_residuals, in_gps_frame
+from graphslam.evaluate.gps import gps_residuals, move_to_gps_frame
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 
 FRAME = (500.0, -200.0, 1.2)
@@ -60,7 +60,7 @@ def test_alignment_is_rigid_and_finds_the_frame() -> None:
     r = gps_residuals(log.truth.trajectory, log["gps"])
     assert np.allclose(r.T_gps_map, FRAME, atol=1e-9)
     assert r.statistics.maximum < 1e-9
-    moved = in_gps_frame(log.truth.trajectory, r)
+    moved = move_to_gps_frame(log.truth.trajectory, r)
     assert np.allclose(moved.poses[0], FRAME, atol=1e-9)
     # a map that is 1 % too large cannot be fitted away
     t = log.truth.trajectory

@@ -11,7 +11,7 @@ from scipy import stats
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_adjoint, se2_between, se2_compose, se2_exp, se2_inverse, se2_log, se2_transform
 from graphslam.core.submap import LandmarkMap, Match, Submap
-from graphslam.evaluate.loop_consistency import find_loops, loop_consistency
+from graphslam.evaluate.loop_consistency import find_landmark_loops, loop_consistency
 from graphslam.join.submap_solver import solve_submaps
 from tests.reference.submap_chain import submap_chain
 
@@ -65,7 +65,7 @@ def drawn(chain: list[Submap], rng: np.random.Generator, scale: float) -> list[S
 
 def test_errors_equal_composed_poses(rng):
     chain, X = loop_chain(rng, sigma=1e-3, sigma_heading=1e-4)
-    loops = find_loops(chain, X)
+    loops = find_landmark_loops(chain, X)
     assert len(loops) > 20
     for k in range(0, len(loops), 3):
         slow = slow_cycle(chain, X, loops.a[k], loops.b[k])
@@ -78,7 +78,7 @@ def test_errors_equal_composed_poses(rng):
 def test_joint_covariance_is_that_of_a_sample_of_composed_poses(rng):
     chain, X = loop_chain(rng, sigma=2e-3, sigma_heading=2e-4, submaps=9, landmarks=25, reach=25.0)
     clean = drawn(chain, rng, 0.0)
-    loops = find_loops(clean, X)
+    loops = find_landmark_loops(clean, X)
     some = np.array([0, len(loops) // 2, len(loops) - 1])
     sample = []
     for _ in range(300):
@@ -97,7 +97,7 @@ def test_joint_covariance_is_that_of_a_sample_of_composed_poses(rng):
 
 def test_matrix_equals_one_pair_at_a_time(rng):
     chain, X = loop_chain(rng)
-    loops = find_loops(chain, X, min_gap=2)
+    loops = find_landmark_loops(chain, X, min_gap=2)
     got = loop_consistency(loops)
     S = loops.covariance
     for i in range(0, len(loops), 5):
@@ -124,7 +124,7 @@ def test_alarm_fires_for_half_and_double_noise_and_is_silent_else(claimed, verdi
     verdicts, values, inside, shape = [], [], [], []
     for seed in range(20):
         chain, _ = loop_chain(np.random.default_rng(seed), claimed=claimed)
-        loops = find_loops(chain, solve_submaps(chain).poses)
+        loops = find_landmark_loops(chain, solve_submaps(chain).poses)
         test = loop_consistency(loops).test()
         verdicts.append(test["verdict"])
         values.append(test["value"])
@@ -140,7 +140,7 @@ def test_alarm_fires_for_half_and_double_noise_and_is_silent_else(claimed, verdi
 
 def test_a_scale_of_the_covariance_is_one_of_the_squares(rng):
     chain, X = loop_chain(rng)
-    one, five = (loop_consistency(find_loops(chain, X, covariance_scale=s)) for s in (1.0, 5.0))
+    one, five = (loop_consistency(find_landmark_loops(chain, X, covariance_scale=s)) for s in (1.0, 5.0))
     assert np.allclose(one.d2, 5.0 * five.d2, rtol=1e-6)
     assert one.test()["dof"] == pytest.approx(five.test()["dof"])
 
@@ -151,9 +151,9 @@ def test_a_false_loop_disagrees_with_the_others_and_is_named(rng):
     ids = [s.landmarks.ids.copy() for s in chain]
     assert not set(ids[2]) & set(ids[8])
     ids[8][:2] = ids[2][:2]
-    honest = loop_consistency(find_loops(chain, X))
+    honest = loop_consistency(find_landmark_loops(chain, X))
     assert honest.blame().max() < 0.5
-    got = loop_consistency(find_loops(chain, X, ids=ids))
+    got = loop_consistency(find_landmark_loops(chain, X, ids=ids))
     # the pair also turns up between these submaps' neighbours; the loop 2–8 is the false one of all
     k = int(np.flatnonzero((got.loops.a == 2) & (got.loops.b == 8))[0])
     assert got.blame()[k] > 0.9
@@ -176,7 +176,7 @@ def test_matches_of_a_front_end_are_loops(rng):
 
     bare[6] = replace(bare[6], matches=(match(0, 6, [0.0, 0.0, 0.0]), match(1, 6, [0.01, 0.0, 0.0])))
     bare[9] = replace(bare[9], matches=(match(0, 9, [3.0, 0.0, 0.5]), replace(match(0, 9, [0.0, 0.0, 0.0]), target=77)))
-    loops = find_loops(bare, X)
+    loops = find_landmark_loops(bare, X)
     assert list(zip(loops.a, loops.b)) == [(0, 6), (1, 6), (0, 9)]  # submap 77 is nowhere
     got = loop_consistency(loops)
     assert np.argmax(got.blame()) == 2
@@ -190,24 +190,24 @@ def test_matches_of_a_front_end_are_loops(rng):
 
 def test_few_are_chosen_evenly_and_the_rest_is_counted(rng):
     chain, X = loop_chain(rng)
-    everything, some = find_loops(chain, X), find_loops(chain, X, max_loops=10)
+    everything, some = find_landmark_loops(chain, X), find_landmark_loops(chain, X, max_loops=10)
     assert len(some) <= 10
     assert some.left_out == len(everything) - len(some)
     pairs = set(zip(everything.a.tolist(), everything.b.tolist()))
     assert set(zip(some.a.tolist(), some.b.tolist())) < pairs
-    far = find_loops(chain, X, min_gap=4)
+    far = find_landmark_loops(chain, X, min_gap=4)
     assert np.all(far.b - far.a >= 4)
 
 
 def test_impossible_questions_are_refused(rng):
     chain, X = loop_chain(rng, submaps=4, laps=0.3)
     with pytest.raises(DataError, match="poses do not fit"):
-        find_loops(chain, X[:-1])
+        find_landmark_loops(chain, X[:-1])
     with pytest.raises(DataError, match="two shared landmarks"):
-        find_loops(chain, X, min_shared=1)
+        find_landmark_loops(chain, X, min_shared=1)
     with pytest.raises(DataError, match="no loops"):
-        find_loops(chain, X, ids=[np.full(len(s.landmarks), -1) for s in chain])
+        find_landmark_loops(chain, X, ids=[np.full(len(s.landmarks), -1) for s in chain])
     lm = chain[1].landmarks
     same = replace(lm, positions=np.tile(lm.positions[:1], (len(lm), 1)))  # all landmarks at one point: no heading
     with_same = [chain[0], Submap.from_landmarks(1, same), *chain[2:]]
-    assert find_loops(with_same, X).skipped >= 1
+    assert find_landmark_loops(with_same, X).skipped >= 1

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.report.curves import _Axis, extremes
+from graphslam.app.report.curves import _Axis, extreme_rows
 from graphslam.core import se3
-from graphslam.core.charts import along_arc
+from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_compose, se2_exp, wrap_angle
 from graphslam.core.trajectory import Trajectory
@@ -38,7 +38,7 @@ def test_a_pose_in_the_plane_is_judged_as_the_metric_of_the_run_judges_it(chart:
     e = true - x
     e[:, 2] = wrap_angle(e[:, 2])
     if chart == "group":
-        e[:, :2] = along_arc(e[:, :2], e[:, 2])
+        e[:, :2] = apply_inverse_left_jacobian(e[:, :2], e[:, 2])
     got, Q = map_errors(x, P, true, chart)
     assert got == pytest.approx(e, abs=1e-9)
     assert pytest.approx(J @ P @ np.swapaxes(J, 1, 2), abs=1e-6) == Q
@@ -101,7 +101,7 @@ def test_a_long_curve_keeps_its_ends_and_every_peak(n: int) -> None:
     if n > 100:
         at = RNG.choice(np.arange(1, n - 1), 9, replace=False)
         values[at] = [50.0, -50.0, 60.0, -60.0, 70.0, -70.0, 80.0, -80.0, 90.0]
-    keep = extremes(values, 2000)
+    keep = extreme_rows(values, 2000)
     assert len(keep) <= 2000
     assert np.all(np.diff(keep) > 0)
     if n <= 2000:

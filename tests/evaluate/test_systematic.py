@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.systematic import KINDS, Systematic, sums, systematic_findings
-from graphslam_frontends.landmarks.systematic import PARAMETERS
+from graphslam.evaluate.bias_test import KINDS, BiasTest, bias_test_findings, sum_bias_windows
+from graphslam_frontends.landmarks.bias_score import PARAMETERS
 from tests.faults import inject_landmarks as inject
 
 
 def reports(log: SensorLog, frontend: str) -> list[dict]:
-    options = recommended(log, frontend)["frontend"]
+    options = recommended_options(log, frontend)["frontend"]
     return [s.report for s in make_front_end(frontend, options).submaps(log, seed=SeedTree(1))]
 
 
@@ -41,14 +41,14 @@ def test_both_sides_name_the_same_errors() -> None:
 )
 @pytest.mark.parametrize("frontend", ["rbpf-ekf", "ekf-slam"])
 def test_an_error_is_measured(log: SensorLog, frontend: str, fault: inject.Inject, name: str, truth: float) -> None:
-    found = sums(reports(fault(log), frontend))
-    assert isinstance(found, Systematic)
+    found = sum_bias_windows(reports(fault(log), frontend))
+    assert isinstance(found, BiasTest)
     k = PARAMETERS.index(name)
     assert abs(found.error[k]) > 4 * found.sigma[k]
     assert found.error[k] == pytest.approx(truth, abs=4 * found.sigma[k])
     best = float(found.taken.max())
     assert found.taken[k] > 0.95 * best  # scales of ranges and of distances take away the same: one cannot be told
-    lines = {f.code: f for f in systematic_findings(reports(fault(log), frontend))}
+    lines = {f.code: f for f in bias_test_findings(reports(fault(log), frontend))}
     said = KINDS[name].more if truth > 0 else KINDS[name].less
     assert said.partition("{}")[2] in lines["calibration"].text
 
@@ -66,8 +66,8 @@ def test_honest_robots_have_no_error(seed: int) -> None:
     )
     for frontend in ("rbpf-ekf", "ekf-slam"):
         made = reports(log, frontend)
-        assert systematic_findings(made) == []
-        found = sums(made)
+        assert bias_test_findings(made) == []
+        found = sum_bias_windows(made)
         assert found is not None
         assert 0.9 < found.ratio < 1.1
 
@@ -75,12 +75,12 @@ def test_honest_robots_have_no_error(seed: int) -> None:
 def test_noise_that_is_larger_than_stated_is_said() -> None:
     for scale, level in ((1.12, "look"), (2.0, "bad")):
         log = simulate("landmark-field", seed=5, preset="quick", noise_scale=scale)
-        options = recommended(log, "rbpf-ekf")["frontend"]
+        options = recommended_options(log, "rbpf-ekf")["frontend"]
         options["motion"] = {k: v / scale for k, v in options["motion"].items()}
         made = [s.report for s in make_front_end("rbpf-ekf", options).submaps(log, seed=SeedTree(1))]
-        lines = systematic_findings(made)
+        lines = bias_test_findings(made)
         assert [(f.code, f.level) for f in lines] == [("residuals", level)]
 
 
 def test_nothing_to_judge_says_nothing() -> None:
-    assert systematic_findings([]) == systematic_findings([{}, {"systematic": {}}]) == []
+    assert bias_test_findings([]) == bias_test_findings([{}, {"systematic": {}}]) == []

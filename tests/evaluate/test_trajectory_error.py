@@ -9,7 +9,7 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import rotation2, se2_compose, se2_exp
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.trajectory_error import associate, ate, delta_pairs, rpe
+from graphslam.evaluate.trajectory_error import ate, delta_pairs, match_stamps, rpe
 from graphslam.io.tum import embed_plane
 
 
@@ -153,12 +153,12 @@ def test_delta_pairs_equal_brute_force(rng: np.random.Generator) -> None:
 
 
 def test_association_is_mutual_and_within_max_diff() -> None:
-    i, j = associate([0.0, 1.0, 2.0, 3.0], [0.004, 0.996, 1.001, 2.5, 3.02], max_diff=0.01)
+    i, j = match_stamps([0.0, 1.0, 2.0, 3.0], [0.004, 0.996, 1.001, 2.5, 3.02], max_diff=0.01)
     assert list(zip(i.tolist(), j.tolist())) == [(0, 0), (1, 2)]
-    i, j = associate([0.0, 1.0], [0.4, 0.6], max_diff=1.0)
+    i, j = match_stamps([0.0, 1.0], [0.4, 0.6], max_diff=1.0)
     assert list(zip(i.tolist(), j.tolist())) == [(0, 0), (1, 1)]
-    assert len(associate([], [1.0])[0]) == 0
-    assert len(associate([5.0], [1.0], max_diff=10.0)[0]) == 1
+    assert len(match_stamps([], [1.0])[0]) == 0
+    assert len(match_stamps([5.0], [1.0], max_diff=10.0)[0]) == 1
 
 
 def test_association_decides_which_poses_are_compared() -> None:

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from graphslam.app.run.verdict import Figures, stated
+from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
 from graphslam.core.records import Gps
-from graphslam.evaluate.systematic import sums
-from graphslam.evaluate.trust import (
-    BENT,
-    Evidence,
-    by_score,
-    by_size,
-    of_systematic,
+from graphslam.evaluate.bias_test import sum_bias_windows
+from graphslam.evaluate.covariance_assessment import (
+    MAX_NONLINEARITY,
+    ConsistencyTest,
+    assess_covariances,
+    chi_square_ratio_test,
+    largest_score_test,
     pooled_nonlinearity,
-    rows_as_json,
-    rows_of_json,
-    trust,
+    short_window_tests,
+    tests_as_json,
+    tests_of_json,
 )
-from graphslam.evaluate.whiteness import whiteness
-from graphslam.evaluate.without_truth import LASTING, class_consistency
+from graphslam.evaluate.residual_consistency import LASTING, class_consistency
+from graphslam.evaluate.whiteness import residual_whiteness
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import make_solver
@@ -40,9 +40,9 @@ def walk(rng: np.random.Generator, n: int, keep: float, d: int = 2) -> np.ndarra
 
 def test_scores_of_white_residuals_are_standard_normal_and_lasting_ones_are_found(rng):
     times = np.arange(120.0)
-    scores = [w.score for _ in range(300) if (w := whiteness(times, rng.standard_normal((120, 2))))]
+    scores = [w.score for _ in range(300) if (w := residual_whiteness(times, rng.standard_normal((120, 2))))]
     assert stats.kstest(scores, "norm").pvalue > 0.01
-    found = [whiteness(times, 0.3 * walk(rng, 120, 0.6)) for _ in range(50)]
+    found = [residual_whiteness(times, 0.3 * walk(rng, 120, 0.6)) for _ in range(50)]
     assert all(w is not None and w.lasting() for w in found)  # small as they are
     # integrated over all lags (1 + 0.6) / (1 - 0.6) = 4
     assert np.mean([w.tau for w in found if w]) == pytest.approx(4.0, rel=0.25)
@@ -58,8 +58,8 @@ def test_what_the_fit_makes_of_white_noise_is_not_called_lasting(rng):
     told, naive = [], []
     for _ in range(300):
         r = (C @ rng.standard_normal(n))[:, None]
-        told.append(whiteness(t, r, C.reshape(n, 1, n, 1)).score)
-        naive.append(whiteness(t, r).score)
+        told.append(residual_whiteness(t, r, C.reshape(n, 1, n, 1)).score)
+        naive.append(residual_whiteness(t, r).score)
     # scaled by the size that was found: the mean is right to a tenth of σ
     assert abs(np.mean(told)) < 0.15
     assert 0.8 < np.std(told) < 1.2
@@ -67,9 +67,9 @@ def test_what_the_fit_makes_of_white_noise_is_not_called_lasting(rng):
 
 
 def test_pauses_are_not_bridged_and_few_residuals_tell_nothing(rng):
-    assert whiteness(np.arange(8.0), rng.standard_normal((8, 2))) is None
+    assert residual_whiteness(np.arange(8.0), rng.standard_normal((8, 2))) is None
     times = np.concatenate([np.arange(30.0), 1000.0 + np.arange(30.0)])
-    w = whiteness(times, rng.standard_normal((60, 2)))
+    w = residual_whiteness(times, rng.standard_normal((60, 2)))
     assert w is not None
     assert w.pairs == 58
 
@@ -106,9 +106,9 @@ def test_fixes_whose_errors_last_are_over_confident_however_small_their_residual
     assert all(c.independent < 0.4 * c.dof for c in lasting)
 
 
-HONEST = by_size("map", "map", 1.0, 2000.0) + by_size("fixes", "fixes", 1.0, 400.0)
+HONEST = chi_square_ratio_test("map", "map", 1.0, 2000.0) + chi_square_ratio_test("fixes", "fixes", 1.0, 400.0)
 
-SMALL = by_size("fixes", "fixes", 0.13, 400.0)
+SMALL = chi_square_ratio_test("fixes", "fixes", 0.13, 400.0)
 
 
 @pytest.mark.parametrize(
@@ -117,31 +117,40 @@ SMALL = by_size("fixes", "fixes", 0.13, 400.0)
         (HONEST, True, "consistent"),
         (HONEST[:1], False, "consistent"),
         (HONEST[:1], True, "undecided"),  # nothing says how good the fixes are
-        (by_size("map", "map", 1.0, 8.0), False, "undecided"),  # half as large again is possible
+        (chi_square_ratio_test("map", "map", 1.0, 8.0), False, "undecided"),  # half as large again is possible
         ([], False, "undecided"),
-        (by_size("map", "map", 1.3, 2000.0), False, "over-confident"),
-        (by_size("map", "map", 0.6, 2000.0), False, "pessimistic"),
-        (by_size("map", "map", 0.97, 20000.0), False, "consistent"),  # significant, and of no matter
+        (chi_square_ratio_test("map", "map", 1.3, 2000.0), False, "over-confident"),
+        (chi_square_ratio_test("map", "map", 0.6, 2000.0), False, "pessimistic"),
+        (chi_square_ratio_test("map", "map", 0.97, 20000.0), False, "consistent"),  # significant, and of no matter
         # small residuals, and alike from one to the next: never pessimistic
-        ([*HONEST[:1], *SMALL, by_score("next", "fixes", 9.0)], True, "over-confident"),
+        ([*HONEST[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "over-confident"),
         ([*HONEST[:1], *SMALL], True, "pessimistic"),
-        ([*by_size("map", "map", 0.5, 2000.0), by_score("calibration", "map", 6.0, tests=16)], False, "over-confident"),
+        (
+            [
+                *chi_square_ratio_test("map", "map", 0.5, 2000.0),
+                largest_score_test("calibration", "map", 6.0, tests=16),
+            ],
+            False,
+            "over-confident",
+        ),
     ],
 )  # fmt: skip
-def test_the_word(rows: list[Evidence], fixes: bool, word: str) -> None:
-    assert trust(rows, fixes=fixes).word == word
+def test_the_word(rows: list[ConsistencyTest], fixes: bool, word: str) -> None:
+    assert assess_covariances(rows, fixes=fixes).word == word
 
 
 def test_maps_that_bend_are_promised_nothing() -> None:
-    assert trust(HONEST, fixes=True, nonlinearity=0.9 * BENT).word == "consistent"
-    found = trust(HONEST, fixes=True, nonlinearity=1.1 * BENT)
+    assert assess_covariances(HONEST, fixes=True, nonlinearity=0.9 * MAX_NONLINEARITY).word == "consistent"
+    found = assess_covariances(HONEST, fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY)
     assert found.word == "undecided"
     assert found.bent
     assert not found.missing
-    assert trust([*HONEST[:1], *SMALL], fixes=True, nonlinearity=1.1 * BENT).word == "undecided"
+    assert (
+        assess_covariances([*HONEST[:1], *SMALL], fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY).word == "undecided"
+    )
     # what the log itself contradicts comes first
-    wrong = by_size("map", "map", 1.3, 2000.0)
-    assert trust(wrong, fixes=False, nonlinearity=1.1 * BENT).word == "over-confident"
+    wrong = chi_square_ratio_test("map", "map", 1.3, 2000.0)
+    assert assess_covariances(wrong, fixes=False, nonlinearity=1.1 * MAX_NONLINEARITY).word == "over-confident"
     # a mean over unknowns, of the submaps that say it
     reports = [{"nonlinearity": 0.01, "unknowns": 30}, {"nonlinearity": 0.04, "unknowns": 10}, {}]
     assert pooled_nonlinearity(reports) == pytest.approx(0.0175)
@@ -151,9 +160,11 @@ def test_maps_that_bend_are_promised_nothing() -> None:
 def test_honest_runs_are_seldom_called_wrong(rng):
     wrong = 0
     for _ in range(400):
-        rows = [by_size(f"{k}", "map", rng.chisquare(200 * k) / (200 * k), 200.0 * k)[0] for k in range(1, 8)]
-        rows += [by_score(f"s{k}", "map", rng.standard_normal()) for k in range(5)]
-        wrong += trust(rows, fixes=False).word in ("over-confident", "pessimistic")
+        rows = [
+            chi_square_ratio_test(f"{k}", "map", rng.chisquare(200 * k) / (200 * k), 200.0 * k)[0] for k in range(1, 8)
+        ]
+        rows += [largest_score_test(f"s{k}", "map", rng.standard_normal()) for k in range(5)]
+        wrong += assess_covariances(rows, fixes=False).word in ("over-confident", "pessimistic")
     assert wrong <= stats.binom.ppf(0.999, 400, 0.05)
 
 
@@ -173,7 +184,7 @@ def test_errors_that_last_for_a_window_are_found(rng):
     def named(lasts: float) -> int:
         found = 0
         for _ in range(40):
-            rows = of_systematic(sums([windows(rng, 6, lasts), windows(rng, 6, lasts)]))
+            rows = short_window_tests(sum_bias_windows([windows(rng, 6, lasts), windows(rng, 6, lasts)]))
             found += next(r for r in rows if r.name.startswith("time-correlated errors")).too_large < 0.01
         return found
 
@@ -182,14 +193,16 @@ def test_errors_that_last_for_a_window_are_found(rng):
 
 
 def test_the_line_says_what_it_rests_on_and_survives_the_file():
-    rows = json.loads(json.dumps(rows_as_json(HONEST)))
-    assert rows_of_json(rows) == HONEST
-    assert rows_of_json([{"name": "x"}, 3, None]) == rows_of_json(None) == []
-    lines = {f.code: f for f in stated(Figures({"converged": True, "evidence": rows}, {}))}
+    rows = json.loads(json.dumps(tests_as_json(HONEST)))
+    assert tests_of_json(rows) == HONEST
+    assert tests_of_json([{"name": "x"}, 3, None]) == tests_of_json(None) == []
+    lines = {f.code: f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": rows}, {}))}
     assert lines["trust"].level == "good"
     assert "without ground truth" in lines["trust"].text
     assert "errors match" not in " ".join(f.text for f in lines.values())
-    alone = rows_as_json(by_size("map", "map", 1.0, 8.0))
-    (line,) = [f for f in stated(Figures({"converged": True, "evidence": alone}, {})) if f.code == "trust"]
+    alone = tests_as_json(chi_square_ratio_test("map", "map", 1.0, 8.0))
+    (line,) = [
+        f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": alone}, {})) if f.code == "trust"
+    ]
     assert "covariances: not tested" in line.text
     assert line.level == ""

@@ -12,9 +12,9 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import GpsInnovations, _arm_covariance, gps_innovations
-from graphslam.evaluate.without_truth import class_consistency, correlated_dof, two_sided
-from graphslam.graph.gps import GpsConfig, arm_of
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.evaluate.residual_consistency import class_consistency, correlated_dof, two_sided_bounds
+from graphslam.graph.gps import GpsConfig, antenna_in_base
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 from graphslam.solve.registry import make_solver
@@ -48,7 +48,7 @@ def solved_graph(rng, *, robust=NO_KERNEL, bias_sigma=None, m=6) -> tuple[PoseGr
     return graph, gps.take(slice(1, None, 2))
 
 
-@pytest.mark.parametrize("robust", [NO_KERNEL, Robust("cauchy", 1.0), Robust("huber", 0.8)])
+@pytest.mark.parametrize("robust", [NO_KERNEL, RobustKernel("cauchy", 1.0), RobustKernel("huber", 0.8)])
 def test_leverage_and_dof_equal_the_dense_hat_matrix(rng, robust):
     graph, _ = solved_graph(rng, robust=robust)
     graph.add_between(
@@ -87,7 +87,7 @@ def test_prediction_of_a_withheld_fix_equals_the_dense_one(rng):
         out = []
         for t in withheld.times:
             s = by_node[min(int(t // 10), len(graph.submaps) - 1)]
-            arm, _ = arm_of(s.trajectory, np.array([t]), withheld.lever)
+            arm, _ = antenna_in_base(s.trajectory, np.array([t]), withheld.lever)
             out.append(se2_transform(se2_compose(values.datum, values.poses[s.node]), arm[0]) + graph.gps_origin)
         return np.array(out).ravel()
 
@@ -181,11 +181,11 @@ def test_correlated_squares_have_the_two_moments_that_the_bounds_use(rng):
     assert q.mean() == pytest.approx(12, rel=0.02)
     assert q.var() == pytest.approx(2 * 12**2 / dof, rel=0.05)
     assert correlated_dof(np.diag(np.arange(1.0, 13.0)), 3) == pytest.approx(12)
-    low, high, verdict = two_sided(1.0, dof, 0.95)
+    low, high, verdict = two_sided_bounds(1.0, dof, 0.95)
     assert (verdict, low < 1 < high) == ("consistent", True)
 
 
-def small_run(seed: int, scale: float, robust: Robust) -> tuple[PoseGraph, Gps]:
+def small_run(seed: int, scale: float, robust: RobustKernel) -> tuple[PoseGraph, Gps]:
     """A simulated loop through the front end and the graph; the estimators are told the noise of scale 1."""
     c = landmark_field_preset("quick", gps_rate=1.0, gps_sigma=0.5, laps=1.6, noise_scale=scale, gps_lever=(1.0, 0.3))
     log = simulate_landmark_field(c, seed)
@@ -200,7 +200,7 @@ def small_run(seed: int, scale: float, robust: Robust) -> tuple[PoseGraph, Gps]:
     return graph, gps.take(~used)
 
 
-@pytest.mark.parametrize("robust", [NO_KERNEL, Robust("cauchy", 1.0)])
+@pytest.mark.parametrize("robust", [NO_KERNEL, RobustKernel("cauchy", 1.0)])
 @pytest.mark.parametrize("scale", [1.0, 2.0, 0.5])
 def test_alarm_is_silent_for_honest_noise_and_fires_for_half_and_double(scale, robust):
     verdicts, ratios = [], []
@@ -270,5 +270,5 @@ def test_what_cannot_be_predicted_is_refused_or_counted(rng):
 
 
 def test_bounds_are_those_of_chi_square():
-    low, high, _ = two_sided(1.0, 10.0, 0.95)
+    low, high, _ = two_sided_bounds(1.0, 10.0, 0.95)
     assert (10 * low, 10 * high) == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 10)))

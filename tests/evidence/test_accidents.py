@@ -16,7 +16,7 @@ import graphslam.evidence
 from graphslam.evidence import pool as pool_module
 from graphslam.evidence import scratch as scratch_module
 from graphslam.evidence.batch import update_grids
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.pool import GridPool
 from tests.reference.evidence_pool import assert_same, check_pool
 from tests.reference.evidence_twin import EvidenceTwin
@@ -65,7 +65,7 @@ def _write_twin(twins: list[EvidenceTwin], w: World) -> None:
 
 
 def _compact(w: World) -> None:
-    compact(w.grids)
+    compact_grids(w.grids)
 
 
 def _unchanged(twins: list[EvidenceTwin], w: World) -> None:

@@ -11,8 +11,8 @@ from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.cast_kernels import cast_rays, unit_directions
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.queries import HIT, INSIDE, LEFT, MAX_RANGE, UNKNOWN_SPACE, UNUSABLE, cast, cast_grids
-from graphslam.evidence.query_kernels import look_up
+from graphslam.evidence.queries import HIT, INSIDE, LEFT, MAX_RANGE, UNKNOWN_SPACE, UNUSABLE, cast_beams, cast_grids
+from graphslam.evidence.query_kernels import look_up_values
 from tests.reference.evidence_twin import EvidenceTwin
 from tests.reference.plain_cast import plain_cast
 
@@ -63,7 +63,7 @@ def assert_as_plain(
 ) -> None:
     units = np.empty_like(directions)
     unit_directions(directions, units)
-    found = cast(grid, origins, directions, reach, ignore_unknown=ignore, voxels=True)
+    found = cast_beams(grid, origins, directions, reach, ignore_unknown=ignore, voxels=True)
     values, half, v = voxels_of(grid), grid.pool.half, grid.voxel_size
     assert found.voxels is not None
     for k in range(len(directions)):
@@ -90,7 +90,7 @@ def test_large_empty_cubes_are_jumped_to_the_same_voxels(rng: np.random.Generato
         grid = scattered(rng, spread=spread, count=count)
         origins = rng.uniform(-7 * spread, 7 * spread, (rays, 3))
         directions = towards(rng, grid, origins)
-        hits = (cast(grid, origins, directions, reach).status == HIT).mean()
+        hits = (cast_beams(grid, origins, directions, reach).status == HIT).mean()
         assert 0.1 < hits < 0.9  # both kinds
         assert_as_plain(grid, origins, directions, reach, True)
 
@@ -121,7 +121,7 @@ def test_hits_are_those_of_the_exact_twin(rng: np.random.Generator, dim: int) ->
         directions = se3_transform(se3_inverse(pose), origins + directions) - origins
     met = 0
     for ignore in (True, False):
-        found = cast(grid, origins, directions, 3.0, pose=pose, ignore_unknown=ignore, voxels=True)
+        found = cast_beams(grid, origins, directions, 3.0, pose=pose, ignore_unknown=ignore, voxels=True)
         assert found.voxels is not None
         for k in range(len(origins)):
             what, enter, voxel = twin.cast(origins[k], directions[k], 3.0, pose=pose, ignore_unknown=ignore)
@@ -145,7 +145,7 @@ def test_octomap_meets_the_same_voxels(rng: np.random.Generator) -> None:
     tree.updateInnerOccupancy()
     origins = rng.normal(0, 0.8, (400, 3))
     directions = towards(rng, grid, origins)
-    found = cast(grid, origins, directions, 30.0, voxels=True)
+    found = cast_beams(grid, origins, directions, 30.0, voxels=True)
     assert found.voxels is not None
     same = hits = 0
     for k in range(400):
@@ -167,7 +167,7 @@ def test_ranges_have_no_bias_where_entries_have_half_a_voxel(rng: np.random.Gene
         grid.insert_scan(np.stack([np.full(y.size, depth), y.ravel(), z.ravel()], axis=1))
         slope = rng.uniform(-0.35, 0.35, (50, 2))
         directions = np.column_stack([np.ones(50), slope])
-        found = cast(grid, None, directions, 20.0, voxels=True)
+        found = cast_beams(grid, None, directions, 20.0, voxels=True)
         assert found.voxels is not None
         assert (found.status == HIT).all()
         length = np.linalg.norm(directions, axis=1)
@@ -182,42 +182,42 @@ def test_maximum_range_and_leaving(rng: np.random.Generator) -> None:
     grid.insert_scan([[10.2, 0.1, 0.1]], [0.1, 0.1, 0.1])
     ahead = [[1.0, 0.0, 0.0]]
     start = [0.1, 0.1, 0.1]
-    assert cast(grid, start, ahead, 9.8).status[0] == MAX_RANGE  # voxel [10, 10.5) is entered at 9.9
-    assert cast(grid, start, ahead, 9.8).ranges[0] == 9.8
-    just = cast(grid, start, ahead, 10.0)
+    assert cast_beams(grid, start, ahead, 9.8).status[0] == MAX_RANGE  # voxel [10, 10.5) is entered at 9.9
+    assert cast_beams(grid, start, ahead, 9.8).ranges[0] == 9.8
+    just = cast_beams(grid, start, ahead, 10.0)
     assert (just.status[0], just.ranges[0]) == (HIT, 10.0)  # not beyond the maximum range
-    far = cast(grid, start, ahead, 100.0)
+    far = cast_beams(grid, start, ahead, 100.0)
     assert (far.status[0], far.ranges[0]) == (HIT, pytest.approx(10.15))
-    back = cast(grid, start, [[-3.0, 0.0, 0.0]], np.inf)  # directions may be of any length
+    back = cast_beams(grid, start, [[-3.0, 0.0, 0.0]], np.inf)  # directions may be of any length
     assert (back.status[0], back.ranges[0]) == (LEFT, pytest.approx(32.1))
-    inside = cast(grid, [10.1, 0.2, 0.3], rng.normal(size=(20, 3)), 5.0)
+    inside = cast_beams(grid, [10.1, 0.2, 0.3], rng.normal(size=(20, 3)), 5.0)
     assert (inside.status == INSIDE).all()
     assert (inside.ranges == 0).all()
     assert inside.hit.all()
-    unknown = cast(grid, [0.1, 5.0, 0.1], ahead, 5.0, ignore_unknown=False)
+    unknown = cast_beams(grid, [0.1, 5.0, 0.1], ahead, 5.0, ignore_unknown=False)
     assert (unknown.status[0], unknown.ranges[0]) == (UNKNOWN_SPACE, 0.0)
-    stopped = cast(grid, start, [[-1.0, 0.0, 0.0]], 5.0, ignore_unknown=False)
+    stopped = cast_beams(grid, start, [[-1.0, 0.0, 0.0]], 5.0, ignore_unknown=False)
     assert (stopped.status[0], stopped.ranges[0]) == (UNKNOWN_SPACE, pytest.approx(0.1))
 
 
 def test_empty_maps_stop_nothing() -> None:
     grid = EvidenceGrid(0.1)
-    found = cast(grid, None, [[1.0, 2.0, 3.0]], 7.0)
+    found = cast_beams(grid, None, [[1.0, 2.0, 3.0]], 7.0)
     assert (found.status[0], found.ranges[0]) == (MAX_RANGE, 7.0)
-    assert cast(grid, None, [[1.0, 2.0, 3.0]], 7.0, ignore_unknown=False).status[0] == UNKNOWN_SPACE
-    assert cast(grid, None, np.zeros((0, 3)), 7.0).ranges.shape == (0,)
+    assert cast_beams(grid, None, [[1.0, 2.0, 3.0]], 7.0, ignore_unknown=False).status[0] == UNKNOWN_SPACE
+    assert cast_beams(grid, None, np.zeros((0, 3)), 7.0).ranges.shape == (0,)
 
 
 def test_beams_that_cannot_be_used_are_marked(rng: np.random.Generator) -> None:
     grid = scanned(rng)
     directions = np.array([[1.0, 0, 0], [0, 0, 0], [np.nan, 1, 0], [np.inf, 0, 0], [1e-308, 0, 0], [1e300, 1e300, 0]])
-    found = cast(grid, None, directions, 5.0)
+    found = cast_beams(grid, None, directions, 5.0)
     assert found.status.tolist()[1:4] == [UNUSABLE] * 3
     assert np.isnan(found.ranges[1:4]).all()
     assert not np.isnan(found.ranges[[0, 4, 5]]).any()  # tiny and huge directions have a direction
     assert found.ranges[4] == found.ranges[0]
     origins = np.array([[1e4, 0, 0], [np.nan, 0, 0], [0, -1e4, 0], [0, 0, 0.0]])
-    found = cast(grid, origins, np.ones((4, 3)), 5.0)
+    found = cast_beams(grid, origins, np.ones((4, 3)), 5.0)
     assert (found.status == UNUSABLE).tolist() == [True, True, True, False]
 
 
@@ -226,13 +226,13 @@ def test_impossible_requests_are_refused(rng: np.random.Generator) -> None:
     one = np.ones((1, 3))
     for limit in (0.0, -1.0, np.nan):
         with pytest.raises(GridError, match="maximum range"):
-            cast(grid, None, one, limit)
+            cast_beams(grid, None, one, limit)
     with pytest.raises(GridError, match="beam directions"):
-        cast(grid, None, np.ones((3, 2)), 1.0)
+        cast_beams(grid, None, np.ones((3, 2)), 1.0)
     with pytest.raises(GridError, match="differ in number"):
-        cast(grid, np.zeros((2, 3)), np.ones((3, 3)), 1.0)
+        cast_beams(grid, np.zeros((2, 3)), np.ones((3, 3)), 1.0)
     with pytest.raises(GeometryError, match="finite"):
-        cast(grid, None, one, 1.0, pose=[np.nan, 0, 0, 0, 0, 0, 1])
+        cast_beams(grid, None, one, 1.0, pose=[np.nan, 0, 0, 0, 0, 0, 1])
     pose = np.array([[0.0, 0, 0, 0, 0, 0, 1]])
     with pytest.raises(GridError, match="differ in number"):
         cast_grids([grid, grid], pose, None, one, 1.0)
@@ -263,7 +263,7 @@ def test_many_grids_at_once_are_as_one_by_one_whatever_the_threads(rng: np.rando
     assert two.voxels is not None
     assert (one.voxels[usable] == two.voxels[usable]).all()
     for k, grid in enumerate(grids):
-        alone = cast(grid, origins, directions, 4.0, pose=poses[k])
+        alone = cast_beams(grid, origins, directions, 4.0, pose=poses[k])
         assert (alone.ranges == one.ranges[k]).all()
     assert len(np.unique(one.ranges)) > 15
     assert cast_grids([], np.zeros((0, 7)), None, directions, 4.0).ranges.shape == (0, 40)
@@ -273,8 +273,8 @@ def test_pose_and_origin_move_the_beams(rng: np.random.Generator) -> None:
     grid = scanned(rng)
     pose = se3_exp(rng.normal(0, 0.3, 6))
     origins, directions = rng.normal(0, 0.2, (60, 3)), rng.normal(0, 1, (60, 3))
-    moved = cast(grid, origins, directions, 4.0, pose=pose)
-    still = cast(
+    moved = cast_beams(grid, origins, directions, 4.0, pose=pose)
+    still = cast_beams(
         grid,
         se3_transform(pose, origins),
         se3_transform(pose, directions) - se3_transform(pose, np.zeros(3)),
@@ -282,7 +282,7 @@ def test_pose_and_origin_move_the_beams(rng: np.random.Generator) -> None:
     )
     assert (moved.status == still.status).all()
     np.testing.assert_allclose(moved.ranges, still.ranges, atol=1e-9)
-    assert not np.allclose(moved.ranges, cast(grid, origins, directions, 4.0, pose=se3_inverse(pose)).ranges)
+    assert not np.allclose(moved.ranges, cast_beams(grid, origins, directions, 4.0, pose=se3_inverse(pose)).ranges)
 
 
 def test_uncompiled_kernel_agrees(rng: np.random.Generator) -> None:
@@ -299,7 +299,7 @@ def test_uncompiled_kernel_agrees(rng: np.random.Generator) -> None:
             pool.half, pool.levels, grid.model.threshold_step, stop, pool.children, pool.node_occupied, pool.bricks,
             pool.brick_lines, ranges, status, np.empty((0, 0, 0), np.int32),
         )  # fmt: skip
-        compiled = cast(grid, origins, units, 3.0, ignore_unknown=not stop)
+        compiled = cast_beams(grid, origins, units, 3.0, ignore_unknown=not stop)
         assert (compiled.status == status[0]).all()
         # compilers may fuse a multiplication and an addition
         np.testing.assert_allclose(compiled.ranges, ranges[0], rtol=0, atol=1e-12)
@@ -308,7 +308,7 @@ def test_uncompiled_kernel_agrees(rng: np.random.Generator) -> None:
 def test_read_only_arrays_compile_nothing_anew(rng: np.random.Generator) -> None:
     grid = scanned(rng)
     points = rng.normal(0, 1, (10, 3))
-    kernels = [k for k in (cast_rays, unit_directions, look_up) if hasattr(k, "signatures")]
+    kernels = [k for k in (cast_rays, unit_directions, look_up_values) if hasattr(k, "signatures")]
     grid.cast(points, points, 3.0)
     grid.log_odds_at(points)
     before = [len(k.signatures) for k in kernels]

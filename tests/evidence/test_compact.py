@@ -11,7 +11,7 @@ import pytest
 
 from graphslam.core.errors import GridError
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import CompactReport, compact, move
+from graphslam.evidence.compact import CompactReport, compact_grids, move_grids
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.evidence.pool import GridPool
@@ -29,7 +29,7 @@ def test_cubes_of_one_value_are_kept_once() -> None:
     grid = grid_of_map(voxels, levels=3)
     # 8³, 4³ and 1 bricks of the blocks, and that of the single voxel
     assert used(grid.pool)[1] == 512 + 64 + 1 + 1
-    report = compact(grid)
+    report = compact_grids(grid)
     check_pool(grid.pool, [grid])
     assert map_of_grid(grid) == voxels
     # of 5, of -7, and the mixed one
@@ -37,7 +37,7 @@ def test_cubes_of_one_value_are_kept_once() -> None:
     assert report.bricks == 578 - 3
     assert report.nodes > 0
     assert report.freed_bytes == 268 * report.nodes + 1030 * report.bricks
-    assert compact(grid) == CompactReport()  # a second time there is nothing to do
+    assert compact_grids(grid) == CompactReport()  # a second time there is nothing to do
     grid.release()
     assert used(grid.pool) == (0, 0)
 
@@ -48,15 +48,15 @@ def test_unknown_bricks_are_dropped_and_an_emptied_map_is_empty() -> None:
     where = grid.brick_coordinates()
     grid.write_bricks(where[:1], np.full((1, 512), UNKNOWN, np.int16))
     assert len(grid.brick_coordinates()) == 2
-    report = compact(grid)
+    report = compact_grids(grid)
     assert len(grid.brick_coordinates()) == 1
     assert (report.nodes, report.bricks) == (4, 1)  # its path, too
     grid.write_bricks(where[1:], np.full((1, 512), UNKNOWN, np.int16))
-    compact(grid)
+    compact_grids(grid)
     assert (grid.brick_coordinates().shape, map_of_grid(grid)) == ((0, 3), {})
     assert map_of_grid(kept) == {(0, 0, 0): 5, (3000, -2000, 7): 6}
     check_pool(grid.pool, [grid, kept])
-    assert compact(EvidenceGrid(0.1)) == compact([]) == CompactReport()
+    assert compact_grids(EvidenceGrid(0.1)) == compact_grids([]) == CompactReport()
 
 
 @pytest.mark.parametrize("levels", [2, 5, 7])
@@ -64,7 +64,7 @@ def test_maps_stay_as_they_are(rng: np.random.Generator, levels: int) -> None:
     voxels = random_map(rng, 4 * 4**levels)
     grid = grid_of_map(voxels, levels=levels)
     before = used(grid.pool)
-    report = compact(grid)
+    report = compact_grids(grid)
     assert map_of_grid(grid) == voxels
     check_pool(grid.pool, [grid])
     assert used(grid.pool) == (before[0] - report.nodes, before[1] - report.bricks)
@@ -74,7 +74,7 @@ def test_maps_stay_as_they_are(rng: np.random.Generator, levels: int) -> None:
 def test_a_map_without_equal_cubes_saves_nothing(rng: np.random.Generator) -> None:
     grid = grid_of_map({(8 * i, 0, 0): i for i in range(-20, 20)})
     before = used(grid.pool)
-    assert compact(grid) == CompactReport()
+    assert compact_grids(grid) == CompactReport()
     assert used(grid.pool) == before
 
 
@@ -82,7 +82,7 @@ def test_compacted_maps_are_written_like_any_other(rng: np.random.Generator) -> 
     """Bricks with many parents are copied when written, also many times in one scan."""
     voxels = cube((-32, -32, -32), 64, -500)
     plain, small = grid_of_map(voxels, levels=4), grid_of_map(voxels, levels=4)
-    compact(small)
+    compact_grids(small)
     assert used(small.pool)[1] == 1
     for _ in range(4):
         points, origin = rng.uniform(-4, 4, (30, 3)), rng.uniform(-2, 2, 3)
@@ -94,7 +94,7 @@ def test_compacted_maps_are_written_like_any_other(rng: np.random.Generator) -> 
         assert map_of_grid(small) == map_of_grid(plain)
         assert map_of_grid(copy) == held
         if rng.random() < 0.5:
-            compact([small, copy])
+            compact_grids([small, copy])
     del copy
     small.release()
     assert used(small.pool) == (0, 0)
@@ -115,7 +115,7 @@ def test_what_grids_share_stays_shared(rng: np.random.Generator) -> None:
         twin = family[2].copy()
         maps = [map_of_grid(g) for g in family]
         before = used(parent.pool)
-        report = compact(family if together else family[3])
+        report = compact_grids(family if together else family[3])
         after = used(parent.pool)
         assert (before[0] - after[0], before[1] - after[1]) == (report.nodes, report.bricks)
         assert report.bricks >= (26 if together else 1)  # what others hold of it is not one's own to free
@@ -128,7 +128,7 @@ def test_what_grids_share_stays_shared(rng: np.random.Generator) -> None:
 def test_locked_grids_may_be_compacted() -> None:
     grid = grid_of_map(cube((0, 0, 0), 32, 5))
     grid.lock()
-    assert compact(grid).bricks == 63
+    assert compact_grids(grid).bricks == 63
 
 
 def test_grids_of_other_thresholds_share_no_flags() -> None:
@@ -137,7 +137,7 @@ def test_grids_of_other_thresholds_share_no_flags() -> None:
     voxels = cube((0, 0, 0), 32, 300)
     grids = [grid_of_map(voxels, pool=pool, model=BeamModel(threshold=t)) for t in (0.5, 0.9, 0.5)]
     assert grids[1].model.threshold_step > 300
-    compact(grids)
+    compact_grids(grids)
     assert used(pool)[1] == 2
     check_pool(pool, grids)
     assert [g.voxel_counts().occupied for g in grids] == [32**3, 0, 32**3]
@@ -146,7 +146,7 @@ def test_grids_of_other_thresholds_share_no_flags() -> None:
 def test_grids_of_other_pools_are_refused() -> None:
     grids = [grid_of_map({(0, 0, 0): 1}), grid_of_map({(0, 0, 0): 1})]
     with pytest.raises(GridError, match="different pools"):
-        compact(grids)
+        compact_grids(grids)
 
 
 def test_moved_maps_are_the_same_and_the_old_pool_is_free(rng: np.random.Generator, tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_moved_maps_are_the_same_and_the_old_pool_is_free(rng: np.random.Generat
     for k, g in enumerate((first, second)):
         g.save(tmp_path / f"{k}.npz")
     bytes_used = first.pool.used_bytes
-    move([first, second])
+    move_grids([first, second])
     del dying
     gc.collect()
     assert old() is None

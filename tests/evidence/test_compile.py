@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from graphslam.evidence import compile as compiling
-from graphslam.evidence import first_use
+from graphslam.evidence import jit_notice
 from graphslam.evidence.mark_kernels import mark_grids
 from graphslam.evidence.pool import GridPool
 
@@ -44,8 +44,8 @@ def test_what_the_second_process_does_not_do_is_done_here(
 
 def test_nothing_is_said_where_the_kernels_are_compiled(capfd: pytest.CaptureFixture[str]) -> None:
     GridPool()
-    assert first_use.is_compiled(mark_grids)
-    first_use._state["checked"] = False
+    assert jit_notice.is_compiled(mark_grids)
+    jit_notice._state["checked"] = False
     GridPool()
     assert capfd.readouterr().err == ""
 
@@ -63,12 +63,12 @@ def test_code_older_than_its_source_is_compiled_again_and_announced(
 
     kernel = SimpleNamespace(py_func=mark_grids, stats=SimpleNamespace(cache_path=str(code.parent)))
     started: list[str] = []
-    monkeypatch.setattr(first_use, "mark_grids", kernel)
-    monkeypatch.setattr(first_use, "start_compiling", lambda part, start: started.append(part))
-    monkeypatch.setattr(first_use.inspect, "getsourcefile", lambda function: str(source))
+    monkeypatch.setattr(jit_notice, "mark_grids", kernel)
+    monkeypatch.setattr(jit_notice, "start_compiling", lambda part, start: started.append(part))
+    monkeypatch.setattr(jit_notice.inspect, "getsourcefile", lambda function: str(source))
     for seconds, wanted in ((100, []), (300, ["all"])):
         os.utime(source, (seconds, seconds))
-        first_use._state["checked"] = False
+        jit_notice._state["checked"] = False
         GridPool()
         GridPool()
         assert started == wanted
@@ -88,6 +88,6 @@ def test_a_machine_without_code_is_told_once_and_processes_that_compile_start_no
         "print(started)\n"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    environment |= {first_use.COMPILING: "1"} if compiling_already else {}
+    environment |= {jit_notice.COMPILING: "1"} if compiling_already else {}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == ("[]" if compiling_already else "['all']"), done.stderr

@@ -11,7 +11,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood, log_weights
-from graphslam.evidence.queries import HIT, INSIDE, LEFT, MAX_RANGE, UNKNOWN_SPACE, UNUSABLE, cast
+from graphslam.evidence.queries import HIT, INSIDE, LEFT, MAX_RANGE, UNKNOWN_SPACE, UNUSABLE, cast_beams
 
 HALF = np.array([3.05, 2.05, 1.55])  # in the middle of voxels of 0.1 m
 
@@ -101,7 +101,7 @@ def test_weights_are_sums_over_single_beams(rng: np.random.Generator, room: Evid
         ]
         whole = log_weights([room], pose, scan, model, origin=origin, max_range=10.0)
         assert whole[0] == pytest.approx(sum(single))
-    found = cast(room, origin, scan - origin, 10.0, pose=pose[0])
+    found = cast_beams(room, origin, scan - origin, 10.0, pose=pose[0])
     z = np.minimum(np.abs(np.linalg.norm(scan - origin, axis=1) - found.ranges) / 0.2, 3.0)
     assert log_weights([room], pose, scan, CastLikelihood(0.1), origin=origin, max_range=10.0)[0] == pytest.approx(
         0.1 * np.sum(-0.5 * z * z)

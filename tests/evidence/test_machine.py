@@ -22,7 +22,7 @@ from hypothesis.stateful import (
 from graphslam.core.errors import GridError, GridLockedError
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
 from tests.reference.evidence_pool import assert_same, check_pool
@@ -183,7 +183,7 @@ class GridMachine(RuleBasedStateMachine):
     def compact(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         before = self.pool.used_nodes, self.pool.used_bricks
-        report = compact([p.grid for p in self.living if rng.random() < 0.7])
+        report = compact_grids([p.grid for p in self.living if rng.random() < 0.7])
         assert (self.pool.used_nodes, self.pool.used_bricks) == (before[0] - report.nodes, before[1] - report.bricks)
         assert min(report.nodes, report.bricks) >= 0
 

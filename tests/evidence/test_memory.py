@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import GridError
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.memory import memory
+from graphslam.evidence.memory import measure_memory
 from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES
 
 
@@ -43,9 +43,9 @@ def test_private_memory_is_what_a_release_frees(rng: np.random.Generator, compac
         grids = family(rng)
         pool = grids[0].pool
         if compacted:
-            compact(grids)
+            compact_grids(grids)
         chosen = [grids[k] for k in rng.choice(len(grids), rng.integers(1, 8), replace=False)]
-        told = memory(chosen)
+        told = measure_memory(chosen)
         assert (told.nodes, told.bricks) == reached(chosen)
         assert told.total == told.nodes * NODE_BYTES + told.bricks * BRICK_BYTES
         assert told.shared == told.total - told.private >= 0
@@ -66,23 +66,23 @@ def test_a_copy_costs_nothing_and_a_write_what_it_changes(rng: np.random.Generat
     assert alone.private == alone.total == grid.pool.used_bytes
     twin = grid.copy()
     assert grid.memory().private == twin.memory().private == 0
-    assert memory([grid, twin]).private == memory([twin, grid, twin]).private == alone.total
+    assert measure_memory([grid, twin]).private == measure_memory([twin, grid, twin]).private == alone.total
     twin.insert_scan([[1.0, 0.0, 0.0]])
     assert 0 < twin.memory().private < 0.5 * alone.total
-    assert memory([grid, twin]).total == grid.pool.used_bytes
+    assert measure_memory([grid, twin]).total == grid.pool.used_bytes
     del twin
     assert grid.memory() == alone
 
 
 def test_everything_together_is_the_pool(rng: np.random.Generator) -> None:
     grids = family(rng)
-    told = memory(grids)
+    told = measure_memory(grids)
     assert told.private == told.total == grids[0].pool.used_bytes
     assert sum(g.memory().private for g in grids) < told.total < sum(g.memory().total for g in grids)
 
 
 def test_nothing_and_strangers() -> None:
-    assert memory([]).total == 0
+    assert measure_memory([]).total == 0
     assert EvidenceGrid(0.1).memory().total == 0
     with pytest.raises(GridError, match="different pools"):
-        memory([EvidenceGrid(0.1), EvidenceGrid(0.1)])
+        measure_memory([EvidenceGrid(0.1), EvidenceGrid(0.1)])

@@ -10,7 +10,7 @@ import pytest
 from graphslam.core.errors import ConfigError, GeometryError, GridError
 from graphslam.core.geometry import se2_transform
 from graphslam.core.se3 import se3_exp, se3_transform
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.evidence.pool import GridPool
@@ -214,7 +214,7 @@ def test_compacted_maps_answer_the_same(rng: np.random.Generator) -> None:
     values[mixed] = rng.choice(np.array([UNKNOWN, -400, 700], np.int16), (40, 512))
     grid.write_bricks(bricks, values)
     before = grid.copy()
-    assert compact(grid).bricks > 3000
+    assert compact_grids(grid).bricks > 3000
     assert grid.entropy() == before.entropy()
     assert grid.voxel_counts() == before.voxel_counts()
     assert (grid.occupied_cloud() == before.occupied_cloud()).all()

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.core.shelf import Shelf
+from graphslam.core.spill_cache import SpillCache
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.shelved import ShelvedGrid, load_shelved, packed_values, shelved, unpacked_values
+from graphslam.evidence.spilled_grid import SpilledGrid, load_spilled, packed_values, spill_grid, unpacked_values
 from graphslam.evidence.views import GridView
 
 
@@ -35,11 +35,11 @@ def same(a: EvidenceGrid, b: EvidenceGrid) -> bool:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_grids_are_the_same_from_memory_and_from_disk(dim: int) -> None:
     plain = [scanned(k, dim) for k in range(8)]
-    shelf = Shelf(room=1)  # of all of them one is in memory
-    put = [shelved(g, shelf) for g in plain]
+    shelf = SpillCache(room=1)  # of all of them one is in memory
+    put = [spill_grid(g, shelf) for g in plain]
     points = np.random.default_rng(99).uniform(-9.0, 9.0, (500, dim))
     for a, b in zip(plain, put):
-        assert isinstance(b, ShelvedGrid)
+        assert isinstance(b, SpilledGrid)
         assert same(a, b)
         assert np.array_equal(a.log_odds_at(points), b.log_odds_at(points), equal_nan=True)
         assert np.array_equal(GridView(a).points(1), GridView(b).points(1))
@@ -57,12 +57,12 @@ def test_no_more_trees_are_alive_than_there_is_room_for(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(GridPool, "__init__", counted)
     one = scanned(0)
-    size = shelved(one, Shelf()).pool.nbytes
+    size = spill_grid(one, SpillCache()).pool.nbytes
     del one
     gc.collect()
-    shelf, put, most = Shelf(room=4 * size), [], 0
+    shelf, put, most = SpillCache(room=4 * size), [], 0
     for k in range(20):
-        put.append(shelved(scanned(k), shelf))
+        put.append(spill_grid(scanned(k), shelf))
         most = max(most, len(alive))
     assert most <= 6  # without a shelf it is 20
     for g in put[::3] + put:
@@ -72,25 +72,25 @@ def test_no_more_trees_are_alive_than_there_is_room_for(monkeypatch: pytest.Monk
 
 
 def test_files_are_the_same_bytes(tmp_path: Path) -> None:
-    plain, shelf = scanned(3), Shelf(room=1)
-    put, _ = shelved(plain, shelf), shelved(scanned(4), shelf)
+    plain, shelf = scanned(3), SpillCache(room=1)
+    put, _ = spill_grid(plain, shelf), spill_grid(scanned(4), shelf)
     plain.save(tmp_path / "a.npz")
     put.save(tmp_path / "b.npz")
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    loaded = load_shelved(tmp_path / "a.npz")
+    loaded = load_spilled(tmp_path / "a.npz")
     assert same(loaded, plain)
-    assert shelved(loaded) is loaded
+    assert spill_grid(loaded) is loaded
 
 
 def test_who_writes_has_a_grid_of_his_own() -> None:
-    shelf = Shelf(room=1)
-    put, other = shelved(scanned(5), shelf), shelved(scanned(6), shelf)
+    shelf = SpillCache(room=1)
+    put, other = spill_grid(scanned(5), shelf), spill_grid(scanned(6), shelf)
     twin, points = put.copy(), np.array([[1.0, 2.0, 0.5]])
     other.voxel_counts()  # the first is on disk now, but for the twin
     twin.insert_scan(points)
     assert same(put, scanned(5))
     assert not same(twin, put)
-    assert same(shelved(twin, shelf), twin)
+    assert same(spill_grid(twin, shelf), twin)
     put.insert_scan(points)
     other.voxel_counts()
     assert same(put, twin)
@@ -98,8 +98,8 @@ def test_who_writes_has_a_grid_of_his_own() -> None:
 
 
 def test_two_on_disk_are_merged() -> None:
-    shelf = Shelf(room=1)
-    put = [shelved(scanned(k), shelf) for k in range(3)]
+    shelf = SpillCache(room=1)
+    put = [spill_grid(scanned(k), shelf) for k in range(3)]
     T = np.array([0.4, -0.2, 0.6, 0.0, 0.0, np.sin(0.2), np.cos(0.2)])
     plain = scanned(0)
     plain.merge(scanned(1), T)
@@ -111,13 +111,13 @@ def test_two_on_disk_are_merged() -> None:
 def test_locked_stays_locked() -> None:
     grid = scanned(7)
     grid.lock()
-    assert shelved(grid, Shelf()).locked
-    assert not shelved(grid, Shelf()).copy().locked
+    assert spill_grid(grid, SpillCache()).locked
+    assert not spill_grid(grid, SpillCache()).copy().locked
 
 
 def test_an_empty_grid() -> None:
-    shelf = Shelf(room=1)
-    put, _ = shelved(EvidenceGrid(0.1), shelf), shelved(scanned(1), shelf)
+    shelf = SpillCache(room=1)
+    put, _ = spill_grid(EvidenceGrid(0.1), shelf), spill_grid(scanned(1), shelf)
     assert len(put.brick_coordinates()) == 0
     assert put.root == 0 or put.voxel_counts().known == 0
 

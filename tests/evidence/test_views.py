@@ -11,7 +11,7 @@ from graphslam.core.dense import CloudMap
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.views import CloudView, GridView, has_view, view_of
+from graphslam.evidence.views import CloudView, GridView, dense_view, has_dense_view
 from tests.reference.small_maps import same_map
 
 
@@ -82,15 +82,15 @@ def test_of_a_grid_and_a_cloud_the_points_are_the_clouds_and_the_space_the_grids
     points = np.random.default_rng(4).uniform(-4, 4, (200, 3))
     grid = EvidenceGrid(0.5)
     grid.insert_scan(points)
-    view = view_of(submap(cloud=points, grid=grid))
+    view = dense_view(submap(cloud=points, grid=grid))
     assert view.knows_space
     assert view.evidence() is grid
     assert len(view.points()) > len(GridView(grid).points())
     assert view.cloud is not None
-    assert view_of(submap(grid=grid)).cloud is None
+    assert dense_view(submap(grid=grid)).cloud is None
     with pytest.raises(DataError, match="submap 4 has no map"):
-        view_of(submap())
-    assert [has_view(submap(**p)) for p in ({}, {"grid": grid}, {"cloud": points})] == [False, True, True]
+        dense_view(submap())
+    assert [has_dense_view(submap(**p)) for p in ({}, {"grid": grid}, {"cloud": points})] == [False, True, True]
 
 
 def test_impossible_clouds_are_refused() -> None:

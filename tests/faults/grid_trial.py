@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 import graphslam as gs
 from graphslam.app.run.run import Run
-from graphslam.core.config import merge
+from graphslam.core.config import merge_options
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
@@ -94,7 +94,7 @@ def trial(row: Row | None, drive: Drive, frontend: str, *, seed: int = 1) -> See
     options: Any = drive.of(frontend)
     log = drive.log
     if row is not None:
-        options, log = merge(options, row.options), row.inject(log)
+        options, log = merge_options(options, row.options), row.inject(log)
     assert row is None or log.truth is None
     try:
         run = gs.run(log if row else SensorLog(**{**_parts(log), "truth": None}), frontend=frontend, seed=seed,

@@ -12,9 +12,9 @@ from graphslam.core.geometry import se2_between
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.records import LaserScans, VelocityControls
 from graphslam.core.trajectory import Trajectory
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.frontends.grid_world import drive, ranges
 
 SPEED, RATE = 0.75, 20.0
@@ -24,7 +24,7 @@ RANGE = 8.0
 @cache
 def court_log(seed: int = 3, seconds: float = 40.0) -> SensorLog:
     """The court: a scanner whose head spins, an IMU, wheels."""
-    log = simulate_crawler(court(seed=seed), seed, CrawlerConfig(max_range=RANGE))
+    log = simulate_crawler(ring_hall(seed=seed), seed, CrawlerConfig(max_range=RANGE))
     return log.slice(0.0, seconds)
 
 

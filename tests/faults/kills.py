@@ -46,9 +46,9 @@ from graphslam.app.worlds import simulate, write_simulated
 from graphslam.core.digest import Digest
 from graphslam.core.errors import RunFolderError
 from graphslam.io.submap_store import SubmapStore, read_submaps
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from graphslam_studies.montecarlo import folder as study_folder
 from graphslam_studies.montecarlo.folder import StudyFolder
 
@@ -107,7 +107,7 @@ def log_2d(work: Path) -> None:
 
 def log_3d(work: Path) -> None:
     """Twice round a corner, with a re-entry."""
-    write_simulated(simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0)), work / "log")
+    write_simulated(simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0)), work / "log")
 
 
 def arguments_2d(work: Path, out: str = "out", seed: int = 5) -> list[str]:
@@ -373,7 +373,7 @@ class Bench:
                 StudyFolder(self.out).collect()
             return ""
         try:
-            outputs.open_run(self.out)
+            outputs.read_run_folder(self.out)
             return "an unfinished run is opened as a finished one"
         except RunFolderError:
             pass
@@ -395,7 +395,7 @@ class Bench:
         page = make_report(self.out)
         lost = {k: v for k, v in page.problems.items() if k != "clearest.json"}
         if self.name != "merge":
-            outputs.open_run(self.out)
+            outputs.read_run_folder(self.out)
             loops_of_run(self.out)
         return f"the report misses {lost}" if lost else ""
 

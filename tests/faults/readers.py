@@ -21,12 +21,12 @@ import numpy as np
 import scipy.io
 import scipy.sparse as sp
 
-from graphslam.app.folders.generations import outputs
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.report.folder import read_folder
 from graphslam.app.report.report import make_report
 from graphslam.app.run.files import loops_of_run, read_merged_dense
-from graphslam.app.run.outputs import open_run, refined_submaps_of
+from graphslam.app.run.outputs import read_run_folder, refined_submaps_of
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.atomic import write_json, write_npz
 from graphslam.core.config import read_toml
@@ -53,7 +53,7 @@ from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.io.bags import read_bag
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.cloud_logs import read_clouds, read_kitti
 from graphslam.io.euroc import read_euroc
 from graphslam.io.g2o import read_g2o
@@ -80,7 +80,7 @@ from graphslam.io.victoria_park_published import (
 )
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
-from graphslam_frontends.odometry.lasting import LEAST
+from graphslam_frontends.odometry.bias_sigmas import LEAST
 from graphslam_studies.montecarlo.folder import StudyFolder
 from graphslam_studies.montecarlo.study import open_study
 from graphslam_studies.montecarlo.trials import Measurement
@@ -244,7 +244,7 @@ def finished_run() -> Path:
 
     with pytest.MonkeyPatch.context() as patch:  # pictures take longer than the run
         patch.setattr(outputs, "save_figures", lambda *_: None)
-        patch.setattr(report, "report_beside", lambda *_: None)
+        patch.setattr(report, "add_report", lambda *_: None)
         run(log, frontend="rbpf-ekf", out=out, progress=False, config={"frontend": {"particles": 5}})
     arrays = {"times": gps.times, "positions": gps.positions, "sigma": gps.sigma, "lever": gps.lever}
     write_npz(out / "fixes.npz", {"format": "graphslam.fixes/1", **arrays})
@@ -253,9 +253,9 @@ def finished_run() -> Path:
         "lever": gps.lever, "fitted": np.int64(3), "outside": np.int64(0), "in_gap": np.int64(0),
     }  # fmt: skip
     write_npz(out / "gps_all.npz", {"format": "graphslam.gps-residuals/1", **residuals})
-    from graphslam.loops.ledger import Decision
+    from graphslam.loops.ledger import LoopDecision
 
-    loop = Decision(
+    loop = LoopDecision(
         loop=0, verdict="accepted", why="because", i=0, j=1, submap_i=0, submap_j=1, source="proximity", factor_id=9,
         T_ij=[1.0, 0.0, 0.0], covariance=np.eye(3).tolist(), gates={"fitness": 0.5, "entries": [[0, 1]]}, chi2=1.0,
         score=0.5, gain=1.0, effect=0.1, effect_predicted=0.1, effect_earlier=0.0,
@@ -278,7 +278,7 @@ def run_folder(root: Path) -> None:
 
 
 def read_run(root: Path) -> Any:
-    run = open_run(root)
+    run = read_run_folder(root)
     run._repr_html_()
     source = submap_source(run)
     return run, loops_of_run(root).decisions, source
@@ -287,8 +287,8 @@ def read_run(root: Path) -> Any:
 def refined_run(root: Path) -> None:
     """The same run as if its path had been refined by scans."""
     run_folder(root)
-    at = outputs(root)
-    run = open_run(root)
+    at = current_outputs(root)
+    run = read_run_folder(root)
     frames = base_frames(run.map)
     store = SubmapStore(at / "refined")
     for s, a, b in zip(run.submaps, frames, frames[1:]):
@@ -347,8 +347,8 @@ def read_scans(root: Path) -> Any:
 
 
 def read_refined(root: Path) -> Any:
-    run = open_run(root)
-    return run, run.verdict, refined_submaps_of(run), Scans.load(outputs(root) / "scans.npz")
+    run = read_run_folder(root)
+    return run, run.verdict, refined_submaps_of(run), Scans.load(current_outputs(root) / "scans.npz")
 
 
 def report_of_run(root: Path) -> Any:
@@ -359,11 +359,11 @@ def read_config(root: Path) -> Any:
     """What a resumed run does first."""
     from graphslam.app.run.files import read_options
     from graphslam.backend.config import BackEndConfig, GpsOptions
-    from graphslam.core.config import build
+    from graphslam.core.config import build_config
 
     values = read_options(root)
     for part, kind in (("backend", BackEndConfig), ("gps", GpsOptions)):
-        build(kind, values.get(part, {}), part)
+        build_config(kind, values.get(part, {}), part)
     return read_toml(root / "config.toml")
 
 
@@ -763,5 +763,5 @@ READERS: dict[str, Reader] = {
     "bag-ros1": Reader(bag("ros1"), with_points(read_bag), RANGES, slow=3),
     "bag-ros2": Reader(bag("ros2"), with_points(read_bag), RANGES, slow=3),
     "bag-mcap": Reader(bag("mcap"), with_points(read_bag), RANGES, slow=3),
-    "recognised": Reader(clouds_of("bin", "tum"), with_points(lambda p: load(p))),
+    "recognised": Reader(clouds_of("bin", "tum"), with_points(lambda p: load_recording(p))),
 }

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from graphslam.app.folders.generations import new_generation
-from graphslam.app.folders.lock import locked
+from graphslam.app.folders.lock import lock_folder
 from graphslam.app.report.report import make_report
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.loops import loops_of_run
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import FormatError, GraphSlamError, RunFolderError, UnknownNameError
 from graphslam.io.log_folder import read_log_mesh
@@ -62,7 +62,7 @@ def test_a_run_folder_imports_nothing(tmp_path: Path, trap: Path) -> None:
     file = (folder / "run.json").resolve()
     facts = json.loads(file.read_text())
     file.write_text(json.dumps({**facts, "frontend": "a_trap:Front", "source": "a_trap:log"}))
-    assert open_run(folder).name == "a_trap:log"
+    assert read_run_folder(folder).name == "a_trap:log"
     assert not trap.exists()
 
 
@@ -112,12 +112,12 @@ def test_links_of_a_run_lead_nowhere_else(name: str, plain: bool, tmp_path: Path
     run_folder(tmp_path / "made")
     folder = Path(shutil.copytree(tmp_path / "made", tmp_path / "run", symlinks=not plain))
     own = folder / "current" if name in OF_A_STATE and not plain else folder
-    open_run(folder)
+    read_run_folder(folder)
     (folder / "figures").mkdir(exist_ok=True)
     (own / name).rename(tmp_path / "outside")
     (own / name).symlink_to(tmp_path / "outside")
     before = tree(tmp_path / "outside")
-    for read in (open_run, make_report, submap_source, loops_of_run):
+    for read in (read_run_folder, make_report, submap_source, loops_of_run):
         with pytest.raises(FormatError, match="leads out of its folder"):
             read(folder)
     with pytest.raises(FormatError, match="leads out of its folder"), new_generation(folder):
@@ -138,7 +138,7 @@ def test_links_that_no_reader_of_ours_follows_are_left_alone(tmp_path: Path) -> 
     run_folder(tmp_path / "made")
     (tmp_path / "run").symlink_to(tmp_path / "made")
     (tmp_path / "run" / "log").symlink_to(ROOT)
-    assert len(open_run(tmp_path / "run").submaps)
+    assert len(read_run_folder(tmp_path / "run").submaps)
 
 
 def test_links_of_a_study_lead_nowhere_else(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_lock_that_is_a_link_is_not_written(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".lock").symlink_to(tmp_path / "mine.txt")
-    with pytest.raises(RunFolderError, match="cannot be written"), locked(tmp_path / "run"):
+    with pytest.raises(RunFolderError, match="cannot be written"), lock_folder(tmp_path / "run"):
         pass
     assert (tmp_path / "mine.txt").read_text() == "mine"
 

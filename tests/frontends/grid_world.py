@@ -140,9 +140,9 @@ def ring(
     times = 0.4 * np.arange(n)
     tilt = None
     if dim == 3 and tilt_sigma > 0:
-        from graphslam_frontends.grid.motion import tilts
+        from graphslam_frontends.grid.motion import roll_pitch_of
 
-        tilt = tilts(truth) + tilt_sigma * rng.normal(size=(n, 2))
+        tilt = roll_pitch_of(truth) + tilt_sigma * rng.normal(size=(n, 2))
     return Steps(
         times=times,
         odometry=Odometry(times=times, increments=increments, covariances=np.tile(np.diag(sigma**2), (n, 1, 1))),
@@ -163,9 +163,9 @@ def ring(
 
 def true_end(steps: Steps) -> Array:
     """True pose ``(7,)`` or ``(3,)`` at the end in the gravity-aligned frame of the first base."""
-    from graphslam.core.poses import group_of, level
+    from graphslam.core.poses import group_of, remove_roll_pitch
 
     assert steps.truth is not None
     poses = steps.truth.poses
     group = group_of(poses)
-    return group.between(level(poses[0]), poses[-1])
+    return group.between(remove_roll_pitch(poses[0]), poses[-1])

@@ -12,7 +12,7 @@ import pytest
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, EvidenceReusedError, GeometryError
 from graphslam.core.poses import SE2, SE3
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.gnc import GncSolver
@@ -159,7 +159,7 @@ def test_a_network_and_a_graph_are_one_problem(rng):
     net = net.with_poses(SE3.compose(SE3.inverse(net.poses[0]), net.poses))
     graph = in_one_call(net, np.linalg.inv(net.information))
     mine, theirs = graph.flat().evaluate(graph.values, dense=True), problem_of_network(net, ordered=False)
-    system = theirs.evaluate(values_of(net, net.poses), dense=True)
+    system = theirs.evaluate(network_values(net, net.poses), dense=True)
     np.testing.assert_allclose(mine.A, system.A, atol=1e-9 * np.abs(system.A).max())
     np.testing.assert_allclose(mine.chi2, system.chi2, rtol=1e-6, atol=1e-9)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_between, se2_log
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
@@ -24,12 +24,12 @@ def rich_graph(rng) -> PoseGraph:
     chain = make_chain(rng, m=6, landmarks=10)
     g = PoseGraph()
     gps = make_gps(chain, rng, np.array([5.0, -3.0, 1.1]), step=2.0)
-    g.add_gps(gps, config=GpsConfig(robust=Robust("cauchy", 1.0), bias_sigma=0.5, segment_gap=9.0, baseline=15.0))
+    g.add_gps(gps, config=GpsConfig(robust=RobustKernel("cauchy", 1.0), bias_sigma=0.5, segment_gap=9.0, baseline=15.0))
     for s in chain.submaps:
         g.add_submap(s)
     C = np.diag([1e-2, 2e-2, 1e-3])
     rel = se2_between(chain.poses[0], chain.poses[4])
-    g.add_between(0, 4, rel + [0.3, 0, 0], C, evidence="shared-scan", robust=Robust("huber", 1.0))
+    g.add_between(0, 4, rel + [0.3, 0, 0], C, evidence="shared-scan", robust=RobustKernel("huber", 1.0))
     g.add_between(5, 0, se2_between(chain.poses[5], chain.poses[0]), C, streams=["wheel"], interval=(0, 50))
     g.add_between(2, 5, se2_between(chain.poses[2], chain.poses[5]), C, evidence="shared-scan")
     shared = [i for i in g.values.landmark_ids if len(g.sightings(int(i)) & g.sightings(int(g.values.landmark_ids[0])))]
@@ -73,7 +73,7 @@ def test_objective_is_that_of_the_slow_twin(rng):
     g = rich_graph(rng)
     chi2 = g.flat().evaluate(g.values, hessian=False).chi2
     for record, e, value in zip(g.records.values(), slow_residuals(g, g.values), chi2):
-        kernel = getattr(record, "robust", Robust())
+        kernel = getattr(record, "robust", RobustKernel())
         assert value == pytest.approx(float(kernel.loss(np.array([e @ e]))[0]), rel=1e-10), record.label()
 
 
@@ -82,7 +82,7 @@ def test_gradient_and_matrix_against_finite_differences(rng):
     flat, n, h = g.flat(), g.flat().layout.size, 1e-6
     system = flat.evaluate(g.values, dense=True)
     weights = [
-        float(np.sqrt(getattr(r, "robust", Robust()).weight(np.array([e @ e]))[0]))
+        float(np.sqrt(getattr(r, "robust", RobustKernel()).weight(np.array([e @ e]))[0]))
         for r, e in zip(g.records.values(), slow_residuals(g, g.values))
     ]
     J, gradient = [], []
@@ -118,7 +118,7 @@ def test_vector_and_tangent_blocks_share_one_model(rng, chart):
         g.add_submap(replace(s, landmarks=replace(s.landmarks, chart=chart)))
     g.set_values(g.values.retract(0.4 * rng.standard_normal(g.flat().layout.size)))
     r = _submaps(g)[1]
-    only = FlatGraph([r], g.flat().layout)
+    only = FactorArrays([r], g.flat().layout)
     A = only.evaluate(g.values, dense=True).A
     points = g.values.landmarks[[g.flat().layout.row_of[int(i)] for i in r.landmark_ids]]
     J_s, J_e, J_l = submap_jacobians(g.values.poses[1], g.values.poses[2], points, r.z, r.chart, tangent=True)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import DataError
-from graphslam.core.lasting import LastingErrors
 from graphslam.core.path_points import PathPoints
+from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.submap import Submap
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_value
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
@@ -39,7 +39,7 @@ def with_errors(rng, s: Submap, *, points: int = 0) -> Submap:
         own = gain @ P @ gain.T + 0.01 * np.eye(2 * points)
         poses = s.trajectory.interpolate(times)
         path = PathPoints(times=times, lever=np.zeros(2), positions=poses[:, :2], covariance=own, cross=gain @ P)
-    lasting = LastingErrors(
+    lasting = SensorBiases(
         names=NAMES, sigmas=np.array([0.02, 0.05, 0.3, 0.1, 0.2, 0.2]), response=0.05 * rng.standard_normal((n, 6)),
         score=B.T @ rng.standard_normal(8), information=B.T @ B,
         path=0.1 * rng.standard_normal((len(s.trajectory), 3, 6)), points=0.05 * rng.standard_normal((2 * points, 6)),
@@ -164,12 +164,12 @@ def test_what_is_known_of_the_errors_moves_and_widens_a_map(rng):
     chain = make_chain(rng, m=2, landmarks=6)
     s = with_errors(rng, chain.submaps[0])
     g = np.array([0.01, 0.02, -0.1, 0.03, 0.1, -0.1])
-    moved = s.landmarks.erring(g, np.eye(6))
+    moved = s.landmarks.with_biases(g, np.eye(6))
     S = s.landmarks.lasting.response
     np.testing.assert_allclose(moved.mean, s.landmarks.mean + S @ g)
     np.testing.assert_allclose(moved.covariance, s.landmarks.dense_covariance() + S @ S.T)
     plain = chain.submaps[1]
-    assert plain.landmarks.erring(g, np.eye(6)) is plain.landmarks
+    assert plain.landmarks.with_biases(g, np.eye(6)) is plain.landmarks
 
 
 def test_a_store_keeps_them(rng, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, EvidenceReusedError
 from graphslam.graph.ledger import Ledger
-from graphslam.graph.noise import Robust, whitener
+from graphslam.graph.noise import RobustKernel, whitener
 from tests.reference.graph_chain import correlated_covariance
 
 
@@ -43,7 +43,7 @@ def test_bad_scale_is_refused(scale):
 @pytest.mark.parametrize("k", [0.7, 1.345, 3.0])
 def test_kernels_are_gtsams(kind, k):
     theirs = getattr(gtsam.noiseModel.mEstimator, kind.capitalize()).Create(k)
-    ours = Robust(kind, k)
+    ours = RobustKernel(kind, k)
     for d in (0.0, 0.3, 0.7, 1.345, 2.0, 10.0, 1e3):
         assert ours.loss(np.array([d * d]))[0] == pytest.approx(2 * theirs.loss(d), rel=1e-12, abs=1e-300)
         assert ours.weight(np.array([d * d]))[0] == pytest.approx(theirs.weight(d), rel=1e-12)
@@ -51,9 +51,9 @@ def test_kernels_are_gtsams(kind, k):
 
 def test_unknown_kernels_are_refused():
     with pytest.raises(ConfigError, match="known"):
-        Robust("tukey", 1.0)  # type: ignore[arg-type]
+        RobustKernel("tukey", 1.0)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="positive"):
-        Robust("huber", 0.0)
+        RobustKernel("huber", 0.0)
 
 
 # ------------------------------------------------------------------ ledger
@@ -97,7 +97,7 @@ def test_other_streams_and_declared_kinds_pass(ledger):
 
 
 def test_refund_makes_room_for_the_same_evidence_only(ledger):
-    ledger.refund(0)
+    ledger.release(0)
     ledger.spend(2, "again", ["laser"], (0.0, 10.0))
     with pytest.raises(EvidenceReusedError):
         ledger.spend(3, "again", ["laser"], (15.0, 16.0))
@@ -107,13 +107,13 @@ def test_refund_of_a_declared_factor_frees_nobody_elses_evidence(ledger):
     """A scan match over the interval of a submap: removing the match must not make the submap's scans free again."""
     ledger.spend(-1, "match before", ["laser"], (0.0, 10.0), kind="shared-scan")
     ledger.spend(7, "match after", ["laser"], (15.0, 20.0), kind="shared-scan")
-    ledger.refund(-1)
-    ledger.refund(7)
+    ledger.release(-1)
+    ledger.release(7)
     assert [e.factor for e in ledger.entries() if e.stream == "laser"] == ["submap 0", "submap 1"]
     for interval in ((0.0, 10.0), (10.0, 20.0)):
         with pytest.raises(EvidenceReusedError):
             ledger.spend(8, "again", ["laser"], interval)
-    ledger.refund(99)  # never entered
+    ledger.release(99)  # never entered
     assert len(ledger) == 4
 
 

@@ -21,7 +21,11 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
-from graphslam_frontends.landmarks.smoothing_kernels import Evidence, path_covariances, smoothed_covariances
+from graphslam_frontends.landmarks.smoothing_kernels import (
+    SmoothingMeasurements,
+    path_covariances,
+    smoothed_covariances,
+)
 from graphslam_studies.charts import ChartConfig, draw_log
 
 FRAME = np.array([50.0, -20.0, 0.6])
@@ -111,7 +115,7 @@ def test_joint_covariances_equal_the_dense_ones(rng):
     z = np.column_stack([np.zeros((len(pairs), 2)), np.full(len(pairs), 0.01), np.full(len(pairs), 1e-3)])
     d = np.einsum("kji,kj->ki", rotation2(poses[pairs[:, 0], 2]), landmarks[pairs[:, 1]] - poses[pairs[:, 0], :2])
     z[:, 0], z[:, 1] = np.hypot(d[:, 0], d[:, 1]), np.arctan2(d[:, 1], d[:, 0])
-    evidence = Evidence(u, W, pairs[:, 0].copy(), pairs[:, 1].copy(), z, np.ones(len(z)), np.zeros(3))
+    evidence = SmoothingMeasurements(u, W, pairs[:, 0].copy(), pairs[:, 1].copy(), z, np.ones(len(z)), np.zeros(3))
     at = np.array([-1, 1, 1, 3, 4], dtype=np.int64)
     G0, G1 = rng.standard_normal((5, 2, 3)), rng.standard_normal((5, 2, 3))
     G0[0] = 0.0

@@ -12,15 +12,15 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose, pose_array
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import to_network
-from graphslam.graph.noise import NO_KERNEL, Robust, robust_terms, whitener
+from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms, whitener
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values, gtsam_key, key_name
 from graphslam.io.g2o import read_g2o, write_g2o
@@ -36,7 +36,7 @@ def random_poses(rng: np.random.Generator, n: int) -> np.ndarray:
     return SE3.exp(rng.normal(size=(n, 6)) * [0.6, 0.6, 0.9, 3.0, 3.0, 1.0])
 
 
-def loop_graph(chain: DenseChain, rng: np.random.Generator, robust: Robust = NO_KERNEL, update=lambda g: None):
+def loop_graph(chain: DenseChain, rng: np.random.Generator, robust: RobustKernel = NO_KERNEL, update=lambda g: None):
     g = PoseGraph(dim=3)
     for s in chain.submaps:
         g.add_submap(s)
@@ -65,17 +65,17 @@ def rich_records(rng: np.random.Generator) -> tuple[list, Values]:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     arm, z = rng.normal(size=(4, 3)), 5 * rng.normal(size=(4, 3))
     records = [
-        BetweenRecord(0, 1, 3, near, W(6), Robust("huber", 1.0)),
+        BetweenRecord(0, 1, 3, near, W(6), RobustKernel("huber", 1.0)),
         BetweenRecord(1, 0, 2, SE3.between(values.poses[0], random_poses(rng, 1)[0]), W(6)),
         BetweenRecord(2, 4, 0, SE3.inverse(values.poses[4]) + 0.0, W(6)),
         GpsRecord(3, 0, 0.0, arm[0], z[0], W(3), bias=1, tilt=True),
-        GpsRecord(4, 2, 1.0, arm[1], z[1], W(3), Robust("cauchy", 1.0)),
+        GpsRecord(4, 2, 1.0, arm[1], z[1], W(3), RobustKernel("cauchy", 1.0)),
         GpsRecord(5, 3, 2.0, arm[2], z[2], W(3), bias=0),
         GpsRecord(6, 4, 3.0, arm[3], z[3], W(3), tilt=True),
         BiasPriorRecord(7, 0, 0.5, dim=3),
         BiasPriorRecord(8, 1, 0.7, dim=3),
         AttitudeRecord(9, 0, direction[0], W(2)),
-        AttitudeRecord(10, 3, direction[1], W(2), Robust("huber", 0.5)),
+        AttitudeRecord(10, 3, direction[1], W(2), RobustKernel("huber", 0.5)),
     ]
     return records, values
 
@@ -103,7 +103,7 @@ def test_a_pose_tangent_is_gtsams_rotation_first(rng):
 
 def test_gradient_and_matrix_against_finite_differences(rng):
     records, values = rich_records(rng)
-    flat = FlatGraph(records, values.layout())
+    flat = FactorArrays(records, values.layout())
     n, h = flat.layout.size, 1e-6
     assert n == 4 * 6 + 4 + 2 * 3 + 2
     system = flat.evaluate(values, dense=True)
@@ -149,7 +149,7 @@ def test_every_factor_is_gtsams(rng):
     theirs, layout = to_gtsam(values), values.layout()
     for record in records:
         factor = gtsam_factor(record, values.poses[0])
-        one = FlatGraph([record], layout).evaluate(values, dense=True)
+        one = FactorArrays([record], layout).evaluate(values, dense=True)
         assert 2 * factor.error(theirs) == pytest.approx(one.objective, rel=1e-9), record.label()
         gaussian = factor.linearize(theirs)
         A, b = gaussian.jacobian()
@@ -169,7 +169,7 @@ def test_values_go_to_gtsam_and_back(rng):
     assert [key_name(gtsam_key(n)) for n in names] == names
 
 
-@pytest.mark.parametrize("robust", [Robust(), Robust("cauchy", 1.0)], ids=lambda r: r.kind)
+@pytest.mark.parametrize("robust", [RobustKernel(), RobustKernel("cauchy", 1.0)], ids=lambda r: r.kind)
 def test_isam2_batch_and_gtsam_agree(rng, robust):
     chain = dense_chain(rng, noise=2.0)
     seed = int(rng.integers(1 << 30))

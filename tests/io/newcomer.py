@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.core import se3
 from graphslam.core.geometry import se2_compose
-from graphslam.io.catalog import load, locate
+from graphslam.io.catalog import load_recording, locate
 from tests.io.bag_worlds import Messages, write_mcap, write_ros2
 
 
@@ -28,7 +28,7 @@ def bins(out: Path, scans: int = 154) -> None:
     """KITTI 0005 as float32 x y z intensity, one file a scan."""
     folder = out / "drive" / "velodyne"
     folder.mkdir(parents=True)
-    clouds = load("lidar3d-kitti-0005")["clouds"]
+    clouds = load_recording("lidar3d-kitti-0005")["clouds"]
     for k in range(min(scans, len(clouds))):
         xyz = clouds.cloud(k)
         np.column_stack([xyz, np.zeros(len(xyz))]).astype("<f4").tofile(folder / f"{k:06d}.bin")
@@ -40,7 +40,7 @@ def plys(out: Path, scans: int = 160) -> None:
 
     folder = out / "scans"
     folder.mkdir(parents=True)
-    log = load("lidar3d-hku1")
+    log = load_recording("lidar3d-hku1")
     clouds, poses = log["clouds"], se3_chain(log["odometry"].increments)
     rows = []
     for k in range(min(scans, len(clouds))):
@@ -60,7 +60,7 @@ def se3_chain(increments: np.ndarray) -> np.ndarray:
 
 def ros2(out: Path, seconds: float = 300.0) -> None:
     """Freiburg 079 as LaserScan and Odometry, by rosbags."""
-    log = load("radish-fr079")
+    log = load_recording("radish-fr079")
     laser, odometry, m = log["laser"], log["odometry"], Messages()
     pose, messages = np.zeros(3), []
     place = np.array([*laser.T_base_sensor[:2], 0.2, 0, 0, 0, 1.0])
@@ -82,7 +82,7 @@ def ros2(out: Path, seconds: float = 300.0) -> None:
 
 def mcap(out: Path, scans: int = 200) -> None:
     """HKU main building as PointCloud2 alone, by mcap."""
-    clouds, m = load("lidar3d-hku-mb")["clouds"], Messages()
+    clouds, m = load_recording("lidar3d-hku-mb")["clouds"], Messages()
     messages = [
         ("/livox/points", "sensor_msgs/msg/PointCloud2", t, m.cloud(t, clouds.cloud(k), frame="livox"))
         for k, t in enumerate(clouds.times[:scans].tolist())
@@ -94,7 +94,7 @@ def tables(out: Path) -> None:
     """Robot 2 of MRCLAM as CSV with headers, semicolons and units."""
     folder = out / "robot_csv"
     folder.mkdir(parents=True)
-    log = load("mrclam-dataset7", robot=2)
+    log = load_recording("mrclam-dataset7", robot=2)
     c, z = log["controls"], log["landmarks"]
     np.savetxt(
         folder / "odometry.csv",

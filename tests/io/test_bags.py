@@ -10,7 +10,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError
 from graphslam.core.geometry import se2_between
 from graphslam.core.records import LaserScans
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from tests.io.bag_worlds import LIVOX, Messages, write_mcap, write_ros1, write_ros2
 
 N = 12
@@ -66,7 +66,7 @@ FORMS = ["ros1", "ros1:BZ2", "ros1:LZ4", "ros2", "ros2:FILE", "ros2:MESSAGE", "r
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_holds_the_same(tmp_path: Path, form: str) -> None:
     path = written(tmp_path, form, world(Messages(form.startswith("ros1"))))
-    log = load(path)
+    log = load_recording(path)
     assert log.meta["reader"]["name"] == "ros-bag"
     assert set(log.streams) == {"clouds", "odometry", "imu", "gps"}
     c = log["clouds"]
@@ -96,7 +96,7 @@ def test_every_form_holds_the_same(tmp_path: Path, form: str) -> None:
     ids=str,
 )
 def test_layouts_of_clouds(tmp_path: Path, change: dict) -> None:
-    c = load(written(tmp_path, "ros2", world(Messages(), **change)))["clouds"]
+    c = load_recording(written(tmp_path, "ros2", world(Messages(), **change)))["clouds"]
     np.testing.assert_allclose(c.cloud(2), clouds()[2, :58], atol=1e-6)
     np.testing.assert_allclose(c.ages(2), -1.5e-3 * np.arange(58), atol=1e-7)
 
@@ -123,7 +123,7 @@ def test_times_of_points(tmp_path: Path, times, field, ages) -> None:
         )
         for k, xyz in enumerate(clouds())
     ]
-    c = load(written(tmp_path, "ros2", messages))["clouds"]
+    c = load_recording(written(tmp_path, "ros2", messages))["clouds"]
     if ages is None:
         assert c.ages(1) is None
     else:
@@ -137,7 +137,7 @@ def test_livox(tmp_path: Path, ros1: bool) -> None:
     messages = [
         ("/livox/lidar", LIVOX, T0 + 0.1 * k, m.livox(T0 + 0.1 * k, p, offsets)) for k, p in enumerate(clouds())
     ]
-    c = load(written(tmp_path, "ros1" if ros1 else "ros2", messages))["clouds"]
+    c = load_recording(written(tmp_path, "ros1" if ros1 else "ros2", messages))["clouds"]
     np.testing.assert_allclose(c.cloud(3), clouds()[3], atol=1e-6)
     np.testing.assert_allclose(c.ages(3), -1.6e-3 * np.arange(60), atol=1e-7)
     np.testing.assert_allclose(c.times, T0 + 0.1 * np.arange(N), atol=1e-6)
@@ -160,7 +160,7 @@ def laser_world(m: Messages, *, mount: np.ndarray | None = None, tf: bool = Fals
 
 @pytest.mark.parametrize("tf", [False, True])
 def test_planar_laser(tmp_path: Path, tf: bool) -> None:
-    log = load(written(tmp_path, "ros2", laser_world(Messages(), tf=tf)))
+    log = load_recording(written(tmp_path, "ros2", laser_world(Messages(), tf=tf)))
     laser, odometry = log["laser"], log["odometry"]
     assert laser.ranges.shape == (N, 20)
     np.testing.assert_allclose(laser.bearings, -1.0 + 0.1 * np.arange(20), atol=1e-6)
@@ -172,9 +172,9 @@ def test_planar_laser(tmp_path: Path, tf: bool) -> None:
 
 def test_a_laser_upside_down_and_one_that_counts_backwards(tmp_path: Path) -> None:
     down = np.array([0.3, 0, 0.2, 1.0, 0, 0, 0])  # half a turn about x
-    a = load(written(tmp_path, "ros2", laser_world(Messages(), mount=down)))["laser"]
+    a = load_recording(written(tmp_path, "ros2", laser_world(Messages(), mount=down)))["laser"]
     (tmp_path / "b").mkdir()
-    b = load(written(tmp_path / "b", "ros2", laser_world(Messages(), step=-0.1)))["laser"]
+    b = load_recording(written(tmp_path / "b", "ros2", laser_world(Messages(), step=-0.1)))["laser"]
     for laser in (a, b):
         np.testing.assert_allclose(laser.bearings, -0.9 + 0.1 * np.arange(20), atol=1e-6)
         np.testing.assert_allclose(laser.ranges[0][::-1][:3], [1.0, 2.0, 3.0])
@@ -190,13 +190,13 @@ def test_two_lidars_of_which_one_is_chosen(tmp_path: Path) -> None:
         if name == "front" or k > 1
     ]
     path = written(tmp_path, "ros2", messages)
-    log = load(path)
+    log = load_recording(path)
     assert log["clouds"].cloud(0).max() < 10
     assert "clouds from /front/points (also /rear/points (10): option clouds=)" in log.meta["notes"]
     assert log.dropped["bag: /rear/points (sensor_msgs/msg/PointCloud2) not chosen"] == 10
-    assert load(path, clouds="/rear/points")["clouds"].cloud(0).min() > 40
+    assert load_recording(path, clouds="/rear/points")["clouds"].cloud(0).min() > 40
     with pytest.raises(ConfigError, match=r"no topic '/side' of clouds in a; there are: /front/points, /rear/points"):
-        load(path, clouds="/side")
+        load_recording(path, clouds="/side")
 
 
 def test_a_depth_camera_is_no_lidar(tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_a_depth_camera_is_no_lidar(tmp_path: Path) -> None:
         ("/camera/depth/points", "sensor_msgs/msg/PointCloud2", T0 + 0.1 * k, m.cloud(T0 + 0.1 * k, xyz))
         for k, xyz in enumerate(clouds())
     ]
-    log = load(written(tmp_path, "ros2", laser_world(m) + depth))
+    log = load_recording(written(tmp_path, "ros2", laser_world(m) + depth))
     assert isinstance(log["laser"], LaserScans)
     assert "clouds" not in log
 
@@ -216,13 +216,13 @@ def test_what_is_missing_is_said_and_replaced(tmp_path: Path) -> None:
     for _, _, _, message in messages:
         if hasattr(message, "header") and hasattr(message, "point_step"):
             object.__setattr__(message, "header", m.header(0.0, "lidar"))
-    log = load(written(tmp_path, "ros2", messages))
+    log = load_recording(written(tmp_path, "ros2", messages))
     notes = " ".join(log.meta["notes"])
     assert "no transform from 'base_link' to 'lidar'" in notes
     assert "clouds has no stamps in its headers: times of the bag are used" in notes
     assert "imu left out: no transform from 'base_link' to 'imu'" in notes
     np.testing.assert_allclose(log["clouds"].times, T0 + 0.02 + 0.1 * np.arange(N), atol=1e-6)
-    placed = load(tmp_path / "a", mount=[0.5, 0, 0, 0, 0, np.pi / 2])["clouds"].T_base_sensor
+    placed = load_recording(tmp_path / "a", mount=[0.5, 0, 0, 0, 0, np.pi / 2])["clouds"].T_base_sensor
     np.testing.assert_allclose(placed, [0.5, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
 
 
@@ -232,7 +232,7 @@ def test_fixes_without_covariance_or_place(tmp_path: Path) -> None:
     for k in range(N):
         place = (0.0, 0.0, 0.0) if k == 2 else (np.nan, 8.0, 1.0) if k == 4 else (50.0, 8.0, 1.0)
         fixes.append(("/fix", "sensor_msgs/msg/NavSatFix", T0 + k, m.fix(T0 + k, place, kind=0 if k == 6 else 2)))
-    log = load(written(tmp_path, "ros2", fixes))
+    log = load_recording(written(tmp_path, "ros2", fixes))
     assert len(log["gps"].times) == N - 2
     assert log.dropped["gps: latitude and longitude are 0"] == 1
     assert log.dropped["gps: no place on Earth"] == 1
@@ -240,7 +240,7 @@ def test_fixes_without_covariance_or_place(tmp_path: Path) -> None:
     none = [(a, b, t, m.fix(t, (50.0, 8.0, 1.0), status=-1)) for a, b, t, _ in fixes]
     (tmp_path / "none").mkdir()
     with pytest.raises(DataError, match="no fix"):
-        load(written(tmp_path / "none", "ros2", none))
+        load_recording(written(tmp_path / "none", "ros2", none))
 
 
 @pytest.mark.parametrize("form", ["ros1", "db3", "mcap"])
@@ -249,44 +249,44 @@ def test_a_bag_that_is_cut_off_or_empty(tmp_path: Path, form: str) -> None:
     raw = path.read_bytes()
     path.write_bytes(raw[: len(raw) // 2])
     if form == "mcap":
-        log = load(path)
+        log = load_recording(path)
         assert 0 < len(log["clouds"].times) < N
         assert any("cut off" in k for k in log.dropped)
     else:
         with pytest.raises(GraphSlamError, match=r"bag cannot be opened.*wanted a bag that is whole"):
-            load(path)
+            load_recording(path)
     path.write_bytes(b"")
     with pytest.raises(MissingDataError, match="which is empty; wanted a bag that is whole"):
-        load(path)
+        load_recording(path)
     path.write_bytes(b"something else" * 100)
     with pytest.raises(MissingDataError, match="does not begin like one"):
-        load(path)
+        load_recording(path)
 
 
 def test_bags_without_a_scanner(tmp_path: Path) -> None:
     m = Messages()
     talk = [("/chatter", "std_msgs/msg/String", T0 + k, m.text("hello")) for k in range(3)]
     with pytest.raises(MissingDataError, match=r"no scanner in this bag; got 3 std_msgs/msg/String"):
-        load(written(tmp_path, "ros2", talk))
+        load_recording(written(tmp_path, "ros2", talk))
     (tmp_path / "two").mkdir()
     written(tmp_path / "two", "mcap", talk)
     (tmp_path / "two/a.mcap").rename(tmp_path / "two/b.mcap")
     written(tmp_path / "two", "mcap", talk)
     with pytest.raises(MissingDataError, match=r"2 bags here; got a.mcap, b.mcap; wanted one"):
-        load(tmp_path / "two")
+        load_recording(tmp_path / "two")
 
 
 def test_clouds_without_a_point(tmp_path: Path) -> None:
     m = Messages()
     empty = [("/p", "sensor_msgs/msg/PointCloud2", T0 + k, m.cloud(T0 + k, np.zeros((0, 3)))) for k in range(5)]
     with pytest.raises(DataError, match="all clouds are empty"):
-        load(written(tmp_path, "ros2", empty))
+        load_recording(written(tmp_path, "ros2", empty))
 
 
 def test_a_message_whose_fields_do_not_fit(tmp_path: Path) -> None:
     messages = world(Messages())
     bad = [m for t, _, _, m in messages if t == "/points"][4]
     object.__setattr__(bad, "width", 10**9)
-    log = load(written(tmp_path, "ros2", messages))
+    log = load_recording(written(tmp_path, "ros2", messages))
     assert len(log["clouds"].times) == N - 1
     assert any(k.startswith("clouds: message cannot be decoded") for k in log.dropped)

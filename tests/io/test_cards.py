@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from graphslam.core.errors import FormatError, UnknownNameError
-from graphslam.io.cards import Card, card, cards_folder, list_cards, read_card
+from graphslam.io.cards import Card, cards_folder, find_card, list_cards, read_card
 from graphslam.io.catalog import check_file
-from graphslam.io.readers import readers
+from graphslam.io.readers import list_readers
 
 CARDS = list_cards()
 
@@ -27,7 +27,7 @@ def test_card_says_what_a_user_must_know(c: Card) -> None:
         assert len(text) > 3
     assert c.caveats
     assert re.match(r"https?://", c.source)
-    assert c.reader is None or c.reader in readers() or c.reader == "pose-network"
+    assert c.reader is None or c.reader in list_readers() or c.reader == "pose-network"
     for f in c.files:
         assert f.url is None or f.url.startswith("https://")
         if f.path.endswith((".gz", ".bz2", ".xz")):
@@ -60,9 +60,9 @@ def test_checksums_are_those_of_the_recorded_data(c: Card, data_dir: Path) -> No
 
 def test_unknown_name_offers_close_ones() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown data set 'victoria-prak'; did you mean victoria-park"):
-        card("victoria-prak")
+        find_card("victoria-prak")
     with pytest.raises(UnknownNameError, match=r"unknown data set 'zzz'; known: carmen"):
-        card("zzz")
+        find_card("zzz")
 
 
 GOOD = """format = "graphslam.card/1"

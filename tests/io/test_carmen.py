@@ -11,8 +11,8 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.core.log import DropCounter
-from graphslam.io.carmen import bearings, mend_stamps, read_carmen
-from graphslam.io.catalog import load
+from graphslam.io.carmen import beam_bearings, mend_stamps, read_carmen
+from graphslam.io.catalog import load_recording
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 
@@ -63,8 +63,8 @@ def test_a_log(tmp_path: Path, beams: int) -> None:
 
 
 def test_bearings_are_those_of_the_scanner() -> None:
-    np.testing.assert_allclose(np.rad2deg(bearings(181)), np.arange(-90, 91), atol=1e-9)
-    np.testing.assert_allclose(np.rad2deg(bearings(360)), np.arange(-90, 90, 0.5), atol=1e-9)
+    np.testing.assert_allclose(np.rad2deg(beam_bearings(181)), np.arange(-90, 91), atol=1e-9)
+    np.testing.assert_allclose(np.rad2deg(beam_bearings(360)), np.arange(-90, 90, 0.5), atol=1e-9)
 
 
 def test_stamps_are_mended_the_least(rng: np.random.Generator) -> None:
@@ -160,7 +160,7 @@ def test_refusals(tmp_path: Path) -> None:
 )
 def test_recorded_logs_become_steps(data_dir: Path, name: str, scans: int, corrected: int, metres: float) -> None:
     drops = DropCounter()
-    log = load(name)  # reads the corrected log as well
+    log = load_recording(name)  # reads the corrected log as well
     assert len(log["laser"].times) == scans
     assert len(log["reference"]) == corrected
     steps = make_steps(log, StepConfig(most_points=180), drops=drops)

@@ -16,8 +16,8 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps, LandmarkObservations
 from graphslam.core.submap import Submap
 from graphslam.io import catalog
-from graphslam.io.cards import Card, CardFile, card
-from graphslam.io.catalog import check, data_roots, load, locate
+from graphslam.io.cards import Card, CardFile, find_card
+from graphslam.io.catalog import check_files, data_roots, load_recording, locate
 
 
 def sha(data: bytes) -> str:
@@ -73,15 +73,15 @@ def test_roots_in_order(roots: tuple[Path, Path, Path], monkeypatch: pytest.Monk
 @pytest.mark.parametrize("where", [0, 1, 2])
 def test_locate_and_check(roots: tuple[Path, Path, Path], where: int, plain: bool) -> None:
     c = toy_card()
-    assert [k.state for k in check(c)] == ["missing"] * 3
+    assert [k.state for k in check_files(c)] == ["missing"] * 3
     write_toy(roots[where], plain=plain)
     assert locate(c) == roots[where] / "toy"
-    assert [k.state for k in check(c)] == ["ok", "ok", "missing"]
+    assert [k.state for k in check_files(c)] == ["ok", "ok", "missing"]
     (roots[where] / "toy/sub/b.bin").write_bytes(b"abd")
-    assert [k.state for k in check(c)] == ["ok", "differs", "missing"]
+    assert [k.state for k in check_files(c)] == ["ok", "differs", "missing"]
     target = roots[where] / ("toy/a.txt" if plain else "toy/a.txt.gz")
     target.write_bytes(target.read_bytes()[:-1])
-    assert [k.state for k in check(c)] == ["differs", "differs", "missing"]
+    assert [k.state for k in check_files(c)] == ["differs", "differs", "missing"]
 
 
 def test_missing_data_says_how_to_get_it(roots: tuple[Path, Path, Path]) -> None:
@@ -98,28 +98,28 @@ def test_missing_data_says_how_to_get_it(roots: tuple[Path, Path, Path]) -> None
 
 def test_load_from_a_path(roots: tuple[Path, Path, Path], tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="data set or path"):
-        load(tmp_path / "nowhere")
+        load_recording(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(FormatError, match="no reader knows this folder; got an empty folder"):
-        load(tmp_path / "empty")
+        load_recording(tmp_path / "empty")
     file = tmp_path / "graph.g2o"
     file.write_text("VERTEX_SE2 0 0 0 0\n")
-    assert load(file) == file
+    assert load_recording(file) == file
 
 
 def test_load_of_a_card(roots: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     c = toy_card()
     monkeypatch.setattr(catalog, "list_cards", lambda: (c,))
-    monkeypatch.setattr(catalog, "card", lambda name: c)
+    monkeypatch.setattr(catalog, "find_card", lambda name: c)
     write_toy(roots[1])
     with pytest.raises(DataError, match="no reader for data set 'toy'"):
-        load("toy")
-    assert load("toy/sub/b") == roots[1] / "toy/sub/b.bin"
-    assert load("toy/a.txt") == roots[1] / "toy/a.txt.gz"
+        load_recording("toy")
+    assert load_recording("toy/sub/b") == roots[1] / "toy/sub/b.bin"
+    assert load_recording("toy/a.txt") == roots[1] / "toy/a.txt.gz"
     with pytest.raises(MissingDataError, match="no such file"):
-        load("toy/note.txt")
+        load_recording("toy/note.txt")
     with pytest.raises(UnknownNameError, match="file of data set 'toy' 'c'"):
-        load("toy/c")
+        load_recording("toy/c")
 
 
 def test_folders_are_told_apart_by_what_they_hold(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -133,11 +133,11 @@ def test_folders_are_told_apart_by_what_they_hold(tmp_path: Path, rng: np.random
     )
     write_submaps(tmp_path / "run", [sub])
     for folder in (tmp_path / "run", tmp_path / "run/submaps"):
-        (back,) = load(folder)
+        (back,) = load_recording(folder)
         np.testing.assert_array_equal(back.landmarks.positions, sub.landmarks.positions)
     fixes = Gps(times=[0.0, 1.0], positions=np.zeros((2, 2)), sigma=[1.0, 1.0], lever=[0.0, 0.0])
     save_log(SensorLog(name="made", streams={"gps": fixes}), tmp_path / "log")
-    assert load(tmp_path / "log").name == "made"
+    assert load_recording(tmp_path / "log").name == "made"
 
 
 def test_catalogue_imports_nothing_heavy() -> None:
@@ -153,20 +153,20 @@ def test_catalogue_imports_nothing_heavy() -> None:
 @pytest.mark.data
 def test_recorded_data_by_name(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRAPHSLAM_DATA", str(data_dir))
-    log = load("victoria-park", gps="none")
+    log = load_recording("victoria-park", gps="none")
     assert isinstance(log, SensorLog)
     assert set(log.streams) == {"laser", "controls"}
-    again = load(data_dir / "victoria_park_raw", gps="none")
+    again = load_recording(data_dir / "victoria_park_raw", gps="none")
     np.testing.assert_array_equal(again["laser"].times, log["laser"].times)
-    assert len(load("victoria-park-local-maps")) == 200
-    assert isinstance(load("victoria-park-detections"), LandmarkObservations)
-    assert load("victoria-park-graph") == data_dir / "victoria_park_graph/victoria_park.txt.gz"
-    assert load("posegraphs/intel") == data_dir / "posegraphs/intel.g2o.xz"
-    assert load("posegraphs/intel.g2o") == data_dir / "posegraphs/intel.g2o.xz"
+    assert len(load_recording("victoria-park-local-maps")) == 200
+    assert isinstance(load_recording("victoria-park-detections"), LandmarkObservations)
+    assert load_recording("victoria-park-graph") == data_dir / "victoria_park_graph/victoria_park.txt.gz"
+    assert load_recording("posegraphs/intel") == data_dir / "posegraphs/intel.g2o.xz"
+    assert load_recording("posegraphs/intel.g2o") == data_dir / "posegraphs/intel.g2o.xz"
     with pytest.raises(DataError, match=r"name one.*posegraphs/sphere2500"):
-        load("posegraphs")
-    assert {k.state for k in check("victoria-park")} == {"ok"}
-    assert card("victoria-park").fetchable
+        load_recording("posegraphs")
+    assert {k.state for k in check_files("victoria-park")} == {"ok"}
+    assert find_card("victoria-park").fetchable
 
 
 def test_packed_form_of_other_compressions() -> None:

@@ -12,7 +12,7 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, GraphSlam
 from graphslam.core.geodesy import geodetic_to_ecef
 from graphslam.core.gnss import TangentPlane
 from graphslam.io import cloud_logs
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.cloud_files import bin_columns, count_points, read_cloud
 from graphslam.io.readers import recognise
 from tests.io import small_sources as small
@@ -29,7 +29,7 @@ def chained(increments: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_points_come_out_as_they_were_written_in_the_order_of_their_numbers(form: str, tmp_path: Path) -> None:
-    log = load(small.cloud_folder(tmp_path / "a", form, spacing=1.0))
+    log = load_recording(small.cloud_folder(tmp_path / "a", form, spacing=1.0))
     assert log.meta["reader"]["name"] == "clouds"
     step = 1e-4 if form.startswith("la") else 1e-6
     for k, xyz in enumerate(small.clouds(spacing=1.0)):  # scan_10 is after scan_9
@@ -41,35 +41,35 @@ def test_points_come_out_as_they_were_written_in_the_order_of_their_numbers(form
 
 
 def test_points_of_las_and_ply_keep_their_times(tmp_path: Path) -> None:
-    las = load(small.cloud_folder(tmp_path / "las", "las", table="tum", spacing=1.0))["clouds"]
-    ply = load(small.cloud_folder(tmp_path / "ply", "ply-times", table="tum", spacing=1.0))["clouds"]
+    las = load_recording(small.cloud_folder(tmp_path / "las", "las", table="tum", spacing=1.0))["clouds"]
+    ply = load_recording(small.cloud_folder(tmp_path / "ply", "ply-times", table="tum", spacing=1.0))["clouds"]
     offset = small.point_times(las.source.counts[0] and len(las.cloud(0)))
     np.testing.assert_allclose(las.ages(3), -offset, atol=1e-6)  # GPS time on the clock of the poses
     np.testing.assert_allclose(ply.ages(3), -offset, atol=1e-6)  # seconds since the begin of the scan
-    straight = load(tmp_path / "ply", point_times=False)["clouds"]
+    straight = load_recording(tmp_path / "ply", point_times=False)["clouds"]
     assert straight.ages(3) is None
 
 
 @pytest.mark.parametrize("table", ["tum", "kitti"])
 def test_poses_beside_clouds_are_the_odometry(table: str, tmp_path: Path) -> None:
-    log = load(small.cloud_folder(tmp_path / "a", "bin", table=table, spacing=1.0))
+    log = load_recording(small.cloud_folder(tmp_path / "a", "bin", table=table, spacing=1.0))
     truth = small.poses()
     want = se3.se3_between(np.tile(truth[0], (len(truth), 1)), truth)
     got = chained(log["odometry"].increments)
     assert np.abs(np.linalg.norm(se3.se3_between(got, want)[:, :3], axis=1)).max() < 1e-6
     assert log["clouds"].times[0] == (pytest.approx(small.T0) if table == "tum" else 0.0)
-    assert "odometry" not in load(tmp_path / "a", poses="none")
+    assert "odometry" not in load_recording(tmp_path / "a", poses="none")
 
 
 def test_stamps_of_a_table_of_names_and_of_an_option(tmp_path: Path) -> None:
     folder = small.cloud_folder(tmp_path / "a", "bin", spacing=1.0)
-    assert np.diff(load(folder, period=0.5)["clouds"].times)[0] == pytest.approx(0.5)
+    assert np.diff(load_recording(folder, period=0.5)["clouds"].times)[0] == pytest.approx(0.5)
     np.savetxt(folder / "times.txt", 3.0 + 0.2 * np.arange(small.STEPS), fmt="%.6f")
-    np.testing.assert_allclose(load(folder)["clouds"].times[:2], [3.0, 3.2])
+    np.testing.assert_allclose(load_recording(folder)["clouds"].times[:2], [3.0, 3.2])
     (folder / "times.txt").unlink()
     for k in range(small.STEPS):
         (folder / f"scan_{k}.bin").rename(folder / f"{1_700_000_000_000_000_000 + k * 250_000_000}.bin")
-    assert np.diff(load(folder)["clouds"].times)[0] == pytest.approx(0.25)
+    assert np.diff(load_recording(folder)["clouds"].times)[0] == pytest.approx(0.25)
 
 
 def test_poses_that_do_not_go_with_the_clouds_are_refused_with_what_to_do(tmp_path: Path) -> None:
@@ -77,11 +77,11 @@ def test_poses_that_do_not_go_with_the_clouds_are_refused_with_what_to_do(tmp_pa
     lines = (folder / "poses.txt").read_text().splitlines()
     (folder / "poses.txt").write_text("\n".join(lines[:-2]))
     with pytest.raises(DataError, match="poses=none"):
-        load(folder)
+        load_recording(folder)
     small.tum_table(folder / "poses.txt")
     np.savetxt(folder / "times.txt", 5.0 + 0.1 * np.arange(small.STEPS))
     with pytest.raises(DataError, match="no time in common"):
-        load(folder)
+        load_recording(folder)
 
 
 def test_bad_points_are_dropped_and_counted_and_bad_files_too(tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_bad_points_are_dropped_and_counted_and_bad_files_too(tmp_path: Path) ->
     small.write_bin(folder / "scan_3.bin", np.vstack([xyz, [np.nan] * 3, [0, 0, 0], [0, 0, 0]]))
     (folder / "scan_7.bin").write_bytes(b"")
     (folder / "scan_8.bin").write_bytes((folder / "scan_8.bin").read_bytes()[:-3])
-    log = load(folder)
+    log = load_recording(folder)
     assert len(log["clouds"]) == 38
     np.testing.assert_allclose(log["clouds"].cloud(3), xyz)
     assert log.dropped == {
@@ -102,7 +102,7 @@ def test_bad_points_are_dropped_and_counted_and_bad_files_too(tmp_path: Path) ->
     for k in range(10):
         (folder / f"scan_{k}.bin").write_bytes(b"123")
     with pytest.raises(FormatError, match="of 40 clouds are damaged"):
-        load(folder)
+        load_recording(folder)
 
 
 def test_a_large_folder_is_opened_without_decoding_it_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,7 +116,7 @@ def test_a_large_folder_is_opened_without_decoding_it_all(tmp_path: Path, monkey
 
     monkeypatch.setattr(cloud_logs, "read_cloud", counted)
     monkeypatch.setattr(cloud_logs, "MOST_DECODED", 4)
-    log = load(folder)
+    log = load_recording(folder)
     assert len(decoded) <= 6
     assert log.dropped["clouds: file is damaged"] == 1  # by its header and its size
     np.testing.assert_allclose(log["clouds"].cloud(4), small.clouds(40, 2.0)[4], atol=1e-6)
@@ -158,10 +158,10 @@ def test_columns_of_bin_and_options_that_are_wrong(tmp_path: Path) -> None:
     folder.mkdir()
     for k, xyz in enumerate(small.clouds(3, 1.0)):
         np.column_stack([xyz, np.zeros((len(xyz), 2))]).astype("<f4").tofile(folder / f"{k}.bin")
-    np.testing.assert_allclose(load(folder, columns=5)["clouds"].cloud(1), small.clouds(3, 1.0)[1])
+    np.testing.assert_allclose(load_recording(folder, columns=5)["clouds"].cloud(1), small.clouds(3, 1.0)[1])
     for bad in ({"period": 0.0}, {"odometry_sigmas": (0.0, 0.1)}, {"colums": 5}):
         with pytest.raises(ConfigError):
-            load(folder, reader="clouds", **bad)
+            load_recording(folder, reader="clouds", **bad)
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5, 6])
@@ -174,7 +174,7 @@ def test_columns_of_bin_are_told_by_content(tmp_path: Path, columns: int) -> Non
         xyz = far[:, None] * np.column_stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)])
         more = np.column_stack([rng.uniform(0, 1, n), beam, (turn + np.pi) / 62.8])
         np.column_stack([xyz, more])[:, :columns].astype("<f4").tofile(tmp_path / f"{k}.bin")
-    log = load(tmp_path)
+    log = load_recording(tmp_path)
     np.testing.assert_allclose(log["clouds"].cloud(5), xyz, rtol=1e-6)
     said = [n for n in log.meta["notes"] if "columns" in n]
     assert bool(said) == (columns != 4)
@@ -189,7 +189,7 @@ def test_bin_files_that_say_nothing_of_their_columns_are_those_of_kitti(tmp_path
 
 
 def test_kitti_odometry_brings_poses_of_the_camera_to_the_lidar(tmp_path: Path) -> None:
-    log = load(small.kitti_odometry(tmp_path / "00"))
+    log = load_recording(small.kitti_odometry(tmp_path / "00"))
     assert log.meta["reader"]["name"] == "kitti"
     truth = small.poses()
     want = se3.se3_between(np.tile(truth[0], (len(truth), 1)), truth)
@@ -199,7 +199,7 @@ def test_kitti_odometry_brings_poses_of_the_camera_to_the_lidar(tmp_path: Path) 
 
 
 def test_kitti_raw_has_fixes_and_imu(tmp_path: Path) -> None:
-    log = load(small.kitti_raw(tmp_path / "drive"))
+    log = load_recording(small.kitti_raw(tmp_path / "drive"))
     assert set(log.streams) == {"clouds", "gps", "imu"}
     assert log["clouds"].times[1] - log["clouds"].times[0] == pytest.approx(0.1)
     pose = small.poses()

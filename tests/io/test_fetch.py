@@ -18,8 +18,8 @@ import pytest
 from graphslam.core.errors import DataError, FormatError, MissingDataError
 from graphslam.io import fetch as fetching
 from graphslam.io.cards import Card, CardArchive, CardFile
-from graphslam.io.catalog import check, locate
-from graphslam.io.fetch import fetch
+from graphslam.io.catalog import check_files, locate
+from graphslam.io.fetch import fetch_dataset
 from tests.io.test_catalog import sha, toy_card, write_toy
 
 CONTENT = b"0 1 2\n" * 50
@@ -75,22 +75,22 @@ def test_fetch_checks_and_does_not_fetch_twice(
     serve(root)
     c = linked(url)
     with caplog.at_level(logging.INFO):
-        folder = fetch(c)
+        folder = fetch_dataset(c)
     assert folder == tmp_path / "cache/toy" == locate(c)
-    assert [k.state for k in check(c)] == ["ok"] * 3
+    assert [k.state for k in check_files(c)] == ["ok"] * 3
     assert (folder / "a.txt").read_bytes() == CONTENT
     for said in ("licence: text", "cite: text", f"downloading {url}/b.bin", "fetching 3 of 3 files"):
         assert said in caplog.text
     assert sorted(Quiet.served) == ["/a.txt", "/b.bin", "/note.txt"]
     with caplog.at_level(logging.INFO):
-        fetch(c)
+        fetch_dataset(c)
     assert len(Quiet.served) == 3
     assert "already in" in caplog.text
     # one spoilt file is fetched again, alone
     (folder / "sub/b.bin").write_bytes(b"xyz")
-    fetch(c)
+    fetch_dataset(c)
     assert Quiet.served[3:] == ["/b.bin"]
-    assert [k.state for k in check(c)] == ["ok"] * 3
+    assert [k.state for k in check_files(c)] == ["ok"] * 3
 
 
 def test_a_spoilt_packed_file_does_not_hide_the_good_plain_one(server: tuple[str, Path], tmp_path: Path) -> None:
@@ -99,9 +99,9 @@ def test_a_spoilt_packed_file_does_not_hide_the_good_plain_one(server: tuple[str
     write_toy(tmp_path / "cache")
     packed = tmp_path / "cache/toy/a.txt.gz"
     packed.write_bytes(b"spoilt")
-    fetch(linked(url))
+    fetch_dataset(linked(url))
     assert not packed.exists()
-    assert [k.state for k in check(linked(url))] == ["ok"] * 3
+    assert [k.state for k in check_files(linked(url))] == ["ok"] * 3
 
 
 def test_wrong_content_is_refused_and_leaves_nothing(server: tuple[str, Path], tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_wrong_content_is_refused_and_leaves_nothing(server: tuple[str, Path], t
     serve(root)
     (root / "b.bin").write_bytes(b"abd")
     with pytest.raises(DataError, match=r"b\.bin: checksum of the downloaded file differs"):
-        fetch(linked(url))
+        fetch_dataset(linked(url))
     assert not (tmp_path / "cache/toy/sub/b.bin").exists()
     left = {p.name for p in (tmp_path / "cache").rglob("*") if p.is_file()}
     assert left <= {"a.txt"}
@@ -120,14 +120,14 @@ def test_wrong_content_is_refused_and_leaves_nothing(server: tuple[str, Path], t
 def test_no_such_file_and_no_server(server: tuple[str, Path]) -> None:
     url, _ = server
     with pytest.raises(MissingDataError, match=r"download failed.*404"):
-        fetch(linked(url))
+        fetch_dataset(linked(url))
     with pytest.raises(MissingDataError, match="download failed"):
-        fetch(linked("http://127.0.0.1:9"))
+        fetch_dataset(linked("http://127.0.0.1:9"))
 
 
 def test_no_direct_download_says_where_to_get_it(server: tuple[str, Path]) -> None:
     with pytest.raises(MissingDataError, match=r"'toy' has no direct download.*wanted a copy from there"):
-        fetch(toy_card())
+        fetch_dataset(toy_card())
 
 
 def test_data_that_is_already_there_is_not_downloaded(
@@ -136,7 +136,7 @@ def test_data_that_is_already_there_is_not_downloaded(
     url, _ = server
     monkeypatch.setenv("GRAPHSLAM_DATA", str(tmp_path / "data"))
     write_toy(tmp_path / "data")
-    assert fetch(linked(url)) == tmp_path / "data/toy"
+    assert fetch_dataset(linked(url)) == tmp_path / "data/toy"
     assert Quiet.served == []
 
 
@@ -157,10 +157,10 @@ def test_archive_members_are_found_checked_and_put_in_place(server: tuple[str, P
     data = zipped(**{"Deep/er/A.TXT": CONTENT, "b.bin": b"abc", "evil.sh": b"rm"})
     (root / "set.zip").write_bytes(data)
     for digest in (None, sha(data)):
-        folder = fetch(archived(url, sha256=digest))
+        folder = fetch_dataset(archived(url, sha256=digest))
         files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
         assert files == {"a.txt", "sub/b.bin"}  # nothing else, and no archive left
-        assert [k.state for k in check(archived(url))] == ["ok", "ok", "missing"]
+        assert [k.state for k in check_files(archived(url))] == ["ok", "ok", "missing"]
         (folder / "a.txt").unlink()
     assert Quiet.served == ["/set.zip", "/set.zip"]
 
@@ -183,7 +183,7 @@ def test_bad_archives(
     (root / "set.zip").write_bytes(zipped(**members))
     before = {p for p in tmp_path.rglob("*") if "cache" not in p.parts}
     with pytest.raises(kind, match=message):
-        fetch(archived(url))
+        fetch_dataset(archived(url))
     assert {p for p in tmp_path.rglob("*") if "cache" not in p.parts} == before
     assert not list((tmp_path / "cache").rglob("*.zip"))
     assert not list((tmp_path / "cache").rglob("*.part"))
@@ -195,10 +195,10 @@ def test_truncated_archive(server: tuple[str, Path]) -> None:
     for cut in (len(data) // 2, len(data) - 5):
         (root / "set.zip").write_bytes(data[:cut])
         with pytest.raises(FormatError, match="truncated or corrupt"):
-            fetch(archived(url))
+            fetch_dataset(archived(url))
     (root / "set.zip").write_bytes(data)
     with pytest.raises(DataError, match="checksum of the downloaded file differs"):
-        fetch(archived(url, sha256="0" * 64))
+        fetch_dataset(archived(url, sha256="0" * 64))
 
 
 def test_a_bomb_stays_folded(server: tuple[str, Path]) -> None:
@@ -207,7 +207,7 @@ def test_a_bomb_stays_folded(server: tuple[str, Path]) -> None:
     (root / "set.zip").write_bytes(zipped(**{"a.txt": b"\0" * 200_000_000, "b.bin": b"abc"}))
     tracemalloc.start()
     with pytest.raises(DataError, match="differs from the description of the data set"):
-        fetch(archived(url))
+        fetch_dataset(archived(url))
     held = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert held < 20_000_000
@@ -218,7 +218,7 @@ def test_optional_file_may_be_missing_from_the_archive(server: tuple[str, Path])
     (root / "set.zip").write_bytes(zipped(**{"a.txt": CONTENT, "b.bin": b"abc"}))
     c = archived(url)
     archive = replace(c.archives[0], members=("a.txt", "b.bin", "note.txt"))
-    folder = fetch(replace(c, archives=(archive,)))
+    folder = fetch_dataset(replace(c, archives=(archive,)))
     assert not (folder / "note.txt").exists()
     assert isinstance(c.files[2], CardFile)
 
@@ -254,7 +254,7 @@ def test_only_https_is_asked(server: tuple[str, Path], tmp_path: Path, monkeypat
     monkeypatch.setattr(fetching, "SCHEMES", SCHEMES)  # as they are
     for address in (url, "ftp://127.0.0.1", f"file://{root}"):
         with pytest.raises(DataError, match="address of another scheme"):
-            fetch(linked(address))
+            fetch_dataset(linked(address))
     assert Quiet.served == []
     assert not list((tmp_path / "cache").rglob("*.txt"))
 
@@ -263,7 +263,7 @@ def test_only_https_is_asked(server: tuple[str, Path], tmp_path: Path, monkeypat
 def test_redirects_to_another_scheme_are_refused(elsewhere: str, to: str) -> None:
     Elsewhere.to = to
     with pytest.raises(DataError, match="address of another scheme"):
-        fetch(linked(elsewhere))
+        fetch_dataset(linked(elsewhere))
     assert Elsewhere.asked == 1
 
 
@@ -272,12 +272,12 @@ def test_redirects_are_followed_and_not_for_ever(elsewhere: str, server: tuple[s
     serve(root)
     Elsewhere.to = f"{url}/a.txt"
     a = linked(elsewhere).files[0]
-    folder = fetch(toy_card(files=(a,)))
+    folder = fetch_dataset(toy_card(files=(a,)))
     assert (folder / "a.txt").read_bytes() == CONTENT
     (folder / "a.txt").unlink()
     Elsewhere.to = f"{elsewhere}/again"
     with pytest.raises(DataError, match="too many redirects"):
-        fetch(toy_card(files=(a,)))
+        fetch_dataset(toy_card(files=(a,)))
 
 
 def test_a_download_that_does_not_end_is_cut(server: tuple[str, Path], tmp_path: Path) -> None:
@@ -285,5 +285,5 @@ def test_a_download_that_does_not_end_is_cut(server: tuple[str, Path], tmp_path:
     serve(root)
     (root / "b.bin").write_bytes(b"abc" + bytes(1_000_000))
     with pytest.raises(DataError, match="download is larger than the description"):
-        fetch(linked(url))
+        fetch_dataset(linked(url))
     assert not list((tmp_path / "cache").rglob("*b.bin*"))

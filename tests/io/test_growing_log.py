@@ -64,7 +64,7 @@ def test_only_beams_are_let_go_of_and_asking_for_them_is_an_error(log: SensorLog
         growing.add(name, part)
     for name, stream in log.streams.items():
         n = len(stream.times)
-        growing.let_go(name, n - 1)
+        growing.discard_before(name, n - 1)
         if isinstance(stream, BEAMS):
             assert growing.held_records[name] == 1
             with pytest.raises(DataError, match="already freed"):

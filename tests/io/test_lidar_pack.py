@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from graphslam.core.errors import ConfigError, DataError, FormatError, GeometryError, MissingDataError
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.se3 import quat_to_matrix, se3_compose, se3_transform
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.lidar_pack import MISSING, read_lidar_pack
 
 STEP = 0.004
@@ -260,7 +260,7 @@ def test_clouds_in_memory_are_checked(rng):
     ],
 )
 def test_the_recordings(data_dir, card, scans, points, seconds, path):
-    log = load(card)
+    log = load_recording(card)
     clouds = log["clouds"]
     assert len(clouds) == scans
     assert clouds.counts.sum() == points
@@ -279,7 +279,7 @@ def test_poses_bring_scans_together_and_the_step_is_right(data_dir):
     A wrong step scales the scene about the sensor while the poses stay, so surfaces no longer meet; distances are
     counted in units of the scaled scene.
     """
-    log = load("lidar3d-hku1")
+    log = load_recording("lidar3d-hku1")
     poses, clouds = log["reference"].poses, log["clouds"]
     pairs = [(k, k + 6) for k in range(60, 240, 30)]
 

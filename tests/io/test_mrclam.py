@@ -11,7 +11,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import se2_inverse, se2_transform, wrap_angle
 from graphslam.core.log import DropCounter
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.mrclam import read_mrclam
 
 BARCODES = "# Subject # Barcode #\n 1 5\n 2 14\n 6 63\n 7 81\n"
@@ -150,7 +150,7 @@ def test_what_is_asked_for_must_be_there(folder, tmp_path):
 @pytest.mark.data
 def test_the_recording(data_dir):
     """Facts counted by hand from the files, and every identity checked against the Vicon truth."""
-    log = load("mrclam-dataset7/robot3")
+    log = load_recording("mrclam-dataset7/robot3")
     assert dict(log.read) == {"controls": 55085, "landmarks": 5399}
     assert log.dropped["landmarks: unknown barcode"] == 9
     assert log.dropped["landmarks: observations of other robots"] == 965
@@ -170,8 +170,8 @@ def test_the_recording(data_dir):
 
 @pytest.mark.data
 def test_parts_of_a_data_set_by_name(data_dir):
-    assert load("mrclam-dataset7", robot=4).name == load("mrclam-dataset7/robot4").name
+    assert load_recording("mrclam-dataset7", robot=4).name == load_recording("mrclam-dataset7/robot4").name
     with pytest.raises(UnknownNameError, match="robot1"):
-        load("mrclam-dataset7/robot9")
+        load_recording("mrclam-dataset7/robot9")
     with pytest.raises(ConfigError, match="robot1"):
-        load("mrclam-dataset7")
+        load_recording("mrclam-dataset7")

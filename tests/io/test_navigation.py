@@ -12,7 +12,7 @@ from graphslam.core.gnss import EARTH_RATE, SPEED_OF_LIGHT, Pseudoranges, Tangen
 from graphslam.core.imu import Imu
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.euroc import read_euroc
 from graphslam.io.kitti_gps import read_kitti_gps
 from graphslam.io.log_store import load_log, save_log
@@ -45,7 +45,7 @@ def city(tmp_path):
 
 
 def test_a_flight_has_an_imu_and_a_prism(flight):
-    log = load(flight, late=0.01, noise_scale=3.0)
+    log = load_recording(flight, late=0.01, noise_scale=3.0)
     imu, leica = log["imu"], log["leica"]
     assert isinstance(imu, Imu)
     assert isinstance(leica, Gps)
@@ -81,14 +81,14 @@ def test_a_bad_reading_is_dropped_and_counted(flight):
 
 
 def test_fixes_without_and_with_the_imu(drive):
-    log = load(drive)
+    log = load_recording(drive)
     np.testing.assert_allclose(log["gps"].times, np.arange(20.0))
     np.testing.assert_allclose(log["gps"].positions[3], [3.5, 6.25, 0.1])
     np.testing.assert_allclose(log["imu"].specific_force[0], [0.0, 0.1, 9.8])
     np.testing.assert_allclose(log["imu"].angular_rate[0], [0.001, 0.0, 0.002])
     assert log["imu"].noise.accelerometer == 0.01
     (drive / "KittiEquivBiasedImu.txt").unlink()
-    assert list(load(drive).streams) == ["gps"]
+    assert list(load_recording(drive).streams) == ["gps"]
 
 
 def test_a_repeated_fix_is_counted_and_another_table_refused(drive):
@@ -100,7 +100,7 @@ def test_a_repeated_fix_is_counted_and_another_table_refused(drive):
 
 
 def test_pseudoranges_by_epoch_and_increments_of_the_odometry(city):
-    log = load(city)
+    log = load_recording(city)
     p, o = log["pseudoranges"], log["odometry"]
     assert isinstance(p, Pseudoranges)
     np.testing.assert_array_equal(p.offsets, np.arange(0, 61, 3))
@@ -175,7 +175,7 @@ def test_covariances_of_fixes_are_checked():
 
 
 def test_the_recorded_sets(data_dir):
-    flight, drive, city = (load(n) for n in ("euroc-mh01-imu-leica", "gtsam-kitti-gps", "smartloc-gnss"))
+    flight, drive, city = (load_recording(n) for n in ("euroc-mh01-imu-leica", "gtsam-kitti-gps", "smartloc-gnss"))
     assert (len(flight["imu"].times), len(flight["leica"].times)) == (36820, 3099)
     assert flight.name == "euroc-mh01-imu-leica"
     assert len(drive["gps"].times) == 470

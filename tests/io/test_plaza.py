@@ -10,9 +10,9 @@ import scipy.io
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.plaza import read_plaza
-from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments
 
 T = 10.0 + 0.2 * np.arange(1, 31)
 D, A = np.linspace(0.1, 0.4, 30), 0.02 * np.cos(np.arange(30))
@@ -34,10 +34,10 @@ def folder(tmp_path: Path) -> Path:
 def test_a_record_is_about_the_interval_before_its_stamp(folder):
     log = read_plaza(folder)
     stamps = np.concatenate([[9.99], T])
-    got, _ = dead_reckoning(log, stamps, MotionNoise())
+    got, _ = dead_reckoned_increments(log, stamps, MotionNoise())
     np.testing.assert_allclose(np.hypot(*got.increments[1:, :2].T), D, rtol=1e-3)  # arc and chord
     np.testing.assert_allclose(got.increments[1:, 2], A, atol=1e-12)
-    after, _ = dead_reckoning(log, T[-1] + np.array([0.0, 5.0]), MotionNoise())
+    after, _ = dead_reckoned_increments(log, T[-1] + np.array([0.0, 5.0]), MotionNoise())
     np.testing.assert_array_equal(after.increments[1], 0.0)  # nothing is known to move after the last record
 
 
@@ -119,12 +119,12 @@ def test_a_beacon_must_have_a_number_and_a_place(folder, beacon):
 
 @pytest.mark.data
 def test_the_recording(data_dir):
-    log = load("plaza1")
+    log = load_recording("plaza1")
     assert dict(log.read) == {"controls": 9657, "landmarks": 3529}
     assert not log.dropped
     assert len(log["landmarks"].ranges) == 3529
     truth = log.truth.trajectory
-    got, _ = dead_reckoning(log, truth.times, MotionNoise())
+    got, _ = dead_reckoned_increments(log, truth.times, MotionNoise())
     u = se2_between(truth.poses[:-1], truth.poses[1:])
     # the headings of the truth are the sums of the recorded changes (the files say so by agreeing to rounding)
     np.testing.assert_allclose(got.increments[1:, 2], u[:, 2], atol=2e-6)

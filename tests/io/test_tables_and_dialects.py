@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.readers import recognise
 from tests.io import small_sources as small
 
 
 def test_speeds_and_sightings(tmp_path: Path) -> None:
-    log = load(small.tables(tmp_path / "robot"))
+    log = load_recording(small.tables(tmp_path / "robot"))
     t, _, w, pose = small.drive()
     np.testing.assert_allclose(log["controls"].times, t, atol=1e-9)
     np.testing.assert_allclose(log["controls"].yaw_rate, w)
@@ -42,7 +42,7 @@ def test_poses_units_separators_comments_and_columns_in_any_order(tmp_path: Path
         header="bearing (deg)\tdistance\tstamp",
         comments="",
     )
-    log = load(folder)
+    log = load_recording(folder)
     np.testing.assert_allclose(log["odometry"].times, t, atol=1e-9)
     assert np.linalg.norm(log["odometry"].increments[1:, :2], axis=1) == pytest.approx(0.05, rel=1e-3)
     assert log["landmarks"].ids is None
@@ -53,14 +53,14 @@ def test_ranges_alone_have_no_bearing(tmp_path: Path) -> None:
     folder = small.tables(tmp_path / "robot")
     rows = np.loadtxt(folder / "sightings.csv", delimiter=",", skiprows=1)[:, :3]
     np.savetxt(folder / "sightings.csv", rows, delimiter=",", header="t,id,range", comments="")
-    assert not load(folder)["landmarks"].has_bearing.any()
+    assert not load_recording(folder)["landmarks"].has_bearing.any()
 
 
 def test_records_left_out_are_counted_under_the_stream_they_were_of(tmp_path: Path) -> None:
     root = small.tables(tmp_path / "robot")
     lines = (root / "odometry.csv").read_text().splitlines()
     (root / "odometry.csv").write_text("\n".join([*lines[:30], lines[29], *lines[30:]]) + "\n")
-    log = load(root)
+    log = load_recording(root)
     assert log.dropped == {"controls: repeated stamp": 1}
     assert log.read["controls"] == len(log["controls"].times) + 1
 
@@ -74,16 +74,16 @@ def test_tables_that_lack_something_say_what(tmp_path: Path) -> None:
     lines = (folder / "sightings.csv").read_text().splitlines()
     (folder / "sightings.csv").write_text("\n".join([lines[0], *(f"9{s}" for s in lines[1:])]))
     with pytest.raises(DataError, match="one clock"):
-        load(folder)
+        load_recording(folder)
     small.tables(folder)
     with pytest.raises(ConfigError):
-        load(folder, range_sigma=-1.0)
-    assert load(folder, range_sigma=0.7)["landmarks"].sigmas[0, 0] == 0.7
+        load_recording(folder, range_sigma=-1.0)
+    assert load_recording(folder, range_sigma=0.7)["landmarks"].sigmas[0, 0] == 0.7
 
 
 @pytest.mark.parametrize("dialect", ["FLASER", "ROBOTLASER1", "RAWLASER1"])
 def test_dialects_of_carmen_say_the_same(dialect: str, tmp_path: Path) -> None:
-    log = load(small.carmen(tmp_path / "robot.log", dialect))
+    log = load_recording(small.carmen(tmp_path / "robot.log", dialect))
     assert log.meta["reader"]["name"] == "carmen"
     laser, odometry = log["laser"], log["odometry"]
     n = len(laser.times)
@@ -97,7 +97,7 @@ def test_dialects_of_carmen_say_the_same(dialect: str, tmp_path: Path) -> None:
 
 
 def test_scans_of_other_beams_are_put_on_those_of_most(tmp_path: Path) -> None:
-    log = load(small.carmen(tmp_path / "robot.log", mixed=True))
+    log = load_recording(small.carmen(tmp_path / "robot.log", mixed=True))
     assert log["laser"].ranges.shape == (40, 181)
     seen = log["laser"].ranges[4]
     want = small.planar_ranges(np.array([0.4 - 2.0, 0.0, 0.04]), log["laser"].bearings)
@@ -109,13 +109,13 @@ def test_scans_of_other_beams_are_put_on_those_of_most(tmp_path: Path) -> None:
 
 def test_a_tum_table_is_odometry_and_a_file_of_any_name_will_do(tmp_path: Path) -> None:
     small.tum_table(tmp_path / "somewhere.dat")
-    log = load(tmp_path / "somewhere.dat")
+    log = load_recording(tmp_path / "somewhere.dat")
     assert log.meta["reader"]["name"] == "tum"
     np.testing.assert_allclose(np.linalg.norm(log["odometry"].increments[1:, :2], axis=1), 0.2, atol=1e-6)
 
 
 def test_euroc_in_the_layout_of_the_asl(tmp_path: Path) -> None:
-    log = load(small.euroc(tmp_path / "MH_01"))
+    log = load_recording(small.euroc(tmp_path / "MH_01"))
     assert log.meta["reader"]["name"] == "euroc"
     assert np.diff(log["imu"].times)[0] == pytest.approx(0.005, abs=1e-6)
     np.testing.assert_allclose(log["imu"].specific_force[0], [9.81, 0.0, 0.2])
@@ -124,6 +124,6 @@ def test_euroc_in_the_layout_of_the_asl(tmp_path: Path) -> None:
 
 def test_a_named_reader_is_taken_before_what_is_recognised(tmp_path: Path) -> None:
     folder = small.cloud_folder(tmp_path / "a", "bin", table="tum", spacing=1.0)
-    assert load(folder).meta["reader"]["also"] == ["tum: a TUM trajectory, poses.txt"]
-    log = load(folder, reader="tum")
+    assert load_recording(folder).meta["reader"]["also"] == ["tum: a TUM trajectory, poses.txt"]
+    log = load_recording(folder, reader="tum")
     assert set(log.streams) == {"odometry"} or "clouds" not in log

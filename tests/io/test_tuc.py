@@ -10,7 +10,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_exp, se2_log
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.tuc import TucLog, read_tuc
 
 
@@ -109,7 +109,7 @@ def test_bad_files_are_refused_with_their_line(tmp_path: Path) -> None:
 
 @pytest.mark.data
 def test_recorded_hall(data_dir: Path) -> None:
-    log = load("tuc-slam-lecture-hall")
+    log = load_recording("tuc-slam-lecture-hall")
     assert (len(log.times), len(log.loops), len(log.truth)) == (13838, 5180, 6919)
     assert log.dropped == {} or sum(log.dropped.values()) == 0
     network, times = log.to_network(min_similarity=0.5)

@@ -13,7 +13,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
 from graphslam.io.slsjf import read_slsjf_local_maps
 from graphslam.join import association
-from graphslam.join.association import Association, CandidatePairs, associate
+from graphslam.join.association import CandidatePairs, MapAssociationConfig, match_landmarks
 from graphslam.join.eif import join_maps
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinedMap
@@ -39,7 +39,7 @@ def pair_scores(submaps: list[Submap], found: tuple[np.ndarray, ...]) -> tuple[f
 @pytest.mark.parametrize("join", [join_sequential, join_tree, join_ekf])
 def test_landmarks_are_recognised_around_a_loop(join, rule: str, rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, submaps=20, landmarks=60)
-    options = Association(rule=rule, sensor_range=14.0)
+    options = MapAssociationConfig(rule=rule, sensor_range=14.0)
     joined = join(forget(submaps), association=options)
     precision, recall = pair_scores(submaps, joined.submap_ids)
     assert precision > 0.995
@@ -54,7 +54,7 @@ def test_landmarks_are_recognised_around_a_loop(join, rule: str, rng: np.random.
 def test_landmarks_of_the_published_maps_are_recognised(data_dir: Path) -> None:
     """200 real local maps, five loops through a park, 299 trees: against the published identities."""
     submaps = read_slsjf_local_maps(data_dir / "victoria_park_processed")
-    joined = join_sequential(submaps, association=Association(rule="joint"))
+    joined = join_sequential(submaps, association=MapAssociationConfig(rule="joint"))
     precision, recall = pair_scores(submaps, joined.submap_ids)
     assert precision > 0.9995
     assert recall > 0.985
@@ -73,7 +73,7 @@ def test_a_submap_out_of_reach_is_not_even_looked_at(rng: np.random.Generator) -
     asked: list[np.ndarray] = []
     real = a.covariance_block
     a.covariance_block = lambda ix: asked.append(ix) or real(ix)  # type: ignore[method-assign,func-returns-value]
-    associate(a, far, Association(sensor_range=60.0, radius=5.0))
+    match_landmarks(a, far, MapAssociationConfig(sensor_range=60.0, radius=5.0))
     assert len(joined.landmark_ids) > 0
     assert max(len(ix) for ix in asked) < 0.5 * len(a.x)  # a submatrix, never the whole
 
@@ -188,4 +188,4 @@ def test_innovation_covariance_is_right_by_monte_carlo(rng: np.random.Generator)
 )
 def test_impossible_options_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
-        Association(**bad)
+        MapAssociationConfig(**bad)

@@ -119,7 +119,7 @@ def test_a_map_is_pulled_back_as_its_chart_says(rng: np.random.Generator) -> Non
         )
     here = replace_values(slow, m)
     x = m.x + rng.normal(0, 0.4, len(m.x))
-    blocks, gradient = kernels.pulled_back(eif.blocks_of(m), m.anchor, x)
+    blocks, gradient = kernels.relinearise_in_chart(eif.block_map_of(m), m.anchor, x)
     u = here.difference(x)
     J = np.stack([(here.difference(x + h) - here.difference(x - h)) / 2e-6 for h in 1e-6 * np.eye(len(x))], axis=1)
     I = here.information
@@ -241,7 +241,7 @@ def test_ranks_of_a_tree_order_are_followed_only_where_both_maps_have_them(which
             m.order = np.argsort(m.rank)
     a.fill, b.fill = 0.2, 1e-3
     none = np.zeros(len(b.x))
-    joined, gradient, _ = eif._assemble(a, b, eif.match_by_id(a, b), eif.blocks_of(a), eif.blocks_of(b), none)
+    joined, gradient, _ = eif._assemble(a, b, eif.match_by_id(a, b), eif.block_map_of(a), eif.block_map_of(b), none)
     assert gradient is not None
     assert joined.fill == 0.2  # the larger: what the worse of the two was worth when it was fresh
     if which == "both":

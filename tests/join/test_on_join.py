@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.submap import Submap
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
-from graphslam.join.joined_map import MapView
+from graphslam.join.joined_map import JoinedMapView
 from graphslam.join.order import join_sequential
 from tests.reference.submap_chain import submap_chain
 
@@ -24,7 +24,7 @@ def chain(rng: np.random.Generator) -> list[Submap]:
 def test_the_view_after_submap_k_is_the_join_of_the_first_k(join, chain: list[Submap]) -> None:
     seen: list[int] = []
 
-    def on_join(k: int, view: MapView) -> None:
+    def on_join(k: int, view: JoinedMapView) -> None:
         seen.append(k)
         whole = join(chain[: k + 1])
         np.testing.assert_array_equal(view.ids, whole.landmark_ids)
@@ -47,7 +47,7 @@ def test_both_forms_tell_the_same_at_every_submap(chain: list[Submap]) -> None:
     told: dict[str, list[np.ndarray]] = {"eif": [], "ekf": []}
     for name, join in (("eif", join_sequential), ("ekf", join_ekf)):
 
-        def on_join(k: int, view: MapView, name: str = name) -> None:
+        def on_join(k: int, view: JoinedMapView, name: str = name) -> None:
             told[name].append(
                 np.concatenate([view.pose(), view.pose_covariance().ravel(), view.landmark_marginals().ravel()])
             )
@@ -67,10 +67,10 @@ def test_watching_changes_nothing(join, chain: list[Submap]) -> None:
 def test_recognised_landmarks_have_no_id_in_the_view(join, chain: list[Submap]) -> None:
     counts: list[int] = []
 
-    def on_join(k: int, view: MapView) -> None:
+    def on_join(k: int, view: JoinedMapView) -> None:
         assert np.all(view.ids == -1)
         assert len(view.ids) == len(view.landmark_at) == 1 + max(e.max() for e in view.entries)
         counts.append(len(view.ids))
 
-    joined = join(chain, association=Association(rule="nearest", sensor_range=14.0), on_join=on_join)
+    joined = join(chain, association=MapAssociationConfig(rule="nearest", sensor_range=14.0), on_join=on_join)
     assert counts[-1] == len(joined.landmark_ids) == len(np.unique(joined.landmark_ids))

@@ -10,8 +10,8 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees
-from graphslam.join.association import Association
-from graphslam.join.joined_map import MapView
+from graphslam.join.association import MapAssociationConfig
+from graphslam.join.joined_map import JoinedMapView
 from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential
 from graphslam.join.submap_solver import solve_submaps
@@ -29,7 +29,7 @@ def chain(rng: np.random.Generator) -> list[Submap]:
 def test_every_submap_is_the_batch_optimum_of_the_submaps_so_far(chain: list[Submap]) -> None:
     seen = []
 
-    def on_join(k: int, view: MapView) -> None:
+    def on_join(k: int, view: JoinedMapView) -> None:
         best = solve_submaps(chain[: k + 1])
         np.testing.assert_allclose(view.x[view.landmark_at[:, None] + np.arange(2)], best.landmarks, atol=1e-6)
         np.testing.assert_allclose(view.pose(), best.poses[-1], atol=1e-6)
@@ -78,7 +78,7 @@ def test_headings_stay_near_their_linearisation(chain: list[Submap]) -> None:
     used: list[float] = []
     arrived, optimal = [0.0], []
 
-    def on_join(k: int, view: MapView) -> None:
+    def on_join(k: int, view: JoinedMapView) -> None:
         headings = view.x[view.pose_at + 2]
         if k:
             used.append(arrived[-1])
@@ -99,7 +99,7 @@ def test_recognised_landmarks_of_a_relinearised_map(rng: np.random.Generator) ->
     submaps, _ = submap_chain(rng, submaps=20, landmarks=60)
     nobody = [s.with_ids(np.full(len(s.landmarks), -1)) for s in submaps]
     joined = join_online(
-        nobody, association=Association(rule="joint", sensor_range=14.0), policy=RelinearisationPolicy(every=1)
+        nobody, association=MapAssociationConfig(rule="joint", sensor_range=14.0), policy=RelinearisationPolicy(every=1)
     )
     by_name = join_online(submaps, policy=RelinearisationPolicy(every=1))
     assert len(joined.landmark_ids) == pytest.approx(len(by_name.landmark_ids), abs=2)

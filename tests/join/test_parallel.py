@@ -9,14 +9,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from graphslam.core.cluster import connect
+from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError, CovarianceError, IndeterminateError
 from graphslam.core.extras import import_extra
 from graphslam.core.submap import Submap
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinedMap, JoinResult
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_tree
-from graphslam.join.polish import polish
 from graphslam.sim.local_maps import simulate_local_maps
 
 
@@ -43,21 +43,23 @@ def assert_same(a: JoinResult, b: JoinResult) -> None:
     assert a.objective == b.objective
 
 
-RULES = [None, Association(rule="nearest", sensor_range=30.0)]
+RULES = [None, MapAssociationConfig(rule="nearest", sensor_range=30.0)]
 
 
 @pytest.mark.parametrize("association", RULES, ids=["ids", "recognised"])
 def test_a_cluster_and_a_pool_give_the_same_bits(
-    chain: list[Submap], scheduler: str, association: Association | None
+    chain: list[Submap], scheduler: str, association: MapAssociationConfig | None
 ) -> None:
     alone = join_tree(chain, association=association)
     assert_same(join_tree(chain, association=association, executor=scheduler), alone)
-    with connect(scheduler) as client:
+    with connect_cluster(scheduler) as client:
         shared = join_tree(chain, association=association, executor=client)
         assert client.submit(math.sqrt, 4).result() == 2.0  # the caller's client is left open
     assert_same(shared, alone)
     assert all(shared.times[part] > 0.0 for part in ("association", "update", "recovery"))
-    assert polish(chain, shared).objective_polished == pytest.approx(polish(chain, alone).objective_polished, rel=1e-9)
+    assert optimise_from_join(chain, shared).objective_polished == pytest.approx(
+        optimise_from_join(chain, alone).objective_polished, rel=1e-9
+    )
 
 
 def test_processes_give_the_same_bits(chain: list[Submap]) -> None:
@@ -95,4 +97,6 @@ def test_a_joined_map_travels_without_its_factors(chain: list[Submap]) -> None:
     again = pickle.loads(pickle.dumps(joined))
     assert again.problem is None
     np.testing.assert_array_equal(again.vector, joined.vector)
-    assert polish(chain, again).objective_polished == pytest.approx(polish(chain, joined).objective_polished, rel=1e-12)
+    assert optimise_from_join(chain, again).objective_polished == pytest.approx(
+        optimise_from_join(chain, joined).objective_polished, rel=1e-12
+    )

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.compare import compare, default_methods
+from graphslam.app.compare import compare_methods, default_methods
 from graphslam.app.join_verdict import compare_verdict
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import ConfigError, DataError, MissingDataError, UnknownNameError
@@ -17,14 +17,14 @@ from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.evaluate.consistency import joint_nees, pose_error
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.network_file import read_network
 from graphslam.join.pose_ekf import MOST
-from graphslam.join.pose_estimate import PoseEstimate, polish_poses
+from graphslam.join.pose_estimate import PoseEstimate, optimise_poses
 from graphslam.join.pose_join import POSE_JOINERS, join_poses_sequential, join_poses_tree
 from graphslam.join.pose_problem import PoseProblem
-from graphslam.join.registry import join
+from graphslam.join.registry import join_by_method
 from graphslam.solve.batch import BatchSolver, optimise_graph
 from tests.reference.best_known import BEST_KNOWN
 from tests.reference.pose_ramp import pose_ramp
@@ -42,7 +42,7 @@ def truth_of(problem: PoseProblem, poses: Array) -> MapTruth:
 @pytest.mark.parametrize("case", CASES)
 def test_five_methods_one_optimum_and_the_price_of_filtering_before_it(case: dict) -> None:
     problem, truth = pose_ramp(2, submaps=7, radians=0.03, **case)  # an odd one goes up the tree by itself
-    table = compare(problem, truth=truth_of(problem, truth), memory=False).set_index("method")
+    table = compare_methods(problem, truth=truth_of(problem, truth), memory=False).set_index("method")
     assert list(table.index) == list(METHODS)
     best = table["objective_polished"]["batch"]
     np.testing.assert_allclose(table["objective_polished"], best, rtol=1e-9)
@@ -64,7 +64,7 @@ def test_five_methods_one_optimum_and_the_price_of_filtering_before_it(case: dic
 @pytest.mark.parametrize("case", CASES)
 def test_the_filter_in_sequence_is_the_dense_filter(case: dict) -> None:
     problem, _ = pose_ramp(6, submaps=5, radians=0.05, **case)
-    sparse, dense = join(problem, "eif-sequential"), join(problem, "ekf")
+    sparse, dense = join_by_method(problem, "eif-sequential"), join_by_method(problem, "ekf")
     np.testing.assert_allclose(dense.poses, sparse.poses, atol=1e-9)
     assert sparse.information.shape == (problem.states, problem.states) == (sparse.states, dense.states)
     if problem.levelled:
@@ -84,16 +84,16 @@ def test_more_passes_come_nearer_to_the_optimum() -> None:
     problem, _ = pose_ramp(3, submaps=8, loops=40, radians=0.03)
     for way in (join_poses_tree, join_poses_sequential):
         once, thrice = way(problem), way(problem, passes=3)
-        best = polish_poses(problem, once).objective_polished
+        best = optimise_poses(problem, once).objective_polished
         assert once.objective - best > 3 * (thrice.objective - best) > 0
 
 
 def test_where_loops_bend_each_submap_only_the_refinement_helps() -> None:
     problem, _ = pose_ramp(7, submaps=10, loops=60, radians=0.1)
-    tree = join(problem, "eif-tree")
-    best = polish_poses(problem, tree)
+    tree = join_by_method(problem, "eif-tree")
+    best = optimise_poses(problem, tree)
     assert tree.objective > 1.2 * best.objective_polished
-    assert best.objective_polished == pytest.approx(join(problem, "batch").objective, rel=1e-8)
+    assert best.objective_polished == pytest.approx(join_by_method(problem, "batch").objective, rel=1e-8)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -107,7 +107,7 @@ def test_covariances_are_honest(case: dict) -> None:
         )
         dof = problem.group.dof * (len(truth) - 1)
         for method in METHODS:
-            found = join(problem, method, polish=method == "isam2")
+            found = join_by_method(problem, method, polish=method == "isam2")
             error = pose_error(found.poses[1:], truth[1:]).ravel()
             P = found.covariance_block(np.arange(dof))
             values[method].append(joint_nees(error, covariance=P))
@@ -129,10 +129,10 @@ def test_ties_enter_whatever_their_direction_and_order() -> None:
     W[back] = W[back] @ g.adjoint(T[back])  # the residual of the inverse is -Ad(T) that of the measurement
     ends = np.where(back[:, None], problem.ends[:, ::-1], problem.ends)
     other = replace(problem, ends=ends[order], measured=T[order], whiteners=W[order])
-    a, b = join(problem, "batch"), join(other, "batch")
+    a, b = join_by_method(problem, "batch"), join_by_method(other, "batch")
     np.testing.assert_allclose(a.poses, b.poses, atol=1e-7)
     for method in ("eif-tree", "eif-sequential"):
-        there, here = join(other, method), join(problem, method)
+        there, here = join_by_method(other, method), join_by_method(problem, method)
         assert there.objective == pytest.approx(here.objective, rel=1e-9)
         np.testing.assert_allclose(there.poses, here.poses, atol=1e-7)
 
@@ -165,7 +165,7 @@ def dense_submaps(dim: int = 3) -> tuple[list[Submap], PoseProblem]:
 def test_submaps_are_joined_by_their_exits_and_matches(dim: int) -> None:
     submaps, problem = dense_submaps(dim)
     assert any(s.matches for s in submaps)
-    found = join(submaps, "eif-tree", polish=True)
+    found = join_by_method(submaps, "eif-tree", polish=True)
     assert isinstance(found, PoseEstimate)
     assert found.states == problem.group.dof * 10
     graph = PoseGraph(dim)
@@ -176,10 +176,10 @@ def test_submaps_are_joined_by_their_exits_and_matches(dim: int) -> None:
     best = optimise_graph(graph)
     assert found.objective_polished == pytest.approx(best.objective, rel=1e-9)
     np.testing.assert_allclose(found.poses, best.values.poses, atol=1e-6)
-    wide = join(submaps, "eif-tree", polish=True, covariance_scale=4.0)
+    wide = join_by_method(submaps, "eif-tree", polish=True, covariance_scale=4.0)
     assert wide.objective_polished < found.objective_polished
     doubted = [replace(s, matches=tuple(replace(m, support=0.1) for m in s.matches)) for s in submaps]
-    assert join(doubted, "batch").dof == 0
+    assert join_by_method(doubted, "batch").dof == 0
 
 
 def test_a_tie_counts_with_the_weight_that_its_kernel_gives_it() -> None:
@@ -191,12 +191,12 @@ def test_a_tie_counts_with_the_weight_that_its_kernel_gives_it() -> None:
     far = problem.group.exp(np.array([0, 0, 1.0, 3, 3, 0]))
     for i, j in ((0, 6), (1, 9)):
         graph.add_between(
-            i, j, far, 1e-2 * np.eye(6), streams=["x"], evidence="shared-scan", robust=Robust("cauchy", 1.0)
+            i, j, far, 1e-2 * np.eye(6), streams=["x"], evidence="shared-scan", robust=RobustKernel("cauchy", 1.0)
         )
     solver = BatchSolver(graph)
     solver.solve_to_optimum()
     weighted = PoseProblem.of_graph(graph)
-    found = join(weighted, "eif-tree", polish=True)
+    found = join_by_method(weighted, "eif-tree", polish=True)
     np.testing.assert_allclose(found.poses, graph.values.poses, atol=1e-5)
     assert found.objective_polished < graph.objective().total
 
@@ -209,12 +209,12 @@ def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
     )
     mixed = [replace(submaps[0], landmarks=marks), *submaps[1:]]
     refused = [
-        (lambda: join(mixed, "eif-tree"), DataError, "not joined by matches"),
-        (lambda: join(problem, "eif-online"), UnknownNameError, "eif-online"),
-        (lambda: compare(problem, ["magic"], memory=False), UnknownNameError, "magic"),
-        (lambda: join(problem, "eif-tree", associate="joint"), ConfigError, "no landmarks to be associated"),
-        (lambda: join(problem, "eif-tree", workers=2), ConfigError, "one process"),
-        (lambda: join(problem, "eif-tree", covariance_scale=2.0), ConfigError, "scale 1"),
+        (lambda: join_by_method(mixed, "eif-tree"), DataError, "not joined by matches"),
+        (lambda: join_by_method(problem, "eif-online"), UnknownNameError, "eif-online"),
+        (lambda: compare_methods(problem, ["magic"], memory=False), UnknownNameError, "magic"),
+        (lambda: join_by_method(problem, "eif-tree", associate="joint"), ConfigError, "no landmarks to be associated"),
+        (lambda: join_by_method(problem, "eif-tree", workers=2), ConfigError, "one process"),
+        (lambda: join_by_method(problem, "eif-tree", covariance_scale=2.0), ConfigError, "scale 1"),
         (lambda: PoseProblem.of_graph(PoseGraph(3)), DataError, "no submaps"),
         (lambda: two_sessions(submaps), DataError, "one chain"),
     ]
@@ -224,7 +224,7 @@ def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
         assert "\n" not in str(error.value)
     large, _ = pose_ramp(1, dim=3, submaps=2, steps=MOST // 12 + 1, loops=0)
     with pytest.raises(DataError, match="no room"):
-        join(large, "ekf")
+        join_by_method(large, "ekf")
     assert default_methods(large) == tuple(m for m in METHODS if m != "ekf")
     assert default_methods(problem) == METHODS
 
@@ -243,7 +243,7 @@ def test_a_problem_on_disk_is_the_same_problem(tmp_path: Path) -> None:
     problem, _ = pose_ramp(5, level_sigma=0.01)
     problem.save(tmp_path / "p.npz")
     again = PoseProblem.load(tmp_path / "p.npz")
-    assert join(again, "eif-tree").objective == join(problem, "eif-tree").objective
+    assert join_by_method(again, "eif-tree").objective == join_by_method(problem, "eif-tree").objective
     part = problem.part(0, 3)
     assert len(part.keys) == 3
     assert part.level_nodes.tolist() == [k for k in problem.level_nodes if k <= part.bases[-1]]
@@ -261,7 +261,7 @@ def test_published_graphs_cut_into_submaps(
     own = POSE_JOINERS["eif-tree"](problem)
     assert own.objective < tree
     assert join_poses_sequential(problem).objective < sequence
-    best = polish_poses(problem, own)
+    best = optimise_poses(problem, own)
     assert best.converged
     assert best.objective_polished == pytest.approx(BEST_KNOWN[file], rel=1e-6)
 
@@ -269,7 +269,7 @@ def test_published_graphs_cut_into_submaps(
 def test_a_pose_graph_file_is_cut_where_it_is_named(data_dir: Path) -> None:
     found = submap_source(data_dir / "posegraphs/intel.g2o.xz", submap_poses=100)
     assert len(found.material.keys) == 18
-    table = compare(found.material, ["eif-tree", "batch"], memory=False)
+    table = compare_methods(found.material, ["eif-tree", "batch"], memory=False)
     np.testing.assert_allclose(table["objective_polished"], BEST_KNOWN["posegraphs/intel.g2o.xz"], rtol=1e-6)
     assert found.times == list(range(1728))
     with pytest.raises(MissingDataError, match="cut into some by --submap-poses"):

@@ -13,7 +13,7 @@ from graphslam.core.poses import SE3, Group, group_of
 from graphslam.core.se3 import quat_rotate, so3_exp
 from graphslam.join.joined_map import JoinTimes
 from graphslam.join.pose_map import PoseMap, join_poses, level_meeting, level_step, level_tangent
-from graphslam.join.pose_problem import PoseProblem, Ties
+from graphslam.join.pose_problem import PoseProblem, RelativePoseFactors
 from tests.reference.pose_ramp import pose_ramp
 
 NONE = np.zeros(0, dtype=np.int64)
@@ -28,7 +28,7 @@ def stepped(group: Group, poses: Array, up: Array | None, xi: Array) -> tuple[Ar
     return moved, up
 
 
-def residuals(ties: Ties, poses: Array, up: Array | None) -> Array:
+def residuals(ties: RelativePoseFactors, poses: Array, up: Array | None) -> Array:
     """Whitened residuals of all ties, one by one."""
     g, out = group_of(poses), []
     for (i, j), T, W in zip(ties.ends, ties.measured, ties.whiteners):
@@ -43,7 +43,7 @@ def residuals(ties: Ties, poses: Array, up: Array | None) -> Array:
     return np.concatenate(out)
 
 
-def jacobian(ties: Ties, poses: Array, up: Array | None, h: float = 1e-6) -> Array:
+def jacobian(ties: RelativePoseFactors, poses: Array, up: Array | None, h: float = 1e-6) -> Array:
     """Of :func:`residuals` by central differences, over all nodes, base included, and the level frame."""
     g, n = group_of(poses), len(poses)
     columns = [(k, c) for k in range(n) for c in range(g.dof)] + ([] if up is None else [(n, 0), (n, 1)])

@@ -15,7 +15,7 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.se3 import se3_between, se3_inverse, se3_transform
 from graphslam.core.submap import Submap
 from graphslam.io.submap_store import read_submaps, write_submaps
-from graphslam.join.registry import join
+from graphslam.join.registry import join_by_method
 
 METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf", "eif-tree-classical", "eif-sequential-classical")
 FIELD = {"seconds": 60.0, "points": 150}
@@ -60,7 +60,7 @@ def test_every_method_ends_at_one_optimum(drifting) -> None:
 def test_the_filters_in_both_forms_are_one_algebra(drifting) -> None:
     """The Kalman filter and the classical information filter in sequence are linearised at the same places."""
     submaps = drifting[0][:3]
-    covariance, information = join(submaps, "ekf"), join(submaps, "eif-sequential-classical")
+    covariance, information = join_by_method(submaps, "ekf"), join_by_method(submaps, "eif-sequential-classical")
     np.testing.assert_allclose(covariance.poses, information.poses, atol=1e-7)
     np.testing.assert_allclose(covariance.landmarks, information.landmarks, atol=1e-7)
     np.testing.assert_allclose(covariance.covariance, information.joint_covariance(), rtol=1e-5, atol=1e-9)
@@ -68,7 +68,7 @@ def test_the_filters_in_both_forms_are_one_algebra(drifting) -> None:
 
 def test_a_tree_of_two_is_the_sequence(drifting) -> None:
     submaps = drifting[0][:2]
-    tree, sequence = join(submaps, "eif-tree"), join(submaps, "eif-sequential")
+    tree, sequence = join_by_method(submaps, "eif-tree"), join_by_method(submaps, "eif-sequential")
     np.testing.assert_array_equal(tree.poses, sequence.poses)
     np.testing.assert_array_equal(tree.information.toarray(), sequence.information.toarray())
 
@@ -79,7 +79,7 @@ def test_joined_maps_are_honest() -> None:
     for seed in range(8):
         log = gs.simulate("point-field", seed=100 + seed, **FIELD)
         submaps = local_maps(log)
-        found = join(submaps, "eif-tree")
+        found = join_by_method(submaps, "eif-tree")
         one, n = map_nees(found, [s.key for s in submaps], truth_of(log, submaps))
         d2, dof = d2 + one, dof + n
     low, high = chi2_quantile(0.001, dof) / dof, chi2_quantile(0.999, dof) / dof
@@ -93,25 +93,25 @@ def test_submaps_in_space_survive_the_disk(tmp_path, drifting) -> None:
     write_submaps(tmp_path / "maps", list(submaps))
     again = read_submaps(tmp_path / "maps")
     assert [s.landmarks.chart for s in again] == ["group"] * len(submaps)
-    np.testing.assert_array_equal(join(again, "eif-tree").poses, join(submaps, "eif-tree").poses)
+    np.testing.assert_array_equal(join_by_method(again, "eif-tree").poses, join_by_method(submaps, "eif-tree").poses)
 
 
 def test_a_submap_without_landmarks_measures_its_end(drifting) -> None:
     first, second, *_ = drifting[0]
     bare = replace(second, landmarks=None)
-    found = join([first, bare], "batch")
+    found = join_by_method([first, bare], "batch")
     np.testing.assert_allclose(se3_between(found.poses[1], found.poses[2]), bare.exit_pose, atol=1e-9)
 
 
 def test_what_cannot_be_joined_is_refused(drifting) -> None:
     submaps = drifting[0]
     with pytest.raises(ConfigError, match="by the ids that they bear"):
-        join(submaps, associate="joint")
+        join_by_method(submaps, associate="joint")
     with pytest.raises(ConfigError, match="one process"):
-        join(submaps, workers=2)
+        join_by_method(submaps, workers=2)
     nobody = [submaps[0].with_ids(np.full(len(submaps[0].landmarks), -1)), *submaps[1:]]
     with pytest.raises(DataError, match="has no id, or its id is repeated"):
-        join(nobody)
+        join_by_method(nobody)
     flat = gs.local_maps(gs.simulate("landmark-field", preset="quick", seed=1))[0]
     with pytest.raises(DataError, match="two dimensions"):
-        join([submaps[0], flat])
+        join_by_method([submaps[0], flat])

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.io.slsjf import read_slsjf_local_maps
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential
-from graphslam.join.polish import polish
 from graphslam.join.submap_blocks import SubmapProblem
-from graphslam.join.submap_solver import minimise, solve_submaps
+from graphslam.join.submap_solver import minimise_submaps, solve_submaps
 from tests.reference.submap_chain import submap_chain
 
 
@@ -63,13 +63,13 @@ def test_poor_starts_reach_the_optimum_downhill(
         monkeypatch.setattr(SubmapProblem, "bent", lambda self, x, step: x + step)
     submaps, _ = submap_chain(rng, submaps=15, landmarks=40)
     problem = SubmapProblem(submaps)
-    best = minimise(problem, problem.initial())
+    best = minimise_submaps(problem, problem.initial())
     refused, reached, jumps = 0, 0, 0
     for _ in range(16):
         x = best.x.copy()
         x[2:45:3] = wrap_angle(x[2:45:3] + rng.normal(0.0, 1.1, 15))
         x[45:] += rng.normal(0.0, 15.0, len(x) - 45)
-        found = minimise(problem, x, max_iterations=200)
+        found = minimise_submaps(problem, x, max_iterations=200)
         steps = np.diff(found.history)
         jumps += np.max(steps / np.maximum(found.history[:-1], 1.0)) > 1e-12  # never uphill, but for rounding
         if found.objective < best.objective * (1 + 1e-9):
@@ -86,10 +86,10 @@ def test_poor_starts_reach_the_optimum_downhill(
 def test_a_kilometre_loop_joined_in_sequence_is_polished_in_a_few_steps() -> None:
     """Where headings are corrected by degrees, straight steps leave the valley and damped ones crawl along it."""
     log = simulate("landmark-field", preset="A", seed=3, layout_seed=1, laps=1.08, lap_length=2500.0, landmarks=260)
-    options = {**recommended(log, "rbpf-ekf")["frontend"], "particles": 20}
+    options = {**recommended_options(log, "rbpf-ekf")["frontend"], "particles": 20}
     submaps = list(make_front_end("rbpf-ekf", options).submaps(log, seed=SeedTree(0)))
     joined, tree = join_sequential(submaps), solve_submaps(submaps)
-    polished = polish(submaps, joined)
+    polished = optimise_from_join(submaps, joined)
     assert polished.converged
     assert polished.iterations <= 9  # 16 with straight and damped steps alone
     assert polished.objective_polished == pytest.approx(tree.objective, rel=1e-9)
@@ -107,7 +107,7 @@ def test_a_start_that_is_not_a_number_is_an_error(rng: np.random.Generator) -> N
     submaps, _ = submap_chain(rng, submaps=3)
     problem = SubmapProblem(submaps)
     with pytest.raises(SolverError, match="nan"):
-        minimise(problem, np.full(problem.size, np.nan))
+        minimise_submaps(problem, np.full(problem.size, np.nan))
 
 
 def test_covariance_blocks_by_sparse_solves_are_the_dense_inverse(rng: np.random.Generator) -> None:

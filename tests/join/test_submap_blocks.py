@@ -12,7 +12,7 @@ from graphslam.core.errors import CovarianceError, DataError, GeometryError, Ind
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.graph.submap_model import submap_residual
 from graphslam.join.submap_blocks import SubmapProblem, fuse_repeated, relabel, scale_covariances
-from graphslam.join.submap_solver import minimise, solve_submaps
+from graphslam.join.submap_solver import minimise_submaps, solve_submaps
 from graphslam.linear.symmetric_factor import SymmetricFactor
 from tests.reference.dense_join import dense_normal_equations, first_sighting
 from tests.reference.submap_chain import submap_chain
@@ -89,7 +89,7 @@ def test_gradient_matches_finite_differences(chain: list[Submap], rng: np.random
 def test_a_step_of_a_linear_problem_ends_at_its_minimum(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng, known_heading=True)
     problem = SubmapProblem(submaps)
-    best = minimise(problem, problem.initial())
+    best = minimise_submaps(problem, problem.initial())
     assert best.converged
     assert best.iterations <= 3
     assert best.history[1] == pytest.approx(best.objective, rel=1e-6)

@@ -18,12 +18,12 @@ from graphslam.loops.candidates import (
     CandidateConfig,
     front_end_candidates,
     information_gain,
-    nearness,
+    overlap_probability,
+    pairs_sharing_scans,
     proximity_candidates,
-    sharing_maps,
-    thinned,
+    thin_candidates,
 )
-from graphslam.loops.places import ChainRelative, Places, chain_increments, places_of
+from graphslam.loops.places import ChainRelativePoses, Places, chain_increments, loop_places
 
 D3 = np.diag([1e-6, 1e-6, 4e-6, 1e-4, 1e-4, 2.5e-5])
 
@@ -69,8 +69,8 @@ def square(side: float = 30.0, laps: float = 1.25, dim: int = 3, cut: float = 20
 def test_what_a_chain_knows_of_two_places_is_what_samples_say(dim: int) -> None:
     """Poses of places with sampled noise on every step, against mean and covariance, forwards and backwards."""
     submaps = square(dim=dim)
-    places = places_of(submaps, 4.0)
-    chain = ChainRelative(submaps, places)
+    places = loop_places(submaps, 4.0)
+    chain = ChainRelativePoses(submaps, places)
     T, Q = chain_increments(submaps, places)
     g = group_of(T)
     rng = np.random.default_rng(1)
@@ -93,7 +93,7 @@ def test_what_a_chain_knows_of_two_places_is_what_samples_say(dim: int) -> None:
 
 def test_places_lie_along_the_way() -> None:
     submaps = square()
-    places = places_of(submaps, 3.0)
+    places = loop_places(submaps, 3.0)
     assert np.all(np.abs(np.diff(places.way) - 3.0) <= 1.01)
     assert places.of_submap(1).tolist() == np.flatnonzero(places.submap == 1).tolist()
     assert places.way[places.of_submap(2)[0]] == pytest.approx(40.0)
@@ -103,10 +103,10 @@ def test_places_lie_along_the_way() -> None:
     with pytest.raises(DataError):
         Places(places.node, places.submap, places.T_base_node, places.way[::-1], places.time)
     with pytest.raises(DataError):
-        places_of([Submap(key=0, interval=(0, 1), exit_pose=np.zeros(3), exit_covariance=np.eye(3))])
+        loop_places([Submap(key=0, interval=(0, 1), exit_pose=np.zeros(3), exit_covariance=np.eye(3))])
 
 
-def plain_pairs(places: Places, chain: ChainRelative, c: CandidateConfig) -> set[tuple[int, int]]:
+def plain_pairs(places: Places, chain: ChainRelativePoses, c: CandidateConfig) -> set[tuple[int, int]]:
     """All pairs that may be tried, one by one."""
     out = set()
     for i in range(len(places)):
@@ -128,8 +128,8 @@ def plain_pairs(places: Places, chain: ChainRelative, c: CandidateConfig) -> set
 
 def test_proximity_gives_the_pairs_that_may_overlap() -> None:
     submaps = square()
-    places = places_of(submaps, 5.0)
-    chain = ChainRelative(submaps, places)
+    places = loop_places(submaps, 5.0)
+    chain = ChainRelativePoses(submaps, places)
     for c in (
         CandidateConfig(stretch=0.0, keep=10_000, batch=37),
         CandidateConfig(stretch=0.0, keep=10_000, overlap=3.0, least_gain=4.0, least_way=60.0),
@@ -154,7 +154,7 @@ def test_proximity_gives_the_pairs_that_may_overlap() -> None:
 def test_a_storey_above_is_no_candidate() -> None:
     T = np.array([[1.0, 1.0, z, 0, 0, 0, 1] for z in (0.0, 2.0, 3.2)])
     P = np.broadcast_to(np.diag([1e-4] * 3 + [1.0, 1.0, 0.16]), (3, 6, 6))
-    chance, may = nearness(T, P, CandidateConfig())
+    chance, may = overlap_probability(T, P, CandidateConfig())
     assert may.tolist() == [True, True, False]
     assert chance[0] > 0.9 > 0.1 > chance[1] > chance[2]
 
@@ -165,7 +165,7 @@ def test_chance_is_that_of_samples_along_a_line() -> None:
     P = np.zeros((1, 3, 3))
     P[0, 0, 0] = 9.0
     P[0, 1, 1] = P[0, 2, 2] = 1e-8
-    chance, _ = nearness(np.array([[10.0, 0.0, 0.0]]), P, CandidateConfig())
+    chance, _ = overlap_probability(np.array([[10.0, 0.0, 0.0]]), P, CandidateConfig())
     x = 10.0 + 3.0 * rng.standard_normal(100_000)
     assert chance[0] == pytest.approx(np.mean(np.abs(x) < 8.0), abs=0.01)
 
@@ -183,10 +183,10 @@ def test_gain_is_the_entropy_that_a_match_takes() -> None:
 def test_thinning_takes_the_best_first() -> None:
     target, way = np.array([0, 0, 0, 1]), np.array([0.0, 5.0, 20.0, 1.0])
     score = np.array([1.0, 3.0, 2.0, 0.5])
-    assert thinned(target, way, score, 10.0, 9) == [1, 2, 3]
-    assert thinned(target, way, score, 10.0, 2) == [1, 2]
-    assert thinned(target, way, score, 10.0, 9, [(0, 22.0)]) == [1, 3]
-    assert thinned(target, way, score, 0.0, 9) == [1, 2, 0, 3]
+    assert thin_candidates(target, way, score, 10.0, 9) == [1, 2, 3]
+    assert thin_candidates(target, way, score, 10.0, 2) == [1, 2]
+    assert thin_candidates(target, way, score, 10.0, 9, [(0, 22.0)]) == [1, 3]
+    assert thin_candidates(target, way, score, 0.0, 9) == [1, 2, 0, 3]
 
 
 def with_matches(submaps: list[Submap], matches: dict[int, list[Match]], report: dict[int, dict]) -> list[Submap]:  # type: ignore[type-arg]
@@ -206,7 +206,7 @@ def test_front_ends_matches_become_candidates_at_the_nearest_place() -> None:
     weak = Match(target=1, T_target_here=here, covariance=C, fitness=0.9, support=0.01)
     gone = Match(target=77, T_target_here=here, covariance=C, fitness=0.9, support=0.9)
     submaps = with_matches(square(dim=2), {6: [match, weak, gone]}, {6: {"entered": "match"}})
-    places = places_of(submaps, 3.0)
+    places = loop_places(submaps, 3.0)
     (x,) = front_end_candidates(submaps, places)
     assert (places.submap[x.i], places.submap[x.j], x.source) == (0, 6, "front-end")
     assert x.facts == {"support": 0.7, "fitness": 0.9}
@@ -220,8 +220,8 @@ def test_submaps_that_hold_the_same_scans_are_known() -> None:
     C = np.eye(3)
     into = [Match(target=0, T_target_here=np.zeros(3), covariance=C, fitness=0.9, support=1.0)]
     submaps = with_matches(square(dim=2), {4: into}, {4: {"entered": "match"}, 6: {"holds": [6, 4, 0]}})
-    assert sharing_maps(submaps) == {(0, 4), (0, 6), (4, 6)}
-    assert sharing_maps(square(dim=2)) == set()
+    assert pairs_sharing_scans(submaps) == {(0, 4), (0, 6), (4, 6)}
+    assert pairs_sharing_scans(square(dim=2)) == set()
 
 
 def test_impossible_configurations_are_refused() -> None:

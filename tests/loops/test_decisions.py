@@ -13,7 +13,7 @@ from scipy import stats
 from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.loops.ledger import Decision, LoopLedger
+from graphslam.loops.ledger import LoopDecision, LoopLedger
 from graphslam.loops.loops import LoopCloser, LoopConfig
 from graphslam.loops.measure import Loop
 from tests.reference.loop_chain import MATCH, chain_of, loop_of, right_loops, square_poses
@@ -199,7 +199,7 @@ def test_the_ledger_survives_json_and_makes_a_table() -> None:
         assert (a.loop, a.verdict, a.why, a.i, a.j, a.factor_id) == (b.loop, b.verdict, b.why, b.i, b.j, b.factor_id)
     with pytest.raises(DataError):
         LoopLedger.from_events([{"event": "loop", "loop": 3}])
-    assert LoopLedger([Decision(loop=0, verdict="accepted", why="", i=0, j=1)]).of(0).verdict == "accepted"
+    assert LoopLedger([LoopDecision(loop=0, verdict="accepted", why="", i=0, j=1)]).of(0).verdict == "accepted"
 
 
 def test_injected_loops_are_wrong_and_as_many_as_asked() -> None:

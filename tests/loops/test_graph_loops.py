@@ -11,12 +11,12 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.graph_loops import GROUP, GraphLoops, chain_of_graph, places_of_graph
 from graphslam.loops.ledger import LoopLedger
 from graphslam.loops.loops import LoopCloser
-from graphslam.loops.places import places_of
+from graphslam.loops.places import loop_places
 from graphslam.solve.batch import BatchSolver
 from tests.reference.loop_chain import STEP, chain_of, loop_of, right_loops, square_poses
 from tests.reference.loop_network import LoopNetwork
@@ -94,13 +94,13 @@ def test_undo_gives_the_evidence_back() -> None:
     closer.undo(d.loop)
     assert d.factor_id not in ours.graph.records
     np.testing.assert_allclose(ours.graph.values.poses, before, atol=1e-6)
-    ours.add_loop(loop_of(poses[::3], 2, 18, np.random.default_rng(1)), Robust("huber", 3.0))
+    ours.add_loop(loop_of(poses[::3], 2, 18, np.random.default_rng(1)), RobustKernel("huber", 3.0))
 
 
 def test_places_of_a_graph_are_those_of_its_submaps() -> None:
     poses = square_poses(3, nodes=73)
     submaps = submaps_of(poses, np.random.default_rng(2))
-    ours, plain = graph_of(submaps).places, places_of(submaps, 3.0)
+    ours, plain = graph_of(submaps).places, loop_places(submaps, 3.0)
     np.testing.assert_allclose(ours.T_base_node, plain.T_base_node, atol=1e-9)
     np.testing.assert_array_equal(ours.submap, plain.submap)
     np.testing.assert_allclose(ours.time, plain.time)

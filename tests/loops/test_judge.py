@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.poses import group_of
-from graphslam.loops.judge import settled_loops
+from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop
 from tests.reference.loop_chain import chain_of, loop_of, right_loops, square_poses
@@ -29,7 +29,7 @@ def test_half_of_the_loops_wrong(dim: int, kind: Kind) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         loops, wrong = inject_wrong_loops(right_loops(poses, rng, 8), poses, 0.5, rng, kind=kind, period=4.0)
-        good = settled_loops(*chain_of(poses, rng), arrays(loops))
+        good = truncated_least_squares_inliers(*chain_of(poses, rng), arrays(loops))
         wrong_taken += int((good & wrong).sum())
         right_taken, right_all = right_taken + int((good & ~wrong).sum()), right_all + int((~wrong).sum())
     assert wrong_taken <= 3  # of 24: one group that a short chain bears, for which others must speak
@@ -75,4 +75,4 @@ def test_neighbouring_nodes_are_not_judged() -> None:
     poses = square_poses(2)
     T, P = chain_of(poses, np.random.default_rng(0))
     loop = loop_of(poses, 4, 5, np.random.default_rng(0), np.array([9.0, 0.0, 0.0]))
-    assert settled_loops(T, P, arrays([loop])).tolist() == [True]
+    assert truncated_least_squares_inliers(T, P, arrays([loop])).tolist() == [True]

@@ -12,15 +12,15 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.relative import relative_poses
-from graphslam.loops.graph_loops import GraphRelative
+from graphslam.loops.graph_loops import GraphRelativePoses
+from graphslam.loops.inter_session_loops import InterSessionConfig, SessionMap, TwoSessions, session_start
 from graphslam.loops.measure import Loop
-from graphslam.loops.session_ties import SessionMap, TieConfig, TwoSessions, start_of
 from tests.reference.box_submaps import straight_path
 from tests.reference.box_world import corridor, hall
 from tests.reference.hall_sessions import HallDrive, hall_drive
 from tests.reference.space_chain import dense_chain
 
-CONFIG = TieConfig()
+CONFIG = InterSessionConfig()
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_right_ties_are_found_from_nothing(drives: tuple, two: TwoSessions) -> N
     assert len({(x.i, x.j) for x in ties.chosen}) == len(ties.chosen)
     # the true poses of the nodes in their own frames give the start
     own = [se3.se3_between(np.broadcast_to(w[0], w.shape), w) for w in where]
-    e = se3.se3_log(se3.se3_between(start_of(ties.chosen, own[0], own[1]), truth_between(*drives)))
+    e = se3.se3_log(se3.se3_between(session_start(ties.chosen, own[0], own[1]), truth_between(*drives)))
     assert np.linalg.norm(e[3:]) < 1.0
     assert abs(e[2]) < 0.05
     rows = ties.rows()
@@ -132,9 +132,9 @@ def test_what_cannot_be_placed_is_refused(two: TwoSessions, drives: tuple) -> No
     with pytest.raises(DataError, match="at least one"):
         SessionMap([])
     with pytest.raises(ConfigError, match="level"):
-        TieConfig(level=1.0)
+        InterSessionConfig(level=1.0)
     with pytest.raises(ConfigError, match="least"):
-        TieConfig(least=0)
+        InterSessionConfig(least=0)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -150,7 +150,7 @@ def test_nodes_are_those_of_a_graph(dim: int) -> None:
     S = S.reshape(n, d, n, d)
     i, j = np.array([0, 5, n - 1]), np.array([7, 2, 3])
     poses = graph.values.poses
-    T, P = GraphRelative(graph)(i, j)
+    T, P = GraphRelativePoses(graph)(i, j)
     want = relative_poses(poses[i], poses[j], S[i, :, i], S[i, :, j], S[j, :, j])
     np.testing.assert_allclose(T, want[0])
     np.testing.assert_allclose(P, want[1], atol=1e-15)

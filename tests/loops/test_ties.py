@@ -14,8 +14,8 @@ from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
-from graphslam.loops.places import Places, places_of
-from graphslam.loops.ties import TieConfig, tie_candidates
+from graphslam.loops.overlap_constraints import OverlapConfig, overlap_candidates
+from graphslam.loops.places import Places, loop_places
 from graphslam.solve.batch import BatchSolver
 
 OUT = 20
@@ -65,8 +65,8 @@ def where(places: Places, submaps: list[Submap], starts: list[Array]) -> Array:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_way_out_is_tied_to_the_way_in(dim: int) -> None:
     submaps = dead_end(dim, 1)
-    places = places_of(submaps, 3.0)
-    found = tie_candidates(submaps, places)
+    places = loop_places(submaps, 3.0)
+    found = overlap_candidates(submaps, places)
     assert found
     assert all(x.source == "tie" and x.facts == {"entries": []} for x in found)
     g = group_of(places.T_base_node)
@@ -80,7 +80,7 @@ def test_the_way_out_is_tied_to_the_way_in(dim: int) -> None:
     ways = places.way[[x.j for x in found]]
     assert np.diff(ways).min() >= 6.0
     assert len(found) == 2
-    assert not tie_candidates(submaps, places, config=TieConfig(least_way=100.0))
+    assert not overlap_candidates(submaps, places, config=OverlapConfig(least_way=100.0))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -91,14 +91,14 @@ def test_in_another_map_by_the_entries_that_are_believed(dim: int) -> None:
     turned = drives[0].exit_pose
     drives[1] = entered(drives[1], 10, turned, [10, 11])
     drives[2] = entered(drives[2], 11, g.inverse(turned), [10, 11, 12])
-    places = places_of(drives, 3.0)
+    places = loop_places(drives, 3.0)
     poses = where(places, drives, [g.identity, turned, g.identity])
-    own = {(x.i, x.j) for x in tie_candidates(drives, places)}
+    own = {(x.i, x.j) for x in overlap_candidates(drives, places)}
     assert {int(places.submap[i]) for i, _ in own} == {0, 1, 2}
     assert all(places.submap[i] == places.submap[j] for i, j in own)
 
     def check(entries: set[tuple[int, int]]) -> set[tuple[int, int]]:
-        found = tie_candidates(drives, places, entries)
+        found = overlap_candidates(drives, places, entries)
         for x in found:
             np.testing.assert_allclose(x.T_ij, g.between(poses[x.i], poses[x.j]), atol=1e-9)
         return {(int(places.submap[x.i]), int(places.submap[x.j])) for x in found}
@@ -106,14 +106,14 @@ def test_in_another_map_by_the_entries_that_are_believed(dim: int) -> None:
     assert (0, 1) in check({(10, 11)})
     assert (1, 2) not in check({(10, 11)})
     assert not any(target != 2 and j == 2 for target, j in check({(10, 11)}))  # its own entry is not believed
-    both = tie_candidates(drives, places, {(10, 11), (11, 12)})
+    both = overlap_candidates(drives, places, {(10, 11), (11, 12)})
     last = [x for x in both if places.submap[x.j] == 2]
     by = {tuple(map(tuple, x.facts["entries"])) for x in last if places.submap[x.i] == 0}
     assert by <= {((10, 11), (11, 12))}
     assert {int(places.submap[x.i]) for x in last} <= {0, 1}
     # one that does not hold the other's scans left its map again
     gone = [drives[0], replace(drives[1], report={"holds": [11], "entered": "match"}), drives[2]]
-    assert all(places.submap[x.i] != 0 or places.submap[x.j] == 0 for x in tie_candidates(gone, places, {(10, 11)}))
+    assert all(places.submap[x.i] != 0 or places.submap[x.j] == 0 for x in overlap_candidates(gone, places, {(10, 11)}))
 
 
 @pytest.mark.parametrize("right", [True, False])
@@ -150,4 +150,4 @@ def test_ties_come_and_go_with_their_match(right: bool) -> None:
 def test_impossible_ties_are_refused() -> None:
     for bad in ({"spacing": 0.0}, {"sigma": -1.0}, {"sigma_angle": float("nan")}):
         with pytest.raises(ConfigError, match="ties"):
-            TieConfig(**bad)
+            OverlapConfig(**bad)

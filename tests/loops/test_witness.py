@@ -10,11 +10,11 @@ import pytest
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.loops.disputes import weigh
-from graphslam.loops.judge import settled_loops
+from graphslam.loops.conflicting_groups import choose_group
+from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
+from graphslam.loops.map_overlap_test import ERROR, FEWEST, disagreement_shares, overlap_log_likelihood_ratio
 from graphslam.loops.measure import Loop
-from graphslam.loops.witness import ERROR, FEWEST, log_ratio, of_pairs
 from tests.reference.loop_chain import chain_of, loop_of, square_poses
 from tests.reference.loop_network import LoopNetwork
 
@@ -26,23 +26,23 @@ def shares(rng: np.random.Generator, angle: float, n: int) -> Array:
 def test_maps_tell_which_solution_is_right(rng) -> None:
     right, moved = shares(rng, 0.05, 30), shares(rng, 0.4, 30)
     good, bad = shares(rng, 0.05, 3), shares(rng, 0.4, 3)
-    said = log_ratio(right, moved, good, bad)
+    said = overlap_log_likelihood_ratio(right, moved, good, bad)
     assert said > -np.log(ERROR)
-    assert log_ratio(right, moved, bad, good) == pytest.approx(-said)
-    assert weigh(np.full(3, 1.0), np.full(2, 500.0), said)[0] == "changes"
-    assert weigh(np.full(2, 500.0), np.full(3, 1.0), -said)[0] == "stays"
+    assert overlap_log_likelihood_ratio(right, moved, bad, good) == pytest.approx(-said)
+    assert choose_group(np.full(3, 1.0), np.full(2, 500.0), said)[0] == "changes"
+    assert choose_group(np.full(2, 500.0), np.full(3, 1.0), -said)[0] == "stays"
     # both solutions are wrong alike, or too few tell how maps lie on each other
-    assert log_ratio(right, moved, bad, bad) == pytest.approx(0.0, abs=1e-9)
-    assert log_ratio(right[: FEWEST - 1], moved, good, bad) == 0.0
+    assert overlap_log_likelihood_ratio(right, moved, bad, bad) == pytest.approx(0.0, abs=1e-9)
+    assert overlap_log_likelihood_ratio(right[: FEWEST - 1], moved, good, bad) == 0.0
     # of one loop alone nothing but the maps is believed
-    assert weigh(np.full(3, 500.0), np.full(1, 1.0), 1.0)[0] == "stays"
+    assert choose_group(np.full(3, 500.0), np.full(1, 1.0), 1.0)[0] == "stays"
 
 
 def test_maps_say_nothing_where_the_world_repeats_itself(rng) -> None:
     decided = 0
     for _ in range(500):
         args = [shares(rng, 0.1, n) for n in (20, 20, 4, 4)]
-        decided += abs(log_ratio(*args)) > -np.log(ERROR)
+        decided += abs(overlap_log_likelihood_ratio(*args)) > -np.log(ERROR)
     assert decided <= 5
 
 
@@ -52,7 +52,7 @@ def test_maps_seldom_decide_wrongly(rng, apart: float) -> None:
     wrong = 0
     for _ in range(2000):
         args = [shares(rng, a, n) for a, n in ((0.3, 30), (0.3 + apart, 60), (0.3, 6), (0.3 + apart, 6))]
-        wrong += log_ratio(*args) < np.log(ERROR)
+        wrong += overlap_log_likelihood_ratio(*args) < np.log(ERROR)
     assert wrong <= 6
 
 
@@ -60,7 +60,7 @@ def test_places_of_one_pair_of_submaps_are_one_piece_of_evidence() -> None:
     poses = square_poses(2)
     x = loop_of(poses, 3, 51, np.random.default_rng(0))
     loops = [replace(x, submaps=p) for p in ((0, 4), (4, 0), (1, 4))]
-    assert of_pairs(loops, np.array([0.1, 0.3, 0.5])).tolist() == pytest.approx([0.2, 0.5])
+    assert disagreement_shares(loops, np.array([0.1, 0.3, 0.5])).tolist() == pytest.approx([0.2, 0.5])
 
 
 def test_one_right_loop_stands_against_three_wrong_ones_by_what_the_maps_say() -> None:
@@ -87,7 +87,7 @@ def test_one_right_loop_stands_against_three_wrong_ones_by_what_the_maps_say() -
     taken = []
     for asked in (None, witness):
         T, P = chain_of(poses, np.random.default_rng(7))
-        closer = LoopCloser(LoopNetwork(T, P), T, P, judge=settled_loops, witness=asked)
+        closer = LoopCloser(LoopNetwork(T, P), T, P, judge=truncated_least_squares_inliers, witness=asked)
         closer.propose([*calm, *wrong])
         (d,) = closer.propose([one])
         taken.append((len(closer.accepted), d.verdict))

@@ -11,7 +11,7 @@ from graphslam.core.errors import DataError, GridError
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.submap import Match, Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.added import added, own_evidence
+from graphslam.maps.increment import map_increment, own_evidence
 from tests.reference.plain_fuse import voxels_of_grid
 from tests.reference.small_maps import room, scanned, some_pose
 
@@ -32,7 +32,7 @@ def later(grid: EvidenceGrid, dim: int, seed: int = 3) -> tuple[EvidenceGrid, Ev
 def test_what_came_in_since_is_what_was_scanned(dim: int, rng: np.random.Generator) -> None:
     old = scanned(rng, dim, scans=1)
     new, alone = later(old, dim)
-    found = added(new, old)
+    found = map_increment(new, old)
     wanted, got = voxels_of_grid(alone), voxels_of_grid(found.grid)
     assert set(got) <= set(wanted)
     # but for what was saturated, nothing is lost and nothing changed
@@ -47,13 +47,13 @@ def test_what_came_in_since_is_what_was_scanned(dim: int, rng: np.random.Generat
     assert found.shared == old.voxel_counts().known
     assert found.copied == sum(whole[v] == value for v, value in voxels_of_grid(old).items())
     # a map beside itself added nothing
-    assert added(old, old.copy()).known == 0
+    assert map_increment(old, old.copy()).known == 0
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_value_from_beside_is_no_change_where_maps_were_rounded_twice(dim: int, rng: np.random.Generator) -> None:
     old, new = scanned(rng, dim), scanned(rng, dim)
-    got = added(new, old, slack=1)
+    got = map_increment(new, old, slack=1)
     before, up = voxels_of_grid(old), 1 if dim == 3 else 0
     wanted = {}
     for (x, y, z), value in voxels_of_grid(new).items():
@@ -62,10 +62,10 @@ def test_a_value_from_beside_is_no_change_where_maps_were_rounded_twice(dim: int
             continue
         wanted[x, y, z] = value - before.get((x, y, z), 0)
     assert voxels_of_grid(got.grid) == wanted
-    assert got.known < added(new, old).known
-    assert added(old, old.copy(), slack=1).known == 0
+    assert got.known < map_increment(new, old).known
+    assert map_increment(old, old.copy(), slack=1).known == 0
     with pytest.raises(GridError):
-        added(new, old, slack=2)
+        map_increment(new, old, slack=2)
 
 
 def resampled(grid: EvidenceGrid, T: np.ndarray) -> EvidenceGrid:
@@ -99,7 +99,7 @@ def test_submaps_lose_what_they_took_over(dim: int, rng: np.random.Generator) ->
     assert entered == {2: 0}
     assert grids[0] is first
     assert grids[2].voxel_counts().known < here.voxel_counts().known
-    assert voxels_of_grid(grids[2]) == voxels_of_grid(added(here, first, group.inverse(T), slack=1).grid)
+    assert voxels_of_grid(grids[2]) == voxels_of_grid(map_increment(here, first, group.inverse(T), slack=1).grid)
     # one that goes on in the map of the one before
     further = [submap(0, first), submap(1, resampled(copy, group.inverse(group.identity)), (), "same")]
     grids, entered = own_evidence(further)
@@ -115,6 +115,6 @@ def test_submaps_lose_what_they_took_over(dim: int, rng: np.random.Generator) ->
 
 def test_other_grids_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(GridError):
-        added(scanned(rng, 3), scanned(rng, 2))
+        map_increment(scanned(rng, 3), scanned(rng, 2))
     with pytest.raises(GridError):
-        added(scanned(rng, 3), room(SE3.identity))
+        map_increment(scanned(rng, 3), room(SE3.identity))

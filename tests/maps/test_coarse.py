@@ -14,11 +14,11 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import half_edge
 from graphslam.evidence.octomap import read_octomap
 from graphslam.evidence.pool import GridPool
-from graphslam.maps.coarse import coarse_grid, drawable, levels_for
+from graphslam.maps.coarse import coarse_grid, drawable_map, pool_levels
 from graphslam.maps.export import save_maps
 from graphslam.maps.fuse import FusedMap
 from graphslam.maps.global_map import GlobalMap
-from graphslam.maps.pieces import whole
+from graphslam.maps.pieces import piece_of_grid
 from graphslam.maps.run_map import make_run_map
 from tests.reference.plain_fuse import voxels_of_grid
 from tests.reference.small_maps import room, same_map, scanned, straight
@@ -38,7 +38,7 @@ def test_a_coarser_voxel_is_the_largest_of_those_under_it(dim: int, rng: np.rand
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_fused_map_takes_levels_as_it_grows(dim: int) -> None:
-    piece = whole(room((SE3 if dim == 3 else SE2).identity, dim=dim, beams=500))
+    piece = piece_of_grid(room((SE3 if dim == 3 else SE2).identity, dim=dim, beams=500))
     far = np.array([3000.0, -40.0, 0.3] if dim == 2 else [3000.0, -40.0, 5.0, 0, 0, np.sin(0.15), np.cos(0.15)])
     near = (SE3 if dim == 3 else SE2).identity
     grown = FusedMap(0.2, dim=dim)
@@ -48,7 +48,7 @@ def test_a_fused_map_takes_levels_as_it_grows(dim: int) -> None:
     grown.add({"far": piece}, {"far": far})
     wide = FusedMap(0.2, dim=dim, pool=GridPool(7))
     wide.add({"near": piece, "far": piece}, {"near": near, "far": far})
-    assert grown.grid.pool.levels == 6 == levels_for(15_100)
+    assert grown.grid.pool.levels == 6 == pool_levels(15_100)
     assert same_map(grown.grid, wide.grid)
     assert grown.entropy() == wide.entropy()
     assert len(before) == 1
@@ -96,8 +96,8 @@ def test_pictures_are_bounded() -> None:
     ends = np.array([[0.0, 0.0], [3000.0, 3000.0]])
     grid = EvidenceGrid(0.2, dim=2, pool=GridPool(7))
     grid.insert_scan(ends + 0.1, [0.05, 0.05])
-    drawn = drawable(grid)
+    drawn = drawable_map(grid)
     assert drawn.voxel_size == 0.8
     assert drawn.values_at(ends + 0.1).min() > -32768
-    assert drawable(drawn) is drawn
+    assert drawable_map(drawn) is drawn
     assert half_edge(7) > 15_000

@@ -8,10 +8,10 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError, GridError
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.beams import BeamModel
-from graphslam.maps.entropy import clarity, clarity_of, disagreement, placements
-from graphslam.maps.fuse import fuse
-from graphslam.maps.minimum_entropy import Candidate, rank_by_entropy, visiting_order
-from graphslam.maps.pieces import whole
+from graphslam.maps.entropy import grid_placements, map_entropy, mean_map_entropy, measure_disagreement
+from graphslam.maps.fuse import fuse_pieces
+from graphslam.maps.minimum_entropy import MapHypothesis, rank_by_entropy, visiting_order
+from graphslam.maps.pieces import piece_of_grid
 from tests.reference.plain_fuse import fused_voxels, plain_disagreement
 from tests.reference.small_maps import room, same_map, scanned, some_pose
 
@@ -27,42 +27,43 @@ def plain_entropy(voxels: dict[tuple[int, int, int], int], volume: float) -> flo
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_entropy_is_that_of_the_voxels_one_by_one(dim: int, rng: np.random.Generator) -> None:
-    pieces = {k: whole(scanned(rng, dim)) for k in range(2)}
+    pieces = {k: piece_of_grid(scanned(rng, dim)) for k in range(2)}
     poses = {k: some_pose(rng, dim) for k in pieces}
-    fused = fuse(pieces, poses)
+    fused = fuse_pieces(pieces, poses)
     voxels = fused_voxels(pieces, poses, BeamModel().clamp_steps)
     assert fused.entropy() == pytest.approx(plain_entropy(voxels, 0.25**dim), rel=1e-12)
-    assert clarity(pieces, poses).volume == pytest.approx(len(voxels) * 0.25**dim)
+    assert map_entropy(pieces, poses).volume == pytest.approx(len(voxels) * 0.25**dim)
     # the same seen twice is clearer; of the same volume
-    twice = fuse(dict.fromkeys("ab", pieces[0]), dict.fromkeys("ab", poses[0]))
-    once = fuse({0: pieces[0]}, {0: poses[0]})
+    twice = fuse_pieces(dict.fromkeys("ab", pieces[0]), dict.fromkeys("ab", poses[0]))
+    once = fuse_pieces({0: pieces[0]}, {0: poses[0]})
     assert twice.entropy() < 0.9 * once.entropy()
     assert twice.known_volume() == once.known_volume()
 
 
 def test_clarity_is_the_mean_over_placements(rng: np.random.Generator) -> None:
-    pieces = {k: whole(scanned(rng, 3)) for k in range(2)}
+    pieces = {k: piece_of_grid(scanned(rng, 3)) for k in range(2)}
     poses = {k: some_pose(rng, 3) for k in pieces}
     maps = [
-        fuse(pieces, {k: SE3.compose(T, p) for k, p in poses.items()}, tolerance=0.0) for T in placements(3, 0.25, 3)
+        fuse_pieces(pieces, {k: SE3.compose(T, p) for k, p in poses.items()}, tolerance=0.0)
+        for T in grid_placements(3, 0.25, 3)
     ]
-    mean = clarity_of(maps)
-    got = clarity(pieces, poses, count=3)
+    mean = mean_map_entropy(maps)
+    got = map_entropy(pieces, poses, count=3)
     assert (got.entropy, got.volume) == pytest.approx((mean.entropy, mean.volume), rel=1e-12)
-    assert got.entropy != clarity(pieces, poses).entropy
+    assert got.entropy != map_entropy(pieces, poses).entropy
     assert got.per_volume == got.entropy / got.volume
     with pytest.raises(DataError):
-        clarity_of([])
+        mean_map_entropy([])
     with pytest.raises(DataError):
-        clarity({}, {})
+        map_entropy({}, {})
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("slack", [0, 1])
 def test_disagreement_is_its_slow_twin(dim: int, slack: int, rng: np.random.Generator) -> None:
-    a, b = whole(scanned(rng, dim), some_pose(rng, dim)), whole(scanned(rng, dim))
+    a, b = piece_of_grid(scanned(rng, dim), some_pose(rng, dim)), piece_of_grid(scanned(rng, dim))
     T_a, T_b = some_pose(rng, dim, 0.2), some_pose(rng, dim, 0.2)
-    got = disagreement(a, T_a, b, T_b, slack=slack, doubt=0.4)
+    got = measure_disagreement(a, T_a, b, T_b, slack=slack, doubt=0.4)
     margin = round(0.4 * 2048)
     wanted = plain_disagreement(a, T_a, b, T_b, margin, -margin, slack)
     assert (got.overlap, got.agreeing, got.contradicting, got.free, got.sure) == wanted
@@ -74,34 +75,38 @@ def test_pieces_of_one_room_agree_and_displaced_ones_contradict(dim: int) -> Non
     group = SE3 if dim == 3 else SE2
     poses = [group.identity, group.exp(np.r_[np.zeros(group.dof - 3), 0.3, 0.2, 0.4] if dim == 2 else
                                        np.r_[0, 0, 0.4, 0.3, 0.2, 0.0])]  # fmt: skip
-    pieces = [whole(room(p, dim=dim, beams=4000 if dim == 3 else 600)) for p in poses]
-    right = disagreement(pieces[0], poses[0], pieces[1], poses[1])
+    pieces = [piece_of_grid(room(p, dim=dim, beams=4000 if dim == 3 else 600)) for p in poses]
+    right = measure_disagreement(pieces[0], poses[0], pieces[1], poses[1])
     assert right.share < 0.05
     assert right.agreeing > 50
     off = np.zeros(group.dof)
     off[group.position.start] = 1.0
-    wrong = disagreement(pieces[0], poses[0], pieces[1], group.compose(group.exp(off), poses[1]))
+    wrong = measure_disagreement(pieces[0], poses[0], pieces[1], group.compose(group.exp(off), poses[1]))
     assert wrong.share > max(0.06, 3 * right.share)
     assert 0 < wrong.share_of_overlap < wrong.share
     apart = np.zeros(group.dof)
     apart[group.position.start] = 50.0
-    nothing = disagreement(pieces[0], poses[0], pieces[1], group.exp(apart))
+    nothing = measure_disagreement(pieces[0], poses[0], pieces[1], group.exp(apart))
     assert nothing.overlap == 0
     assert np.isnan(nothing.share)
     assert np.isnan(nothing.share_of_overlap)
 
 
 def test_impossible_comparisons_are_refused(rng: np.random.Generator) -> None:
-    a, flat, fine = whole(scanned(rng, 3)), whole(scanned(rng, 2)), whole(scanned(rng, 3, size=0.5))
+    a, flat, fine = (
+        piece_of_grid(scanned(rng, 3)),
+        piece_of_grid(scanned(rng, 2)),
+        piece_of_grid(scanned(rng, 3, size=0.5)),
+    )
     for other in (flat, fine):
         with pytest.raises(GridError):
-            disagreement(a, SE3.identity, other, SE3.identity)
+            measure_disagreement(a, SE3.identity, other, SE3.identity)
     for wrong in ({"slack": -1}, {"slack": 9}, {"doubt": float("nan")}, {"doubt": -0.1}):
         with pytest.raises(ConfigError):
-            disagreement(a, SE3.identity, a, SE3.identity, **wrong)
+            measure_disagreement(a, SE3.identity, a, SE3.identity, **wrong)
 
 
-def candidates(rng: np.random.Generator, dim: int) -> list[Candidate]:
+def candidates(rng: np.random.Generator, dim: int) -> list[MapHypothesis]:
     """A room seen five times; the right poses are the third, the others move one or two of the views."""
     group = SE3 if dim == 3 else SE2
     views = []
@@ -110,7 +115,7 @@ def candidates(rng: np.random.Generator, dim: int) -> list[Candidate]:
         xi[group.heading] = 0.3 * rng.normal()
         xi[group.position.start : group.position.start + 2] = 0.2 * rng.normal(size=2)
         views.append(group.exp(xi))
-    pieces = {k: whole(room(T, dim=dim, beams=3000 if dim == 3 else 600)) for k, T in enumerate(views)}
+    pieces = {k: piece_of_grid(room(T, dim=dim, beams=3000 if dim == 3 else 600)) for k, T in enumerate(views)}
     out = []
     for wrong in ([1, 2], [2], [], [4], [1, 2, 3]):
         poses = dict(enumerate(views))
@@ -118,7 +123,7 @@ def candidates(rng: np.random.Generator, dim: int) -> list[Candidate]:
             off = np.zeros(group.dof)
             off[group.position.start] = 0.5
             poses[k] = group.compose(group.exp(off), views[k])
-        out.append(Candidate(pieces, poses, f"{wrong}"))
+        out.append(MapHypothesis(pieces, poses, f"{wrong}"))
     return out
 
 
@@ -126,7 +131,7 @@ def candidates(rng: np.random.Generator, dim: int) -> list[Candidate]:
 def test_candidates_come_in_the_order_of_maps_from_scratch(dim: int, rng: np.random.Generator) -> None:
     given = candidates(rng, dim)
     ranking = rank_by_entropy(given)
-    scratch = [fuse(c.pieces, c.poses) for c in given]
+    scratch = [fuse_pieces(c.pieces, c.poses) for c in given]
     by_index = {r.index: r for r in ranking.order}
     for k, f in enumerate(scratch):
         assert by_index[k].clarity.entropy == f.entropy()  # to the last bit
@@ -140,20 +145,20 @@ def test_candidates_come_in_the_order_of_maps_from_scratch(dim: int, rng: np.ran
 
 def test_candidates_may_have_other_pieces(rng: np.random.Generator) -> None:
     given = candidates(rng, 3)
-    fewer = Candidate({k: given[2].pieces[k] for k in (0, 3)}, given[2].poses, "fewer")
-    other = Candidate({**given[2].pieces, 1: whole(scanned(rng, 3, size=0.2))}, given[0].poses, "other")
+    fewer = MapHypothesis({k: given[2].pieces[k] for k in (0, 3)}, given[2].poses, "fewer")
+    other = MapHypothesis({**given[2].pieces, 1: piece_of_grid(scanned(rng, 3, size=0.2))}, given[0].poses, "other")
     ranking = rank_by_entropy([given[0], fewer, other, given[2]])
     for r in ranking.order:
         c = [given[0], fewer, other, given[2]][r.index]
-        scratch = fuse(c.pieces, {k: c.poses[k] for k in c.pieces})
+        scratch = fuse_pieces(c.pieces, {k: c.poses[k] for k in c.pieces})
         assert r.clarity.entropy == scratch.entropy()
         assert r.name == c.name
     mean = rank_by_entropy([given[0], given[2]], count=2)
     for r in mean.order:
         c = [given[0], given[2]][r.index]
-        assert r.clarity.entropy == pytest.approx(clarity(c.pieces, c.poses, count=2).entropy, rel=1e-12)
+        assert r.clarity.entropy == pytest.approx(map_entropy(c.pieces, c.poses, count=2).entropy, rel=1e-12)
     best = [given[0], given[2]][mean.order[0].index]
-    assert same_map(mean.best.grid, fuse(best.pieces, best.poses).grid)  # the map itself stands as it was given
+    assert same_map(mean.best.grid, fuse_pieces(best.pieces, best.poses).grid)  # the map itself stands as it was given
 
 
 def test_visiting_order_goes_to_the_nearest() -> None:
@@ -165,9 +170,9 @@ def test_visiting_order_goes_to_the_nearest() -> None:
 
 
 def test_impossible_candidates_are_refused(rng: np.random.Generator) -> None:
-    piece = whole(scanned(rng, 2))
-    good = Candidate({0: piece}, {0: np.zeros(3)})
-    for wrong in ([], [good, Candidate({}, {})], [Candidate({0: piece}, {1: np.zeros(3)})]):
+    piece = piece_of_grid(scanned(rng, 2))
+    good = MapHypothesis({0: piece}, {0: np.zeros(3)})
+    for wrong in ([], [good, MapHypothesis({}, {})], [MapHypothesis({0: piece}, {1: np.zeros(3)})]):
         with pytest.raises(DataError):
             rank_by_entropy(wrong)
     with pytest.raises(ConfigError):

@@ -12,8 +12,8 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.octomap import read_octomap
 from graphslam.maps.export import floor_plan, save_maps, save_ply, storeys
-from graphslam.maps.fuse import fuse
-from graphslam.maps.pieces import whole
+from graphslam.maps.fuse import fuse_pieces
+from graphslam.maps.pieces import piece_of_grid
 from tests.reference.plain_fuse import voxels_of_grid
 from tests.reference.small_maps import room, scanned
 
@@ -59,7 +59,7 @@ def test_floor_plan_is_the_largest_of_each_column(rng: np.random.Generator) -> N
 
 
 def test_a_map_is_written_in_every_form(tmp_path: Path) -> None:
-    fused = fuse({0: whole(room(SE3.identity))}, {0: SE3.identity})
+    fused = fuse_pieces({0: piece_of_grid(room(SE3.identity))}, {0: SE3.identity})
     made = save_maps(fused.grid, tmp_path / "out", name="a", bands={"low": (-1.0, 1.0), "none": (50.0, 51.0)})
     assert [p.name for p in made] == ["a.ply", "a.bt", "a-low.yaml", "a-low.pgm"]
     assert all(p.is_file() for p in made)

@@ -7,7 +7,7 @@ from graphslam.core.dense import CloudMap
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.moving import MovedThings, MovingConfig, moving_points, without_moving
+from graphslam.maps.moving import MovedObjects, MovingConfig, moving_points, without_moving
 from graphslam.sim.raycast import RayCaster
 
 SUBMAPS, SCANS = 12, 4
@@ -129,13 +129,13 @@ def test_a_thing_most_of_which_moved_goes_as_a_whole_and_what_stands_beside_it_s
     points = np.concatenate([ground, car, wall])
     kind = np.repeat([0, 1, 2], [len(ground), len(car), len(wall)])
     known = car[(car[:, 0] > 1.0) & (car[:, 2] > 0.4)]
-    parts = MovedThings(known).parts(points)
+    parts = MovedObjects(known).parts(points)
     assert parts[kind == 1].all()
     assert not parts[kind == 2].any()
     away = np.hypot(*(np.maximum(np.abs(ground[:, :2] - [1.5, 0.0]) - [1.5, 0.9], 0.0)).T)
     assert not parts[kind == 0][away > 1.1].any()
     # a few points that were wrongly taken for moved do not take the wall with them
-    some = MovedThings(wall[(np.abs(wall[:, 0]) < 0.1) & (wall[:, 2] > 0.4)]).parts(points)
+    some = MovedObjects(wall[(np.abs(wall[:, 0]) < 0.1) & (wall[:, 2] > 0.4)]).parts(points)
     assert 0 < some[kind == 2].sum() < 0.15 * (kind == 2).sum()
 
 
@@ -143,8 +143,8 @@ def test_what_is_near_to_what_moved_is_what_a_plain_search_finds(rng):
     points, known = rng.uniform(-6.0, 6.0, (3000, 3)), rng.uniform(-3.0, 3.0, (40, 3))
     points[:, 2] = 0.0  # nothing stands: only what is near belongs
     nearest = np.min(np.hypot(*(points[:, None, :2] - known[None, :, :2]).transpose(2, 0, 1)), axis=1)
-    parts = MovedThings(known).parts(points)
+    parts = MovedObjects(known).parts(points)
     assert parts[nearest < 0.6 - 0.22].all()
     assert not parts[nearest > 0.6 + 0.22].any()
-    assert not MovedThings(np.zeros((0, 3))).parts(points).any()
-    assert MovedThings(known).parts(points[:0]).shape == (0,)
+    assert not MovedObjects(np.zeros((0, 3))).parts(points).any()
+    assert MovedObjects(known).parts(points[:0]).shape == (0,)

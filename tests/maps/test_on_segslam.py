@@ -11,17 +11,17 @@ from graphslam.core.errors import DataError
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.added import own_evidence
-from graphslam.maps.fuse import fuse
+from graphslam.maps.fuse import fuse_pieces
+from graphslam.maps.increment import own_evidence
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.segslam_evidence import own_evidence_of
 from graphslam.maps.submaps import divide_submaps
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.segslam.front_end import settled
+from graphslam_frontends.segslam.front_end import submaps_of_best_particle
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_frontends.segslam.submaps import settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain
 from tests.benchmarks.bench_maps import insert, scene, submaps_of
 from tests.reference.small_maps import same_map
 
@@ -39,7 +39,7 @@ def test_at_the_chain_pieces_are_the_submaps(run: tuple[Steps, list[Submap]]) ->
     assert len(divided.pieces) > 2 * len(submaps) > 4
     rigid = divide_submaps(submaps, every=None, own=False)
     assert set(rigid.pieces) == {(m.key, 0) for m in submaps}
-    a, b = fuse(divided.pieces, divided.poses).grid, fuse(rigid.pieces, rigid.poses).grid
+    a, b = fuse_pieces(divided.pieces, divided.poses).grid, fuse_pieces(rigid.pieces, rigid.poses).grid
     # pieces of one submap have one base pose, but for rounding of nodes composed and taken apart: 1e-15 m
     assert a.known_volume() == pytest.approx(b.known_volume(), rel=1e-5)
     points = b.occupied_cloud()
@@ -57,13 +57,13 @@ def test_the_map_is_clearer_at_the_true_poses(run: tuple[Steps, list[Submap]]) -
     divided = divide_submaps(submaps, config=DivisionConfig(reach=9.0))
     assert steps.truth is not None
     true = divided.along(steps.truth)
-    fused = fuse(divided.pieces, divided.poses)
+    fused = fuse_pieces(divided.pieces, divided.poses)
     before = fused.entropy()
     change = fused.move(true)
     assert change.moved > len(divided.pieces) // 2
     after = fused.entropy()
     assert after < before
-    assert same_map(fused.grid, fuse(divided.pieces, fused.poses).grid)
+    assert same_map(fused.grid, fuse_pieces(divided.pieces, fused.poses).grid)
     # and is near what the scans themselves make at the true poses
     scans: EvidenceGrid = insert(steps, steps.truth.interpolate(steps.times), 0.2, fused.grid.model)
     assert after == pytest.approx(scans.entropy(), rel=0.05)
@@ -71,7 +71,7 @@ def test_the_map_is_clearer_at_the_true_poses(run: tuple[Steps, list[Submap]]) -
     # one rigid piece a submap leaves the bend inside: not as near
     rigid = divide_submaps(submaps, every=1e9)
     occupied = scans.occupied_cloud()
-    near = [np.mean(m.grid.occupied_at(occupied)) for m in (fused, fuse(rigid.pieces, rigid.along(steps.truth)))]
+    near = [np.mean(m.grid.occupied_at(occupied)) for m in (fused, fuse_pieces(rigid.pieces, rigid.along(steps.truth)))]
     assert near[0] > near[1]
 
 
@@ -91,12 +91,12 @@ def reentered() -> tuple[SegSlamResult, list[Submap]]:
     s = scene("court")
     steps = make_steps(s.log, s.config.steps)
     result = run_segslam(steps, replace(s.config.filter, particles=5), s.config.segslam, SeedTree(0))
-    return result, settled(result, s.config.drift, s.config.segslam)
+    return result, submaps_of_best_particle(result, s.config.drift, s.config.segslam)
 
 
 def test_a_segment_that_entered_a_map_is_left_with_its_own(reentered: tuple[SegSlamResult, list[Submap]]) -> None:
     result, submaps = reentered
-    chain = settled_chain(result.segmap, int(result.closed[result.best]))
+    chain = common_ancestor_chain(result.segmap, int(result.closed[result.best]))
     exact = own_evidence_of(result.segmap, chain, submaps)
     entered = [m for m in submaps if m.report["entered"] != "new"]
     assert entered
@@ -116,7 +116,7 @@ def test_a_segment_that_entered_a_map_is_left_with_its_own(reentered: tuple[SegS
     off = []
     for grids in (None, told, exact):
         divided = divide_submaps(submaps, own=False, grids=grids, config=DivisionConfig(reach=9.0))
-        off.append(abs(fuse(divided.pieces, divided.along(path)).entropy() - scans.entropy()))
+        off.append(abs(fuse_pieces(divided.pieces, divided.along(path)).entropy() - scans.entropy()))
     assert off[2] < off[0]
     assert max(off) < 0.05 * scans.entropy()
     with pytest.raises(DataError):

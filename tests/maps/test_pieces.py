@@ -11,15 +11,15 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
-from graphslam.maps.fuse import fuse
+from graphslam.maps.fuse import fuse_pieces
 from graphslam.maps.pieces import (
     DivisionConfig,
     Piece,
-    divide,
+    divide_grid,
     node_times_every,
     owning_places,
+    piece_of_grid,
     pieces_of_submap,
-    whole,
 )
 from tests.reference.plain_fuse import nearest_owner, voxels_of, voxels_of_grid
 from tests.reference.small_maps import same_map, scanned, some_pose, straight
@@ -43,7 +43,7 @@ def test_every_known_voxel_goes_to_the_nearest_place(
     grid = corridor(path, rng)
     config = DivisionConfig(stretch=stretch, reach=reach, spacing=0.0)
     times = [0.0, 3.0, 7.5]
-    pieces = divide(grid, path, times, config=config)
+    pieces = divide_grid(grid, path, times, config=config)
     places, nodes = owning_places(path, np.array(times), config)
     at = np.zeros((len(places), 3))
     at[:, :dim] = places
@@ -78,13 +78,13 @@ def test_pieces_at_rest_make_the_submap_again(dim: int, rng: np.random.Generator
     pieces = pieces_of_submap(submap, times)
     assert set(pieces) == {(3, 0), (3, 1), (3, 2)}
     inner = path.interpolate(times)
-    fused = fuse(pieces, {(3, k): inner[k] for k in range(3)})
+    fused = fuse_pieces(pieces, {(3, k): inner[k] for k in range(3)})
     assert same_map(fused.grid, grid)
     # moved as one they are the whole submap moved; bent they are not
     group = SE3 if dim == 3 else SE2
     T = some_pose(rng, dim)
     fused.move({(3, k): group.compose(T, inner[k]) for k in range(3)}, tolerance=0)
-    rigid = fuse(pieces_of_submap(submap), {(3, 0): T})
+    rigid = fuse_pieces(pieces_of_submap(submap), {(3, 0): T})
     assert same_map(fused.grid, rigid.grid)
     fused.move({(3, 2): T})
     assert not same_map(fused.grid, rigid.grid)
@@ -106,16 +106,16 @@ def test_out_and_back_goes_with_the_way_out(rng: np.random.Generator) -> None:
     path = Trajectory(np.linspace(0.0, 20.0, 92), poses)
     grid = corridor(path, rng)
     times = [0.0, 5.0, 12.0, 17.0]
-    pieces = divide(grid, path, times, config=DivisionConfig(retrace=1.0))
+    pieces = divide_grid(grid, path, times, config=DivisionConfig(retrace=1.0))
     back = [v for p in pieces[2:] for v in voxels_of(p.coordinates, p.values)]
     # what lies around the turn is first seen there; of the walls along the way nothing goes with the way back
     assert min(v[0] for v in back) * grid.voxel_size > 5.5
     assert pieces[3].known == 0
-    dealt = divide(grid, path, times, config=DivisionConfig(retrace=0.0))
+    dealt = divide_grid(grid, path, times, config=DivisionConfig(retrace=0.0))
     assert sum(p.known for p in dealt[2:]) > 0.35 * sum(p.known for p in dealt)
     # a lane of its own is no way back
     lanes = np.concatenate([out.poses, out.poses[::-1] + [0.0, 2.5, np.pi]])
-    apart = divide(grid, Trajectory(path.times, lanes), times, config=DivisionConfig(retrace=1.0))
+    apart = divide_grid(grid, Trajectory(path.times, lanes), times, config=DivisionConfig(retrace=1.0))
     assert sum(p.known for p in apart[2:]) > 0.25 * sum(p.known for p in apart)
 
 
@@ -132,7 +132,7 @@ def test_a_floor_between_storeys_goes_with_the_upper_one() -> None:
     slab = np.array([[x, 0.1, 2.5] for x in np.arange(1.0, 9.0, 0.2)])
     grid.insert_scan(slab, origin=slab + [0.0, 0.0, 0.05])
     upper = {
-        s: divide(grid, path, [0.0, 15.0], config=DivisionConfig(stretch=s))[1].known / grid.voxel_counts().known
+        s: divide_grid(grid, path, [0.0, 15.0], config=DivisionConfig(stretch=s))[1].known / grid.voxel_counts().known
         for s in (1.0, 4.0)
     }
     assert upper[1.0] < 0.2
@@ -141,7 +141,7 @@ def test_a_floor_between_storeys_goes_with_the_upper_one() -> None:
 
 def test_a_piece_knows_its_box(rng: np.random.Generator) -> None:
     T = some_pose(rng, 3)
-    piece = whole(scanned(rng, 3), T)
+    piece = piece_of_grid(scanned(rng, 3), T)
     known = np.array(list(voxels_of(piece.coordinates, piece.values)))
     low, high = known.min(axis=0) * 0.25, (known.max(axis=0) + 1) * 0.25
     base = SE3.transform(np.broadcast_to(T, (8, 7)), piece.corners)
@@ -178,11 +178,11 @@ def test_impossible_divisions_are_refused(rng: np.random.Generator) -> None:
     grid = corridor(path, rng)
     for times in ([], [3.0, 1.0], [0.0, 99.0], [0.0, np.nan]):
         with pytest.raises(DataError):
-            divide(grid, path, times)
+            divide_grid(grid, path, times)
     with pytest.raises(DataError):
-        divide(grid, straight(3), [0.0])
+        divide_grid(grid, straight(3), [0.0])
     with pytest.raises(DataError):
-        divide(grid, path, [0.0, 1.0], T_base_nodes=np.zeros((3, 3)))
+        divide_grid(grid, path, [0.0, 1.0], T_base_nodes=np.zeros((3, 3)))
     for wrong in ({"stretch": 0.0}, {"reach": -1.0}, {"retrace": np.nan}, {"spacing": np.inf}):
         with pytest.raises(ConfigError):
             DivisionConfig(**wrong)

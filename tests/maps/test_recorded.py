@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
-from graphslam.maps.fuse import fuse
+from graphslam.maps.fuse import fuse_pieces
 from graphslam.maps.pieces import DivisionConfig
 from graphslam.maps.submaps import divide_submaps
 from graphslam_frontends.odometry.make_steps import make_steps
@@ -26,7 +26,7 @@ def test_pieces_make_what_the_scans_make(data_dir: Path) -> None:
     size, model = divided.pieces[0, 0].voxel_size, submaps[0].grid.model  # type: ignore[union-attr]
     bodies = bodies_of(submaps, steps)
     scans = insert(steps, bodies, size, model)
-    fused = fuse(divided.pieces, divided.poses, model=model)
+    fused = fuse_pieces(divided.pieces, divided.poses, model=model)
     assert fused.known_volume() == pytest.approx(scans.known_volume(), rel=0.05)
     assert fused.entropy() == pytest.approx(scans.entropy(), rel=0.05)
     # a bend of 4° and 1.2 m, spread over the way

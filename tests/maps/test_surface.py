@@ -15,7 +15,7 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, GridError
 from graphslam.core.geometry import Array
 from graphslam.maps.surface.field_kernels import curvature
 from graphslam.maps.surface.layer import SurfaceLayer
-from graphslam.maps.surface.mesh import Mesh, Mesher, owners, position_sigma, save_mesh, zero_set
+from graphslam.maps.surface.mesh import Mesh, Mesher, position_sigma, save_mesh, vertex_owners, zero_set
 from graphslam.maps.surface.piece import SurfaceConfig, SurfacePiece, normals_of, piece_of_planes, piece_of_scans
 from tests.reference.plain_surface import plain_planes, plain_pose
 
@@ -251,7 +251,7 @@ def test_position_sigma_is_that_of_drawn_poses(
 ) -> None:
     layer = _made(four)
     mesh = zero_set(layer.bricks(), layer.config.voxel)
-    own = owners(mesh, layer)
+    own = vertex_owners(mesh, layer)
     assert {0, 1, 2, 3} <= set(np.unique(own).tolist())
     assert np.mean(own < 0) < 0.02  # beside the voxels of any piece
     rng = np.random.default_rng(10)

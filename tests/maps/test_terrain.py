@@ -14,11 +14,19 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, GeometryE
 from graphslam.core.geometry import Array
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, Figures
-from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe
-from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, plan_way, save_cost_map
+from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, DetectorSettings
+from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe_terrain
+from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, plan_vehicle_path, save_cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
-from graphslam.maps.terrain.tables import BINS, Tables, calibrated, dampened, fixed_tables, noisy_or, read_tables
+from graphslam.maps.terrain.tables import (
+    BINS,
+    TerrainWeights,
+    calibrate_probability,
+    effective_count,
+    fixed_tables,
+    noisy_or,
+    read_tables,
+)
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
 from graphslam_studies.maps.learning import fit_calibration, fit_weights, ratios_of
 from graphslam_studies.sim.street import StreetRobot, draw_street, drive_street
@@ -30,7 +38,7 @@ ELEVATION = np.deg2rad(-65.0 + 0.5 * np.arange(181))
 SENSOR, VEHICLE = LineSensor(), Vehicle()
 BOX = (-2.0, -2.0, 14.0, 2.0)
 FIXED = np.array([-3.0, 0.0, 8.0, -3.0, 0.0, 8.0, 0.7, 0.0, 1.0])
-DRIVEN = Tables(fixed_tables(4, 0.85, 0.4), np.array([FIXED] * 4), FIXED, 0.5, {})
+DRIVEN = TerrainWeights(fixed_tables(4, 0.85, 0.4), np.array([FIXED] * 4), FIXED, 0.5, {})
 
 
 def profile_line(solids: list[tuple[float, float, float, float]], floor: list[tuple[float, float]]) -> Array:
@@ -62,7 +70,7 @@ def lines_of(points: Array, feet: float = 0.0) -> ScanLines:
 
 def said(points: Array) -> dict[int, dict[int, int]]:
     """Channel → ix of cells of 0.1 m → value, in one band of 0.1 m up to 20 m."""
-    rows = np.concatenate(list(observe(lines_of(points), np.array([20.0]), np.array([0.1]), VEHICLE)))
+    rows = np.concatenate(list(observe_terrain(lines_of(points), np.array([20.0]), np.array([0.1]), VEHICLE)))
     out: dict[int, dict[int, int]] = {k: {} for k in range(4)}
     for row in rows[rows[:, 4] < 4]:
         out[int(row[4])][int(row[2])] = int(row[5])
@@ -143,9 +151,9 @@ def test_detectors_are_those_of_the_plain_twin() -> None:
             points.append(line)
     lines = lines_of(np.array(points), 0.01)
     edges, cells = SENSOR.band_edges(), np.array(CELLS)
-    made = np.concatenate(list(observe(lines, edges, cells, VEHICLE)))
+    made = np.concatenate(list(observe_terrain(lines, edges, cells, VEHICLE)))
     c = DetectorConfig()
-    f = Figures(
+    f = DetectorSettings(
         c.smooth, c.window, math.tan(VEHICLE.max_slope), c.residual, c.residual_rate, c.memory, c.support_reach,
         math.tan(VEHICLE.max_slope + math.radians(5.0)), VEHICLE.clearance, VEHICLE.height, c.above_limit,
         VEHICLE.climbable_step, VEHICLE.width,
@@ -169,7 +177,7 @@ def missing(points: Array, foot: float = 0.0, height: float = 1.77) -> list[int]
     """Depths [cm] that the statements of missing support of one line give; points are places and heights."""
     line = np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
     lines = ScanLines(line[None], np.array([[0.0, 0.0, foot + height]]), np.array([foot]))
-    rows = np.concatenate(list(observe(lines, SENSOR.band_edges(), np.array(CELLS), VEHICLE)))
+    rows = np.concatenate(list(observe_terrain(lines, SENSOR.band_edges(), np.array(CELLS), VEHICLE)))
     return [int(v) for v in rows[(rows[:, 4] == SUPPORT) & (rows[:, 5] > 0), 5]]
 
 
@@ -314,22 +322,22 @@ def test_probability_is_a_noisy_or() -> None:
     assert p(zero, 0, 0, 0) == 0.0
     assert p(zero - 500.0, 1, 1, 2) == pytest.approx(1.0 - math.exp(-1.0))
     assert p(zero + [[2.0], [0.0]], 1, 0, 0) == pytest.approx(1.0 / (1.0 + math.exp(-2.0 / 1.2)))
-    assert dampened(np.array(1e6)) == pytest.approx(5.0, rel=1e-4)  # many lines count as five
+    assert effective_count(np.array(1e6)) == pytest.approx(5.0, rel=1e-4)  # many lines count as five
 
 
 def test_a_calibrated_probability_is_as_often_right_as_it_says() -> None:
     rng = np.random.default_rng(5)
     p = rng.random(60_000)
-    hazard = rng.random(60_000) < calibrated(p, 0.8, 1.5)
+    hazard = rng.random(60_000) < calibrate_probability(p, 0.8, 1.5)
     u, v = fit_calibration(p, hazard)
     assert u == pytest.approx(0.8, abs=0.05)
     assert v == pytest.approx(1.5, abs=0.05)
     for low in (0.1, 0.4, 0.7):
-        q = calibrated(p, u, v)
+        q = calibrate_probability(p, u, v)
         some = (q > low) & (q < low + 0.2)
         assert np.mean(hazard[some]) == pytest.approx(float(q[some].mean()), abs=0.02)
-    assert calibrated(np.array([0.3]), 0.0, 1.0)[0] == pytest.approx(0.3)
-    assert np.isnan(calibrated(np.array([np.nan]), 0.0, 1.0)[0])
+    assert calibrate_probability(np.array([0.3]), 0.0, 1.0)[0] == pytest.approx(0.3)
+    assert np.isnan(calibrate_probability(np.array([np.nan]), 0.0, 1.0)[0])
 
 
 def test_weights_are_found_again() -> None:
@@ -481,27 +489,27 @@ def test_ways_lead_round_hazards_and_never_through_them() -> None:
     wall[:, 3] = np.repeat(np.arange(-20, 4), 20)
     p.add(wall)
     costs = cost_map(p.classify(), VEHICLE)
-    way = plan_way(costs, np.array([1.0, 0.0]), np.array([5.0, 0.0]))
+    way = plan_vehicle_path(costs, np.array([1.0, 0.0]), np.array([5.0, 0.0]))
     assert way is not None
     off = np.hypot(way.points[:, 0] - 3.05, np.maximum(way.points[:, 1] - 0.35, 0.0))
     assert off.min() >= 0.5 * VEHICLE.width - 0.06
     assert way.length == pytest.approx(np.sum(np.linalg.norm(np.diff(way.points, axis=0), axis=1)))
-    assert plan_way(costs, np.array([1.0, 0.0]), np.array([3.05, -0.5])) is None
+    assert plan_vehicle_path(costs, np.array([1.0, 0.0]), np.array([3.05, -0.5])) is None
     with pytest.raises(DataError, match="outside the terrain map"):
-        plan_way(costs, np.array([-9.0, 0.0]), np.array([5.0, 0.0]))
+        plan_vehicle_path(costs, np.array([-9.0, 0.0]), np.array([5.0, 0.0]))
     # of several goals the cheapest to reach, closed ones left out
     near = np.array([[5.0, 0.0], [2.0, 0.5], [3.05, -0.5]])
-    to_one = plan_way(costs, np.array([1.0, 0.0]), near)
+    to_one = plan_vehicle_path(costs, np.array([1.0, 0.0]), near)
     assert to_one is not None
     assert np.hypot(*(to_one.points[-1] - near[1])) < 0.1
     # a vehicle that stands too near to a wall leaves it on its own side
     stands = np.array([2.75, -0.5])
     assert not np.isfinite(costs.cost[costs.index(stands)])
-    out = plan_way(costs, stands, near[1])
+    out = plan_vehicle_path(costs, stands, near[1])
     assert out is not None
     assert np.array_equal(out.points[0], stands)
     assert np.all(out.points[:, 0] <= 2.8)
-    assert plan_way(costs, np.array([3.05, -0.5]), near[1]) is None  # … but nothing leads out of a hazard
+    assert plan_vehicle_path(costs, np.array([3.05, -0.5]), near[1]) is None  # … but nothing leads out of a hazard
 
 
 def test_what_only_coarse_bands_say_costs_but_does_not_close() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.plots.evidence import plot_heights, plot_section, plot_sharing, section
+from graphslam.plots.evidence import grid_section, plot_heights, plot_section, plot_sharing
 
 
 def room() -> EvidenceGrid:
@@ -19,7 +19,7 @@ def room() -> EvidenceGrid:
 
 
 def test_section_holds_the_probabilities_of_the_plane() -> None:
-    p, (left, right, bottom, top) = section(room(), "z", 0.25)
+    p, (left, right, bottom, top) = grid_section(room(), "z", 0.25)
     columns, rows = round((right - left) / 0.5), round((top - bottom) / 0.5)
     assert p.shape == (rows, columns)
     i, j = int((0.25 - bottom) / 0.5), int((3.25 - left) / 0.5)
@@ -27,7 +27,7 @@ def test_section_holds_the_probabilities_of_the_plane() -> None:
     assert p[i, j - 1] == pytest.approx(0.4, abs=1e-3)
     assert np.isnan(p[i + 1, j])
     assert np.isfinite(p).sum() == 7 + 1  # the beam along x with its end, and the first steps of the other one
-    p, (left, *_) = section(room(), "y", 0.25)  # rows are z now
+    p, (left, *_) = grid_section(room(), "y", 0.25)  # rows are z now
     assert np.isfinite(p).sum() > 8
 
 
@@ -52,7 +52,7 @@ def test_plots_take_and_return_axes_also_for_an_empty_grid() -> None:
     with pytest.raises(ConfigError, match="no heights"):
         plot_heights(flat)
     with pytest.raises(ConfigError, match="no section"):
-        section(flat, "x")
+        grid_section(flat, "x")
     plt.close("all")
 
 

@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 
 from graphslam.core.errors import DataError
 from graphslam.plots.loops import plot_loops
-from graphslam.plots.save import png, save
+from graphslam.plots.save import figure_png, save_figure
 
 PATH = np.array([[0.0, 0.0, 5.0], [10.0, 0.0, 5.0], [np.nan, np.nan, np.nan], [10.0, 10.0, 5.0], [0.0, 10.0, 5.0]])
 NODES = PATH[[0, 1, 3, 4]]
@@ -52,5 +52,5 @@ def test_what_cannot_be_drawn_is_refused(loop: tuple[int, int, str]) -> None:
 def test_a_png_in_memory_is_the_one_on_disk(tmp_path) -> None:
     before = plt.get_fignums()
     made = [plot_loops(None, PATH, NODES, [(0, 3, "accepted")]) for _ in range(2)]
-    assert png(made[0]) == save(made[1], tmp_path / "a.png").read_bytes()
+    assert figure_png(made[0]) == save_figure(made[1], tmp_path / "a.png").read_bytes()
     assert plt.get_fignums() == before  # those that other tests have left open

@@ -16,7 +16,7 @@ from graphslam.app.run.local_maps import first_particles, local_maps
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.submap_consistency import true_submap
-from graphslam.join.registry import join
+from graphslam.join.registry import join_by_method
 from graphslam.plots.method_maps import plot_method_maps
 from graphslam.plots.particles import (
     histories_left,
@@ -108,7 +108,7 @@ def test_lineage_is_sideways_from_the_smoothed_path(made) -> None:
 
 def test_method_maps_state_their_own_figures(log) -> None:
     submaps = local_maps(log, seed=2, options=OPTIONS)
-    joined = join(submaps, "eif-tree", polish=True)
+    joined = join_by_method(submaps, "eif-tree", polish=True)
     (whole,) = local_maps(log, "ekf-slam", seed=2)
     one, two = plot_method_maps({"polished": joined, "EKF": whole}, log.truth)
     truth = dict(zip(log.truth.landmark_ids.tolist(), log.truth.landmarks))

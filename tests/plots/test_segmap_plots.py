@@ -14,8 +14,8 @@ from graphslam.core.errors import DataError
 from graphslam.plots import style
 from graphslam.plots.segmap import plot_expansion, plot_score_map, plot_segmap
 from graphslam.plots.segments import sample_paths
-from graphslam_frontends.segslam.sampling import grow, root_of_segment
-from graphslam_frontends.segslam.segmap import Entry, SegMap
+from graphslam_frontends.segslam.sampling import grow_sample, root_of_segment
+from graphslam_frontends.segslam.segmap import SegMap, SegmentEntry
 from tests.reference.segmap_twin import flat_grid, match_entry, small_segmap, straight
 
 
@@ -29,7 +29,7 @@ def two_particles() -> SegMap:
     """Two intervals with two segments each; in a third both particles are back in the first map."""
     m = small_segmap(7, 2)
     for k in range(2):
-        m.open(2 * k, [Entry(T_entry=np.zeros(3))] * 2)
+        m.open(2 * k, [SegmentEntry(T_entry=np.zeros(3))] * 2)
         paths = [straight(np.zeros(3), 2.0, 2), straight(np.zeros(3), 2.1 + 0.1 * k, 2)]
         m.close(2 * k + 2, [flat_grid(), flat_grid()], paths)
     back = np.array([1.9, 2.1, np.pi])
@@ -44,7 +44,7 @@ def legend_of(ax: plt.Axes) -> list[str]:
 
 def test_a_segmap_is_drawn_segment_by_segment() -> None:
     m = two_particles()
-    sample = grow(m, root_of_segment(m, len(m) - 1), np.random.default_rng(0))
+    sample = grow_sample(m, root_of_segment(m, len(m) - 1), np.random.default_rng(0))
     ax = plot_segmap(None, m, sample=sample)
     ax.figure.canvas.draw()
     said = legend_of(ax)
@@ -64,7 +64,7 @@ def test_a_segmap_is_drawn_segment_by_segment() -> None:
 
 def test_a_sample_is_coloured_by_its_links_from_the_root() -> None:
     m = two_particles()
-    sample = grow(m, root_of_segment(m, len(m) - 1), np.random.default_rng(0))
+    sample = grow_sample(m, root_of_segment(m, len(m) - 1), np.random.default_rng(0))
     ax = plot_expansion(None, m, sample)
     paths = sample_paths(m, sample)[0]
     for line, path in zip(ax.lines, paths):

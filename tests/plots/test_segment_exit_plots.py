@@ -11,7 +11,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
 from graphslam.plots.segment_exits import plot_exit_nees, plot_segment_exit
-from graphslam_frontends.segslam.covariance import Nees
+from graphslam_frontends.segslam.covariance import ExitNees
 
 
 def ending(sigma: float) -> Submap:
@@ -42,7 +42,7 @@ def test_exit_shows_every_particle_and_each_covariance() -> None:
 
 def test_scores_of_all_segments_are_there_and_those_inside_counted() -> None:
     honest, sure = np.array([2.0, 4.0, 20.0]), np.array([400.0, 4000.0, 3.0])
-    scores = {n: Nees(v, 4, np.zeros((3, 4))) for n, v in (("honest", honest), ("sure", sure))}
+    scores = {n: ExitNees(v, 4, np.zeros((3, 4))) for n, v in (("honest", honest), ("sure", sure))}
     ax = plot_exit_nees(None, scores)
     points = [line for line in ax.lines if line.get_marker() not in ("None", "")]
     np.testing.assert_allclose(points[0].get_ydata(), honest / 4)
@@ -54,7 +54,11 @@ def test_scores_of_all_segments_are_there_and_those_inside_counted() -> None:
     low, high = band.get_y(), band.get_y() + band.get_height()
     assert low == pytest.approx(chi2_quantile(0.025, 4) / 4)
     assert high == pytest.approx(chi2_quantile(0.975, 4) / 4)
-    for bad in ({}, {"a": Nees(np.zeros(0), 4, np.zeros((0, 4)))}, {"a": scores["sure"], "b": Nees(sure[:1], 4, sure)}):
+    for bad in (
+        {},
+        {"a": ExitNees(np.zeros(0), 4, np.zeros((0, 4)))},
+        {"a": scores["sure"], "b": ExitNees(sure[:1], 4, sure)},
+    ):
         with pytest.raises(DataError, match="no exits"):
             plot_exit_nees(None, bad)
     plt.close("all")

@@ -9,7 +9,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_compose
 from graphslam.plots.segments import (
-    Tie,
+    DrawnMatch,
     plot_entropies,
     plot_samples,
     plot_scores,
@@ -17,9 +17,9 @@ from graphslam.plots.segments import (
     running_maximum,
     sample_paths,
 )
-from graphslam_frontends.segslam.paths import concatenate
-from graphslam_frontends.segslam.sampling import grow, root_of_segment
-from graphslam_frontends.segslam.segmap import Entry, SegMap
+from graphslam_frontends.segslam.paths import concatenate_segments
+from graphslam_frontends.segslam.sampling import grow_sample, root_of_segment
+from graphslam_frontends.segslam.segmap import SegMap, SegmentEntry
 from tests.reference.segmap_twin import flat_grid, match_entry, small_segmap, straight
 
 
@@ -33,7 +33,7 @@ def two_sides() -> SegMap:
     path = straight(np.zeros(3), 2.0, 2)
     path[-1, 2] = np.pi / 2
     for k in range(2):
-        m.open(2 * k, [Entry(T_entry=np.zeros(3))])
+        m.open(2 * k, [SegmentEntry(T_entry=np.zeros(3))])
         m.close(2 * k + 2, [flat_grid()], [path])
     m.open(4, [match_entry(np.array([1.9, 2.1, np.pi]), 0)])
     m.close(6, [flat_grid()], [straight(np.array([1.9, 2.1, np.pi]), 1.0, 2)])
@@ -59,11 +59,11 @@ def test_scores_are_drawn_with_the_boundaries_and_their_reasons() -> None:
 
 def test_segments_stand_where_the_sample_puts_them_and_matches_join_them() -> None:
     m = two_sides()
-    sample = grow(m, root_of_segment(m, 2), np.random.default_rng(0))
+    sample = grow_sample(m, root_of_segment(m, 2), np.random.default_rng(0))
     paths, ties, labels = sample_paths(m, sample)
     assert labels == ["0", "1", "2m"]
     assert len(ties) == 1
-    whole = concatenate(m, sample)
+    whole = concatenate_segments(m, sample)
     np.testing.assert_allclose(np.concatenate([paths[0], paths[1][1:], paths[2][1:]]), whole.positions, atol=1e-12)
     # the match: from the entry of segment 2 to the nearest pose of segment 0, at its end
     k = sample.segments.tolist().index(0)
@@ -90,7 +90,7 @@ def test_segments_stand_where_the_sample_puts_them_and_matches_join_them() -> No
 
 def test_other_planes_and_impossible_ones() -> None:
     p = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
-    ax = plot_segments(None, [p], ties=[Tie(p[0], p[1])], plane="xz")
+    ax = plot_segments(None, [p], ties=[DrawnMatch(p[0], p[1])], plane="xz")
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), p[:, [0, 2]])
     assert ax.get_ylabel() == "z [m]"
     with pytest.raises(DataError, match="cannot be drawn"):

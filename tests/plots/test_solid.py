@@ -8,7 +8,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.maps.terrain.pyramid import TerrainMap
-from graphslam.plots.solid import View, plot_cloud, plot_solid
+from graphslam.plots.solid import ViewDirection, plot_cloud, plot_solid
 from graphslam.plots.surface import plot_surface
 from graphslam.plots.terrain import plot_bands
 from graphslam.sim.mesh import MeshBuilder
@@ -36,19 +36,19 @@ def picture(ax: plt.Axes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_views_keep_lengths_and_point_the_right_way() -> None:
-    view = View(azimuth=-np.pi / 2, elevation=np.pi / 2)  # from straight above, north up
+    view = ViewDirection(azimuth=-np.pi / 2, elevation=np.pi / 2)  # from straight above, north up
     np.testing.assert_allclose(view.project([[1.0, 2.0, 7.0]]), [[1.0, 2.0]], atol=1e-12)
-    axes = View(azimuth=0.7, elevation=0.4).axes
+    axes = ViewDirection(azimuth=0.7, elevation=0.4).axes
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)  # not a mirror image
     assert axes[1, 2] > 0  # up is up
     for bad in (0.0, 2.0, np.nan):
         with pytest.raises(ConfigError, match="elevation"):
-            View(elevation=bad)
+            ViewDirection(elevation=bad)
 
 
 def test_the_lid_comes_off_and_the_tower_stands_where_it_is() -> None:
-    view = View(azimuth=-np.pi / 2, elevation=np.pi / 2)
+    view = ViewDirection(azimuth=-np.pi / 2, elevation=np.pi / 2)
     cut = plot_solid(boxes(), below=3.5, view=view, margin=3.0, pixels=160, way=False)
     a, at = picture(cut)
     tower = (at[..., 0] > 4.2) & (at[..., 0] < 5.8) & (at[..., 1] > -1.8) & (at[..., 1] < -1.2)
@@ -63,7 +63,7 @@ def test_the_lid_comes_off_and_the_tower_stands_where_it_is() -> None:
 
 def test_the_way_is_dotted_where_something_hides_it() -> None:
     """From the south, 45° up, a tower of 3 m whose north side is at y = -1 hides the ground behind it to y = 2."""
-    view = View(azimuth=-np.pi / 2, elevation=np.pi / 4)
+    view = ViewDirection(azimuth=-np.pi / 2, elevation=np.pi / 4)
     ax = plot_solid(boxes(), below=3.5, view=view, pixels=120)
     dotted, seen = (np.column_stack(line.get_data()) for line in ax.lines[:2])
     hidden = np.isfinite(dotted[:, 0])
@@ -81,7 +81,7 @@ def test_the_way_is_dotted_where_something_hides_it() -> None:
 def test_clouds_are_drawn_far_to_near_and_refused_if_broken() -> None:
     rng = np.random.default_rng(0)
     p = rng.normal(size=(50, 3))
-    view = View(azimuth=0.3, elevation=0.5)
+    view = ViewDirection(azimuth=0.3, elevation=0.5)
     ax = plot_cloud(p, view=view)
     dots = ax.collections[0]
     order = np.argsort(p @ view.axes[2])

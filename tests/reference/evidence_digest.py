@@ -16,10 +16,10 @@ import numpy as np
 
 from graphslam.evidence import contents, queries
 from graphslam.evidence.batch import update_grids
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.formats import load_npz, to_dense
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.memory import memory
+from graphslam.evidence.memory import measure_memory
 from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.evidence.pool import GridPool
 
@@ -88,8 +88,8 @@ def digest(threads: int = 1, dim: int = 3) -> dict[str, str]:
         contents.bounding_box(g), contents.entropy(g), contents.value_counts(g),
     )  # fmt: skip
     out["dense"] = _hash(to_dense(g).values)
-    out["compacted"] = _hash(repr(compact(grids)).encode(), _grids(grids).encode())
-    out["memory"] = _hash(repr(memory(grids[:2])).encode())
+    out["compacted"] = _hash(repr(compact_grids(grids)).encode(), _grids(grids).encode())
+    out["memory"] = _hash(repr(measure_memory(grids[:2])).encode())
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.npz"
         g.save(path)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.poses import SE3, heading_of, upright
+from graphslam.core.poses import SE3, heading_of, level_poses
 
 FILE = Path(__file__).with_name("garage_exits.npz")
 RUNS = (*(("A", seed) for seed in range(100, 106)), ("B", 101), ("B", 103))
@@ -60,7 +60,7 @@ def read(*particles: int, pieces: bool = False) -> Ends:
         x = data["paths"][kept].astype(np.float64)
         return Ends(
             data["particles"][kept].astype(np.int64),
-            upright(x[..., :3], x[..., 3]),
+            level_poses(x[..., :3], x[..., 3]),
             data["errors"][kept].astype(np.float64),
             data["spreads"][kept].astype(np.float64),
         )
@@ -68,7 +68,7 @@ def read(*particles: int, pieces: bool = False) -> Ends:
 
 def drive(layout: str, seed: int) -> Iterator[tuple[int, bool, Array, Array, Array]]:
     """Particles, whether a piece, path, error and spread of every end of one drive."""
-    from graphslam.core.poses import level
+    from graphslam.core.poses import remove_roll_pitch
     from graphslam_studies.segslam_garage import WORLDS
     from graphslam_studies.segslam_trial import GridTrial
 
@@ -81,24 +81,24 @@ def drive(layout: str, seed: int) -> Iterator[tuple[int, bool, Array, Array, Arr
     for length in PIECES:
         for start in np.linspace(0.0, s[-1] - length, 6):
             a, b = np.searchsorted(s, [start, start + length])
-            about, true = (g.between(level(p[a]), level(p[b])) for p in (path, trial.truth))
+            about, true = (g.between(remove_roll_pitch(p[a]), remove_roll_pitch(p[b])) for p in (path, trial.truth))
             at = np.linspace(a, b, NODES).round().astype(int)
-            seen = g.between(np.broadcast_to(level(path[a]), path[at].shape), path[at])
+            seen = g.between(np.broadcast_to(remove_roll_pitch(path[a]), path[at].shape), path[at])
             yield 20, True, seen, g.log(g.between(about, true))[2:], np.zeros((4, 4))
 
 
 def segment_ends(result: object, truth: Array) -> Iterator[tuple[Array, Array, Array]]:
     """Path, error and spread of every settled segment."""
-    from graphslam.core.poses import level
+    from graphslam.core.poses import remove_roll_pitch
     from graphslam_frontends.segslam.covariance import exit_covariance
-    from graphslam_frontends.segslam.submaps import base_of, exits_of_interval, settled_chain
+    from graphslam_frontends.segslam.submaps import common_ancestor_chain, exits_of_interval, segment_base
 
     m = result.segmap  # type: ignore[attr-defined]
     g = m.group
-    for index in settled_chain(m, int(result.closed[result.best])):  # type: ignore[attr-defined]
+    for index in common_ancestor_chain(m, int(result.closed[result.best])):  # type: ignore[attr-defined]
         s = m[int(index)]
-        about = g.between(base_of(m, s.T_entry), base_of(m, s.T_exit))
-        true = g.between(*(level(truth[k]) for k in s.interval))
+        about = g.between(segment_base(m, s.T_entry), segment_base(m, s.T_exit))
+        true = g.between(*(remove_roll_pitch(truth[k]) for k in s.interval))
         ends, weights = exits_of_interval(m, s.interval)
         spread = exit_covariance(ends, about, s.length, lambda _: np.eye(6), weights=weights).particles
         at = np.linspace(0, len(s.path) - 1, NODES).round().astype(int)

@@ -8,7 +8,7 @@ from graphslam.core.geometry import se2_between, se2_log
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.factors.lasting import LastingRecord, errors_at
+from graphslam.graph.factors.sensor_biases import SensorBiasRecord, sensor_biases_at
 from graphslam.graph.noise import robust_terms
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_residual
@@ -24,10 +24,10 @@ def whitened_residual(record: object, values: Values) -> np.ndarray:
         r = W @ submap_residual(values.poses[record.start], values.poses[record.start + 1], points, z, record.chart)
         if record.robot < 0:
             return r
-        g = errors_at(values, record.robot)
+        g = sensor_biases_at(values, record.robot)
         return r + record.whitener[:, len(z) :] @ g
-    if isinstance(record, LastingRecord):
-        return record.root @ errors_at(values, record.robot) - record.told
+    if isinstance(record, SensorBiasRecord):
+        return record.root @ sensor_biases_at(values, record.robot) - record.told
     if isinstance(record, BetweenRecord):
         h = se2_between(values.poses[record.i], values.poses[record.j])
         return record.whitener @ se2_log(se2_between(record.T_ij, h))

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import values_of
-from graphslam.solve.descent import polish
+from graphslam.graph.network import network_values
+from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.network.batch import BatchProblem
 from tests.reference.plain_network import edge_costs
 
@@ -83,7 +83,7 @@ def huber_least_squares(
         weights = np.where(trusted, 1.0, np.minimum(1.0, k / np.sqrt(np.maximum(costs, 1e-300))))
         weighted = replace(network, information=weights[:, None, None] * network.information)
         problem = BatchProblem(weighted)
-        end = polish(problem, problem.pack(values_of(network, now)), max_iterations=3)
+        end = descend_to_minimum(problem, problem.pack(network_values(network, now)), max_iterations=3)
         moved = problem.unpack(end.values).poses
         costs = edge_costs(network, moved)
         fresh = _huber(costs, trusted, k)

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphslam.core import se3
 from graphslam.core.imu import GRAVITY, Imu, ImuNoise
-from graphslam.core.poses import SE3, level
+from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 
@@ -125,7 +125,9 @@ def ring(
     imu, bias = unit_on(np.arange(-10, round((submaps * seconds + 0.2) * hz)) / hz, rng, noise)
     bodies = true_pose(seconds * np.arange(submaps + 1))
     leans = SE3.exp(np.column_stack([lean * rng.standard_normal((submaps + 1, 2)), np.zeros((submaps + 1, 4))]))
-    leans = SE3.compose(SE3.between(bodies, level(bodies)), leans)  # a level base, and the error of levelling it
+    leans = SE3.compose(
+        SE3.between(bodies, remove_roll_pitch(bodies)), leans
+    )  # a level base, and the error of levelling it
     Q, made, n = np.diag(step**2), [], round(seconds / every)
     t0 = 0.0
     for k in range(submaps):

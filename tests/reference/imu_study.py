@@ -12,7 +12,7 @@ import numpy as np
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.se3 import align_se3, quat_rotate, quat_to_matrix, so3_exp
-from graphslam.evaluate.without_truth import class_consistency
+from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.pose_graph import PoseGraph

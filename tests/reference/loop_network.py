@@ -16,12 +16,12 @@ from graphslam.core.errors import DataError, IndeterminateError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.poses import chained, group_of
-from graphslam.graph.noise import Robust
+from graphslam.core.poses import compose_increments, group_of
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
-from graphslam.solve.sparse import factor
+from graphslam.solve.sparse import factorise_sparse
 from tests.reference.plain_network import Layout, edge_costs, linearise
 
 ITERATIONS = 50
@@ -37,7 +37,7 @@ class LoopNetwork:
     Parameters
     ----------
     increments, covariances : (n, 7|3), (n, d, d)
-        From node k to node k + 1, right tangents (:class:`~graphslam.loops.places.ChainRelative`).
+        From node k to node k + 1, right tangents (:class:`~graphslam.loops.places.ChainRelativePoses`).
 
     Raises
     ------
@@ -49,13 +49,13 @@ class LoopNetwork:
         g = group_of(increments)
         for k, P in enumerate(covariances):
             check_covariance(P, what=f"covariance of increment {k}", dim=g.dof)
-        self._poses = chained(increments)
+        self._poses = compose_increments(increments)
         n = len(increments)
         self._ends = [(k, k + 1) for k in range(n)]
         self._measured = [T.copy() for T in increments]
         self._information = [np.linalg.inv(P) for P in covariances]
         self._ids = list(range(n))
-        self._kernels: list[Robust | None] = [None] * n
+        self._kernels: list[RobustKernel | None] = [None] * n
         self._next = n
         self._factored: spla.SuperLU | None = None
 
@@ -66,7 +66,7 @@ class LoopNetwork:
         """Of all nodes in the frame of the first ``(n + 1, 7|3)``."""
         return self._poses
 
-    def add_loop(self, loop: Loop, robust: Robust) -> int:
+    def add_loop(self, loop: Loop, robust: RobustKernel) -> int:
         """See :class:`~graphslam.loops.loops.LoopGraph`."""
         if not (min(loop.i, loop.j) >= 0 and max(loop.i, loop.j) < len(self._poses) and loop.i != loop.j):
             raise DataError("a loop joins nodes that are not there", got=(loop.i, loop.j), wanted=len(self._poses))
@@ -169,6 +169,6 @@ class LoopNetwork:
 
     def _factor(self, J: sp.csr_matrix) -> spla.SuperLU:
         try:
-            return factor(sp.csc_matrix(J.T @ J))
+            return factorise_sparse(sp.csc_matrix(J.T @ J))
         except (RuntimeError, np.linalg.LinAlgError):
             raise IndeterminateError("the chain with its loops does not determine its poses") from None

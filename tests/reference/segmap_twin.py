@@ -9,8 +9,8 @@ import numpy as np
 
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam_frontends.segslam.sampling import Root, grow_by, probabilities
-from graphslam_frontends.segslam.segmap import MATCH, NEW, Entry, SegMap
+from graphslam_frontends.segslam.sampling import SampleRoot, grow_sample_by, segment_probabilities
+from graphslam_frontends.segslam.segmap import MATCH, NEW, SegMap, SegmentEntry
 
 
 class PlainSegMap:
@@ -118,21 +118,21 @@ class _Script:
         return out
 
     def choose(self, fits: np.ndarray) -> int:
-        p = probabilities(fits, self.weights)
+        p = segment_probabilities(fits, self.weights)
         k = self._answer(len(p))
         self.chance *= Fraction(float(p[k])).limit_denominator(10**6)
         return k
 
 
 def all_samples(
-    segmap: SegMap, root: Root, weights: np.ndarray | None = None, **options: Any
+    segmap: SegMap, root: SampleRoot, weights: np.ndarray | None = None, **options: Any
 ) -> dict[tuple[int, ...], Fraction]:
     """Every map sample, as the sorted tuple of its segments, with its probability, by trying every choice there is."""
     found: dict[tuple[int, ...], Fraction] = {}
     digits: list[int] = []  # an odometer over choices whose number depends on the ones before
     while True:
         script = _Script(digits, weights)
-        sample = grow_by(segmap, root, script.order, script.choose, **options)
+        sample = grow_sample_by(segmap, root, script.order, script.choose, **options)
         key = tuple(sorted(sample.segments.tolist()))
         found[key] = found.get(key, Fraction(0)) + script.chance
         digits = (digits + [0] * len(script.options))[: len(script.options)]
@@ -175,7 +175,9 @@ def straight(start: np.ndarray, length: float, steps: int) -> np.ndarray:
     return np.stack([x + s * np.cos(a), y + s * np.sin(a), np.full(steps + 1, a)], axis=1)
 
 
-def match_entry(T: np.ndarray, source: int, fitness: float = 0.9) -> Entry:
+def match_entry(T: np.ndarray, source: int, fitness: float = 0.9) -> SegmentEntry:
     """A match with a small covariance."""
     d = 3 if len(T) == 3 else 6
-    return Entry(T_entry=np.asarray(T, float), kind=MATCH, source=source, covariance=1e-4 * np.eye(d), fitness=fitness)
+    return SegmentEntry(
+        T_entry=np.asarray(T, float), kind=MATCH, source=source, covariance=1e-4 * np.eye(d), fitness=fitness
+    )

@@ -1,6 +1,6 @@
 """χ² of loops and of groups against everything else, the slow way: dense least squares, solved twice.
 
-Nothing is shared with :mod:`graphslam.solve.network.settle` but the linearised arrays of the network.
+Nothing is shared with :mod:`graphslam.solve.network.leave_one_out` but the linearised arrays of the network.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import numpy as np
 
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.trajectory import Trajectory
-from graphslam.evidence.compact import pieces_of
+from graphslam.evidence.compact import grid_pieces
 from graphslam.evidence.grid import EvidenceGrid
 
 
@@ -32,7 +32,7 @@ def some_pose(rng: np.random.Generator, dim: int, spread: float = 1.0) -> np.nda
 
 def same_map(a: EvidenceGrid, b: EvidenceGrid) -> bool:
     """Whether every voxel is the same, whatever happened to the two before."""
-    x, y = pieces_of(a), pieces_of(b)
+    x, y = grid_pieces(a), grid_pieces(b)
     return all(
         np.array_equal(getattr(x, n), getattr(y, n)) for n in ("bricks", "values", "cubes", "log_edges", "cube_values")
     )

@@ -93,10 +93,12 @@ class SmallStudy:
         return {f"World {w}": summarise(rows) for w, rows in whole.groupby("world")}
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        from graphslam.plots.save import save
+        from graphslam.plots.save import save_figure
         from graphslam_studies.plots.study import plot_ci
 
-        return [save(plot_ci(None, rows, "pose_nees"), folder / f"ci-{w}.png") for w, rows in table.groupby("world")]
+        return [
+            save_figure(plot_ci(None, rows, "pose_nees"), folder / f"ci-{w}.png") for w, rows in table.groupby("world")
+        ]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.core.charts import arc_terms
+from graphslam.core.charts import inverse_left_jacobian_terms
 from graphslam.core.geometry import se2_between, wrap_angle
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import LandmarkMap, Submap
@@ -76,7 +76,7 @@ def submap_chain(
         noise = np.linalg.cholesky(P) @ rng.standard_normal(len(z))
         if chart == "group":  # the truth is the estimate, moved along arcs by minus the noise
             rows = np.r_[0:2, 3 : len(z)]
-            a, b, _ = arc_terms(-noise[2])
+            a, b, _ = inverse_left_jacobian_terms(-noise[2])
             noise[rows] = (noise[rows].reshape(-1, 2) @ np.linalg.inv([[a, b], [-b, a]]).T).ravel()
         z = z + noise
         z[2] = wrap_angle(z[2])

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.backend.refining import findings_of
+from graphslam.backend.refining import refinement_findings
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.refine.fixes import FixModel
-from graphslam.refine.problem import Problem
-from graphslam.refine.refine import refine
+from graphslam.refine.problem import RefinementProblem
+from graphslam.refine.refine import refine_by_scans
 from tests.refine.test_problem import dense_terms, some_problem
 from tests.refine.world import court_scans
 
@@ -45,9 +45,9 @@ def test_jacobians(rng, dim, lasting):
         lever=rng.standard_normal(dim),
         covariances=A @ np.swapaxes(A, 1, 2) + np.eye(dim),
     )
-    config = GpsConfig(segment_gap=0.2, robust=Robust("none"), **lasting)
+    config = GpsConfig(segment_gap=0.2, robust=RobustKernel("none"), **lasting)
     model = FixModel(gps, config, problem.motion, poses)
-    problem = Problem(problem.motion, problem.cloud, poses[0].copy(), model)
+    problem = RefinementProblem(problem.motion, problem.cloud, poses[0].copy(), model)
     g = problem.motion.group
     datum = g.exp(0.3 * rng.standard_normal(g.dof))
     states = (*states, datum, rng.standard_normal((len(model.keep), dim)))
@@ -68,7 +68,7 @@ def test_fixes_hold_what_scans_and_motion_do_not(rng):
     """The frame of the fixes is found, and the path in it is nearer the truth and surer."""
     scans, reckoned, truth = court_scans(3)
     gps = fixes_along(truth[::3], scans.times[::3], rng, sigma=0.02)
-    with_fixes = refine(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
+    with_fixes = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
     assert with_fixes.fixes is not None
     assert with_fixes.fixes.used == len(gps.times)
     assert with_fixes.fixes.typical == pytest.approx(1.0, abs=0.35)
@@ -83,7 +83,7 @@ def test_fixes_hold_what_scans_and_motion_do_not(rng):
     there = g.transform(with_fixes.fixes.T_gps_world, g.transform(with_fixes.poses, lever))
     true = g.transform(DATUM, g.transform(truth, lever))
     assert np.sqrt(np.mean(np.sum((there - true) ** 2, axis=1))) < 0.02
-    plain = refine(scans, reckoned)
+    plain = refine_by_scans(scans, reckoned)
     assert plain.fixes is None
     assert np.trace(with_fixes.covariances[-1][3:, 3:]) < np.trace(plain.covariances[-1][3:, 3:])
 
@@ -94,7 +94,7 @@ def test_the_covariance_with_fixes_is_neither_too_small_nor_too_large():
     for seed in range(8):
         scans, reckoned, truth = court_scans(100 + seed)
         gps = fixes_along(truth[::5], scans.times[::5], np.random.default_rng(seed))
-        found = refine(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
+        found = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
         g = group_of(truth)
         e = g.log(g.between(truth, found.poses))
         k = np.arange(5, len(truth), 10)
@@ -112,8 +112,8 @@ def test_errors_that_last_are_no_news_fix_after_fix(rng):
         keep = np.exp(-(gps.times[k] - gps.times[k - 1]) / 60.0)
         bias[k] = keep * bias[k - 1] + np.sqrt(1 - keep**2) * 0.5 * rng.standard_normal(3)
     gps = replace(gps, positions=gps.positions + bias)
-    white = refine(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
-    lasting = refine(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0, bias_sigma=0.5, bias_time=60.0)))
+    white = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
+    lasting = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0, bias_sigma=0.5, bias_time=60.0)))
     assert white.fixes is not None
     assert lasting.fixes is not None
     assert white.fixes.contradicted
@@ -121,24 +121,24 @@ def test_errors_that_last_are_no_news_fix_after_fix(rng):
     g = group_of(truth)
     errors = [np.sqrt(np.mean(g.log(g.between(truth, r.poses))[:, 3:] ** 2)) for r in (white, lasting)]
     assert errors[1] < errors[0]
-    told = {f.code: f for f in findings_of(white)}
+    told = {f.code: f for f in refinement_findings(white)}
     assert told["refine-fixes"].level == "look"
-    assert {f.code: f for f in findings_of(lasting)}["refine-fixes"].level == "good"
+    assert {f.code: f for f in refinement_findings(lasting)}["refine-fixes"].level == "good"
 
 
 def test_fixes_that_do_not_say_where_north_is_hold_nothing(rng):
     scans, reckoned, truth = court_scans(3)
     gps = fixes_along(truth[:4], scans.times[:4], rng)
-    found = refine(scans, reckoned, gps=(gps, GpsConfig(baseline=20.0)))
+    found = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=20.0)))
     assert found.fixes is None
-    np.testing.assert_array_equal(found.poses, refine(scans, reckoned).poses)
+    np.testing.assert_array_equal(found.poses, refine_by_scans(scans, reckoned).poses)
 
 
 def test_fixes_outside_the_path_are_left_out_and_counted(rng):
     scans, reckoned, truth = court_scans(3)
     gps = fixes_along(truth[::3], scans.times[::3], rng)
     late = replace(gps, times=gps.times + 0.5 * (scans.times[-1] - scans.times[0]))
-    found = refine(scans, reckoned, gps=(late, GpsConfig(baseline=1.0)))
+    found = refine_by_scans(scans, reckoned, gps=(late, GpsConfig(baseline=1.0)))
     inside = int(np.sum(late.times <= scans.times[-1]))
     assert found.fixes is not None
     assert (found.fixes.used, found.fixes.left) == (inside, len(late.times) - inside)

@@ -12,11 +12,11 @@ from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
 from graphslam.core.records import LaserScans, Odometry
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import refine
+from graphslam.refine.refine import refine_by_scans
 from graphslam.refine.scans import Scans
-from graphslam.refine.surfaces import Cloud
+from graphslam.refine.surfaces import ScanReturns
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 from tests.calibrate.room import drive, scan
 
@@ -35,7 +35,7 @@ def started(seconds=100.0, **errors):
 def refined(**errors):
     """The refinement from dead reckoning, and its greatest distance from the truth [m]."""
     scans, start, true = started(noise=0.005, **errors)
-    found = refine(scans, start)
+    found = refine_by_scans(scans, start)
     return found, float(np.hypot(*(found.poses - true)[:, :2].T).max()), start, true
 
 
@@ -78,7 +78,7 @@ def test_the_error_is_as_large_as_the_covariance_says() -> None:
     values = []
     for seed in range(3, 9):
         scans, start, true = started(seconds=60.0, spread=5e-3, seed=seed)
-        values.append(normalised(refine(scans, start), true).mean())
+        values.append(normalised(refine_by_scans(scans, start), true).mean())
     assert 0.5 < np.mean(values) < 1.1
 
 
@@ -91,7 +91,7 @@ def test_errors_that_a_scan_has_in_common_widen_the_covariance() -> None:
         off = np.repeat(1e-2 * rng.standard_normal(len(scans)), np.diff(scans.offsets))
         ends = scans.points - scans.origins
         ends *= 1.0 + off[:, None] / np.maximum(np.linalg.norm(ends, axis=1, keepdims=True), 0.1)
-        found.append(refine(replace(scans, points=(scans.origins + ends).astype(np.float32)), start))
+        found.append(refine_by_scans(replace(scans, points=(scans.origins + ends).astype(np.float32)), start))
         values.append(normalised(found[-1], true).mean())
     assert all(r.alike > 2.0 for r in found)
     assert 0.4 < np.mean(values) < 1.6
@@ -100,7 +100,7 @@ def test_errors_that_a_scan_has_in_common_widen_the_covariance() -> None:
 def test_a_step_between_nodes_is_uncertain_where_wheels_slipped() -> None:
     """Between nodes only the odometry tells the way, and a slip lies anywhere between them."""
     scans, start, true = started(seconds=60.0, spread=5e-3, slip=0.5)
-    found = refine(scans, start, RefineConfig(spacing=1.0, turn=1.0))
+    found = refine_by_scans(scans, start, RefineConfig(spacing=1.0, turn=1.0))
     off = np.hypot(*(found.poses - true)[:, :2].T)
     assert off.max() > 0.2  # nobody can know better
     nees = normalised(found, true)
@@ -132,7 +132,7 @@ def corridor(seed, *, rest=0.0):
     log = SensorLog(name="corridor", streams={"odometry": odometry, "scans": scans})
     steps = Scans.of(make_steps(log, StepConfig(period=None, match_scans=False)))
     true = way[np.searchsorted(t, steps.times)]
-    return steps, chain(steps.odometry).poses, se2_between(np.broadcast_to(true[0], true.shape), true)
+    return steps, chain_odometry(steps.odometry).poses, se2_between(np.broadcast_to(true[0], true.shape), true)
 
 
 def test_a_corridor_is_uncertain_along_itself() -> None:
@@ -140,7 +140,7 @@ def test_a_corridor_is_uncertain_along_itself() -> None:
     along, across = [], []
     for seed in range(6):
         steps, start, true = corridor(seed)
-        found = refine(steps, start)
+        found = refine_by_scans(steps, start)
         e = se2_log(se2_between(found.poses, true))[20:]
         variance = np.einsum("kii->ki", found.covariances)[20:]
         along.append(np.mean(e[:, 0] ** 2 / variance[:, 0]))
@@ -156,7 +156,7 @@ def test_where_a_robot_stood_is_as_uncertain_as_its_odometry_until_it_left() -> 
     values = []
     for seed in range(4):
         steps, start, true = corridor(seed, rest=24.0)
-        found = refine(steps, start)
+        found = refine_by_scans(steps, start)
         for k in range(0, len(steps) - 20, 7):
             P = found.joint([k, k + 20])
             step = se2_between(found.poses[k], found.poses[k + 20])
@@ -171,12 +171,12 @@ def test_turns_on_the_spot_begin_new_chunks() -> None:
     log, _ = drive(seconds=50.0)
     scans = Scans.of(make_steps(log, StepConfig(period=None, match_scans=False)))
     turned = np.abs(scans.odometry.increments[:, 2])
-    cloud = Cloud.of(scans, chunk_length=100.0, chunk_time=1000.0, chunk_turn=0.5)
+    cloud = ScanReturns.of(scans, chunk_length=100.0, chunk_time=1000.0, chunk_turn=0.5)
     assert cloud.chunks > 3
     for c in range(cloud.chunks):
         inside = np.flatnonzero(cloud.chunk == c)
         assert turned[inside[1:]].sum() <= 0.5
-    assert Cloud.of(scans, chunk_length=100.0, chunk_time=1000.0).chunks == 1
+    assert ScanReturns.of(scans, chunk_length=100.0, chunk_time=1000.0).chunks == 1
 
 
 def test_scans_that_mended_the_odometry_are_not_in_its_sigma() -> None:

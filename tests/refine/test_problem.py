@@ -11,11 +11,19 @@ from scipy.linalg import eigh
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam.refine.motion import MotionModel
-from graphslam.refine.problem import FEIGNED, Problem, alike, held, pair_noise, point_information, residuals
+from graphslam.refine.problem import (
+    FEIGNED,
+    RefinementProblem,
+    chunk_information,
+    correlation_factor,
+    pair_noise,
+    point_information,
+    surface_residuals,
+)
 from graphslam.refine.scans import Scans
-from graphslam.refine.surfaces import Association, Cloud, Surfaces
-from graphslam.registration.plane_kernels import Pairs
-from graphslam_frontends.odometry.lasting import LEAST
+from graphslam.refine.surfaces import ScanReturns, SurfacePairs, Surfaces
+from graphslam.registration.plane_kernels import PlanePairs
+from graphslam_frontends.odometry.bias_sigmas import LEAST
 
 EPS = 1e-6
 
@@ -55,7 +63,7 @@ def path_of(scans, rng):
 
 def some_problem(rng, dim, pairs=40):
     scans = some_scans(rng, dim)
-    cloud = Cloud.of(scans, chunk_length=1.0, chunk_time=10.0)
+    cloud = ScanReturns.of(scans, chunk_length=1.0, chunk_time=10.0)
     motion = MotionModel(scans, knot=1.0, bridge=cloud.bridge())
     normals = rng.standard_normal((len(cloud.points), dim))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -65,9 +73,9 @@ def some_problem(rng, dim, pairs=40):
     other = cloud.step[p] != cloud.step[q]
     p, q = p[other], q[other]
     poses = path_of(scans, rng)
-    problem = Problem(motion, cloud, poses[0].copy())
+    problem = RefinementProblem(motion, cloud, poses[0].copy())
     states = (0.01 * rng.standard_normal(len(motion.knots)), 0.01 * rng.standard_normal(motion.constants))
-    return problem, surfaces, Pairs(p, q, cloud.step[p], cloud.step[q]), poses, states
+    return problem, surfaces, PlanePairs(p, q, cloud.step[p], cloud.step[q]), poses, states
 
 
 def moved(problem, poses, states, column, by):
@@ -126,8 +134,8 @@ def test_one_step_is_that_of_the_dense_problem_and_so_is_the_covariance(rng, dim
     solved, step = problem.linearise(poses, states, pairs, surfaces, w, [])
     size = motion.widths.sum()
     H, g, cost = np.zeros((size, size)), np.zeros(size), 0.0
-    r = residuals(pairs, problem.cloud, surfaces, poses)
-    J = differences(problem, poses, states, lambda p, s: residuals(pairs, problem.cloud, surfaces, p))
+    r = surface_residuals(pairs, problem.cloud, surfaces, poses)
+    J = differences(problem, poses, states, lambda p, s: surface_residuals(pairs, problem.cloud, surfaces, p))
     H += J.T @ (w[:, None] * J)
     g += J.T @ (w * r)
     assert solved.parts["scans"] == pytest.approx(float(w @ r**2), rel=1e-9)
@@ -160,18 +168,18 @@ def test_what_noise_of_normals_feigns_is_not_held(rng, dim):
     problem, surfaces, pairs, poses, states = some_problem(rng, dim, pairs=90)
     g, cloud, d = group_of(poses), problem.cloud, group_of(poses).dof
     k = len(pairs.source)
-    found = Association(pairs, rng.integers(0, 2, k), np.zeros((k, 3)), np.zeros((k, 3)))
+    found = SurfacePairs(pairs, rng.integers(0, 2, k), np.zeros((k, 3)), np.zeros((k, 3)))
     w = rng.uniform(10.0, 1000.0, k)
-    holds = held(found, cloud, surfaces, poses, w)
+    holds = chunk_information(found, cloud, surfaces, poses, w)
 
     def derivatives(s):
-        J = differences(problem, poses, states, lambda p, _: residuals(pairs, cloud, s, p))[:, : len(poses) * d]
+        J = differences(problem, poses, states, lambda p, _: surface_residuals(pairs, cloud, s, p))[:, : len(poses) * d]
         J = J.reshape(k, len(poses), d)
         return J[np.arange(k), pairs.i], J[np.arange(k), pairs.j]
 
     Ji, Jj = derivatives(surfaces)
     tilted = [derivatives(replace(surfaces, normals=surfaces.tilts[:, a].astype(float)))[0] for a in range(dim - 1)]
-    r = residuals(pairs, cloud, surfaces, poses)
+    r = surface_residuals(pairs, cloud, surfaces, poses)
     gradient = np.zeros((len(poses), d))
     for m in (0, 1):
         some = np.flatnonzero(found.whose == m)
@@ -221,7 +229,7 @@ def test_what_noise_of_normals_feigns_is_not_held(rng, dim):
 def test_distances_of_points_from_planes(rng, dim):
     problem, surfaces, pairs, poses, _ = some_problem(rng, dim)
     g, cloud = group_of(poses), problem.cloud
-    for k, r in enumerate(residuals(pairs, problem.cloud, surfaces, poses)):
+    for k, r in enumerate(surface_residuals(pairs, problem.cloud, surfaces, poses)):
         p, q = pairs.source[k], pairs.target[k]
         seen = g.transform(g.inverse(poses[pairs.j[k]]), g.transform(poses[pairs.i[k]], cloud.points[p]))
         assert r == pytest.approx(float(surfaces.normals[q] @ (seen - cloud.points[q])), abs=1e-9)
@@ -236,7 +244,7 @@ def drawn_pairs(rng, points, count):
     once = np.column_stack([c[p] ** 2 + c[q] ** 2, np.ones(count), none])
     spent = np.column_stack([mp * c[p] ** 2 + mq * c[q] ** 2, 0.5 * (mp + mq), none])
     steps = np.zeros(count, np.int64)
-    return Association(Pairs(p, q, steps, steps), steps, once, spent), c
+    return SurfacePairs(PlanePairs(p, q, steps, steps), steps, once, spent), c
 
 
 def test_pairs_promise_no_more_than_their_shared_points_allow(rng):
@@ -277,18 +285,22 @@ def test_errors_that_points_of_a_scan_share_are_seen_in_sums_of_residuals(rng, s
     steps, n, q = 30, 200, 500
     step = np.repeat(np.arange(steps + 1), [n] * steps + [q])
     points = np.zeros((len(step), 2))
-    cloud = Cloud(points, points, step, np.zeros(len(step)), np.zeros(steps + 1, np.int64), np.array([0, len(step)]))
+    cloud = ScanReturns(
+        points, points, step, np.zeros(len(step)), np.zeros(steps + 1, np.int64), np.array([0, len(step)])
+    )
     p, target = np.arange(steps * n), steps * n + rng.integers(0, q, steps * n)
     sigma = 0.02
     r = sigma * (rng.standard_normal(steps * n) + rng.standard_normal(steps * n + q)[target]) / np.sqrt(2.0)
     blocks = step[p] * 3 + (p % n) // 80
     r += shared * rng.standard_normal(3 * steps)[blocks]
     once = np.tile([0.0, 1.0, 0.0], (len(p), 1))
-    found = Association(Pairs(p, target, step[p], step[target]), np.zeros(len(p), np.int64), once, once)
+    found = SurfacePairs(PlanePairs(p, target, step[p], step[target]), np.zeros(len(p), np.int64), once, once)
     variance = sigma**2 + shared**2
     size = np.bincount(blocks)
     wanted = 1.0 + np.sum(shared**2 * size * (size - 1.0)) / np.sum(variance * size) if shared else 1.0
-    assert alike(found, cloud, r, np.array([0.0, variance, 1.0])) == pytest.approx(wanted, rel=0.35 if shared else 0.25)
+    assert correlation_factor(found, cloud, r, np.array([0.0, variance, 1.0])) == pytest.approx(
+        wanted, rel=0.35 if shared else 0.25
+    )
 
 
 def test_wild_pairs_have_no_information(rng):
@@ -302,7 +314,7 @@ def test_wild_pairs_have_no_information(rng):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_beams_are_placed_where_the_motion_within_their_step_was(rng, dim):
     scans = some_scans(rng, dim)
-    cloud = Cloud.of(scans, chunk_length=1.0, chunk_time=10.0)
+    cloud = ScanReturns.of(scans, chunk_length=1.0, chunk_time=10.0)
     g, poses = scans.group, path_of(scans, rng)
     motion = MotionModel(scans, knot=1.0)
     wrong = motion.corrections(poses)

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import graphslam as gs
-from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.app.run.front_ends import recommended_options
+from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
 from graphslam.core.trajectory import Trajectory
 from graphslam.refine.refine import Refinement
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
+from graphslam_studies.evaluate.relations import covered_part, random_pairs, relation_error
 
 FREEHAND = {"period": None, "max_range": 30.0, "most_points": 400, "odometry_tilt_sigma": 0.005}
 """Packs of clouds with poses of lidar and IMU, as their presets have it; the yaw rate as it was recorded."""
@@ -31,7 +31,7 @@ def part(name: str, seconds: float, data_dir: Path) -> SensorLog:
 
 
 def relations(path: Trajectory, reference: Trajectory) -> dict[str, float]:
-    held = covered(reference, path)
+    held = covered_part(reference, path)
     return relation_error(path, held, random_pairs(len(held), 1000, np.random.default_rng(0))).as_row()
 
 
@@ -53,8 +53,10 @@ def refined(building: SensorLog) -> Refinement:
 def test_relations_of_a_planar_log_are_better_than_those_of_its_odometry(
     building: SensorLog, refined: Refinement
 ) -> None:
-    steps = make_steps(building, build(StepConfig, recommended(building, "segslam")["frontend"]["steps"]))
-    before = relations(chain(steps.odometry), building["reference"])
+    steps = make_steps(
+        building, build_config(StepConfig, recommended_options(building, "segslam")["frontend"]["steps"])
+    )
+    before = relations(chain_odometry(steps.odometry), building["reference"])
     after = relations(path_of(refined), building["reference"])
     assert after["translation_mean"] < before["translation_mean"]
     assert refined.agreement[1] > refined.agreement[0]
@@ -90,8 +92,8 @@ def test_scans_of_a_lidar_pack_agree_no_less_than_along_its_odometry(name: str, 
 @pytest.mark.data
 def test_a_path_that_is_off_is_brought_back(data_dir: Path) -> None:
     log = part("lidar3d-hku1", 30.0, data_dir)
-    start = chain(log["odometry"])
-    bent = chain(make_steps(log, build(StepConfig, {**FREEHAND, "yaw_bias": 0.01})).odometry)
+    start = chain_odometry(log["odometry"])
+    bent = chain_odometry(make_steps(log, build_config(StepConfig, {**FREEHAND, "yaw_bias": 0.01})).odometry)
     before = relations(bent, log["reference"])
     found = gs.refine_path(log, bent, steps={**FREEHAND, "yaw_bias": 0.01})
     after = relations(path_of(found), log["reference"])

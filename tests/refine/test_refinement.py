@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.backend.refining import findings_of, wrong_loops
+from graphslam.backend.refining import refinement_findings, wrong_loops
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.nodes import scans_at
-from graphslam.refine.refine import _Work, refine
+from graphslam.refine.refine import _Refiner, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import find_surfaces
 from graphslam_studies.evaluate import segslam_judge as judge
@@ -34,7 +34,7 @@ def drives():
     out = []
     for seed in SEEDS:
         scans, start, truth = court_scans(seed)
-        out.append((scans, start, truth, refine(scans, start)))
+        out.append((scans, start, truth, refine_by_scans(scans, start)))
     return out
 
 
@@ -67,10 +67,10 @@ def test_motion_noisier_than_stated_is_widened_and_honest():
     values, scales, said = [], [], []
     for seed in (41, 42, 44):
         scans, start, truth = court_scans(seed, wheel_sigma=0.06)  # the front end takes 0.02 for it
-        found = refine(scans, start)
+        found = refine_by_scans(scans, start)
         values.append(nees_of(found, truth)["nees"])
         scales.append(found.scales)
-        said += [f.code for f in findings_of(found)]
+        said += [f.code for f in refinement_findings(found)]
     assert np.all(np.array(scales)[:, 1] > 1.5)  # along the way
     np.testing.assert_allclose(np.array(scales)[:, 0], 1.0, atol=0.3)  # the gyro is as stated
     assert 0.5 < np.mean(values) < 2.0
@@ -129,9 +129,9 @@ def test_loops_that_the_refined_path_contradicts_are_named(drives):
     wrong = wrong_loops(graph, m)
     assert [(i, j) for i, j, *_ in wrong] == [(1, 4)]
     assert wrong[0][2] == pytest.approx(4.0)
-    named = {f.code: f.text for f in findings_of(found, wrong)}
+    named = {f.code: f.text for f in refinement_findings(found, wrong)}
     assert "x1 and x4 by 4.0 m" in named["refine-contradicted"]
-    assert "refine-contradicted" not in {f.code for f in findings_of(found, [])}
+    assert "refine-contradicted" not in {f.code for f in refinement_findings(found, [])}
 
 
 def test_a_scanner_that_is_mounted_askew_is_named():
@@ -141,24 +141,24 @@ def test_a_scanner_that_is_mounted_askew_is_named():
     turned = replace(
         scans, points=(scans.points @ R.T).astype(np.float32), origins=(scans.origins @ R.T).astype(np.float32)
     )
-    found = refine(turned, start)
+    found = refine_by_scans(turned, start)
     side, sigma = found.constants["side"]
     assert side == pytest.approx(-a, abs=0.003)
     assert sigma < 0.002
-    named = {f.code: f.text for f in findings_of(found)}
+    named = {f.code: f.text for f in refinement_findings(found)}
     assert "to the right" in named["refine-side"]  # what is ahead seems to lie to the left
-    assert "refine-side" not in {f.code for f in findings_of(refine(scans, start))}
+    assert "refine-side" not in {f.code for f in refinement_findings(refine_by_scans(scans, start))}
 
 
 def test_a_clock_that_is_off_is_named(drives):
     scans, start, _, found = drives[1]
     late = replace(scans, times=scans.times, odometry=_delayed(scans, 0.05))
-    delayed = refine(late, start)
+    delayed = refine_by_scans(late, start)
     off, sigma = delayed.constants["clock"]
     assert off == pytest.approx(-0.05, abs=0.012)
     assert abs(off) > 5 * sigma
-    assert "ms too late" in {f.code: f.text for f in findings_of(delayed)}["refine-clock"]
-    assert "refine-clock" not in {f.code for f in findings_of(found)}
+    assert "ms too late" in {f.code: f.text for f in refinement_findings(delayed)}["refine-clock"]
+    assert "refine-clock" not in {f.code for f in refinement_findings(found)}
 
 
 def _delayed(scans: Scans, by: float):
@@ -174,7 +174,7 @@ def _delayed(scans: Scans, by: float):
 
 def test_the_same_again_to_the_last_byte(drives):
     scans, start, _, found = drives[2]
-    again = refine(scans, start.copy())
+    again = refine_by_scans(scans, start.copy())
     assert again.poses.tobytes() == found.poses.tobytes()
     assert again.covariances.tobytes() == found.covariances.tobytes()
 
@@ -191,14 +191,14 @@ def test_scans_are_read_as_written(drives, tmp_path):
 def test_what_cannot_be_refined_is_refused(drives):
     scans, start, _, _ = drives[0]
     with pytest.raises(GeometryError, match="does not fit"):
-        refine(scans, start[:-1])
+        refine_by_scans(scans, start[:-1])
     with pytest.raises(GeometryError, match="does not fit"):
-        refine(scans, np.where(np.arange(len(start))[:, None] == 3, np.nan, start))
+        refine_by_scans(scans, np.where(np.arange(len(start))[:, None] == 3, np.nan, start))
     with pytest.raises(DataError, match="no beam"):
-        refine(replace(scans, returns=np.zeros(len(scans.returns), bool)), start)
+        refine_by_scans(replace(scans, returns=np.zeros(len(scans.returns), bool)), start)
     few = np.arange(4)
     with pytest.raises(DataError, match="too short to refine"):
-        refine(scans_at(scans, few), start[few])
+        refine_by_scans(scans_at(scans, few), start[few])
 
 
 def test_odometry_better_than_the_start_is_where_the_refinement_begins_again():
@@ -206,13 +206,13 @@ def test_odometry_better_than_the_start_is_where_the_refinement_begins_again():
     scans, start, truth = court_scans(41)
     u = SE3.between(truth[:-1], truth[1:])
     good = replace(scans.odometry, increments=np.concatenate([scans.odometry.increments[:1], u]))
-    found = refine(replace(scans, odometry=good), start)
+    found = refine_by_scans(replace(scans, odometry=good), start)
     assert found.reckoned > found.agreement[0]
     assert found.agreement[1] >= found.reckoned - 0.005
     assert error(scans.times, found.poses, truth) < 0.02
-    assert "input-better" not in {f.code for f in findings_of(found)}
+    assert "input-better" not in {f.code for f in refinement_findings(found)}
     worse = replace(found, reckoned=found.agreement[1] + 0.1)
-    assert {f.code: f.level for f in findings_of(worse)}["input-better"] == "bad"
+    assert {f.code: f.level for f in refinement_findings(worse)}["input-better"] == "bad"
 
 
 def test_odometry_better_than_all_that_was_made_of_it_is_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,22 +221,22 @@ def test_odometry_better_than_all_that_was_made_of_it_is_the_result(monkeypatch:
     u = SE3.between(truth[:-1], truth[1:])
     good = replace(scans.odometry, increments=np.concatenate([scans.odometry.increments[:1], u]))
     scans = replace(scans, odometry=good)
-    rounds = _Work.all_passes
+    rounds = _Refiner.all_passes
 
-    def bent(self: _Work, distances: tuple[float, ...]) -> None:
+    def bent(self: _Refiner, distances: tuple[float, ...]) -> None:
         rounds(self, distances)
         turns = np.linspace(0.0, 1.0, len(self.poses))[:, None] * np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         self.poses = SE3.compose(SE3.exp(turns), self.poses)
         self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
 
-    monkeypatch.setattr(_Work, "all_passes", bent)
-    found = refine(scans, start)
+    monkeypatch.setattr(_Refiner, "all_passes", bent)
+    found = refine_by_scans(scans, start)
     assert found.left is not None
     assert found.left < found.reckoned == found.agreement[1]
     assert found.better
     assert not found.input_better
     assert error(scans.times, found.poses, truth) < 0.01
-    said = {f.code: f.level for f in findings_of(found)}
+    said = {f.code: f.level for f in refinement_findings(found)}
     assert said == {"input-better": "look"}
     # as sure as the motion alone: each step adds its own noise and what lasts, and no scan takes any of it away
     wide = np.sqrt(np.trace(found.covariances[-1][3:, 3:]))

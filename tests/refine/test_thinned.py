@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.records import Odometry
-from graphslam.refine.nodes import thinned
+from graphslam.refine.nodes import thin_beams
 from graphslam.refine.scans import Scans
-from graphslam_frontends.odometry.lasting import LastingSigmas
+from graphslam_frontends.odometry.bias_sigmas import BiasSigmas
 
 
 @pytest.mark.parametrize("most", [1, 7, 40, 99])
@@ -23,12 +23,12 @@ def test_so_many_beams_are_left_each_in_its_step(most: int) -> None:
     scans = Scans(
         times=times, odometry=motion,
         offsets=offsets, points=points, origins=points, returns=np.ones(99, bool), max_range=9.0,
-        lasting=LastingSigmas(**sigmas),
+        lasting=BiasSigmas(**sigmas),
     )  # fmt: skip
-    some = thinned(scans, most)
+    some = thin_beams(scans, most)
     assert len(some.points) == most == some.offsets[-1]
     for k in range(4):
         p, _, _ = some.scan(k)
         assert np.all(p[:, 0] == k)
         assert abs(len(p) - most * counts[k] / 99) <= 1.0
-    assert thinned(scans, 99) is scans
+    assert thin_beams(scans, 99) is scans

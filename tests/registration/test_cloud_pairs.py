@@ -10,7 +10,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.evidence.views import CloudView
 from graphslam.registration.pair_config import PairConfig
-from graphslam.registration.submap_pairs import PreparedMap, contradiction, match_pair
+from graphslam.registration.submap_pairs import PreparedMap, contradiction_share, match_pair
 from tests.reference.box_submaps import clouded, drifted, straight_path
 from tests.reference.box_world import BoxWorld, hall, heading
 
@@ -64,7 +64,7 @@ def test_free_space_contradicts_only_where_it_is_known(pair: tuple[PreparedMap, 
     target, source, T = pair
     off = se3.se3_compose(T, se3.se3_exp([0.0, 0, 0, 2.0, 1.5, 0.0]))
     points = source.around(PLACE)
-    right, wrong = (contradiction(source, PLACE, target, at, points) for at in (T, off))
+    right, wrong = (contradiction_share(source, PLACE, target, at, points) for at in (T, off))
     assert right < 0.02
     assert (wrong > 0.03) == target.view.knows_space
 

@@ -10,7 +10,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.registration.degeneracy import (
     calibrated_covariance,
-    feigned_information,
+    noise_induced_information,
     translational_degeneracy,
 )
 from graphslam.registration.register import Registration, register
@@ -112,7 +112,7 @@ def test_what_is_feigned_is_the_sum_over_the_pairs(dim: int, rng: np.random.Gene
         w = np.trace(np.linalg.inv(C)) - 0.5 * (dim - 1)
         S = 0.5 * np.eye(dim) + w * 0.25 * (noise[1][k] + R @ noise[0][k] @ R.T)
         expected += J.T @ S @ J
-    found = feigned_information(p, R, (own, other), (noise[0], noise[1]))
+    found = noise_induced_information(p, R, (own, other), (noise[0], noise[1]))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 

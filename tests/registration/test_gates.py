@@ -10,19 +10,19 @@ import pytest
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError
-from graphslam.registration.config import Gates, RegistrationConfig
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
 from graphslam.registration.gates import (
     MatchGates,
+    failed_match_gates,
     height_between,
-    match_fails,
-    second_modes,
+    match_margins,
     shift_between,
     tilt_between,
 )
 from graphslam.registration.register import Registration
 
 HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
-RULES = RegistrationConfig(gates=Gates(fitness=0.5))
+RULES = RegistrationConfig(gates=RegistrationGates(fitness=0.5))
 
 
 def found(x: float = 0.0, z: float = 0.0, **rest: object) -> Registration:
@@ -68,7 +68,7 @@ def leaning(degrees: float) -> np.ndarray:
 )
 def test_each_gate_keeps_out_what_is_beyond_it(beyond: dict, within: dict, name: str) -> None:  # type: ignore[type-arg]
     def fails(**change: object) -> list[str]:
-        return match_fails(found(**change), HERE, MatchGates(), RULES, sigma=2.0, margin=1.0)
+        return failed_match_gates(found(**change), HERE, MatchGates(), RULES, sigma=2.0, margin=1.0)
 
     assert [f.startswith(name) for f in fails(**beyond)] == [True]
     assert fails(**within) == []
@@ -76,12 +76,12 @@ def test_each_gate_keeps_out_what_is_beyond_it(beyond: dict, within: dict, name:
 
 def test_margin_rise_and_a_shift_that_is_not_asked() -> None:
     gates = MatchGates(shift=math.inf)
-    assert match_fails(found(x=100.0), HERE, gates, RULES, sigma=1.0, margin=1.0) == []
-    assert match_fails(found(), HERE, gates, RULES, sigma=1.0, margin=0.09) == ["margin 0.090 < 0.1"]
-    assert match_fails(found(z=2.5), HERE, gates, RULES, sigma=1.0, margin=1.0, rise=1.0) == []
-    assert len(match_fails(found(z=2.7), HERE, gates, RULES, sigma=1.0, margin=1.0, rise=1.0)) == 1
+    assert failed_match_gates(found(x=100.0), HERE, gates, RULES, sigma=1.0, margin=1.0) == []
+    assert failed_match_gates(found(), HERE, gates, RULES, sigma=1.0, margin=0.09) == ["margin 0.090 < 0.1"]
+    assert failed_match_gates(found(z=2.5), HERE, gates, RULES, sigma=1.0, margin=1.0, rise=1.0) == []
+    assert len(failed_match_gates(found(z=2.7), HERE, gates, RULES, sigma=1.0, margin=1.0, rise=1.0)) == 1
     vague = found(covariance=np.eye(6))
-    assert match_fails(vague, HERE, gates, RULES, sigma=1.0, margin=1.0, ask_vague=False) == []
+    assert failed_match_gates(vague, HERE, gates, RULES, sigma=1.0, margin=1.0, ask_vague=False) == []
 
 
 def test_second_modes_are_those_of_the_same_map_at_another_place() -> None:
@@ -97,10 +97,10 @@ def test_second_modes_are_those_of_the_same_map_at_another_place() -> None:
         ]
         return results[k].fitness - max(others) if others else 1.0
 
-    np.testing.assert_allclose(second_modes(results, maps, 1.5), [plain(k) for k in range(4)])
+    np.testing.assert_allclose(match_margins(results, maps, 1.5), [plain(k) for k in range(4)])
     gone = [results[0], found(8.0, fitness=0.9, converged=False)]
-    assert second_modes(gone, [0, 0], 1.5).tolist() == [1.0, 1.0]
-    assert second_modes(results[:1], [0], 1.5).tolist() == [1.0]
+    assert match_margins(gone, [0, 0], 1.5).tolist() == [1.0, 1.0]
+    assert match_margins(results[:1], [0], 1.5).tolist() == [1.0]
 
 
 def test_distances_between_a_match_and_its_prediction() -> None:

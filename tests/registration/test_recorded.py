@@ -9,13 +9,13 @@ import pytest
 
 from graphslam.core import se3
 from graphslam.io.lidar_pack import read_lidar_pack
-from graphslam.registration.config import Gates, RegistrationConfig
-from graphslam.registration.register import margin, register, register_starts
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
+from graphslam.registration.register import fitness_margin, register, register_starts
 from graphslam.registration.search import correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 
-HAND_HELD = RegistrationConfig(gates=Gates(tilt=np.pi, fitness=0.4, fitness_upright=0.0))
+HAND_HELD = RegistrationConfig(gates=RegistrationGates(tilt=np.pi, fitness=0.4, fitness_upright=0.0))
 """A single scan of a hand-held lidar covers the one before in part, and no frame stands upright."""
 
 
@@ -75,11 +75,11 @@ def test_recorded_loop_is_found_from_seven_metres_off(data_dir: Path) -> None:
     start = offset_pose(end, (-6.0, 4.0, -0.4, -0.25))
     starts = correlative_search(last, SearchField(first), start, (12.0, 12.0, 0.8, 0.3), (0.4, 0.4, 0.4, 0.0))
     assert starts[0].score > starts[1].score + 0.2
-    config = RegistrationConfig(gates=Gates(tilt=np.radians(8)))
+    config = RegistrationConfig(gates=RegistrationGates(tilt=np.radians(8)))
     results = register_starts(Target(last, voxel=0.3), Target(first, voxel=0.3), [s.T for s in starts], config)
     assert [r.accepted for r in results].count(True) == 1
     assert results[0].accepted, results[0].why
-    assert margin(results) > 0.2
+    assert fitness_margin(results) > 0.2
     # the odometry came back with an error of a few centimetres
     e = se3.se3_log(se3.se3_between(end, results[0].T_target_source))
     assert np.linalg.norm(e[3:]) < 0.1

@@ -10,8 +10,8 @@ from graphslam.core import se3
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
 from graphslam.registration.config import RegistrationConfig
-from graphslam.registration.planar import linearise
-from graphslam.registration.register import margin, register, register_starts
+from graphslam.registration.planar import linearise_alignment
+from graphslam.registration.register import fitness_margin, register, register_starts
 from graphslam.registration.search import correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
@@ -88,7 +88,7 @@ def test_planar_gradient_and_hessian_are_those_of_finite_differences(planar: tup
     T = np.array([20.0, 9.0, 0.4])
     source = Target(flat_scan(world, T, 60, 0.025, rng))
     at = se2.se2_compose(T, [0.1, -0.05, 0.02])
-    H, b, half, pairs = linearise(source, target, at, 1.0)
+    H, b, half, pairs = linearise_alignment(source, target, at, 1.0)
     assert pairs > 40
 
     def error(xi: Array) -> float:
@@ -198,7 +198,7 @@ def test_search_and_registration_find_the_place_and_refuse_its_aliases(garage: t
         assert np.linalg.norm(error3(results[0], T)[3:]) < 0.05
         assert results[0].accepted, results[0].why
         assert np.all(np.diff([r.best_fitness for r in results]) <= 0)
-        assert margin(results) >= 0.02
+        assert fitness_margin(results) >= 0.02
         for r in results[1:]:
             assert not r.accepted, (r.fitness, r.fitness_upright, r.degeneracy)
         lone = register(scan, target, start)
@@ -212,11 +212,11 @@ def test_margin_counts_other_places_only(garage: tuple) -> None:
     source = Target(world.scan(T, around(rng, 1500), 0.025, 25.0, rng), voxel=0.3)
     same = register_starts(source, target, [T, offset_pose(T, (0.2, 0.1, 0.0, 0.02))])
     assert len(same) == 1
-    assert margin(same) == 1.0
-    assert np.isnan(margin([]))
+    assert fitness_margin(same) == 1.0
+    assert np.isnan(fitness_margin([]))
     both = register_starts(source, target, [offset_pose(T, (8.0, 0.0, 0.0, 0.0)), T])
     assert len(both) == 2
-    assert margin(both) == pytest.approx(both[0].fitness - both[1].fitness)
+    assert fitness_margin(both) == pytest.approx(both[0].fitness - both[1].fitness)
     assert np.linalg.norm(error3(both[0], T)[3:]) < 0.05
 
 

@@ -9,8 +9,8 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.log import DropCounter
-from graphslam.registration.config import Gates, RegistrationConfig
-from graphslam.registration.register import register, register_starts, tilt_of
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
+from graphslam.registration.register import register, register_starts, tilt_angle
 from graphslam.registration.search import offset_pose
 from graphslam.registration.target import Target
 from tests.reference.box_world import around, hall, heading
@@ -39,10 +39,10 @@ def test_tilted_result_is_refused(garage: tuple) -> None:
     T = heading(30.0, 9.0, 1.2, 0.3, pitch=np.radians(7))
     source = Target(world.scan(T, around(rng, 2000), 0.025, 25.0, rng), voxel=0.3)
     r = register(source, target, T)
-    assert tilt_of(T) == pytest.approx(np.radians(7))
+    assert tilt_angle(T) == pytest.approx(np.radians(7))
     assert r.tilt == pytest.approx(np.radians(7), abs=0.005)
     assert r.why == "tilt 7.0° > 4.0°"
-    assert register(source, target, T, RegistrationConfig(gates=Gates(tilt=np.pi))).accepted
+    assert register(source, target, T, RegistrationConfig(gates=RegistrationGates(tilt=np.pi))).accepted
 
 
 def test_known_space_counts_alone(garage: tuple) -> None:
@@ -56,7 +56,7 @@ def test_known_space_counts_alone(garage: tuple) -> None:
     assert not blind.accepted
     assert blind.fitness < 0.75
     assert np.isnan(blind.fitness_known)
-    config = RegistrationConfig(gates=Gates(fitness_upright=0.0))
+    config = RegistrationConfig(gates=RegistrationGates(fitness_upright=0.0))
     seen = register(source, target, T, config, known=lambda p: p[:, 0] < 30.0)
     assert seen.accepted, seen.why
     assert seen.fitness == blind.fitness
@@ -154,4 +154,4 @@ def test_impossible_arguments_are_refused(garage: tuple) -> None:
         with pytest.raises(ConfigError):
             RegistrationConfig(**options)
     with pytest.raises(ConfigError, match="fitness"):
-        Gates(fitness=-0.1)
+        RegistrationGates(fitness=-0.1)

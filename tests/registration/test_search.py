@@ -11,7 +11,7 @@ from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.points import spread, thin, transform
+from graphslam.core.points import evenly_spaced, transform_points, voxel_downsample
 from graphslam.registration.search import SearchConfig, correlative_search, make_lattice, offset_pose, score_lattice
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.search_kernels import local_maxima
@@ -95,7 +95,7 @@ def test_best_start_is_the_best_of_the_plain_exhaustive_search(rng: np.random.Ge
     config = SearchConfig(refine=False, apart=1.0, turned=0.15)
     starts = correlative_search(points, field, T, half, steps, 4, config=config)
     lattice = make_lattice(field, half, steps, 1.0)
-    p = thin(points, 0.2)
+    p = voxel_downsample(points, 0.2)
     scores = slow_scores(p, field, T, (lattice.x, lattice.y, lattice.z, lattice.yaw)) / (255.0 * len(p))
     left = sorted(slow_maxima(scores), key=lambda m: (-scores[m], m))
     chosen: list[tuple[float, ...]] = []
@@ -158,8 +158,8 @@ def test_a_coarse_look_first_finds_what_the_whole_search_finds(
     whole = correlative_search(scan, field, start, half, (0.4, 0.4, 0.4, 0.05), 1)[0]
     assert found[0].score > whole.score - 0.05
     # what is scored coarsely is not what is reported: scores are those of the fine field
-    p = spread(thin(scan, field.cell), 300)
-    assert found[0].score == pytest.approx(field.value_at(transform(found[0].T, p)).mean(), abs=0.01)
+    p = evenly_spaced(voxel_downsample(scan, field.cell), 300)
+    assert found[0].score == pytest.approx(field.value_at(transform_points(found[0].T, p)).mean(), abs=0.01)
 
 
 def test_prior_decides_between_aliases(pillars: tuple[BoxWorld, SearchField], rng: np.random.Generator) -> None:

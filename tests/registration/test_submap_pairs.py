@@ -18,7 +18,7 @@ from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.submap_pairs import (
     PairMatch,
     PreparedMap,
-    contradiction,
+    contradiction_share,
     half_widths,
     match_pair,
     prediction_chi2,
@@ -184,14 +184,14 @@ def test_contradiction_is_what_one_has_occupied_and_the_other_free(pair: tuple) 
     target, source, *_ = pair
     T = truth(pair, PLACE)
     points = source.around(PLACE)
-    right = contradiction(source, PLACE, target, T, points)
+    right = contradiction_share(source, PLACE, target, T, points)
     shifted = T.copy()
     shifted[:2] += [2.0, 1.5]
-    wrong = contradiction(source, PLACE, target, shifted, points)
+    wrong = contradiction_share(source, PLACE, target, shifted, points)
     assert right < 0.02
     assert wrong > 0.03 > right
     empty = PreparedMap(GridView(EvidenceGrid(0.2)), CONFIG)
-    assert contradiction(empty, PLACE, empty, T, np.zeros((0, 3))) == 0.0
+    assert contradiction_share(empty, PLACE, empty, T, np.zeros((0, 3))) == 0.0
 
 
 def test_search_is_as_wide_as_the_prediction_allows() -> None:

@@ -19,14 +19,14 @@ from graphslam.core.records import VelocityControls
 from graphslam.core.se3 import quat_multiply, quat_rotate, se3_compose, se3_transform, so3_exp
 from graphslam.io.log_digest import log_digest
 from graphslam.io.log_folder import read_log_folder
-from graphslam.sim.campus import campus_motion, empty_scans, movers_of, pan_angle, slipped
+from graphslam.sim.campus import campus_motion, empty_scans, movers_of, pan_angle, slip_wheels
 from graphslam.sim.campus_config import CampusConfig, campus_preset
 from graphslam.sim.campus_plan import plan_campus
 from graphslam.sim.campus_world import CEILING, campus
 from graphslam.sim.crawler_sensors import scan_rays, true_inertia
+from graphslam.sim.gps_shadowing import GpsFixSeries, draw_satellites, measure_gps, nearest_wall, satellites_in_view
 from graphslam.sim.movers import Mover, clear_of
 from graphslam.sim.raycast import RayCaster
-from graphslam.sim.sky import Fixes, draw_sky, in_view, measure_gps, nearest_wall
 from tests.reference.plain_mesh import box, merge, plain_ranges, quad
 
 QUICK = campus_preset("quick")
@@ -189,12 +189,12 @@ def test_exact_inertia_of_a_robot_that_balances_integrates_to_its_path() -> None
 def test_wheels_slip_as_stated() -> None:
     n, sigma = 20000, 0.02
     wheels = VelocityControls(times=0.04 * np.arange(n), speed=np.full(n, 1.0), yaw_rate=np.zeros(n))
-    error = np.concatenate([slipped(wheels, sigma, 0.4, 1.0, SeedTree(k)).speed for k in range(4)]) - 1.0
+    error = np.concatenate([slip_wheels(wheels, sigma, 0.4, 1.0, SeedTree(k)).speed for k in range(4)]) - 1.0
     # samples ten steps apart share e^-1 of their error: an effective number, and four σ on either side
     effective = len(error) / 21.0
     assert abs(np.mean(error**2) / sigma**2 - 1.0) < 4.0 * np.sqrt(2.0 / effective)
     assert np.corrcoef(error[10:], error[:-10])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.08)
-    assert np.array_equal(slipped(wheels, sigma, 0.4, 0.0, SeedTree(0)).speed, wheels.speed)
+    assert np.array_equal(slip_wheels(wheels, sigma, 0.4, 0.0, SeedTree(0)).speed, wheels.speed)
 
 
 def test_figures_are_drawn_within_their_ranges_over_the_whole_of_them() -> None:
@@ -327,14 +327,14 @@ def test_ranges_have_the_stated_noise(exact: SensorLog, noisy: SensorLog) -> Non
 
 def test_satellites_are_in_view_where_no_triangle_is_before_them(rng: np.random.Generator) -> None:
     world = campus(QUICK, seed=SEED)
-    caster, sky = RayCaster.of(world), draw_sky(QUICK, SeedTree(5))
+    caster, sky = RayCaster.of(world), draw_satellites(QUICK, SeedTree(5))
     assert sky.shape == (QUICK.satellites, 3)
     np.testing.assert_allclose(np.linalg.norm(sky, axis=1), 1.0)
     assert sky[:, 2].min() >= np.sin(QUICK.mask)
     way = world.route().positions(np.linspace(0.0, world.route().length, 20)) + [0.0, 0.0, 1.8]
     rays = np.hstack([np.repeat(way, len(sky), axis=0), np.tile(sky, (len(way), 1))])
     wanted = np.isnan(plain_ranges(world.vertices, world.triangles, rays)).reshape(len(way), -1)
-    seen = in_view(caster, way, sky)
+    seen = satellites_in_view(caster, way, sky)
     np.testing.assert_array_equal(seen, wanted)
     inside = plan_campus(QUICK, SEED).inside(way)
     assert inside.sum() > 2
@@ -357,13 +357,13 @@ def test_there_is_no_fix_inside_and_exact_fixes_are_where_the_antenna_is(exact: 
     np.testing.assert_allclose(g.positions, antenna, atol=1e-4)
 
 
-def fixes(config: CampusConfig, mesh: Any, seed: int, **figures: float) -> Fixes:
+def fixes(config: CampusConfig, mesh: Any, seed: int, **figures: float) -> GpsFixSeries:
     motion = campus_motion(campus(QUICK, seed=SEED), QUICK, robot())
     drawn = {**QUICK.draw(SeedTree(0)), **figures}
     return measure_gps(motion, RayCaster(*mesh), config, drawn, SeedTree(seed))
 
 
-def whitened(f: Fixes) -> Array:
+def whitened(f: GpsFixSeries) -> Array:
     """Errors of fixes ``(n, 3)``, of unit covariance where they are as stated."""
     error = f.positions - f.truth
     return np.asarray(np.linalg.solve(np.linalg.cholesky(f.covariances), error[..., None])[..., 0])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphslam.sim.court import court
 from graphslam.sim.raycast import RayCaster
+from graphslam.sim.ring_hall import ring_hall
 
 
 def test_way_comes_back_and_is_free() -> None:
-    w = court(seed=1)
+    w = ring_hall(seed=1)
     route = w.route()
     (revisit,) = w.meta["revisits"]
     assert revisit["same_heading"]
@@ -27,7 +27,7 @@ def test_way_comes_back_and_is_free() -> None:
 
 
 def test_no_beam_leaves_it() -> None:
-    w = court(seed=2)
+    w = ring_hall(seed=2)
     rng = np.random.default_rng(0)
     d = rng.normal(size=(4000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -37,7 +37,7 @@ def test_no_beam_leaves_it() -> None:
 
 
 def test_parallel_stretches_lie_side_by_side() -> None:
-    w = court()
+    w = ring_hall()
     ((one, other),) = w.meta["parallel"]
     a, b = (w.route().positions(np.linspace(*stretch, 9)) for stretch in (one, other))
     np.testing.assert_allclose(np.abs(a[:, 1] - b[:, 1]), 8.0, atol=1e-9)
@@ -45,7 +45,7 @@ def test_parallel_stretches_lie_side_by_side() -> None:
 
 
 def test_seed_moves_things_and_nothing_else() -> None:
-    a, b, c = court(seed=0), court(seed=1), court(seed=0)
+    a, b, c = ring_hall(seed=0), ring_hall(seed=1), ring_hall(seed=0)
     assert np.array_equal(a.vertices, c.vertices)
     assert not (a.vertices.shape == b.vertices.shape and np.array_equal(a.vertices, b.vertices))
     assert np.array_equal(a.waypoints, b.waypoints)

@@ -21,10 +21,10 @@ from graphslam.sim.crawler_sensors import (
     measure_imu,
     measure_wheels,
     ornstein_uhlenbeck,
-    roll_pitch,
+    roll_pitch_angles,
     yaw_bias_for,
 )
-from graphslam.sim.drive import Motion, drive_motion
+from graphslam.sim.drive import RouteMotion, drive_motion
 from graphslam.sim.raycast import RayCaster
 from tests.reference.plain_mesh import hall
 
@@ -44,7 +44,7 @@ def noisy() -> SensorLog:
 
 
 @pytest.fixture(scope="module")
-def motion() -> Motion:
+def motion() -> RouteMotion:
     return crawler_motion(hall())
 
 
@@ -101,7 +101,7 @@ def test_truth_begins_level_at_the_origin_and_follows_the_world(exact: SensorLog
     # starting on a slope the frame is level, and the base is not
     slope = simulate_crawler(hall([[7, 0, 0.125], [10, 0, 0.5], [14, 0, 0.5]]), 0, EXACT)
     first = slope.truth.trajectory.poses[0]
-    np.testing.assert_allclose(roll_pitch(first[None, 3:])[0], [0.0, -np.arctan(0.125)], atol=1e-6)
+    np.testing.assert_allclose(roll_pitch_angles(first[None, 3:])[0], [0.0, -np.arctan(0.125)], atol=1e-6)
 
 
 def test_exact_inertia_integrates_to_the_truth(exact: SensorLog) -> None:
@@ -121,7 +121,7 @@ def test_exact_inertia_integrates_to_the_truth(exact: SensorLog) -> None:
     assert np.abs(error).max() < 5e-3
     assert np.abs(so3_log(se3_between(unit, np.array(path))[:, 3:])).max() < 2e-5
     assert truth.length() > 25
-    np.testing.assert_allclose(imu.attitude, roll_pitch(unit[:, 3:]), atol=1e-9)
+    np.testing.assert_allclose(imu.attitude, roll_pitch_angles(unit[:, 3:]), atol=1e-9)
     assert np.ptp(imu.attitude, axis=0).min() > 0.1  # askew on a ramp and in turns: both change
 
 
@@ -179,7 +179,7 @@ def test_what_is_too_far_or_too_near() -> None:
     assert not np.any(np.isinf(nothing.ranges))
 
 
-def imu_errors(motion: Motion, seed: int, **changes: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict]:
+def imu_errors(motion: RouteMotion, seed: int, **changes: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict]:
     """Errors of rates, forces and attitude of one log."""
     config = dataclasses.replace(CrawlerConfig(), **changes)
     none = dataclasses.replace(config, noise_scale=0.0)
@@ -194,7 +194,7 @@ def imu_errors(motion: Motion, seed: int, **changes: Any) -> tuple[Any, np.ndarr
     )
 
 
-def test_inertia_has_the_stated_white_noise_and_bias(motion: Motion) -> None:
+def test_inertia_has_the_stated_white_noise_and_bias(motion: RouteMotion) -> None:
     imu, rate, force, _, drawn = imu_errors(motion, 3, gyro_walk=0.0, accelerometer_walk=0.0)
     for errors, density, bias in ((rate, 1e-4, drawn["gyro_bias"]), (force, 2e-3, drawn["accelerometer_bias"])):
         white = (errors - bias) / (density * np.sqrt(100.0))
@@ -207,7 +207,7 @@ def test_inertia_has_the_stated_white_noise_and_bias(motion: Motion) -> None:
     assert imu.noise.accelerometer == 2e-3
 
 
-def test_constants_are_drawn_with_their_stated_sigma(motion: Motion) -> None:
+def test_constants_are_drawn_with_their_stated_sigma(motion: RouteMotion) -> None:
     drawn = [measure_imu(motion, CrawlerConfig(imu_rate=5.0), 1e-3, 1e-3, SeedTree(s))[1] for s in range(300)]
     for name, sigma, axes in (
         ("gyro_bias", 2e-4, slice(0, 2)),
@@ -225,7 +225,7 @@ def test_constants_are_drawn_with_their_stated_sigma(motion: Motion) -> None:
         assert low < np.mean((values / sigma) ** 2) < high
 
 
-def test_biases_walk_as_stated(motion: Motion) -> None:
+def test_biases_walk_as_stated(motion: RouteMotion) -> None:
     walked = []
     for seed in range(60):
         changes = {"imu_rate": 10.0, "gyro": 0.0, "accelerometer": 0.0, "gyro_walk": 1e-4, "accelerometer_walk": 0.01}
@@ -249,7 +249,7 @@ def test_attitude_errors_stay_alike_for_the_stated_time(rng: np.random.Generator
         assert alike == pytest.approx(np.exp(-lag * dt / time), abs=0.02)
 
 
-def test_attitude_of_the_log(motion: Motion) -> None:
+def test_attitude_of_the_log(motion: RouteMotion) -> None:
     values = np.concatenate([imu_errors(motion, s, imu_rate=2.0)[3][::40] for s in range(150)])
     stated = imu_errors(motion, 0, imu_rate=2.0)[0].noise
     assert stated.attitude == pytest.approx(np.radians(np.hypot(0.25, 0.1)))
@@ -257,7 +257,7 @@ def test_attitude_of_the_log(motion: Motion) -> None:
     assert np.sqrt(np.mean(values**2)) == pytest.approx(stated.attitude, rel=0.1)
 
 
-def test_wheels_have_the_stated_noise(motion: Motion) -> None:
+def test_wheels_have_the_stated_noise(motion: RouteMotion) -> None:
     config = CrawlerConfig()
     none = dataclasses.replace(config, noise_scale=0.0)
     got, scale = measure_wheels(motion, config, SeedTree(7))

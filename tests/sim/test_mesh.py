@@ -8,7 +8,7 @@ import pytest
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.sim.clutter import KeepClear, park_cars, scatter
+from graphslam.sim.clutter import KeepClear, park_cars, scatter_obstacles
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.route import plan_route
 from graphslam.sim.section import mesh_section
@@ -143,7 +143,7 @@ def test_nothing_is_put_in_the_way() -> None:
     assert clear.distance((10.0, 3.0), (2.0, 2.0), 0.0, 0.0) == pytest.approx(2.0, abs=0.02)
     rng = SeedTree(1).generator()
     mesh = MeshBuilder()
-    count = scatter(mesh, (0.0, -4.0, 18.0, 4.0), 0.0, 200, clear, rng, forbidden=[(5.0, 1.0, 9.0, 4.0)])
+    count = scatter_obstacles(mesh, (0.0, -4.0, 18.0, 4.0), 0.0, 200, clear, rng, forbidden=[(5.0, 1.0, 9.0, 4.0)])
     bays = np.array([(x, y, np.pi / 2) for x in range(1, 16, 3) for y in (-8.0, -2.6, 9.0)])
     cars = park_cars(mesh, bays, 0.0, 1.0, clear, rng)
     assert 50 < count < 190

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from graphslam.association.consistent_set import Chain, LoopArrays, pair_chi2
+from graphslam.association.consistent_set import LoopArrays, OdometryChain, pair_chi2
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
@@ -67,7 +67,7 @@ def test_a_seed_is_a_set_of_loops() -> None:
 def test_aliased_groups_agree_with_each_other_and_random_ones_do_not(dim: int, solved: bool) -> None:
     net = ring_drive(dim, n=300)
     chain_z, P = net.measurements[:299], np.linalg.inv(net.information)
-    chain = Chain.of(chain_z, P[:299])
+    chain = OdometryChain.of(chain_z, P[:299])
     share = {}
     for kind in ("aliased", "random"):
         rng = SeedTree(2).generator()

@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.schur import Layout, Network, Workers, moved
+from graphslam.skeleton.schur import Network, Workers, WorkRanges, step_poses
 from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 from tests.reference import dense_skeleton as dense
 
@@ -28,12 +28,12 @@ def problem(laps: Laps) -> SkeletonProblem:
 def poses(laps: Laps) -> Poses:
     """Not at the optimum, so that residuals are not small."""
     rng = np.random.default_rng(5)
-    return moved(laps.truth, 0.02 * rng.standard_normal((SMALL.poses, 6)))
+    return step_poses(laps.truth, 0.02 * rng.standard_normal((SMALL.poses, 6)))
 
 
 @pytest.fixture(scope="session")
 def network(problem: SkeletonProblem, poses: Poses) -> Network:
-    return Network(Layout(problem, Workers(1)), poses)
+    return Network(WorkRanges(problem, Workers(1)), poses)
 
 
 @pytest.fixture(scope="session")

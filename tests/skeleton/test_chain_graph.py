@@ -10,7 +10,7 @@ from graphslam.core.se3 import quat_to_matrix, so3_exp
 from graphslam.skeleton import segment_kernels as kernels
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
 from graphslam.skeleton.landmark_kernels import Poses
-from graphslam.skeleton.schur import moved
+from graphslam.skeleton.schur import step_poses
 from tests.reference.dense_chain import jacobian, residuals, slow_optimum
 
 
@@ -85,7 +85,7 @@ def test_impossible_graphs_are_refused() -> None:
 def test_a_segment_joined_to_one_link_is_the_dense_elimination() -> None:
     graph, truth = drawn(9, [])
     rng = np.random.default_rng(3)
-    poses = moved(truth, 0.1 * rng.standard_normal((9, 6)))  # residuals that are not small
+    poses = step_poses(truth, 0.1 * rng.standard_normal((9, 6)))  # residuals that are not small
     poses = Poses(poses.rotation[0].T @ poses.rotation, (poses.position - poses.position[0]) @ poses.rotation[0])
     odometry, _ = graph.links()
     covariance, misfit = np.empty((1, 6, 6)), np.empty((1, 6))
@@ -105,13 +105,13 @@ def test_a_segment_joined_to_one_link_is_the_dense_elimination() -> None:
 
 def test_joined_links_tie_their_ends_as_the_dense_matrix_does() -> None:
     graph, truth = drawn(5, [(1, 3), (4, 2), (3, 1)])
-    poses = moved(truth, 0.1 * np.random.default_rng(4).standard_normal((5, 6)))
+    poses = step_poses(truth, 0.1 * np.random.default_rng(4).standard_normal((5, 6)))
     poses = Poses(poses.rotation[0].T @ poses.rotation, (poses.position - poses.position[0]) @ poses.rotation[0])
     covariance, misfit = np.empty((3, 6, 6)), np.empty((3, 6))
     total = kernels.join_links(graph.links()[1], poses, covariance, misfit)
     blocks, g = np.zeros((7, 6, 6)), np.zeros((5, 6))
     place = np.arange(5), np.array([5, 6, 5])
-    energy, bad = kernels.tie_ends(graph.ends, poses.position, covariance, misfit, place, blocks, g)
+    energy, bad = kernels.add_end_blocks(graph.ends, poses.position, covariance, misfit, place, blocks, g)
     r, J = residuals(graph, poses)[-18:], jacobian(graph, poses)[-18:]
     dense = J.T @ J
     assert bad == -1

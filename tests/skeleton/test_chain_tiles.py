@@ -19,7 +19,7 @@ from graphslam.app.cli import app
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.skeleton import chain_tiles as tiles
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
-from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, pieces_of, relax_tiles, tasks_of
+from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, cut_chain, relax_tiles, tasks_of
 from graphslam.skeleton.landmark_kernels import Poses
 from tests.skeleton.test_chain_graph import drawn
 
@@ -38,7 +38,7 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("size", [1000, 50, 20, 7])
 def test_tiles_end_where_memory_does(graph: ChainGraph, tmp_path: Path, size: int) -> None:
-    found = relax_tiles(chain_to_disk(tmp_path, pieces_of(graph, size)), gain=1e-12)
+    found = relax_tiles(chain_to_disk(tmp_path, cut_chain(graph, size)), gain=1e-12)
     wanted = relax_chain(graph, gain=1e-12)
     assert len(found.names) == -(-98 // size)
     assert found.converged
@@ -67,14 +67,14 @@ def test_each_link_may_have_its_covariance(tmp_path: Path) -> None:
         graph.loop_translation,
         graph.loop_covariance,
     )
-    found = relax_tiles(chain_to_disk(tmp_path, pieces_of(graph, 8)))
+    found = relax_tiles(chain_to_disk(tmp_path, cut_chain(graph, 8)))
     assert found.objective == pytest.approx(relax_chain(graph).objective, rel=1e-9)
 
 
 def test_a_killed_worker_changes_no_byte(graph: ChainGraph, tmp_path: Path) -> None:
     alone, shared = tmp_path / "alone", tmp_path / "shared"
     for folder in (alone, shared):
-        chain_to_disk(folder, pieces_of(graph, 9))
+        chain_to_disk(folder, cut_chain(graph, 9))
     assert bytes_of(alone) == bytes_of(shared)
     wanted = relax_tiles(alone, gain=1e-12)
     killed = []
@@ -115,7 +115,7 @@ def test_tasks_are_as_long_as_what_was_measured_makes_them(
     """Ten times as slow as was thought: tasks of one tile where they were of ten; and no byte differs."""
     sizes: list[list[int]] = []
 
-    def slow(work: list[Any]) -> list[tiles.Done]:
+    def slow(work: list[Any]) -> list[tiles.TaskResult]:
         sizes[-1].append(len(work))
         return [tiles.work_on_tile(*one)._replace(seconds=0.1) for one in work]
 
@@ -123,11 +123,11 @@ def test_tasks_are_as_long_as_what_was_measured_makes_them(
         sizes.append([])
         return [work(*t) for t in tasks]
 
-    folders = [chain_to_disk(tmp_path / name, pieces_of(graph, 5)) for name in ("one", "two")]
+    folders = [chain_to_disk(tmp_path / name, cut_chain(graph, 5)) for name in ("one", "two")]
     wanted = relax_tiles(folders[0])
     monkeypatch.setattr(tiles, "POSE_SECONDS", 0.01 / 5)
     monkeypatch.setattr(tiles, "work_on_tiles", slow)
-    monkeypatch.setattr(tiles, "hands", lambda workers, cluster: nullcontext(run))
+    monkeypatch.setattr(tiles, "task_runner", lambda workers, cluster: nullcontext(run))
     found = relax_tiles(folders[1], task_seconds=0.095)
     assert sizes[:2] == [[20], [10, 10]]  # first there is no step to take, and half to do
     assert all(set(s) == {1} for s in sizes[2:])
@@ -137,7 +137,7 @@ def test_tasks_are_as_long_as_what_was_measured_makes_them(
 
 
 def test_the_command_relaxes_a_folder(graph: ChainGraph, tmp_path: Path) -> None:
-    folder = chain_to_disk(tmp_path / "tiles", pieces_of(graph, 25))
+    folder = chain_to_disk(tmp_path / "tiles", cut_chain(graph, 25))
     done = CliRunner().invoke(app, ["relax", str(folder), "--json"], catch_exceptions=False)
     assert done.exit_code == 0
     value = json.loads(done.stdout)
@@ -154,7 +154,7 @@ def test_the_command_relaxes_a_folder(graph: ChainGraph, tmp_path: Path) -> None
 def test_a_run_that_was_killed_is_repeated_without_a_changed_byte(graph: ChainGraph, tmp_path: Path) -> None:
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     for folder in (whole, stopped):
-        chain_to_disk(folder, pieces_of(graph, 25))
+        chain_to_disk(folder, cut_chain(graph, 25))
 
     class Stop(Exception):
         pass
@@ -173,14 +173,14 @@ def test_impossible_tiles_are_refused(graph: ChainGraph, tmp_path: Path) -> None
     with pytest.raises(MissingDataError):
         relax_tiles(tmp_path)
     with pytest.raises(ConfigError, match="one of them"):
-        relax_tiles(chain_to_disk(tmp_path, pieces_of(graph, 50)), workers=2, cluster="127.0.0.1:1")
-    pieces = list(pieces_of(graph, 50))
+        relax_tiles(chain_to_disk(tmp_path, cut_chain(graph, 50)), workers=2, cluster="127.0.0.1:1")
+    pieces = list(cut_chain(graph, 50))
     with pytest.raises(DataError, match="poses of 0 … 50"):
         chain_to_disk(tmp_path / "other", [ChainPiece(*pieces[0][:3], *pieces[1][3:])])
     with pytest.raises(DataError, match="finite"):
         chain_to_disk(tmp_path / "other", [pieces[0]._replace(translation=np.full((50, 3), np.nan))])
     with pytest.raises(ConfigError, match="links"):
-        next(pieces_of(graph, 0))
+        next(cut_chain(graph, 0))
     for path in sorted(tmp_path.glob("*.arrays")):
         good = path.read_bytes()
         path.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))

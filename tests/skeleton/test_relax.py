@@ -9,12 +9,12 @@ import pytest
 
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, IndeterminateError, SolverError
 from graphslam.skeleton.landmark_kernels import Poses
-from graphslam.skeleton.preconditioner import Levels
+from graphslam.skeleton.preconditioner import PreconditionerLevels
 from graphslam.skeleton.problem import SkeletonProblem
+from graphslam.skeleton.reduced_network import ReducedNetwork, blocks_per_pose
 from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
-from graphslam.skeleton.schur import Layout, Network, Workers
+from graphslam.skeleton.schur import Network, Workers, WorkRanges
 from graphslam.skeleton.start import chain_start, forward_pass
-from graphslam.skeleton.thinning import ThinnedNetwork, blocks_per_pose
 from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 from tests.reference import dense_skeleton as dense
 
@@ -36,11 +36,11 @@ def rms(a: Poses, b: Poses) -> float:
     "config",
     [
         RelaxConfig(gain=1e-9, move=1e-8),
-        RelaxConfig(gain=1e-9, move=1e-8, levels=Levels(4, 16), start="odometry", threads=2),
-        RelaxConfig(gain=1e-9, move=1e-8, levels=Levels()),
+        RelaxConfig(gain=1e-9, move=1e-8, levels=PreconditionerLevels(4, 16), start="odometry", threads=2),
+        RelaxConfig(gain=1e-9, move=1e-8, levels=PreconditionerLevels()),
         RelaxConfig(method="blocks", gain=1e-9, move=1e-8),
         RelaxConfig(method="cg", gain=1e-12, iterations=300),
-        RelaxConfig(method="cg", gain=1e-12, iterations=3000, rebuild=0, levels=Levels(-1, 0)),
+        RelaxConfig(method="cg", gain=1e-12, iterations=3000, rebuild=0, levels=PreconditionerLevels(-1, 0)),
     ],
     ids=["gn", "gn-levels-odometry", "gn-jacobi", "blocks", "cg", "cg-plain"],
 )
@@ -63,17 +63,17 @@ def test_the_optimum_is_that_of_poses_and_landmarks_together(
 def test_keyframes_alone_are_named_approximate_and_end_above_the_optimum(
     problem: SkeletonProblem, optimum: tuple[Poses, np.ndarray, float]
 ) -> None:
-    found = relax_skeleton(problem, RelaxConfig(method="levels", levels=Levels(0, 16)))
+    found = relax_skeleton(problem, RelaxConfig(method="levels", levels=PreconditionerLevels(0, 16)))
     assert found.approximate
     assert not relax_skeleton(problem, RelaxConfig(iterations=1)).approximate
     assert found.objective > 1.01 * optimum[2]
     assert farthest(found.poses, optimum[0]) < 0.5
     with pytest.raises(ConfigError, match="keyframes"):
-        relax_skeleton(problem, RelaxConfig(method="levels", levels=Levels()))
+        relax_skeleton(problem, RelaxConfig(method="levels", levels=PreconditionerLevels()))
 
 
 def test_starts_come_nearer(laps: Laps, problem: SkeletonProblem) -> None:
-    lay = Layout(problem, Workers(1))
+    lay = WorkRanges(problem, Workers(1))
     reckoned, chain = problem.dead_reckoning(), chain_start(problem)
     walk = forward_pass(problem, chain, ago=20)
     cost = [Network(lay, p).objective for p in (reckoned, chain, walk.poses)]
@@ -87,12 +87,15 @@ def test_chain_start_is_the_optimum_of_all_but_the_landmarks(problem: SkeletonPr
     alone = problem.relabelled(np.arange(problem.measurements, dtype=np.int32))
     _, _, objective = dense.optimum(alone, problem.dead_reckoning())
     chain = chain_start(alone, iterations=30)
-    assert Network(Layout(alone, Workers(1)), chain).objective == pytest.approx(objective, rel=1e-3)
+    assert Network(WorkRanges(alone, Workers(1)), chain).objective == pytest.approx(objective, rel=1e-3)
     assert relax_skeleton(alone, RelaxConfig(gain=1e-9)).objective == pytest.approx(objective, rel=1e-9)
 
 
 def test_threads_change_no_byte_of_a_relaxation(problem: SkeletonProblem) -> None:
-    a, b = (relax_skeleton(problem, RelaxConfig(threads=n, iterations=3, levels=Levels(4, 16))) for n in (1, 2))
+    a, b = (
+        relax_skeleton(problem, RelaxConfig(threads=n, iterations=3, levels=PreconditionerLevels(4, 16)))
+        for n in (1, 2)
+    )
     assert a.poses.position.tobytes() == b.poses.position.tobytes()
     assert a.poses.rotation.tobytes() == b.poses.rotation.tobytes()
     assert [h.objective for h in a.history] == [h.objective for h in b.history]
@@ -100,7 +103,7 @@ def test_threads_change_no_byte_of_a_relaxation(problem: SkeletonProblem) -> Non
 
 def test_written_out_network_is_the_schur_complement(network: Network, written_out: dense.Rows) -> None:
     S, _ = dense.schur(written_out, len(network.poses.position))
-    thinned = ThinnedNetwork(network, 1e9)
+    thinned = ReducedNetwork(network, 1e9)
     assert np.abs(thinned.matrix.toarray() - S).max() < 1e-10 * np.abs(S).max()
     full = [np.abs(S[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]).max() > 0 for i in range(96) for j in range(i, 96)]
     assert thinned.blocks == sum(full)
@@ -117,7 +120,7 @@ def test_a_long_drift_is_undone_from_every_start(start: str) -> None:
     """GPS on the first lap only and turns ten times as noisy: the chain is metres off, landmarks pull laps together."""
     world = draw_laps(LapsConfig(poses=1200, laps=6, begin=4, reach=6, odometry=(5e-3, 0.01), gps_laps=1), seed=6)
     problem = world.problem()
-    config = RelaxConfig(start=start, split=False, levels=Levels(10, 40))  # type: ignore[arg-type]
+    config = RelaxConfig(start=start, split=False, levels=PreconditionerLevels(10, 40))  # type: ignore[arg-type]
     best = relax_skeleton(problem, config, world.truth)
     assert rms(chain_start(problem), world.truth) > 1.0
     found = relax_skeleton(problem, config)
@@ -205,7 +208,7 @@ def test_a_pose_that_nothing_holds_is_named(problem: SkeletonProblem) -> None:
         gps_position=np.empty((0, 3)),
     )
     with pytest.raises(IndeterminateError, match="pose 4"):
-        relax_skeleton(alone, RelaxConfig(start="odometry", levels=Levels()))
+        relax_skeleton(alone, RelaxConfig(start="odometry", levels=PreconditionerLevels()))
 
 
 def test_a_chain_whose_end_is_held_by_less_than_rounding_still_starts() -> None:

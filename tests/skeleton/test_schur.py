@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from graphslam.skeleton.landmark_kernels import Poses
-from graphslam.skeleton.preconditioner import KeyframeNetwork, Levels, Preconditioner, chain_of, frames_of
+from graphslam.skeleton.preconditioner import (
+    KeyframeNetwork,
+    Preconditioner,
+    PreconditionerLevels,
+    keyframe_chain_blocks,
+    keyframes_of,
+)
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.schur import Layout, Network, Workers
+from graphslam.skeleton.schur import Network, Workers, WorkRanges
 from tests.reference import dense_skeleton as dense
 
 
@@ -38,12 +44,12 @@ def test_gradient_against_matrix_and_differences(network: Network, written_out: 
     _, g = dense.schur(written_out, len(network.poses.position))
     assert close(network.gradient.ravel(), g, 1e-9)
     rng = np.random.default_rng(1)
-    from graphslam.skeleton.schur import moved
+    from graphslam.skeleton.schur import step_poses
 
     for _ in range(3):
         v = rng.standard_normal(network.gradient.shape)
         h = 1e-5
-        up, down = (Network(network.layout, moved(network.poses, s * h * v)).objective for s in (1, -1))
+        up, down = (Network(network.layout, step_poses(network.poses, s * h * v)).objective for s in (1, -1))
         assert (up - down) / (4 * h) == pytest.approx(float(np.sum(network.gradient * v)), rel=1e-6)
 
 
@@ -63,7 +69,7 @@ def test_keyframe_network_is_the_restricted_schur_complement(network: Network, w
     N = len(network.poses.position)
     S, _ = dense.schur(written_out, N)
     P = dense.interpolation(network.poses, k)
-    assert P.shape[1] == 6 * frames_of(N, k)
+    assert P.shape[1] == 6 * keyframes_of(N, k)
     coarse = KeyframeNetwork(network, k)
     wanted = P.T @ S @ P
     assert close(coarse.matrix().toarray(), wanted, 1e-8)
@@ -71,7 +77,7 @@ def test_keyframe_network_is_the_restricted_schur_complement(network: Network, w
     out = np.zeros_like(r)
     coarse.apply(r, out)
     assert close(out.ravel(), P @ np.linalg.solve(wanted, P.T @ r.ravel()), 1e-6)
-    jacobi = Preconditioner(network, Levels(k, 0))
+    jacobi = Preconditioner(network, PreconditionerLevels(k, 0))
     blocks = np.array([wanted[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] for c in range(len(wanted) // 6)])
     assert close(np.linalg.inv(jacobi.keyframes), blocks, 1e-7)
 
@@ -87,7 +93,7 @@ def test_the_chain_alone_is_restricted_as_well(network: Network) -> None:
             A[6 * i + 6 : 6 * i + 12, 6 * i : 6 * i + 6] = upper[i].T
     P = dense.interpolation(network.poses, 10)
     wanted = P.T @ A @ P
-    D, U = chain_of(network, 10)
+    D, U = keyframe_chain_blocks(network, 10)
     for c in range(len(D)):
         assert close(D[c], wanted[6 * c : 6 * c + 6, 6 * c : 6 * c + 6], 1e-9)
         if c + 1 < len(D):
@@ -95,7 +101,7 @@ def test_the_chain_alone_is_restricted_as_well(network: Network) -> None:
 
 
 def test_preconditioner_is_symmetric_and_positive(network: Network) -> None:
-    M = Preconditioner(network, Levels(4, 16))
+    M = Preconditioner(network, PreconditionerLevels(4, 16))
     rng = np.random.default_rng(4)
     a, b = (rng.standard_normal(network.gradient.shape) for _ in range(2))
     assert np.sum(a * M(b)) == pytest.approx(np.sum(b * M(a)), rel=1e-9)
@@ -105,9 +111,9 @@ def test_preconditioner_is_symmetric_and_positive(network: Network) -> None:
 def test_threads_change_no_byte(problem: SkeletonProblem, poses: Poses) -> None:
     found = []
     for threads in (1, 2, 3):
-        network = Network(Layout(problem, Workers(threads)), poses)
+        network = Network(WorkRanges(problem, Workers(threads)), poses)
         v = np.sin(np.arange(network.gradient.size)).reshape(-1, 6)
-        M = Preconditioner(network, Levels(4, 16))
+        M = Preconditioner(network, PreconditionerLevels(4, 16))
         made = (network.landmarks, network.gradient, network.product(v), network.diagonal(), M(v))
         found.append((network.objective, *(x.tobytes() for x in made)))
         network.layout.workers.close()

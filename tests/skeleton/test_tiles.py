@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
-from graphslam.skeleton.preconditioner import Levels
+from graphslam.skeleton.preconditioner import PreconditionerLevels
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.relax import RelaxConfig, relax_skeleton
 from graphslam.skeleton.tile_store import Tiles, write_tiles
-from graphslam.skeleton.tiles import from_disk, to_disk
+from graphslam.skeleton.tiles import load_tiled_problem, write_tiled_problem
 from graphslam_studies.sim.laps import Laps
 
 
@@ -26,14 +26,14 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("size", [7, 16, 40, 1000])
 def test_a_run_in_tiles_is_the_run_in_memory(problem: SkeletonProblem, tmp_path: Path, size: int) -> None:
-    tiled = to_disk(problem, tmp_path / "tiles", size)
+    tiled = write_tiled_problem(problem, tmp_path / "tiles", size)
     assert len(tiled.points) == 0
     assert (tiled.landmarks, tiled.measurements, tiled.freedom) == (
         problem.landmarks,
         problem.measurements,
         problem.freedom,
     )
-    for levels in (Levels(4, 16), Levels(10, 12)):
+    for levels in (PreconditionerLevels(4, 16), PreconditionerLevels(10, 12)):
         config = RelaxConfig(levels=levels, split=False, iterations=3)
         a, b = relax_skeleton(problem, config), relax_skeleton(tiled, config)
         assert a.poses.position.tobytes() == b.poses.position.tobytes()
@@ -44,7 +44,7 @@ def test_a_run_in_tiles_is_the_run_in_memory(problem: SkeletonProblem, tmp_path:
 
 
 def test_room_on_disk_keeps_its_numbers_and_leaves_no_file(problem: SkeletonProblem, tmp_path: Path) -> None:
-    tiled = to_disk(problem, tmp_path, 30)
+    tiled = write_tiled_problem(problem, tmp_path, 30)
     assert tiled.tiles is not None
     names = sorted(p.name for p in tmp_path.iterdir())
     room = tiled.room((300_000, 3))
@@ -80,7 +80,7 @@ def test_a_world_is_drawn_to_disk_as_in_memory(problem: SkeletonProblem, laps: L
 
 
 def test_what_needs_all_measurements_at_once_says_so(problem: SkeletonProblem, tmp_path: Path) -> None:
-    tiled = to_disk(problem, tmp_path, 30)
+    tiled = write_tiled_problem(problem, tmp_path, 30)
     with pytest.raises(ConfigError, match="split"):
         relax_skeleton(tiled)
     with pytest.raises(ConfigError, match="blocks"):
@@ -130,7 +130,7 @@ def test_a_killed_writer_changes_no_byte(tmp_path: Path) -> None:
 
 
 def test_damaged_folders_are_refused(problem: SkeletonProblem, tmp_path: Path) -> None:
-    to_disk(problem, tmp_path, 30)
+    write_tiled_problem(problem, tmp_path, 30)
     Tiles(tmp_path, verify=True)
     index = tmp_path / "tiles.json"
     good = index.read_text()
@@ -157,6 +157,6 @@ def test_damaged_folders_are_refused(problem: SkeletonProblem, tmp_path: Path) -
     # a folder of another network does not fit the odometry
     other = write_tiles(tmp_path / "other", [([1, 1], np.ones((2, 3), np.float32), np.array([0, 0], np.int32))])
     with pytest.raises(DataError):
-        from_disk(problem, other)
+        load_tiled_problem(problem, other)
     with pytest.raises(DataError, match="first observation"):
         write_tiles(tmp_path / "more", [([1], np.ones((1, 3), np.float32), np.array([4], np.int32))])

@@ -12,7 +12,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.solve.gnc import GncConfig, GncSolver, outliers
+from graphslam.solve.gnc import GncConfig, GncSolver, find_outliers
 from graphslam.solve.registry import SOLVERS, make_solver
 
 SIGMA = {2: np.array([0.05, 0.05, 0.01]), 3: np.array([0.002, 0.002, 0.01, 0.05, 0.05, 0.05])}
@@ -74,7 +74,7 @@ def test_without_outliers_it_is_least_squares(rng, dim):
     other = make_solver("lm", graph)
     other.solve_to_optimum()
     before = graph.objective().total
-    assert outliers(graph, GncConfig(confidence=0.9999)) == []
+    assert find_outliers(graph, GncConfig(confidence=0.9999)) == []
     make_solver("gnc", graph).solve_to_optimum()
     assert graph.objective().total == pytest.approx(before, rel=1e-9)
 

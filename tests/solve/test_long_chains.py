@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 import graphslam.solve.network.multistart as multistart
-from graphslam.app.solve_file import report_of
+from graphslam.app.solve_file import solution_json
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import optimise_graph
-from graphslam.solve.descent import limits_of, polish
+from graphslam.solve.descent import descend_to_minimum, limits_of
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam.solve.network.solve import solve_network
 from tests.reference.graph_chain import dense_submap
@@ -112,12 +112,12 @@ def test_a_slow_descent_gets_to_a_minimum(starts: tuple[str, ...] | None) -> Non
 
 
 def test_no_gap_is_told_where_no_optimum_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(multistart, "polish", partial(polish, max_iterations=3))
+    monkeypatch.setattr(multistart, "descend_to_minimum", partial(descend_to_minimum, max_iterations=3))
     solution = solve_network(noisy_streets(300, 1), "lm", starts=("file",))
     assert not solution.converged
     assert np.isnan(solution.gap)
     assert solution.decrement > 0
-    assert report_of(solution)["gap"] is None
+    assert solution_json(solution)["gap"] is None
     assert "above a minimum" in repr(solution)
 
 

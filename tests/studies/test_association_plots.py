@@ -8,14 +8,14 @@ import pytest
 
 from graphslam.core.errors import DataError
 from graphslam.evaluate.gps_innovation import GpsInnovations
-from graphslam.evaluate.loop_consistency import Loops, loop_consistency
-from graphslam.plots.without_truth import plot_innovations, plot_loop_matrix
+from graphslam.evaluate.loop_consistency import LandmarkLoops, loop_consistency
+from graphslam.plots.residual_consistency import plot_innovations, plot_loop_matrix
 from graphslam_studies.plots.association import plot_runs
 
 
-def loops_of(errors: np.ndarray) -> Loops:
+def loops_of(errors: np.ndarray) -> LandmarkLoops:
     n = len(errors)
-    return Loops(
+    return LandmarkLoops(
         a=np.arange(n),
         b=np.arange(n) + 5,
         shared=np.full(n, 3),

@@ -12,7 +12,7 @@ from graphslam.app.cli import app
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_studies.calibration import STUDY
 from graphslam_studies.calibration_scanned import Added, faulty
 from graphslam_studies.montecarlo.definition import find_study
@@ -52,14 +52,14 @@ def test_added_errors_are_those_that_were_asked_for(g) -> None:
     before, after = (g.log(o.increments) for o in (log["odometry"], worse))
     metres = [np.linalg.norm(xi[1:, g.position], axis=1).sum() for xi in (before, after)]
     assert metres[1] / metres[0] == pytest.approx(1.05, abs=1e-3)
-    turn = g.log(g.between(*(chain(o).poses[-1] for o in (log["odometry"], worse))))
+    turn = g.log(g.between(*(chain_odometry(o).poses[-1] for o in (log["odometry"], worse))))
     assert group_of(worse.increments) is g
     wrapped = np.mod(0.01 * 199.5 + np.pi, 2 * np.pi) - np.pi
     if g is SE2:
         assert turn[g.heading] == pytest.approx(wrapped, abs=1e-6)
     else:  # about the vertical: what the body leans by stays
         up = [
-            g.transform(np.r_[0, 0, 0, chain(o).poses[-1, 3:]], np.array([0.0, 0, 1]))[2]
+            g.transform(np.r_[0, 0, 0, chain_odometry(o).poses[-1, 3:]], np.array([0.0, 0, 1]))[2]
             for o in (log["odometry"], worse)
         ]
         assert up[1] == pytest.approx(up[0], abs=2e-3)

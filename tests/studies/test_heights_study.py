@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.core.poses import upright
+from graphslam.core.poses import level_poses
 from graphslam_studies.evaluate.segslam_judge import climbs
 from graphslam_studies.heights import PAIR, STUDY, exit_table, pair_table
 from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
@@ -65,10 +65,12 @@ def test_climbs_of_a_way_made_by_hand() -> None:
     x = np.arange(0.0, 100.0, 0.25)
     true = np.interp(x, [20.0, 40.0, 60.0, 80.0, 85.0], [0.0, 3.0, 3.0, 0.0, 0.5])  # the last is too short to count
     path = np.interp(x, [20.0, 40.0, 60.0, 80.0], [0.0, 2.7, 2.7, -0.6])
-    found = climbs(upright(np.column_stack([x, 0 * x, path]), 0 * x), upright(np.column_stack([x, 0 * x, true]), 0 * x))
+    found = climbs(
+        level_poses(np.column_stack([x, 0 * x, path]), 0 * x), level_poses(np.column_stack([x, 0 * x, true]), 0 * x)
+    )
     assert found.true == pytest.approx([3.0, -3.0], abs=0.05)
     assert found.error == pytest.approx([-0.1, 0.1], abs=0.01)
-    level = upright(np.column_stack([x, 0 * x, 0 * x]), 0 * x)
+    level = level_poses(np.column_stack([x, 0 * x, 0 * x]), 0 * x)
     assert len(climbs(level, level).true) == 0
 
 

@@ -10,7 +10,7 @@ import pytest
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.imu import Imu
-from graphslam_studies.graph.inertial_start import inertial_start, turned_on
+from graphslam_studies.graph.inertial_start import inertial_start, integrate_attitude
 from tests.reference.imu_ring import NOISE, true_readings, true_unit
 
 UNSURE = replace(NOISE, gyro_bias=0.1)
@@ -37,7 +37,7 @@ def test_attitude_and_bias_are_found(rng, heading):
     attitude, found = inertial_start(read(rng, bias), at, points)
     np.testing.assert_allclose(found, bias, atol=5e-3)
     true = se3.quat_multiply(turn, unit[:, 3:])
-    all_of_them = turned_on(attitude, read(rng, bias), at, found)
+    all_of_them = integrate_attitude(attitude, read(rng, bias), at, found)
     off = np.linalg.norm(se3.so3_log(se3.quat_multiply(all_of_them * CONJUGATE, true)), axis=1)
     assert off.max() < 0.15
 

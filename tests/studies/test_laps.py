@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError
-from graphslam.skeleton.schur import Layout, Network, Workers
+from graphslam.skeleton.schur import Network, Workers, WorkRanges
 from graphslam_studies.sim.laps import Laps, LapsConfig, draw_laps
 
 CONFIG = LapsConfig(poses=480, laps=6, gps_every=5)
@@ -41,7 +41,7 @@ def test_points_have_their_noise(world: Laps) -> None:
 def test_network_is_consistent_at_the_truth(world: Laps) -> None:
     """χ² at the truth: what is measured, less what the landmarks take."""
     problem = world.problem()
-    found = Network(Layout(problem, Workers(1)), world.truth).objective
+    found = Network(WorkRanges(problem, Workers(1)), world.truth).objective
     freedom = problem.freedom + 6 * problem.poses
     assert found / freedom == pytest.approx(1.0, abs=4 * np.sqrt(2 / freedom))
     per = world.shared.shape[0]

@@ -9,7 +9,7 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import rotation2, se2_compose
 from graphslam.core.trajectory import Trajectory
-from graphslam_studies.evaluate.relations import consecutive_pairs, covered, random_pairs, relation_error
+from graphslam_studies.evaluate.relations import consecutive_pairs, covered_part, random_pairs, relation_error
 
 
 def winding(dim: int, n: int = 60) -> Trajectory:
@@ -64,7 +64,7 @@ def test_refusals() -> None:
     short = reference.take(np.arange(10, 50))
     with pytest.raises(DataError, match="20 poses of the reference lie outside"):
         relation_error(short, reference, consecutive_pairs(60))
-    part = covered(reference, short)
+    part = covered_part(reference, short)
     assert len(part) == 40
     assert relation_error(short, part, consecutive_pairs(40)).translation.max() < 1e-12
     with pytest.raises(DataError, match="dimension"):

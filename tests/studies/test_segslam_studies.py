@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.run.front_ends import recommended
-from graphslam.core.config import build
+from graphslam.app.run.front_ends import recommended_options
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import SE2, SE3, heading_of, level
+from graphslam.core.poses import SE2, SE3, heading_of, remove_roll_pitch
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.rbpf_grid import RbpfGridConfig, RbpfResult
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
@@ -217,12 +217,12 @@ def test_fused_map_is_the_map_of_a_filter_on_the_same_path(trial: GridTrial) -> 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_placements_of_a_grid_fill_a_voxel_and_a_quarter_turn(dim: int) -> None:
     group = SE3 if dim == 3 else SE2
-    np.testing.assert_array_equal(judge.placements(1, 0.2, dim), group.identity[None])
-    T = judge.placements(4, 0.2, dim)
+    np.testing.assert_array_equal(judge.grid_placements(1, 0.2, dim), group.identity[None])
+    T = judge.grid_placements(4, 0.2, dim)
     assert T.shape == (4, group.size)
     assert np.all((T[:, :dim] >= 0.0) & (T[:, :dim] < 0.2))
     np.testing.assert_allclose(heading_of(T), np.pi / 2 * np.array([0.125, 0.375, 0.625, 0.875]))
-    np.testing.assert_allclose(level(T), T, atol=1e-12)
+    np.testing.assert_allclose(remove_roll_pitch(T), T, atol=1e-12)
     for axis in range(dim):  # no half of the voxel is left out
         assert len(np.unique(T[:, axis])) == 4
         assert T[:, axis].min() < 0.1 < T[:, axis].max()
@@ -235,7 +235,7 @@ def test_clarity_is_the_mean_over_grids_that_stand_differently(trial: GridTrial)
     one = judge.clarity(steps, trial.truth, model=model)
     grid = judge.fused_grid(steps, trial.truth, model=model)
     assert (one.entropy, one.volume) == (grid.entropy(), grid.known_volume())
-    moved = [SE3.compose(np.broadcast_to(T, trial.truth.shape), trial.truth) for T in judge.placements(2, 0.2, 3)]
+    moved = [SE3.compose(np.broadcast_to(T, trial.truth.shape), trial.truth) for T in judge.grid_placements(2, 0.2, 3)]
     grids = [judge.fused_grid(steps, path, model=model) for path in moved]
     two = judge.clarity(steps, trial.truth, model=model, count=2)
     assert two.entropy == pytest.approx(np.mean([g.entropy() for g in grids]))
@@ -330,8 +330,8 @@ def test_exits_against_the_model_alone(trial: GridTrial, single: SegSlamResult) 
     t = single.segmap.table
     for k, i in enumerate(single.segmap.chain(int(single.closed[0])).tolist()):
         a, b = int(t.start[i]), int(t.end[i])
-        est = SE3.between(level(t.entry[i]), level(t.exit[i]))
-        true = SE3.between(level(trial.truth[a]), level(trial.truth[b]))
+        est = SE3.between(remove_roll_pitch(t.entry[i]), remove_roll_pitch(t.exit[i]))
+        true = SE3.between(remove_roll_pitch(trial.truth[a]), remove_roll_pitch(trial.truth[b]))
         x = SE3.log(SE3.between(est, true))[2:]
         L = float(single.steps.path_length[b] - single.steps.path_length[a])
         assert e.lengths[k] == pytest.approx(L)
@@ -359,9 +359,9 @@ def test_presets_are_the_settings_of_the_studies(world: str) -> None:
     """Who simulates a world and runs a front end on it gets what the study has figures of."""
     study = {**GARAGE.full, **MINE.full, **BUILDING.full}[world]
     log = SensorLog(name=world, streams={})
-    segslam = build(SegSlamFrontEndConfig, recommended(log, "segslam")["frontend"])
+    segslam = build_config(SegSlamFrontEndConfig, recommended_options(log, "segslam")["frontend"])
     assert (segslam.steps, segslam.filter, segslam.segslam, segslam.drift) == (
         study.steps, study.segslam_filter, study.segslam, study.drift,
     )  # fmt: skip
-    rbpf = build(RbpfGridConfig, recommended(log, "rbpf-grid")["frontend"])
+    rbpf = build_config(RbpfGridConfig, recommended_options(log, "rbpf-grid")["frontend"])
     assert (rbpf.steps, rbpf.filter) == (study.steps, study.filter)

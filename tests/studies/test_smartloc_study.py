@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from graphslam.app.cli import app
 from graphslam.core.errors import GraphSlamError
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam_studies import smartloc
 from graphslam_studies.montecarlo.definition import StudyDefinition, find_study
 from graphslam_studies.montecarlo.study import open_study
@@ -68,7 +68,7 @@ def test_settings_are_all_combinations():
 
 def test_some_of_the_recorded_street(data_dir):
     """Forty seconds of it: with biases the error is less, and the covariance says how large it is."""
-    log = load("smartloc-gnss").slice(150.0, 190.0)
+    log = load_recording("smartloc-gnss").slice(150.0, 190.0)
     naive = scored([log], {}, 10)
     settings = {CAUCHY: 1.0, "density_scale": 10.0, "bias_sigma": 5.0, "bias_time": 15.0, "bias_every": 1.0}
     honest = scored([log], settings, 10)

@@ -24,7 +24,7 @@ from graphslam_studies.plots.study import (
     plot_rms_panels,
 )
 from graphslam_studies.plots.study_figures import save_paper_figures
-from graphslam_studies.plots.study_local import plot_local_honesty
+from graphslam_studies.plots.study_local import plot_local_consistency
 from graphslam_studies.plots.study_table import algorithms_with
 from graphslam_studies.plots.study_time import plot_cumulative_time
 from tests.reference.study_rows import COLUMNS, study_rows
@@ -167,7 +167,7 @@ def test_time_is_the_median_and_the_tree_a_level(study) -> None:
 
 def test_local_map_histogram_has_the_area_and_the_density_it_should(study) -> None:
     table, _ = study
-    ax = plot_local_honesty(None, table)
+    ax = plot_local_consistency(None, table)
     widths = None
     for patch in ax.patches:
         if not hasattr(patch, "get_data"):
@@ -186,7 +186,7 @@ def test_local_map_histogram_has_the_area_and_the_density_it_should(study) -> No
     assert "RBPF, moments (paper): mean 1.2" in text
     bad = table[~((table["quantity"] == "local_joint_dof") & (table["submap"] == 3))]
     with pytest.raises(DataError, match="degrees of freedom"):
-        plot_local_honesty(None, bad, algorithms=["local-ekf"])
+        plot_local_consistency(None, bad, algorithms=["local-ekf"])
 
 
 def test_known_algorithms_look_different_and_unknown_ones_are_drawn() -> None:

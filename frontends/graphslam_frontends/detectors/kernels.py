@@ -157,7 +157,7 @@ def _fit_circle(beams_of, a, b, rho, bearing, radius, out):  # type: ignore[no-u
 
 
 @njit
-def detect(ranges, angles, step, parameters, mean_g, var_g):  # type: ignore[no-untyped-def]
+def detect_kernel(ranges, angles, step, parameters, mean_g, var_g):  # type: ignore[no-untyped-def]
     """Trunks of all scans.
 
     Parameters

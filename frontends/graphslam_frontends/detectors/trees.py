@@ -183,7 +183,7 @@ def find_trunks(scans: LaserScans, config: TreeDetectorConfig | None = None) -> 
         ]
     )
     ranges = np.ascontiguousarray(scans.ranges, dtype=np.float64)
-    found = kernels.detect(ranges, scans.bearings, float(steps.mean()), parameters, *half_chord_moments(m))
+    found = kernels.detect_kernel(ranges, scans.bearings, float(steps.mean()), parameters, *half_chord_moments(m))
     return Trunks(
         scan=found[:, kernels.SCAN].astype(np.int64),
         ranges=found[:, kernels.RANGE].copy(),

@@ -28,10 +28,16 @@ from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scan import UpdateReport
 from graphslam_frontends.grid.ancestry import Ancestry
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.motion import motion_covariance, move, square_root, tilted, walk_tilt_errors
+from graphslam_frontends.grid.motion import (
+    motion_covariance,
+    move_poses,
+    square_root,
+    walk_tilt_errors,
+    with_roll_pitch,
+)
 from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
 from graphslam_frontends.grid.upright import upright_beams
-from graphslam_frontends.grid.weights import informed, inherit, spread
+from graphslam_frontends.grid.weights import evenly_spaced_indices, fill_with_mean_likelihood, maps_with_enough_scans
 
 if TYPE_CHECKING:
     from graphslam_frontends.odometry.steps import Steps
@@ -106,7 +112,7 @@ class GridParticles:
 
 
 @dataclass(slots=True)
-class Tally:
+class FilterCounts:
     """What happened so far.
 
     Parameters
@@ -167,7 +173,7 @@ class GridFilter:
             )
         self.steps, self.config, self.seed, self.first = steps, config, seed, first
         n, group = config.particles, SE2 if steps.dim == 2 else SE3
-        self.tally = Tally()
+        self.tally = FilterCounts()
         empty = EvidenceGrid(
             config.voxel_size, model=config.beam_model(), pool=GridPool() if pool is None else pool, dim=steps.dim
         )
@@ -226,7 +232,7 @@ class GridFilter:
             if len(p) > 1:
                 cov = motion_covariance(increment, odometry.covariances[k], self.config)
                 noise = self._normal("motion", k, len(cov)) @ square_root(cov).T
-            p.poses = move(p.poses, increment, noise)
+            p.poses = move_poses(p.poses, increment, noise)
             if p.tilt_errors is not None and len(p) > 1:
                 seconds = float(self.steps.times[k] - self.steps.times[k - 1])
                 p.tilt_errors = walk_tilt_errors(
@@ -244,7 +250,7 @@ class GridFilter:
             gains = np.zeros(len(p))
             points, origins, returns = self.steps.scan(k)
             weighed = self.weighed_beams(k)
-            told = informed(p.ages, config.young)
+            told = maps_with_enough_scans(p.ages, config.young)
             rows = np.flatnonzero(told)
             if weighed and len(rows):
                 for beams, likelihood in weighed:
@@ -258,7 +264,7 @@ class GridFilter:
                         returns=returns[beams],
                         threads=config.threads,
                     )
-                gains = inherit(gains, p.log_weights, told)
+                gains = fill_with_mean_likelihood(gains, p.log_weights, told)
                 p.gain(gains)
             return gains
 
@@ -292,7 +298,7 @@ class GridFilter:
                 self.tally.without_beams += 1
                 return UpdateReport()
             self.tally.without_returns += not returns.any()
-            use = spread(len(points), self.config.map_beams)
+            use = evenly_spaced_indices(len(points), self.config.map_beams)
             leads: dict[tuple[int, bytes, int], int] = {}
             first_of = np.empty(len(p), dtype=np.int64)
             for i, grid in enumerate(p.grids):
@@ -310,7 +316,7 @@ class GridFilter:
                 threads=self.config.threads,
             )
             for i in np.flatnonzero(first_of != np.arange(len(p))).tolist():
-                p.grids[i].take(p.grids[int(first_of[i])])
+                p.grids[i].replace_contents(p.grids[int(first_of[i])])
             p.ages = p.ages + np.array([not g.locked for g in p.grids], dtype=np.int64)
             self.tally.rays += report.rays
             self.tally.dropped_rays += report.dropped
@@ -341,7 +347,7 @@ class GridFilter:
             rows = _some(np.flatnonzero(ends), c.weight_beams)
             out.append((rows, c.by_end_points(len(rows))))
         if c.likelihood == "cast" or self.upright is not None:
-            rows = spread(len(returns), c.weight_beams if self.upright is None else c.cast_beams)
+            rows = evenly_spaced_indices(len(returns), c.weight_beams if self.upright is None else c.cast_beams)
             out.append((rows, c.by_casting(len(rows))))
         return [(rows, likelihood) for rows, likelihood in out if len(rows)]
 
@@ -350,7 +356,7 @@ class GridFilter:
         p = self.particles
         if p.tilt_errors is not None:
             assert self.steps.tilt is not None
-            p.poses = tilted(p.poses, self.steps.tilt[k] - p.tilt_errors)
+            p.poses = with_roll_pitch(p.poses, self.steps.tilt[k] - p.tilt_errors)
 
     def _normal(self, purpose: str, k: int, d: int) -> Array:
         """Standard normal ``(N, d)`` of one purpose in one step."""
@@ -367,4 +373,4 @@ class GridFilter:
 
 def _some(rows: Ints, most: int) -> Ints:
     """At most so many of some rows, evenly spread."""
-    return rows[spread(len(rows), most)]
+    return rows[evenly_spaced_indices(len(rows), most)]

@@ -48,14 +48,14 @@ def square_root(covariance: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def move(poses: Array, increment: Array, noise: Array | None) -> Array:
+def move_poses(poses: Array, increment: Array, noise: Array | None) -> Array:
     """``T ∘ u ∘ Exp(r)`` for poses ``(n, 3)`` or ``(n, 7)`` and noise ``(n, d)``; None: no noise."""
     group = group_of(poses)
     moved = group.compose(poses, np.broadcast_to(increment, poses.shape))
     return moved if noise is None else group.compose(moved, group.exp(noise))
 
 
-def tilts(poses: Array) -> Array:
+def roll_pitch_of(poses: Array) -> Array:
     """Roll and pitch ``(..., 2)`` of 3-D poses [rad], ``R = Rz(heading) Ry(pitch) Rx(roll)``."""
     x, y, z, w = np.moveaxis(poses[..., 3:], -1, 0)
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
@@ -63,7 +63,7 @@ def tilts(poses: Array) -> Array:
     return np.stack([roll, pitch], -1)
 
 
-def tilted(poses: Array, tilt: Array) -> Array:
+def with_roll_pitch(poses: Array, tilt: Array) -> Array:
     """Poses ``(n, 7)`` with roll and pitch ``(n, 2)`` [rad] in place of their own; headings and positions stay."""
     half = 0.5 * np.column_stack([tilt, heading_of(poses)])
     (sr, sp, sy), (cr, cp, cy) = np.sin(half).T, np.cos(half).T

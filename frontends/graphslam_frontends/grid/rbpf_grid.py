@@ -27,13 +27,13 @@ from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.ancestry import Ancestry
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.filter import GridFilter, GridParticles, Tally
-from graphslam_frontends.grid.filter_drift import Passed, between_knots
+from graphslam_frontends.grid.filter import FilterCounts, GridFilter, GridParticles
+from graphslam_frontends.grid.filter_error_model import ErrorPassThrough, interpolate_covariances
 from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.scan_use import (
-    reckoned_covariance,
-    uncorrected,
-    uncorrected_covariance,
+    dead_reckoning_covariance,
+    unobserved_covariance,
+    unobserved_stretches,
     with_findings,
 )
 from graphslam_frontends.odometry.step_config import StepConfig
@@ -62,7 +62,7 @@ class RbpfResult:
         At the end, with the grids of the survivors.
     best : int
         The particle whose map and path are handed over.
-    tally : Tally
+    tally : FilterCounts
         Wall time by part, and what happened to beams.
     used_bytes : int
         Memory of all maps at the end, shared parts once.
@@ -78,7 +78,7 @@ class RbpfResult:
     ancestry: Ancestry
     particles: GridParticles
     best: int
-    tally: Tally
+    tally: FilterCounts
     used_bytes: int
     uses: frozenset[str] = frozenset()
 
@@ -194,7 +194,7 @@ def rbpf_submap(
     key: int = 0,
     drift_scale: float = 1.0,
     steps: Steps | None = None,
-    passed: Passed | None = None,
+    passed: ErrorPassThrough | None = None,
 ) -> Submap:
     """The whole run as one submap: the best particle's map and path, and an honest covariance of where it ends.
 
@@ -207,7 +207,7 @@ def rbpf_submap(
     steps : Steps, optional
         With them, dead reckoning's own covariance is added where no scan corrects it
         (:mod:`graphslam_frontends.odometry.scan_use`), and elsewhere the share of it that the filter passes on.
-    passed : Passed, optional
+    passed : ErrorPassThrough, optional
         That share; default none.
     """
     times = result.times
@@ -225,14 +225,14 @@ def rbpf_submap(
     path = result.trajectory(lambda s: drift_scale * np.asarray(drift(s)))
     added = np.zeros_like(exit.total)
     alone = len(result.particles) == 1  # nobody to choose from: the path is dead reckoning, whatever scans there are
-    if steps is not None and (stretches := [(1, len(path) - 1)] if alone else uncorrected(steps)):
+    if steps is not None and (stretches := [(1, len(path) - 1)] if alone else unobserved_stretches(steps)):
         assert path.covariances is not None
-        more = [uncorrected_covariance(steps, stretches, path.poses[: k + 1], 0, k) for k in range(len(path))]
+        more = [unobserved_covariance(steps, stretches, path.poses[: k + 1], 0, k) for k in range(len(path))]
         path = Trajectory(path.times, path.poses, path.covariances + np.array(more))
         added = more[-1]
     if steps is not None and passed is not None and not alone:
         assert path.covariances is not None
-        leaked = drift_scale * passed_along(steps, path.poses, passed, len(result.particles))
+        leaked = drift_scale * covariance_along_path(steps, path.poses, passed, len(result.particles))
         path = Trajectory(path.times, path.poses, path.covariances + leaked)
         added = added + leaked[-1]
     report["exit_sigma_drift"] = np.sqrt(np.diag(drift_scale * exit.drift + added)).tolist()
@@ -248,7 +248,7 @@ def rbpf_submap(
     )
 
 
-def passed_along(steps: Steps, poses: Array, passed: Passed, particles: int) -> Array:
+def covariance_along_path(steps: Steps, poses: Array, passed: ErrorPassThrough, particles: int) -> Array:
     """Covariances ``(n, d, d)``, along a filter's path, of the errors of dead reckoning that it passes on."""
     n = len(poses)
     knots = np.unique(np.linspace(0, n - 1, min(n, KNOTS)).round().astype(np.int64))
@@ -256,11 +256,11 @@ def passed_along(steps: Steps, poses: Array, passed: Passed, particles: int) -> 
     way = steps.path_length
     C = [
         passed.covariance(
-            reckoned_covariance(steps, 0, k, level_end=False), float(way[k] - way[0]), particles, tilt=tilt
+            dead_reckoning_covariance(steps, 0, k, level_end=False), float(way[k] - way[0]), particles, tilt=tilt
         )
         for k in knots.tolist()
     ]
-    return between_knots(knots, np.array(C), poses, way)
+    return interpolate_covariances(knots, np.array(C), poses, way)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -273,7 +273,7 @@ class RbpfGridConfig:
     """Particles, motion, weights."""
     drift: DriftModel = field(default_factory=DriftModel)
     """Errors that all particles share, by the length of the path; its dimension is that of the log."""
-    passed: Passed = field(default_factory=Passed)
+    passed: ErrorPassThrough = field(default_factory=ErrorPassThrough)
     """What comes on top of them: the share of the errors of dead reckoning that the filter passes on."""
     drift_scale: float = 1.0
     """Factor on the covariances of both."""

@@ -52,12 +52,12 @@ def upright_beams(steps: Steps) -> Flags:
     fit_surfaces(points, near, NEIGHBOURS, normals, spread, np.empty((len(rows), 2, 3)))
     with np.errstate(invalid="ignore", divide="ignore"):
         known = spread[:, 0] <= NEIGHBOURS * SURE**2 * spread[:, 1]
-    up = vertical(steps.tilt)[step]
+    up = up_directions(steps.tilt)[step]
     out[rows] = ~known | (np.abs(np.einsum("ki,ki->k", normals, up)) < STEEP)
     return out
 
 
-def vertical(tilt: Array) -> Array:
+def up_directions(tilt: Array) -> Array:
     """What is up ``(n, 3)``, seen from bodies with roll and pitch ``(n, 2)`` [rad]."""
     (sr, sp), (cr, cp) = np.sin(tilt).T, np.cos(tilt).T
     return np.column_stack([-sp, sr * cp, cr * cp])

@@ -12,14 +12,14 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 
-def spread(n: int, most: int) -> Ints:
+def evenly_spaced_indices(n: int, most: int) -> Ints:
     """At most ``most`` (0: all) of ``n`` indices, ascending and evenly spread: the same ones every time."""
     if most <= 0 or n <= most:
         return np.arange(n, dtype=np.int64)
     return (np.arange(most, dtype=np.int64) * n) // most
 
 
-def informed(ages: Ints, young: int) -> Flags:
+def maps_with_enough_scans(ages: Ints, young: int) -> Flags:
     """Which maps ``(n,)`` may be weighed by what they say: of at least ``young`` scans, or, where none is, the oldest.
 
     Maps without any scan say nothing.
@@ -28,7 +28,7 @@ def informed(ages: Ints, young: int) -> Flags:
     return np.asarray((ages >= min(young, oldest)) & (ages > 0))
 
 
-def inherit(gains: Array, log_weights: Array, told: Flags) -> Array:
+def fill_with_mean_likelihood(gains: Array, log_weights: Array, told: Flags) -> Array:
     """Log-likelihoods ``(n,)`` in which particles that were not ``told`` have the mean likelihood of those that were.
 
     The mean is weighted by what the particles weighed before, which makes it the evidence ``p(z)`` of those told: the

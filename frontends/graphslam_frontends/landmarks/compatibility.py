@@ -18,8 +18,8 @@ from scipy import stats
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam_frontends.landmarks.compatibility_kernels import (
-    Joint,
-    Pairs,
+    JointGaussian,
+    PairingBuffer,
     candidates_kernel,
     joint_kernel,
     nearest_kernel,
@@ -78,7 +78,7 @@ class Pairing:
     capped: bool = False
 
 
-def pair(
+def pair_observations(
     x: Array,
     P: Array,
     observations: Array,
@@ -120,12 +120,12 @@ def pair(
     polar, nearest = np.full((nl, 2), np.nan), np.full(q, np.inf)
     pair_o, pair_k = np.empty(q * nl, dtype=np.int64), np.empty(q * nl, dtype=np.int64)
     d2 = np.empty(q * nl)
-    pairs = Pairs(pair_o, pair_k, d2)
-    n = candidates_kernel(Joint(x, P), alive, observations, sensor, gates, polar, nearest, pairs)
+    pairs = PairingBuffer(pair_o, pair_k, d2)
+    n = candidates_kernel(JointGaussian(x, P), alive, observations, sensor, gates, polar, nearest, pairs)
     match = np.full(q, -1, dtype=np.int64)
     if method == "nearest":
         one = np.isinf(observations[pair_o[:n], 3])
         nearest_kernel(n, pair_o, pair_k, d2[:n] / np.where(one, gates[1], gates[2]), match)
         return Pairing(match, nearest, polar)
-    nodes, capped, joint = joint_kernel(Joint(x, P), observations, sensor, gates, n, pairs, max_nodes, match)
+    nodes, capped, joint = joint_kernel(JointGaussian(x, P), observations, sensor, gates, n, pairs, max_nodes, match)
     return Pairing(match, nearest, polar, float(joint), int(nodes), bool(capped))

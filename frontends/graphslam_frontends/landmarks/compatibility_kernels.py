@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graphslam.core.jit import njit
-from graphslam_frontends.landmarks.ekf_kernels import linearise
-from graphslam_frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam_frontends.landmarks.ekf_kernels import linearise_observation
+from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, wrap_angle_kernel
 
 
-class Joint(NamedTuple):
+class JointGaussian(NamedTuple):
     """A Gaussian over pose and landmarks."""
 
     x: Any
@@ -25,7 +25,7 @@ class Joint(NamedTuple):
     P: Any
 
 
-class Pairs(NamedTuple):
+class PairingBuffer(NamedTuple):
     """Room for pairings (q · nl,)."""
 
     o: Any
@@ -36,7 +36,7 @@ class Pairs(NamedTuple):
     """Distance²."""
 
 
-class Counts(NamedTuple):
+class LandmarkCounts(NamedTuple):
     """Of landmarks, by slot."""
 
     hits: Any
@@ -60,7 +60,7 @@ def candidates_kernel(state, alive, obs, sensor, gates, polar, nearest, pairs):
         if not alive[k]:
             continue
         c = 3 + 2 * k
-        observe(x[0], x[1], x[2], sensor, x[c], x[c + 1], h)
+        observe_landmark(x[0], x[1], x[2], sensor, x[c], x[c + 1], h)
         polar[k, 0], polar[k, 1] = h[0], h[1]
         t = np.zeros((2, 5))
         for r in range(2):
@@ -84,7 +84,7 @@ def candidates_kernel(state, alive, obs, sensor, gates, polar, nearest, pairs):
             if flat:
                 d2 = e0 * e0 / s00
             else:
-                e1, s11 = wrap(obs[o, 1] - polar[k, 1]), S[k, 2] + obs[o, 3]
+                e1, s11 = wrap_angle_kernel(obs[o, 1] - polar[k, 1]), S[k, 2] + obs[o, 3]
                 d2 = (s11 * e0 * e0 - 2.0 * S[k, 1] * e0 * e1 + s00 * e1 * e1) / (s00 * s11 - S[k, 1] ** 2)
             nearest[o] = min(nearest[o], d2 / gate)
             if d2 <= gate:
@@ -142,7 +142,7 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     h = np.empty(12)
     last = 0
     for i in range(count):
-        rows[i] = linearise(x, pair_k[i], obs[pair_o[i]], sensor, h, H[i], nu[i])
+        rows[i] = linearise_observation(x, pair_k[i], obs[pair_o[i]], sensor, h, H[i], nu[i])
         last = max(last, pair_k[i])
     used = np.zeros(last + 1, np.bool_)
     L, y = np.zeros((2 * levels, 2 * levels)), np.zeros(2 * levels)

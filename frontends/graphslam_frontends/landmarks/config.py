@@ -76,7 +76,7 @@ class StoppingConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DelayedStart:
+class DelayedInitialisation:
     """When the ranges to a beacon, kept until then, make a landmark. A single range says too little."""
 
     min_ranges: int = 5
@@ -118,7 +118,7 @@ class FilterConfig:
     """A provisional feature goes after this many scans in which it should have been seen and was not."""
     drop_scans: int = 10
     """A provisional feature goes if it is not confirmed this many scans after its birth."""
-    delayed: DelayedStart = field(default_factory=DelayedStart)
+    delayed: DelayedInitialisation = field(default_factory=DelayedInitialisation)
     """Range-only observations: when the ranges to a beacon make a landmark."""
     max_range: float = 45.0
     """Observations beyond are not used [m]."""
@@ -166,7 +166,7 @@ class RbpfSlamConfig(FilterConfig):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LastingConfig:
+class SensorBiasConfig:
     """Constant errors that a graph estimates with the map: σ of what is known of each beforehand; 0: it is none.
 
     The defaults are what a robot's data sheet and a tape measure leave open.
@@ -198,7 +198,8 @@ class LastingConfig:
                 )
 
     def chosen(self) -> tuple[tuple[str, ...], Array]:
-        """Name and σ of each of :data:`~graphslam.core.lasting.CONSTANTS`; what is none has no name, and a σ of 1."""
+        """Name and σ of each of :data:`~graphslam.core.sensor_biases.CONSTANTS`; what is none has no name, and a σ of
+        1."""
         pairs = (("yaw_bias", "turn_per_metre"), ("distance_scale",), ("range_offset",), ("sensor_yaw", "range_scale"))
         names = tuple(next((n for n in some if getattr(self, n) > 0.0), "") for some in pairs)
         sigmas = [getattr(self, n) if n else 1.0 for n in names]
@@ -225,7 +226,7 @@ class RbpfEkfConfig(FilterConfig):
     stand in the report as an alarm. Costs K times the filter's time; 0 = off."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
     """When a submap ends."""
-    lasting: LastingConfig | None = None
+    lasting: SensorBiasConfig | None = None
     """Constant errors of wheels and sensor that the graph estimates with the map; None: there are none."""
 
     def __post_init__(self) -> None:

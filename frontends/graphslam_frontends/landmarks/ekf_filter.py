@@ -14,12 +14,12 @@ from scipy.linalg.blas import dsyrk
 
 from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array
-from graphslam_frontends.landmarks.compatibility import gates_by_dof, pair
-from graphslam_frontends.landmarks.compatibility_kernels import Counts, misses_kernel
+from graphslam_frontends.landmarks.compatibility import gates_by_dof, pair_observations
+from graphslam_frontends.landmarks.compatibility_kernels import LandmarkCounts, misses_kernel
 from graphslam_frontends.landmarks.ekf_config import EkfFilterConfig
 from graphslam_frontends.landmarks.ekf_kernels import (
-    Active,
-    Now,
+    ActiveState,
+    PoseState,
     augment_kernel,
     gather_kernel,
     innovation_kernel,
@@ -143,7 +143,7 @@ class EkfMap:
         if self._rows + rows > len(self._V):
             self._compress(rows)
         n = 3 + 2 * len(self._active)
-        active = Active(self._ax, self._aP, self._aPhi, self._V, self._theta)
+        active = ActiveState(self._ax, self._aP, self._aPhi, self._V, self._theta)
         nis, used = update_kernel(active, n, self._n0, self._rows, observations, at, self.sensor)
         if used < 0 or not np.isfinite(nis):
             raise CovarianceError(
@@ -181,7 +181,7 @@ class EkfMap:
             if np.any(self._distance(observations, self._passive, cross) < 1.0):
                 self._choose(None, observations)
         alive = self.hits[self._active] > 0
-        p = pair(
+        p = pair_observations(
             self._ax,
             self._aP,
             observations,
@@ -207,7 +207,7 @@ class EkfMap:
         new = gates_by_dof(self.config.gate_new, 2)
         weights = np.broadcast_to([1.0 / new[1], 1.0 / new[2]], (len(observations), 2))
         out = np.empty(len(slots))
-        now = Now(self._ax[:3], self._aP[:3, :3], cross[:3], cross[3])
+        now = PoseState(self._ax[:3], self._aP[:3, :3], cross[:3], cross[3])
         passive_distance_kernel(now, slots, self._x, self._P, np.hstack([observations, weights]), self.sensor, out)
         return out
 
@@ -215,7 +215,7 @@ class EkfMap:
         k = len(polar)  # landmarks founded in this very scan are not judged
         dropped = np.zeros(k, dtype=np.bool_)
         slots = self._active[:k]
-        counts = Counts(self.hits, self.misses, self.born)
+        counts = LandmarkCounts(self.hits, self.misses, self.born)
         if misses_kernel(slots, self.scans, at, polar, counts, self._limits, dropped):
             self.hits[slots[dropped]] = 0  # marginalised out: the row stays until the active part is chosen anew
 

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graphslam.core.jit import njit
-from graphslam_frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, wrap_angle_kernel
 
 
-class Active(NamedTuple):
+class ActiveState(NamedTuple):
     """What an update works on: the active state, and what passive landmarks will be told."""
 
     x: Any
@@ -31,7 +31,7 @@ class Active(NamedTuple):
     theta: Any
 
 
-class Now(NamedTuple):
+class PoseState(NamedTuple):
     """The pose as it is, beside landmarks that are not up to date."""
 
     pose: Any
@@ -51,7 +51,7 @@ def predict_kernel(x, P, n, Phi, n0, u, Q):
     dx, dy = c * u[0] - s * u[1], s * u[0] + c * u[1]
     x[0] += dx
     x[1] += dy
-    x[2] = wrap(x[2] + u[2])
+    x[2] = wrap_angle_kernel(x[2] + u[2])
     # F = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]]: rows first, then columns
     for j in range(n):
         P[0, j] -= dy * P[2, j]
@@ -78,19 +78,19 @@ def predict_kernel(x, P, n, Phi, n0, u, Q):
 
 
 @njit(error_model="numpy")
-def linearise(x, k, row, sensor, h, H, nu):
+def linearise_observation(x, k, row, sensor, h, H, nu):
     """Jacobian rows H (2, 5) over [x, y, θ, l_x, l_y] and innovation nu (2,) of active landmark k; returns 1 or 2.
 
     h (12,) is scratch.
     """
-    observe(x[0], x[1], x[2], sensor, x[3 + 2 * k], x[4 + 2 * k], h)
+    observe_landmark(x[0], x[1], x[2], sensor, x[3 + 2 * k], x[4 + 2 * k], h)
     nu[0] = row[0] - h[0]
     for r in range(2):  # range and bearing depend on l - p, so ∂/∂p = -∂/∂l in the same frame
         H[r, 0], H[r, 1], H[r, 2] = -h[8 + 2 * r], -h[9 + 2 * r], h[4 + 3 * r]
         H[r, 3], H[r, 4] = h[8 + 2 * r], h[9 + 2 * r]
     if math.isinf(row[3]):
         return 1
-    nu[1] = wrap(row[1] - h[1])
+    nu[1] = wrap_angle_kernel(row[1] - h[1])
     return 2
 
 
@@ -109,7 +109,7 @@ def update_kernel(active, n, n0, first, obs, at, sensor):
     for o in range(q):
         if at[o] < 0:
             continue
-        for r in range(linearise(x, at[o], obs[o], sensor, h, Hk, nk)):
+        for r in range(linearise_observation(x, at[o], obs[o], sensor, h, Hk, nk)):
             H[m] = Hk[r]
             col[m], nu[m], var[m] = 3 + 2 * at[o], nk[r], obs[o, 2 + r]
             m += 1
@@ -161,7 +161,7 @@ def update_kernel(active, n, n0, first, obs, at, sensor):
             x[j] += y * W[r, j]
         for j in range(n0):
             theta[j] += y * V[first + r, j]
-    x[2] = wrap(x[2])
+    x[2] = wrap_angle_kernel(x[2])
     for i in range(n):
         for r in range(m):
             f = W[r, i]
@@ -211,7 +211,7 @@ def passive_distance_kernel(now, slots, x, P, obs, sensor, out):
     h = np.empty(12)
     for i in range(len(slots)):
         b = 3 + 2 * slots[i]
-        observe(pose[0], pose[1], pose[2], sensor, x[b] + shift[b], x[b + 1] + shift[b + 1], h)
+        observe_landmark(pose[0], pose[1], pose[2], sensor, x[b] + shift[b], x[b + 1] + shift[b + 1], h)
         S00 = S01 = S11 = 0.0
         for r in range(2):
             g0, g1, g2, g3, g4 = -h[8 + 2 * r], -h[9 + 2 * r], h[4 + 3 * r], h[8 + 2 * r], h[9 + 2 * r]
@@ -233,7 +233,7 @@ def passive_distance_kernel(now, slots, x, P, obs, sensor, out):
             if math.isinf(obs[o, 3]):
                 d2 = e0 * e0 / s00 * obs[o, 4]
             else:
-                e1, s11 = wrap(obs[o, 1] - h[1]), S11 + obs[o, 3]
+                e1, s11 = wrap_angle_kernel(obs[o, 1] - h[1]), S11 + obs[o, 3]
                 det = s00 * s11 - S01 * S01
                 d2 = (s11 * e0 * e0 - 2.0 * S01 * e0 * e1 + s00 * e1 * e1) / det * obs[o, 5]
             best = min(best, d2)
@@ -274,7 +274,7 @@ def innovation_kernel(x, P, obs, at, sensor):
         if at[o] < 0:
             continue
         ix[3], ix[4] = 3 + 2 * at[o], 4 + 2 * at[o]
-        rows = linearise(x, at[o], obs[o], sensor, h, H, nu)
+        rows = linearise_observation(x, at[o], obs[o], sensor, h, H, nu)
         for r in range(rows):
             for t in range(rows):
                 s = obs[o, 2 + r] if r == t else 0.0

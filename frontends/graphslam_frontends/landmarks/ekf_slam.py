@@ -11,41 +11,41 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.path_points import PathPoints
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.landmarks.bias_score import bias_score_test
 from graphslam_frontends.landmarks.ekf_config import EkfConfig, EkfSlamConfig
 from graphslam_frontends.landmarks.ekf_filter import EkfMap
 from graphslam_frontends.landmarks.fix_points import (
-    carried_points,
+    expects_fixes,
     fix_points,
-    fixes_awaited,
-    fixes_inside,
-    way_of_fixes,
+    has_fixes,
+    place_fixes,
+    transfer_points,
 )
-from graphslam_frontends.landmarks.prepare import Prepared, Preparing, known_slots, prepare
+from graphslam_frontends.landmarks.prepare import LogPreparation, PreparedLog, known_slots, prepare_log
 from graphslam_frontends.landmarks.snapshot import Snapshot
-from graphslam_frontends.landmarks.stopping import Stopping
-from graphslam_frontends.landmarks.summarise import Smoothed, smooth
-from graphslam_frontends.landmarks.systematic import systematic
+from graphslam_frontends.landmarks.stopping import StoppingRule
+from graphslam_frontends.landmarks.summarise import SmoothingResult, smooth_submap
 
 Ints = npt.NDArray[np.int64]
 OnScan = Callable[[int], None]
 
 
-def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCounter | None) -> Prepared:
-    data = prepare(log, config, drops if drops is not None else DropCounter())
+def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCounter | None) -> PreparedLog:
+    data = prepare_log(log, config, drops if drops is not None else DropCounter())
     _require_bearings(data, log.name)
     return data
 
 
-def _require_bearings(data: Prepared, where: str) -> None:
+def _require_bearings(data: PreparedLog, where: str) -> None:
     if len(data.rows) and not np.any(np.isfinite(data.rows[:, 3])):
         raise MissingDataError(
             "an EKF cannot start a landmark from ranges alone", where=where, wanted="bearings in some observations"
@@ -55,7 +55,7 @@ def _require_bearings(data: Prepared, where: str) -> None:
 class _Run:
     """One EKF map growing from scan ``first`` on, with the path it took."""
 
-    def __init__(self, data: Prepared, config: EkfSlamConfig | EkfConfig, first: int, t_start: float) -> None:
+    def __init__(self, data: PreparedLog, config: EkfSlamConfig | EkfConfig, first: int, t_start: float) -> None:
         obs = data.observations
         self.local = isinstance(config, EkfConfig)
         self.data, self.config, self.first, self.t_start = data, config, first, t_start
@@ -125,10 +125,10 @@ class _Run:
             out |= {"jcbb_nodes": m.nodes, "jcbb_capped_scans": m.capped}
         return out
 
-    def _smoothed(self, places: Array, rows: Ints, landmark: Ints, trim: float) -> Smoothed:
+    def _smoothed(self, places: Array, rows: Ints, landmark: Ints, trim: float) -> SmoothingResult:
         """Gauss-Newton over the submap's poses and landmarks under the filter's association."""
         data, obs, span = self.data, self.data.observations, slice(self.first, self.next)
-        return smooth(
+        return smooth_submap(
             np.array(self.poses),
             places,
             data.odometry.increments[span],
@@ -141,20 +141,20 @@ class _Run:
             min_hits=self.config.min_hits,
         )
 
-    def submap(self, key: int, report: dict[str, Any], feed: Feed | None = None) -> Submap:
+    def submap(self, key: int, report: dict[str, Any], feed: RecordSource | None = None) -> Submap:
         """The filter's own Gaussian as a submap; points of its path at the fixes of a feed are smoothed beside it."""
         slots = self.map.landmarks(self.config.min_hits)
         mean, P = self.map.joint(slots)
         rows, landmark = self.sightings(slots)
         path = np.array(self.poses)
         places = mean[3:].reshape(-1, 2)
-        report |= {"systematic": systematic(self.data, self.first, self.next, rows, landmark, path, places)}
+        report |= {"systematic": bias_score_test(self.data, self.first, self.next, rows, landmark, path, places)}
         times, points = self.data.observations.times[self.first : self.next], None
-        if feed is not None and fixes_inside(feed, self.t_start, times):
+        if feed is not None and has_fixes(feed, self.t_start, times):
             s = self._smoothed(places, rows, landmark, 0.0)
-            way = way_of_fixes(feed, s, self.t_start, times)
+            way = place_fixes(feed, s, self.t_start, times)
             if way is not None and np.all(s.landmark_kept):
-                points = carried_points(fix_points(s, way), s.gaussian, mean, P)
+                points = transfer_points(fix_points(s, way), s.gaussian, mean, P)
         return self._hand_over(
             key,
             Gaussian(mean, P, (2,)),
@@ -165,7 +165,7 @@ class _Run:
             points,
         )
 
-    def smoothed_submap(self, feed: Feed, key: int, report: dict[str, Any], trim: float) -> Submap:
+    def smoothed_submap(self, feed: RecordSource, key: int, report: dict[str, Any], trim: float) -> Submap:
         """The optimum under the filter's association as a submap."""
         obs, c = self.data.observations, self.config
         slots = self.map.landmarks(c.min_hits)
@@ -176,8 +176,8 @@ class _Run:
         index = (np.cumsum(s.landmark_kept) - 1)[landmark[s.kept]]
         used = int(s.kept.sum())
         places = s.gaussian.mean[3:].reshape(-1, 2)
-        report |= {"systematic": systematic(data, self.first, self.next, rows[s.kept], index, s.poses, places)}
-        way = way_of_fixes(feed, s, self.t_start, obs.times[span])
+        report |= {"systematic": bias_score_test(data, self.first, self.next, rows[s.kept], index, s.poses, places)}
+        way = place_fixes(feed, s, self.t_start, obs.times[span])
         counts = self.report(used) | {"not_associated": self.map.observations - len(rows)}
         return self._hand_over(
             key,
@@ -243,7 +243,7 @@ class Ekf(FrontEnd):
 
     def follow(
         self,
-        feed: Feed,
+        feed: RecordSource,
         *,
         seed: SeedTree,
         after: Submap | None = None,
@@ -251,7 +251,7 @@ class Ekf(FrontEnd):
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
         """See :class:`graphslam_frontends.base.FrontEnd`."""
-        data = Preparing(feed, self.config, drops if drops is not None else DropCounter())
+        data = LogPreparation(feed, self.config, drops if drops is not None else DropCounter())
         yield from data.reach(0)
         if data.done:
             _require_bearings(data.prepared, feed.name)
@@ -266,11 +266,11 @@ class Ekf(FrontEnd):
             key, t_start = key + 1, submap.interval[1]
 
     def _build(
-        self, growing: Preparing, key: int, first: int, t_start: float
+        self, growing: LogPreparation, key: int, first: int, t_start: float
     ) -> Generator[None, None, tuple[Submap, int]]:
         """Filter from scan ``first`` until the submap ends; returns it and the next scan."""
         run = _Run(growing.prepared, self.config, first, t_start)
-        stopping = Stopping(self.config.stopping)
+        stopping = StoppingRule(self.config.stopping)
         ended, previous = None, t_start
         while ended is None and (yield from growing.reach(run.next)):
             k, run.data = run.next, growing.prepared
@@ -284,7 +284,7 @@ class Ekf(FrontEnd):
                 ended = "gap"
         run.data = growing.prepared
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
-        while fixes_awaited(growing.feed, float(run.data.observations.times[run.next - 1])):
+        while expects_fixes(growing.feed, float(run.data.observations.times[run.next - 1])):
             yield None
         if self.config.handover == "filter":
             return run.submap(key, report, growing.feed), run.next

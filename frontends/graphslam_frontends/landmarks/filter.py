@@ -17,7 +17,7 @@ from graphslam_frontends.landmarks.kernels import (
     ScanArrays,
     fastslam_step,
 )
-from graphslam_frontends.landmarks.range_only import Start, WaitingRanges
+from graphslam_frontends.landmarks.range_only import BeaconInitialisation, WaitingRanges
 
 Ints = npt.NDArray[np.int64]
 
@@ -167,7 +167,7 @@ class ParticleSet:
             self.log_weight += np.where(ok, start.log_likelihood, -np.inf)
             self._note_past(start)
 
-    def _note_past(self, start: Start) -> None:
+    def _note_past(self, start: BeaconInitialisation) -> None:
         """Note in the history which observations have become sightings of a landmark."""
         self.assoc[:, start.observations] = np.where(start.used & start.solved[:, None], start.slot, IGNORED)
 

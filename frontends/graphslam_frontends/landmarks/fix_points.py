@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.feed import Feed
 from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import (
     Array,
@@ -20,9 +19,10 @@ from graphslam.core.geometry import (
     wrap_angle,
 )
 from graphslam.core.path_points import SAME_TIME, PathPoints
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Gps
 from graphslam_frontends.landmarks.smoothing_kernels import path_covariances
-from graphslam_frontends.landmarks.summarise import Smoothed
+from graphslam_frontends.landmarks.summarise import SmoothingResult
 
 STEP = 1e-5
 """Of the central differences [m, rad]."""
@@ -30,7 +30,7 @@ FLOOR = 1e-4
 """σ that a point has by itself at least [m]."""
 
 
-def fixes_awaited(feed: Feed, until: float) -> bool:
+def expects_fixes(feed: RecordSource, until: float) -> bool:
     """May fixes of a log that grows still come that are older than ``until`` [s]?
 
     What a front end makes must not depend on the portions in which a log comes.
@@ -39,7 +39,7 @@ def fixes_awaited(feed: Feed, until: float) -> bool:
     return not feed.ended and name is not None and feed.until(name) < until
 
 
-def fixes_inside(feed: Feed, t_start: float, times: Array) -> bool:
+def has_fixes(feed: RecordSource, t_start: float, times: Array) -> bool:
     """Was any fix taken between the ends of a submap?"""
     name = feed.of_type(Gps)
     if name is None:
@@ -48,7 +48,7 @@ def fixes_inside(feed: Feed, t_start: float, times: Array) -> bool:
     return bool(np.any((t > t_start + SAME_TIME) & (t < times[-1] - SAME_TIME)))
 
 
-def carried_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, joint: Array) -> PathPoints | None:
+def transfer_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, joint: Array) -> PathPoints | None:
     """Points beside another Gaussian over exit and landmarks than the smoothed one that they were made with.
 
     What exit and landmarks tell of the points stays as it is; what they are themselves, the other Gaussian says.
@@ -67,7 +67,7 @@ def carried_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, j
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class FixPlacement:
     """Where fixes were taken on a smoothed path: on the arc from pose ``at`` to the next (-1: from the base).
 
     Parameters
@@ -92,7 +92,7 @@ class Way:
     by_second: Array
 
 
-def way_of_fixes(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -> Way | None:
+def place_fixes(feed: RecordSource, smoothed: SmoothingResult, t_start: float, times: Array) -> FixPlacement | None:
     """Where the fixes inside a submap were taken; None where none was taken, or none has come yet.
 
     Parameters
@@ -103,7 +103,7 @@ def way_of_fixes(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -
         Of the smoothed poses [s].
     """
     name = feed.of_type(Gps)
-    if name is None or not fixes_inside(feed, t_start, times):
+    if name is None or not has_fixes(feed, t_start, times):
         return None
     gps: Gps = feed.part(name)  # type: ignore[assignment]
     inside = (gps.times > t_start + SAME_TIME) & (gps.times < times[-1] - SAME_TIME)
@@ -132,10 +132,10 @@ def way_of_fixes(feed: Feed, smoothed: Smoothed, t_start: float, times: Array) -
             G[end, :, :, c] = (moved[0] - moved[1]) / (2.0 * STEP)
     G[0, k == 0] = 0.0  # the base is held
     at = (k - 1).astype(np.int64)
-    return Way(at_fixes, lever, at, share[:, 0], antenna(poses[k], poses[k + 1]), G[0], G[1])
+    return FixPlacement(at_fixes, lever, at, share[:, 0], antenna(poses[k], poses[k + 1]), G[0], G[1])
 
 
-def fix_points(smoothed: Smoothed, way: Way) -> PathPoints:
+def fix_points(smoothed: SmoothingResult, way: FixPlacement) -> PathPoints:
     """Points of a submap's path at the fixes inside it.
 
     Between two scans the path is the arc from one pose to the next, and what it does besides has the variance of a

@@ -23,11 +23,11 @@ from graphslam_frontends.landmarks.measurement_kernels import (
     inverse_innovation,
     landmark_block,
     log_2pi_channels,
-    observe,
+    observe_landmark,
     pose_block,
     pose_update,
-    sample,
-    wrap,
+    sample_pose,
+    wrap_angle_kernel,
 )
 
 # Association outcome of one observation, as stored in ``assoc`` (slots are ≥ 0)
@@ -148,7 +148,7 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
     for j in range(count):
         polar[j, 0] = -1.0
         if hits[j] > 0 and (mean[j, 0] - m[0]) ** 2 + (mean[j, 1] - m[1]) ** 2 <= far2:
-            observe(m[0], m[1], m[2], sensor, mean[j, 0], mean[j, 1], h)
+            observe_landmark(m[0], m[1], m[2], sensor, mean[j, 0], mean[j, 1], h)
             polar[j, 0], polar[j, 1] = h[0], h[1]
             b = int((h[1] + math.pi) / TWO_PI * BUCKETS) % BUCKETS
             link[j] = head[b]
@@ -173,12 +173,12 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
         for b in range(lo, hi + 1):
             j = head[b % BUCKETS]
             while j >= 0:
-                if abs(polar[j, 0] - r) <= rwin and abs(wrap(polar[j, 1] - be)) <= bwin:
-                    observe(m[0], m[1], m[2], sensor, mean[j, 0], mean[j, 1], h)
+                if abs(polar[j, 0] - r) <= rwin and abs(wrap_angle_kernel(polar[j, 1] - be)) <= bwin:
+                    observe_landmark(m[0], m[1], m[2], sensor, mean[j, 0], mean[j, 1], h)
                     p00, p01, p11 = pose_block(h, P)
                     l00, l01, l11 = landmark_block(h, cov[j, 0], cov[j, 1], cov[j, 2])
                     s00, s01, s11 = p00 + l00 + vr, p01 + l01, p11 + l11 + vb
-                    n0, n1 = r - h[0], wrap(be - h[1])
+                    n0, n1 = r - h[0], wrap_angle_kernel(be - h[1])
                     if math.isinf(vb):
                         det = s00
                         d2 = n0 * n0 / s00
@@ -246,10 +246,10 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
         c, s = math.cos(pose[i, 2]), math.sin(pose[i, 2])
         m[0] = pose[i, 0] + c * u[0] - s * u[1]
         m[1] = pose[i, 1] + s * u[0] + c * u[1]
-        m[2] = wrap(pose[i, 2] + u[2])
+        m[2] = wrap_angle_kernel(pose[i, 2] + u[2])
         P[:] = Q
         if cfg[CFG_PROPOSAL_2] < 0.5:
-            sample(m, P, normals[i], L)  # FastSLAM 1.0: the proposal is the motion prior
+            sample_pose(m, P, normals[i], L)  # FastSLAM 1.0: the proposal is the motion prior
             P[:] = 0.0
         if by_identity:
             for o in range(n_obs):
@@ -271,12 +271,12 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
                     gate = _of_channels(vb, cfg[CFG_GATE], cfg[CFG_GATE_1])
                     log_weight[i] -= 0.5 * gate + log_2pi + 0.5 * math.log(_of_channels(vb, vr * vb, vr))
                 continue
-            observe(m[0], m[1], m[2], sensor, mean[i, j, 0], mean[i, j, 1], h)
+            observe_landmark(m[0], m[1], m[2], sensor, mean[i, j, 0], mean[i, j, 1], h)
             p00, p01, p11 = pose_block(h, P)
             l00, l01, l11 = landmark_block(h, cov[i, j, 0], cov[i, j, 1], cov[i, j, 2])
             s00, s01, s11 = p00 + l00 + vr, p01 + l01, p11 + l11 + vb
             i00, i01, i11, det = inverse_innovation(s00, s01, s11)
-            n0, n1 = obs[o, 0] - h[0], wrap(obs[o, 1] - h[1])
+            n0, n1 = obs[o, 0] - h[0], wrap_angle_kernel(obs[o, 1] - h[1])
             d2 = i00 * n0 * n0 + 2.0 * i01 * n0 * n1 + i11 * n1 * n1
             limit = _of_channels(vb, cfg[CFG_OUTLIER], cfg[CFG_OUTLIER_1])
             if by_identity and d2 > limit:  # the likelihood is cut off at the gate, so an outlier decides nothing
@@ -287,14 +287,14 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
             if cfg[CFG_PROPOSAL_2] > 0.5:
                 pose_update(m, P, h, n0, n1, i00, i01, i11)
         if cfg[CFG_PROPOSAL_2] > 0.5:
-            sample(m, P, normals[i], L)
+            sample_pose(m, P, normals[i], L)
         pose[i] = m
         # map: each feature an EKF given the sampled path (B1)
         for o in range(n_obs):
             vr, vb = obs[o, 2], obs[o, 3]
             j = match[o]
             if j >= 0:
-                observe(m[0], m[1], m[2], sensor, mean[i, j, 0], mean[i, j, 1], h)
+                observe_landmark(m[0], m[1], m[2], sensor, mean[i, j, 0], mean[i, j, 1], h)
                 c0, c1, c2 = cov[i, j, 0], cov[i, j, 1], cov[i, j, 2]
                 l00, l01, l11 = landmark_block(h, c0, c1, c2)
                 s00, s01, s11 = l00 + vr, l01, l11 + vb
@@ -303,7 +303,7 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
                 g10, g11 = c1 * h[8] + c2 * h[9], c1 * h[10] + c2 * h[11]
                 k00, k01 = g00 * i00 + g01 * i01, g00 * i01 + g01 * i11
                 k10, k11 = g10 * i00 + g11 * i01, g10 * i01 + g11 * i11
-                n0, n1 = obs[o, 0] - h[0], wrap(obs[o, 1] - h[1])
+                n0, n1 = obs[o, 0] - h[0], wrap_angle_kernel(obs[o, 1] - h[1])
                 mean[i, j, 0] += k00 * n0 + k01 * n1
                 mean[i, j, 1] += k10 * n0 + k11 * n1
                 cov[i, j, 0] = c0 - (k00 * g00 + k01 * g01)

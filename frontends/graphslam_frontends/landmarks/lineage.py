@@ -15,13 +15,13 @@ from graphslam.core.geometry import Array
 from graphslam_frontends.landmarks.config import FilterConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.kernels import IGNORED
-from graphslam_frontends.landmarks.range_only import Start
+from graphslam_frontends.landmarks.range_only import BeaconInitialisation
 from graphslam_frontends.landmarks.summarise import majority_slots
 
 Ints = npt.NDArray[np.int64]
 
 
-class WholeMapParticles(ParticleSet):
+class SingleMapParticles(ParticleSet):
     """N particles over a whole log.
 
     Parameters
@@ -69,7 +69,7 @@ class WholeMapParticles(ParticleSet):
             self._slots[rows] = self.assoc[:, :n_obs].T
             self._scan_of[rows] = self.scans
 
-    def _note_past(self, start: Start) -> None:
+    def _note_past(self, start: BeaconInitialisation) -> None:
         pass  # with known identities no history of associations is kept, and without them no range waits
 
     def _resample(self, survivors: Ints) -> None:

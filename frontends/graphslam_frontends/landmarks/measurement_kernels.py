@@ -18,13 +18,13 @@ LOG_2PI = math.log(TWO_PI)
 
 
 @njit(inline="always")
-def wrap(a):
+def wrap_angle_kernel(a):
     """Angle to (-π, π]."""
     return math.pi - (math.pi - a) % TWO_PI
 
 
 @njit(error_model="numpy")
-def observe(x, y, th, sensor, lx, ly, out):
+def observe_landmark(x, y, th, sensor, lx, ly, out):
     """Range, bearing and their Jacobians for a landmark (lx, ly) seen from pose (x, y, th) with ``sensor (3,)``.
 
     out[0:2] range, bearing; out[2:8] rows of ∂/∂ξ (right tangent of the pose); out[8:12] rows of ∂/∂l.
@@ -38,7 +38,7 @@ def observe(x, y, th, sensor, lx, ly, out):
     ux, uy = dx / r, dy / r
     ex, ey = c * ux + s * uy, -s * ux + c * uy  # line of sight in the body frame
     out[0] = r
-    out[1] = wrap(math.atan2(dy, dx) - th - ath)
+    out[1] = wrap_angle_kernel(math.atan2(dy, dx) - th - ath)
     out[2], out[3], out[4] = -ex, -ey, ex * ay - ey * ax
     out[5], out[6], out[7] = ey / r, -ex / r, (-ey * ay - ex * ax) / r - 1.0
     out[8], out[9], out[10], out[11] = ux, uy, -uy / r, ux / r
@@ -85,16 +85,16 @@ def pose_update(m, P, h, nu0, nu1, i00, i01, i11):
     for r in range(3):  # keep it symmetric: rounding must not accumulate over many features
         for q in range(r):
             P[r, q] = P[q, r] = 0.5 * (P[r, q] + P[q, r])
-    retract(m, K[0, 0] * nu0 + K[0, 1] * nu1, K[1, 0] * nu0 + K[1, 1] * nu1, K[2, 0] * nu0 + K[2, 1] * nu1)
+    retract_pose(m, K[0, 0] * nu0 + K[0, 1] * nu1, K[1, 0] * nu0 + K[1, 1] * nu1, K[2, 0] * nu0 + K[2, 1] * nu1)
 
 
 @njit(inline="always")
-def retract(m, dx, dy, dth):
+def retract_pose(m, dx, dy, dth):
     """``m ← m ∘ (dx, dy, dθ)``; first-order retraction, equal to Exp to the order of the filter."""
     c, s = math.cos(m[2]), math.sin(m[2])
     m[0] += c * dx - s * dy
     m[1] += s * dx + c * dy
-    m[2] = wrap(m[2] + dth)
+    m[2] = wrap_angle_kernel(m[2] + dth)
 
 
 @njit(error_model="numpy")
@@ -113,10 +113,10 @@ def cholesky3(P, L):
 
 
 @njit(error_model="numpy")
-def sample(m, P, z, L):
+def sample_pose(m, P, z, L):
     """``m ← m ∘ L z`` with P = L Lᵀ and z standard normal."""
     cholesky3(P, L)
-    retract(m, L[0, 0] * z[0], L[1, 0] * z[0] + L[1, 1] * z[1], L[2, 0] * z[0] + L[2, 1] * z[1] + L[2, 2] * z[2])
+    retract_pose(m, L[0, 0] * z[0], L[1, 0] * z[0] + L[1, 1] * z[1], L[2, 0] * z[0] + L[2, 1] * z[1] + L[2, 2] * z[2])
 
 
 @njit(inline="always")

@@ -24,7 +24,7 @@ from graphslam.core.records import Odometry, PointObservations
 from graphslam.core.se3 import quat_to_matrix, se3_compose, se3_transform
 from graphslam.core.submap import LandmarkMap, Submap, turned_covariance
 from graphslam.core.trajectory import Trajectory
-from graphslam.linear.space_maps import ORIGIN, Placed, SpaceMap, minimise
+from graphslam.linear.space_maps import ORIGIN, PlacedMap, SpaceMap, minimise_space_maps
 from graphslam_frontends.base import FrontEnd, Watch
 from graphslam_frontends.odometry.motion import MotionNoise
 from graphslam_frontends.odometry.recorded import cut_odometry
@@ -196,7 +196,7 @@ class _Smoothing:
             step = self.steps.increments[self.first + 1 + k]
             own = turned_covariance(quat_to_matrix(step[3:]), self.steps.covariances[self.first + 1 + k])
             one = SpaceMap(step[None], NO_POINTS, NONE, sp.csr_matrix(np.linalg.inv(own)))
-            maps.append(Placed(one, k - 1 if k else ORIGIN, np.array([k]), NONE))
+            maps.append(PlacedMap(one, k - 1 if k else ORIGIN, np.array([k]), NONE))
             here = se3_compose(here, step)
             poses.append(here)
         whole = np.vstack([SE3.identity, poses])
@@ -208,8 +208,8 @@ class _Smoothing:
             seen = SpaceMap(
                 NO_POSES, places[rows], np.full(len(rows), ORIGIN), sp.block_diag(list(information[rows]), format="csr")
             )
-            maps.append(Placed(seen, k if k >= 0 else ORIGIN, NONE, mark[rows]))
-        return minimise(maps, np.array(poses), start, rtol=1e-10)
+            maps.append(PlacedMap(seen, k if k >= 0 else ORIGIN, NONE, mark[rows]))
+        return minimise_space_maps(maps, np.array(poses), start, rtol=1e-10)
 
     @staticmethod
     def _squared(poses: Array, points: Array, pose: Ints, mark: Ints, places: Array, information: Array) -> Array:

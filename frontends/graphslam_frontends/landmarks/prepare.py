@@ -14,20 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry
 from graphslam_frontends.detectors.trees import TreeDetectorConfig, detect_trees
 from graphslam_frontends.landmarks.config import RangeBearingNoise
 from graphslam_frontends.odometry.motion import Motion, MotionNoise, motion_stream, motion_stream_name
-from graphslam_frontends.odometry.motion_gaps import SHORTEST, MotionGap, bridged_reckoning, certain_until
+from graphslam_frontends.odometry.motion_gaps import SHORTEST, MotionGap, dead_reckon_over_gaps, final_until
 
 Ints = npt.NDArray[np.int64]
 
 
 class PrepareConfig(Protocol):
-    """What :func:`prepare` reads of a front end's configuration."""
+    """What :func:`prepare_log` reads of a front end's configuration."""
 
     @property
     def association(self) -> str:
@@ -63,7 +63,7 @@ class PrepareConfig(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Prepared:
+class PreparedLog:
     """A log made ready for a filter.
 
     Parameters
@@ -149,7 +149,7 @@ def landmark_stream(log: SensorLog, detector: TreeDetectorConfig) -> tuple[str, 
     return stream, detect_trees(log[stream], detector)
 
 
-def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepared:
+def prepare_log(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> PreparedLog:
     """Detect, drop what cannot be used (counted), and integrate the motion between scans.
 
     Parameters
@@ -159,32 +159,32 @@ def prepare(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Prepar
     drops : DropCounter
         Where scans and observations that are not used are counted.
     """
-    made = Preparing(Feed(log), config, drops)
+    made = LogPreparation(RecordSource(log), config, drops)
     made.advance()
     return made.prepared
 
 
-class Preparing:
-    """What :func:`prepare` makes of a log, while its records come.
+class LogPreparation:
+    """What :func:`prepare_log` makes of a log, while its records come.
 
     The streams that are worked on are those that are there when the first scan can be made ready.
 
     Parameters
     ----------
     config, drops
-        As in :func:`prepare`.
+        As in :func:`prepare_log`.
     """
 
-    def __init__(self, feed: Feed, config: PrepareConfig, drops: DropCounter) -> None:
+    def __init__(self, feed: RecordSource, config: PrepareConfig, drops: DropCounter) -> None:
         self.feed, self.config, self.drops = feed, config, drops
-        self.made: Prepared | None = None
+        self.made: PreparedLog | None = None
         self.done = False
         """Is the log at its end, and all of it made ready?"""
         self._streams: tuple[str, str] | None = None
         self._taken, self._rows = 0, 0  # scans and observations of the stream
 
     @property
-    def prepared(self) -> Prepared:
+    def prepared(self) -> PreparedLog:
         """All scans so far; there is one at least."""
         assert self.made is not None
         return self.made
@@ -209,13 +209,13 @@ class Preparing:
         if len(motion.times) == 0:
             raise MissingDataError("motion stream is empty", where=self.feed.name)
         if not ended:
-            n = int(np.searchsorted(part.times, certain_until(motion), side="right"))
+            n = int(np.searchsorted(part.times, final_until(motion), side="right"))
             if n == 0:
                 return False
             part = part if n == len(part.times) else part.take(slice(0, n))
         self._taken += len(part.times)
         self._take(part, motion_name, motion, stream, ended)
-        self.feed.let_go(stream, self._taken)
+        self.feed.discard_before(stream, self._taken)
         self.done = ended
         return True
 
@@ -290,7 +290,7 @@ class Preparing:
             float(min(motion.times[0], scans.times[0])) if before is None else float(before.observations.times[-1])
         )
         stamps = scans.times if t_start == scans.times[0] else np.concatenate([[t_start], scans.times])
-        odometry, _, gaps = bridged_reckoning(
+        odometry, _, gaps = dead_reckon_over_gaps(
             SensorLog(name=self.feed.name, streams={motion_name: motion}),
             stamps,
             config.motion,
@@ -304,7 +304,7 @@ class Preparing:
         told = np.isfinite(filter_var[:, 1])
         each = np.column_stack([filter_var[:, 0], np.where(told, filter_var[:, 1], 0.0), told])
         sums = np.cumsum(np.concatenate([np.zeros((1, 3)) if before is None else before.noise[-1:], each]), axis=0)
-        new = Prepared(
+        new = PreparedLog(
             scans,
             original,
             rows,
@@ -320,7 +320,7 @@ class Preparing:
         self.made = new if before is None else _behind(before, new)
 
 
-def _behind(a: Prepared, b: Prepared) -> Prepared:
+def _behind(a: PreparedLog, b: PreparedLog) -> PreparedLog:
     """The scans of two, one behind the other."""
     x, y = a.observations, b.observations
     observations = replace(
@@ -338,7 +338,7 @@ def _behind(a: Prepared, b: Prepared) -> Prepared:
         covariances=np.concatenate([a.odometry.covariances, b.odometry.covariances]),
     )
     known = {g.begin for g in a.gaps}
-    return Prepared(
+    return PreparedLog(
         observations,
         np.concatenate([a.original, b.original]),
         np.concatenate([a.rows, b.rows]),

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array
-from graphslam_frontends.landmarks.config import DelayedStart
+from graphslam_frontends.landmarks.config import DelayedInitialisation
 from graphslam_frontends.landmarks.range_only_kernels import (
     FIT_LENGTH,
     FIT_LOG_LIKELIHOOD,
@@ -30,8 +30,8 @@ from graphslam_frontends.landmarks.range_only_kernels import (
     FIT_Y,
     FIT_YY,
     circle_starts,
-    trilaterate,
-    trilaterate_all,
+    trilaterate_all_kernel,
+    trilaterate_kernel,
 )
 
 Ints = npt.NDArray[np.int64]
@@ -40,7 +40,7 @@ _GROWTH = 1.2  # a beacon that could not start is tried again with a fifth more 
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class BeaconInitialisation:
     """A beacon becomes a landmark.
 
     Parameters
@@ -76,7 +76,7 @@ class WaitingRanges:
         χ² gate (1 dof) beyond which a range is an outlier of the fit; inf = none is.
     """
 
-    def __init__(self, particles: int, config: DelayedStart, limit: float) -> None:
+    def __init__(self, particles: int, config: DelayedInitialisation, limit: float) -> None:
         self.config, self.limit = config, limit
         self._slot = np.zeros(0, dtype=np.int64)
         self._observation = np.zeros(0, dtype=np.int64)
@@ -128,7 +128,7 @@ class WaitingRanges:
         self._tried.pop(slot, None)
         return int((~keep).sum())
 
-    def ready(self, slots: Ints, weights: Array) -> Iterator[Start]:
+    def ready(self, slots: Ints, weights: Array) -> Iterator[BeaconInitialisation]:
         """Beacons among ``slots`` that can start now; what they were made of no longer waits.
 
         Parameters
@@ -150,14 +150,14 @@ class WaitingRanges:
             # by the noise of the motion, so theirs are near
             starts = circle_starts(z[0][best], z[1], self.limit)
             fit, used, minima = np.empty(FIT_LENGTH), np.zeros(len(rows), dtype=np.bool_), np.empty((len(starts), 3))
-            found = trilaterate(z[0][best], z[1], z[2], self.limit, starts, fit, used, minima)
+            found = trilaterate_kernel(z[0][best], z[1], z[2], self.limit, starts, fit, used, minima)
             if not found or not self._good(fit[None], len(rows))[0]:
                 continue
             n = len(weights)
             fits, used, solved = np.full((n, FIT_LENGTH), np.nan), np.zeros((n, len(rows)), bool), np.zeros(n, bool)
-            trilaterate_all(*z, self.limit, np.ascontiguousarray(minima[:found, :2]), fits, used, solved)
+            trilaterate_all_kernel(*z, self.limit, np.ascontiguousarray(minima[:found, :2]), fits, used, solved)
             if float(weights[solved & self._good(fits, len(rows))].sum()) >= c.support:
-                start = Start(
+                start = BeaconInitialisation(
                     slot=slot,
                     observations=self._observation[rows],
                     used=used,

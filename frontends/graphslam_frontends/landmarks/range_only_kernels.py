@@ -100,7 +100,7 @@ def circle_starts(anchors, ranges, limit):
 
 
 @njit(error_model="numpy")
-def trilaterate(anchors, ranges, variances, limit, starts, fit, used, minima):
+def trilaterate_kernel(anchors, ranges, variances, limit, starts, fit, used, minima):
     """Beacon seen at ``ranges`` (k,) with ``variances`` (k,) from ``anchors`` (k, 2); ranges with d² > limit go unused.
 
     Descends from every one of starts (m, 2). Fills fit (FIT_LENGTH): position, covariance, χ² of the inliers, margin by
@@ -160,8 +160,9 @@ def trilaterate(anchors, ranges, variances, limit, starts, fit, used, minima):
 
 
 @njit(error_model="numpy")
-def trilaterate_all(anchors, ranges, variances, limit, starts, fits, used, solved):
-    """:func:`trilaterate` for every particle: anchors (n, k, 2), fits (n, FIT_LENGTH), used (n, k), solved (n,)."""
+def trilaterate_all_kernel(anchors, ranges, variances, limit, starts, fits, used, solved):
+    """:func:`trilaterate_kernel` for every particle: anchors (n, k, 2), fits (n, FIT_LENGTH), used (n, k), solved
+    (n,)."""
     minima = np.empty((len(starts), 3))
     for i in range(len(anchors)):
-        solved[i] = trilaterate(anchors[i], ranges, variances, limit, starts, fits[i], used[i], minima) > 0
+        solved[i] = trilaterate_kernel(anchors[i], ranges, variances, limit, starts, fits[i], used[i], minima) > 0

@@ -10,24 +10,24 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError
-from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.landmarks.bias_score import bias_score_test
 from graphslam_frontends.landmarks.config import RbpfEkfConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
-from graphslam_frontends.landmarks.fix_points import fix_points, fixes_awaited, way_of_fixes
-from graphslam_frontends.landmarks.honesty import distance, flag, particle_gaussians
-from graphslam_frontends.landmarks.lasting import lasting_errors
-from graphslam_frontends.landmarks.prepare import Preparing, known_slots, landmark_stream
-from graphslam_frontends.landmarks.rivals import SubmapProblem, settle_rivals
-from graphslam_frontends.landmarks.stopping import Stopping
-from graphslam_frontends.landmarks.summarise import Smoothed, winning_association
-from graphslam_frontends.landmarks.systematic import systematic
+from graphslam_frontends.landmarks.fix_points import expects_fixes, fix_points, place_fixes
+from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem, resolve_mirror_ambiguity
+from graphslam_frontends.landmarks.moment_consistency import consistency_flag, gaussian_discrepancy, particle_gaussians
+from graphslam_frontends.landmarks.prepare import LogPreparation, known_slots, landmark_stream
+from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases
+from graphslam_frontends.landmarks.stopping import StoppingRule
+from graphslam_frontends.landmarks.summarise import SmoothingResult, winning_association
 
 Ints = npt.NDArray[np.int64]
 
@@ -44,7 +44,7 @@ class RbpfEkf(FrontEnd):
 
     def follow(
         self,
-        feed: Feed,
+        feed: RecordSource,
         *,
         seed: SeedTree,
         after: Submap | None = None,
@@ -56,13 +56,13 @@ class RbpfEkf(FrontEnd):
             yield None if found is None else found[0]
 
     def with_particles(
-        self, feed: Feed, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
+        self, feed: RecordSource, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[tuple[Submap, ParticleSet] | None]:
         """The submaps of :meth:`follow`, each with the particles it was made of as they stood at its last scan.
 
         To look at; with pooled filters those of the one that decides.
         """
-        data = Preparing(feed, self.config, drops if drops is not None else DropCounter())
+        data = LogPreparation(feed, self.config, drops if drops is not None else DropCounter())
         yield from data.reach(0)
         if after is None:
             key, scan, t_start = 0, 0, data.prepared.t_start
@@ -81,7 +81,7 @@ class RbpfEkf(FrontEnd):
         return landmark_stream(log, self.config.detector)
 
     def _build(
-        self, growing: Preparing, key: int, first: int, t_start: float, seed: SeedTree
+        self, growing: LogPreparation, key: int, first: int, t_start: float, seed: SeedTree
     ) -> Generator[None, None, tuple[Submap, ParticleSet, int]]:
         """Filter from scan ``first`` until the submap ends; returns it, its particles and the next scan."""
         c, obs = self.config, growing.prepared.observations
@@ -91,7 +91,7 @@ class RbpfEkf(FrontEnd):
             ParticleSet(c, obs.T_base_sensor, obs.field_of_view, miss_range, branch.generator()) for branch in branches
         ]
         particles = filters[0]  # it decides alone; the others only watch
-        stopping = Stopping(c.stopping)
+        stopping = StoppingRule(c.stopping)
         slots: dict[int, int] = {}
         ended, scan = None, first
         previous = t_start
@@ -109,7 +109,7 @@ class RbpfEkf(FrontEnd):
             if data.splits(scan):
                 ended = "gap"
         report: dict[str, Any] = {"ended": ended or "end-of-log"}
-        while fixes_awaited(growing.feed, float(growing.prepared.observations.times[scan - 1])):
+        while expects_fixes(growing.feed, float(growing.prepared.observations.times[scan - 1])):
             yield None
         made = self._summarise(growing, filters, key, first, scan, t_start, slots, report)
         return made, particles, scan
@@ -122,7 +122,7 @@ class RbpfEkf(FrontEnd):
 
     def _summarise(
         self,
-        growing: Preparing,
+        growing: LogPreparation,
         filters: list[ParticleSet],
         key: int,
         first: int,
@@ -140,7 +140,7 @@ class RbpfEkf(FrontEnd):
         best = particles.best
         z = np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]])
         span = slice(first, last)
-        problem = SubmapProblem(
+        problem = SmoothingProblem(
             increments=data.odometry.increments[span],
             covariances=data.odometry.covariances[span],
             ob_pose=scan_of,
@@ -152,7 +152,7 @@ class RbpfEkf(FrontEnd):
         )
         smoothed = problem.smooth(particles.path[best, : last - first], particles.mean[best, association.slots])
         if not data.has_bearing.all():
-            settled = settle_rivals(problem, smoothed, c.delayed)
+            settled = resolve_mirror_ambiguity(problem, smoothed, c.delayed)
             smoothed = settled.smoothed
             report |= {
                 "beacons_without_landmark": len(particles.waiting.slots),
@@ -163,9 +163,9 @@ class RbpfEkf(FrontEnd):
             }
         slot_of = association.slots[smoothed.landmark_kept]
         made = particle_gaussians(filters, association, smoothed, inflate=c.moment_inflation)
-        report |= distance("moment", made.moments, smoothed.gaussian)
+        report |= gaussian_discrepancy("moment", made.moments, smoothed.gaussian)
         if c.pooled:
-            report |= distance("pooled", made.pooled, smoothed.gaussian) | {
+            report |= gaussian_discrepancy("pooled", made.pooled, smoothed.gaussian) | {
                 "dropped_filters": made.dropped_filters,
                 "pooled_filters": c.pooled - made.dropped_filters,
             }
@@ -194,7 +194,7 @@ class RbpfEkf(FrontEnd):
             "nonlinearity": smoothed.nonlinearity() / len(smoothed.gaussian.mean),
             "unknowns": len(smoothed.gaussian.mean),
         }
-        report["flag"] = flag(report, c.particles)
+        report["flag"] = consistency_flag(report, c.particles)
         handed = {"smoothed": smoothed.gaussian, "moments": made.moments, "pooled": made.pooled}[c.handover]
         if handed is None:
             raise CovarianceError(f"submap {key}: too few particles hold the common features, nothing to moment-match")
@@ -203,13 +203,13 @@ class RbpfEkf(FrontEnd):
         lm_index = (np.cumsum(smoothed.landmark_kept) - 1)[association.landmark[smoothed.kept]]
         places = smoothed.gaussian.mean[3:].reshape(-1, 2)
         used = rows[smoothed.kept]
-        report["systematic"] = systematic(data, first, last, used, lm_index, smoothed.poses, places)
+        report["systematic"] = bias_score_test(data, first, last, used, lm_index, smoothed.poses, places)
         whole = c.handover == "smoothed"
-        way = way_of_fixes(growing.feed, smoothed, t_start, obs.times[span]) if whole else None
+        way = place_fixes(growing.feed, smoothed, t_start, obs.times[span]) if whole else None
         lasting = None
         if whole and c.lasting is not None:
             seconds = np.diff(obs.times[span], prepend=t_start)
-            lasting = lasting_errors(c.lasting, smoothed, seconds, way, base=t_start < obs.times[first])
+            lasting = estimate_sensor_biases(c.lasting, smoothed, seconds, way, base=t_start < obs.times[first])
             report["lasting"] = [n for n in lasting.names if n]
         landmarks = LandmarkMap(
             ids=ids,
@@ -237,7 +237,7 @@ class RbpfEkf(FrontEnd):
         )
 
 
-def _trajectory(t_start: float, times: Array, smoothed: Smoothed) -> Trajectory:
+def _trajectory(t_start: float, times: Array, smoothed: SmoothingResult) -> Trajectory:
     """Path in the base frame; the base itself stands first, exactly known, unless the first scan is the base."""
     if t_start < times[0]:
         return Trajectory(

@@ -21,25 +21,25 @@ from graphslam.core.records import LandmarkObservations
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import FrontEnd, Watch
+from graphslam_frontends.landmarks.bias_score import bias_score_test
 from graphslam_frontends.landmarks.config import RbpfSlamConfig
-from graphslam_frontends.landmarks.lineage import WholeMapParticles
-from graphslam_frontends.landmarks.prepare import Prepared, known_slots, landmark_stream, prepare
+from graphslam_frontends.landmarks.lineage import SingleMapParticles
+from graphslam_frontends.landmarks.prepare import PreparedLog, known_slots, landmark_stream, prepare_log
 from graphslam_frontends.landmarks.snapshot import Snapshot
 from graphslam_frontends.landmarks.summarise import REGULARISER, Moments
-from graphslam_frontends.landmarks.systematic import systematic
 
 Ints = npt.NDArray[np.int64]
 Joint = Literal["never", "last", "all"]
 
 
-class WholeMapFilter:
+class SingleMapFilter:
     """The filter of one log, scan by scan."""
 
-    def __init__(self, data: Prepared, config: RbpfSlamConfig, rng: np.random.Generator) -> None:
+    def __init__(self, data: PreparedLog, config: RbpfSlamConfig, rng: np.random.Generator) -> None:
         obs = data.observations
         self.data, self.config = data, config
         miss_range = 0.9 * min(config.max_range, obs.max_range)
-        self.particles = WholeMapParticles(config, obs.T_base_sensor, obs.field_of_view, miss_range, rng)
+        self.particles = SingleMapParticles(config, obs.T_base_sensor, obs.field_of_view, miss_range, rng)
         self.slot_of: dict[int, int] = {}
         """Slot of every identity, where they are known."""
 
@@ -103,11 +103,11 @@ def rbpf_snapshots(
     """
     if joint not in ("last", "all", "never"):
         raise ConfigError(f"joint = {joint!r}; known: last, all, never")
-    data = prepare(log, config, drops if drops is not None else DropCounter())
+    data = prepare_log(log, config, drops if drops is not None else DropCounter())
     at = [int(c) for c in cuts]
     if any(b <= a for a, b in zip([0, *at], at)) or (at and at[-1] > len(data)):
         raise ConfigError(f"cuts must increase from 1 to the log's {len(data)} scans, got {at[:3]} … {at[-1:]}")
-    filter = WholeMapFilter(data, config, seed.generator())
+    filter = SingleMapFilter(data, config, seed.generator())
     for k, cut in enumerate(at):
         while filter.particles.scans < cut:
             filter.advance()
@@ -135,15 +135,15 @@ class RbpfSlam(FrontEnd):
     ) -> Iterator[Submap]:
         """See :class:`graphslam_frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
         if after is None:
-            data = prepare(log, self.config, drops if drops is not None else DropCounter())
+            data = prepare_log(log, self.config, drops if drops is not None else DropCounter())
             yield self._build(data, seed.child(0))
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
         """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans)."""
         return landmark_stream(log, self.config.detector)
 
-    def _build(self, data: Prepared, seed: SeedTree) -> Submap:
-        filter = WholeMapFilter(data, self.config, seed.generator())
+    def _build(self, data: PreparedLog, seed: SeedTree) -> Submap:
+        filter = SingleMapFilter(data, self.config, seed.generator())
         p, times = filter.particles, data.observations.times
         while p.scans < len(times):
             filter.advance()
@@ -169,7 +169,7 @@ class RbpfSlam(FrontEnd):
         report |= {"used": len(used), "not_associated": p.observations - len(used)}
         path = _trajectory(filter)
         poses = path.poses[len(path) - len(times) :]
-        report["systematic"] = systematic(data, 0, len(times), used, landmark, poses, end.landmarks)
+        report["systematic"] = bias_score_test(data, 0, len(times), used, landmark, poses, end.landmarks)
         sightings = np.column_stack([data.original[used], landmark])
         landmarks = LandmarkMap(
             ids=end.landmark_ids,
@@ -187,7 +187,7 @@ class RbpfSlam(FrontEnd):
             report=report,
         )
 
-    def _associated(self, filter: WholeMapFilter, slots: Ints) -> tuple[Ints, Ints]:
+    def _associated(self, filter: SingleMapFilter, slots: Ints) -> tuple[Ints, Ints]:
         """Observations of the landmarks handed over, as the standard particle has them, and the landmark of each."""
         p = filter.particles
         rank = np.full(p.hits.shape[1] + 1, -1, dtype=np.int64)  # its last entry serves slot -1
@@ -203,7 +203,7 @@ class RbpfSlam(FrontEnd):
         return used, landmark[used]
 
 
-def _trajectory(filter: WholeMapFilter) -> Trajectory:
+def _trajectory(filter: SingleMapFilter) -> Trajectory:
     """Mean path of the particles that are left, with their scatter; the base stands first, exactly known."""
     p, times, t_start = filter.particles, filter.data.observations.times, filter.data.t_start
     paths, w = p.paths(), p.weights

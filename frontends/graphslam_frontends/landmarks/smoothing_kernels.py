@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graphslam.core.jit import njit
-from graphslam_frontends.landmarks.measurement_kernels import observe, wrap
+from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, wrap_angle_kernel
 
 
-class Evidence(NamedTuple):
+class SmoothingMeasurements(NamedTuple):
     """What is known of T poses and L landmarks."""
 
     u: Any
@@ -35,7 +35,7 @@ class Evidence(NamedTuple):
     """(3,): T_base_sensor."""
 
 
-class Normal(NamedTuple):
+class NormalBlocks(NamedTuple):
     """Normal equations."""
 
     A: Any
@@ -75,10 +75,10 @@ def _odometry_residual(a, b, u, e):
     """``e = u⁻¹ ∘ (a⁻¹ ∘ b)`` as (x, y, θ), and the between pose a⁻¹ ∘ b in e[3:6]."""
     c, s = math.cos(a[2]), math.sin(a[2])
     dx, dy = b[0] - a[0], b[1] - a[1]
-    bx, by, bt = c * dx + s * dy, -s * dx + c * dy, wrap(b[2] - a[2])
+    bx, by, bt = c * dx + s * dy, -s * dx + c * dy, wrap_angle_kernel(b[2] - a[2])
     c, s = math.cos(u[2]), math.sin(u[2])
     dx, dy = bx - u[0], by - u[1]
-    e[0], e[1], e[2] = c * dx + s * dy, -s * dx + c * dy, wrap(bt - u[2])
+    e[0], e[1], e[2] = c * dx + s * dy, -s * dx + c * dy, wrap_angle_kernel(bt - u[2])
     e[3], e[4], e[5] = bx, by, bt
 
 
@@ -98,8 +98,8 @@ def smoothing_cost(poses, landmarks, evidence, d2, parts):
     total = parts[0]
     for o in range(len(ob)):
         k, j = ob_pose[o], ob_lm[o]
-        observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
-        n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
+        observe_landmark(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
+        n0, n1 = ob[o, 0] - h[0], wrap_angle_kernel(ob[o, 1] - h[1])
         a, b = n0 * n0 / ob[o, 2], n1 * n1 / ob[o, 3]
         d2[o] = a + b
         parts[1] += weight[o] * a
@@ -150,8 +150,8 @@ def _linearise(poses, landmarks, evidence, normal):
         if weight[o] == 0.0:
             continue
         k, j = ob_pose[o], ob_lm[o]
-        observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
-        n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
+        observe_landmark(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
+        n0, n1 = ob[o, 0] - h[0], wrap_angle_kernel(ob[o, 1] - h[1])
         near = math.sqrt(ob[o, 2])
         if h[0] < near:
             # nearer than its σ a range tells no place: there the bearing's derivative by it, 1/r, has no bound
@@ -222,8 +222,8 @@ def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
     T, n = len(poses), 2 * len(landmarks)
     A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
     H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
-    last_seen = seen_columns(T, n, evidence.ob_pose, evidence.ob_lm)
-    normal = Normal(A, B, C, H, g, gl)
+    last_seen = observed_columns(T, n, evidence.ob_pose, evidence.ob_lm)
+    normal = NormalBlocks(A, B, C, H, g, gl)
     d2, parts = np.empty(len(evidence.ob)), np.empty(3)
     cost = smoothing_cost(poses, landmarks, evidence, d2, parts)
     new_poses, new_lm = np.empty_like(poses), np.empty_like(landmarks)
@@ -249,7 +249,7 @@ def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
                 dx, dy = scale * step[k, 0], scale * step[k, 1]
                 new_poses[k, 0] = poses[k, 0] + c * dx - s * dy
                 new_poses[k, 1] = poses[k, 1] + s * dx + c * dy
-                new_poses[k, 2] = wrap(poses[k, 2] + scale * step[k, 2])
+                new_poses[k, 2] = wrap_angle_kernel(poses[k, 2] + scale * step[k, 2])
             for j in range(len(landmarks)):
                 new_lm[j, 0] = landmarks[j, 0] + scale * x[3 + 2 * j]
                 new_lm[j, 1] = landmarks[j, 1] + scale * x[4 + 2 * j]
@@ -269,7 +269,7 @@ def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
 
 
 @njit
-def seen_columns(T, n, ob_pose, ob_lm):
+def observed_columns(T, n, ob_pose, ob_lm):
     """last_seen[k]: number of leading landmark columns that poses 0 … k touch (landmarks come in order of sighting)."""
     out = np.zeros(T, np.int64)
     for o in range(len(ob_pose)):
@@ -288,8 +288,8 @@ def _at_optimum(poses, landmarks, evidence):
     T, n = len(poses), 2 * len(landmarks)
     A, B, C = np.empty((T, 3, 3)), np.empty((T, 3, 3)), np.empty((T, 3, n))
     H, g, gl, Ainv = np.empty((n, n)), np.empty((T, 3)), np.empty(n), np.empty((T, 3, 3))
-    last_seen = seen_columns(T, n, evidence.ob_pose, evidence.ob_lm)
-    normal = Normal(A, B, C, H, g, gl)
+    last_seen = observed_columns(T, n, evidence.ob_pose, evidence.ob_lm)
+    normal = NormalBlocks(A, B, C, H, g, gl)
     _linearise(poses, landmarks, evidence, normal)
     _eliminate(normal, last_seen, Ainv)
     joint = np.linalg.inv(_reduced(A, C, H))
@@ -383,7 +383,7 @@ def path_covariances(poses, landmarks, evidence, at, G0, G1):
 
 
 @njit(error_model="numpy")
-def bends(poses, landmarks, evidence):
+def second_order_bias(poses, landmarks, evidence):
     """What curvature adds to ranges and bearings on average, by the covariance of each landmark as its sensor has it.
 
     The line of sight q, in the frame of the pose, moves by ``F`` times the errors of pose and landmark; with its
@@ -413,7 +413,7 @@ def bends(poses, landmarks, evidence):
         while o >= 0 and ob_pose[order[o]] == k:
             i = order[o]
             j = ob_lm[i]
-            observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
+            observe_landmark(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
             r = max(h[0], math.sqrt(ob[i, 2]))  # nearer than its σ a range tells no place
             ux, uy = -h[2], -h[3]
             F[0, 2], F[1, 2] = r * uy + sensor[1], -r * ux - sensor[0]
@@ -427,7 +427,7 @@ def bends(poses, landmarks, evidence):
 
 
 @njit(error_model="numpy")
-def responses(poses, landmarks, evidence, along, seen):
+def bias_sensitivities(poses, landmarks, evidence, along, seen):
     """How the optimum moves with constants that all residuals know, and what the residuals say of these.
 
     Parameters
@@ -474,8 +474,8 @@ def responses(poses, landmarks, evidence, along, seen):
         if weight[o] == 0.0:
             continue
         k, j = ob_pose[o], ob_lm[o]
-        observe(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
-        n0, n1 = ob[o, 0] - h[0], wrap(ob[o, 1] - h[1])
+        observe_landmark(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
+        n0, n1 = ob[o, 0] - h[0], wrap_angle_kernel(ob[o, 1] - h[1])
         near = math.sqrt(ob[o, 2])
         if h[0] < near:
             share = h[0] / near

@@ -33,7 +33,7 @@ class GrowingMap(Protocol):
         """Standard deviation of x, y [m] and heading [rad], ``(3,)``."""
 
 
-class Stopping:
+class StoppingRule:
     """Watches one submap grow."""
 
     def __init__(self, config: StoppingConfig) -> None:

@@ -17,9 +17,9 @@ from graphslam.core.gaussian import Gaussian, equal_tail_gate
 from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.smoothing_kernels import (
-    Evidence,
-    bends,
-    responses,
+    SmoothingMeasurements,
+    bias_sensitivities,
+    second_order_bias,
     smooth_kernel,
     smoothed_covariances,
     smoothing_cost,
@@ -34,7 +34,7 @@ infinite."""
 
 
 @dataclass(frozen=True, slots=True)
-class Association:
+class LandmarkAssociation:
     """The winning association of a submap: which observation saw which landmark, landmarks in order of sighting.
 
     Parameters
@@ -52,7 +52,7 @@ class Association:
     landmark: Ints
 
 
-def winning_association(particles: ParticleSet, min_hits: int) -> Association:
+def winning_association(particles: ParticleSet, min_hits: int) -> LandmarkAssociation:
     """Association of the standard particle, restricted to landmarks seen at least ``min_hits`` times."""
     a = particles.assoc[particles.best, : particles.observations].astype(np.int64)
     used = np.flatnonzero(a >= 0)
@@ -63,10 +63,10 @@ def winning_association(particles: ParticleSet, min_hits: int) -> Association:
     rank = np.full(int(a.max(initial=0)) + 1, -1, dtype=np.int64)
     rank[slots] = np.arange(len(slots))
     lm = rank[a[used]]
-    return Association(slots, used[lm >= 0], lm[lm >= 0])
+    return LandmarkAssociation(slots, used[lm >= 0], lm[lm >= 0])
 
 
-def common_features(particles: ParticleSet, association: Association) -> tuple[Ints, Ints]:
+def common_features(particles: ParticleSet, association: LandmarkAssociation) -> tuple[Ints, Ints]:
     """Order every particle's features as the standard particle has them (eq. 9–11).
 
     A feature of another particle corresponds to a common feature if it holds the majority of the observations (unique
@@ -171,7 +171,9 @@ class Moments:
         return Gaussian(self.mean, within + 0.5 * (between + between.T) * inflation + floor, (2,))
 
 
-def moment_matched(particles: ParticleSet, association: Association, *, inflate: bool = False) -> tuple[Gaussian, int]:
+def gaussian_of_particles(
+    particles: ParticleSet, association: LandmarkAssociation, *, inflate: bool = False
+) -> tuple[Gaussian, int]:
     """Mixture → Gaussian over ``[exit pose, landmarks]`` (eq. 5–8) and the number of particles dropped.
 
     Parameters
@@ -185,7 +187,7 @@ def moment_matched(particles: ParticleSet, association: Association, *, inflate:
 
 
 @dataclass(frozen=True, slots=True)
-class Smoothed:
+class SmoothingResult:
     """Result of smoothing a submap.
 
     Parameters
@@ -204,7 +206,7 @@ class Smoothed:
         Shares of the objective: odometry, range, bearing.
     landmarks : (L, 2)
         Those that were kept.
-    evidence : Evidence
+    evidence : SmoothingMeasurements
         What was smoothed.
     """
 
@@ -218,7 +220,7 @@ class Smoothed:
     parts: Array
     converged: bool
     landmarks: Array
-    evidence: Evidence
+    evidence: SmoothingMeasurements
 
     def nonlinearity(self) -> float:
         """Distance², under the own covariance, by which curvature moves the optimum from the mean; 0 if all is linear.
@@ -230,14 +232,14 @@ class Smoothed:
         if not len(self.landmarks):
             return 0.0
         odometry = np.zeros((len(self.poses), 3, 1))
-        mean = bends(self.poses, self.landmarks, self.evidence)
-        moved, shifted, _, _ = responses(self.poses, self.landmarks, self.evidence, odometry, mean[:, :, None])
+        mean = second_order_bias(self.poses, self.landmarks, self.evidence)
+        moved, shifted, _, _ = bias_sensitivities(self.poses, self.landmarks, self.evidence, odometry, mean[:, :, None])
         by = moved[-1, :, 0]
         step = np.concatenate([rotation2(self.poses[-1, 2]) @ by[:2], by[2:], shifted[:, 0]])
         return float(step @ np.linalg.solve(self.gaussian.covariance, step))
 
 
-def smooth(
+def smooth_submap(
     poses: Array,
     landmarks: Array,
     increments: Array,
@@ -250,7 +252,7 @@ def smooth(
     trim: float = 0.0,
     min_hits: int = 1,
     max_iterations: int = 50,
-) -> Smoothed:
+) -> SmoothingResult:
     """One Gauss-Newton smoothing of a submap: all poses and landmarks, base fixed at identity.
 
     Parameters
@@ -277,12 +279,12 @@ def smooth(
     d2, parts = np.zeros(len(observations)), np.zeros(3)
     args = (increments, W, ob_pose, ob_landmark, observations)
     if trim > 0.0 and len(observations):
-        smooth_kernel(p, l, Evidence(*args, weight, sensor), 6, 1e-3)
+        smooth_kernel(p, l, SmoothingMeasurements(*args, weight, sensor), 6, 1e-3)
         for _ in range(3):  # Huber by reweighting; few passes, it only has to unmask the outliers
-            smoothing_cost(p, l, Evidence(*args, weight, sensor), d2, parts)
+            smoothing_cost(p, l, SmoothingMeasurements(*args, weight, sensor), d2, parts)
             weight = np.minimum(1.0, np.sqrt(_HUBER2 / np.maximum(d2, 1e-12)))
-            smooth_kernel(p, l, Evidence(*args, weight, sensor), 3, 1e-3)
-        smoothing_cost(p, l, Evidence(*args, weight, sensor), d2, parts)
+            smooth_kernel(p, l, SmoothingMeasurements(*args, weight, sensor), 3, 1e-3)
+        smoothing_cost(p, l, SmoothingMeasurements(*args, weight, sensor), d2, parts)
         gates = np.where(np.isinf(observations[:, 3]), equal_tail_gate(trim, 2, 1), trim)
         weight = (d2 <= gates).astype(np.float64)
     left = np.bincount(ob_landmark, weights=weight, minlength=len(l)) >= min_hits
@@ -291,7 +293,7 @@ def smooth(
     args = (increments, W, ob_pose[kept], (np.cumsum(left) - 1)[ob_landmark[kept]], observations[kept])
     weight = np.ones(int(kept.sum()))
     d2 = np.zeros(len(weight))
-    evidence = Evidence(*args, weight, sensor)
+    evidence = SmoothingMeasurements(*args, weight, sensor)
     chi2, _, converged = smooth_kernel(p, l, evidence, max_iterations, 1e-9)
     joint, marginals = smoothed_covariances(p, l, evidence)
     smoothing_cost(p, l, evidence, d2, parts)
@@ -304,4 +306,4 @@ def smooth(
     gaussian = Gaussian(np.concatenate([p[-1], l.ravel()]), G @ joint @ G.T, (2,))
     channels = int(kept.sum() + np.isfinite(observations[kept, 3]).sum())
     dof = channels - 2 * len(l)
-    return Smoothed(gaussian, p, marginals, kept, left, float(chi2), dof, parts, bool(converged), l, evidence)
+    return SmoothingResult(gaussian, p, marginals, kept, left, float(chi2), dof, parts, bool(converged), l, evidence)

@@ -394,7 +394,7 @@ def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: floa
 
 
 @njit(nogil=True)
-def normal_equations(
+def cell_normal_equations(
     c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, H: F8, g: F8, told: F8
 ) -> None:
     """Gauss–Newton's normal equations of points on cells, weights by Geman and McClure.
@@ -530,7 +530,7 @@ def _log(R: F8, t: F8, out: F8) -> None:
 
 
 @njit(nogil=True)
-def descend(
+def descend_pose(
     c: Cells,
     points: F8,
     pose: tuple[F8, F8],
@@ -672,7 +672,7 @@ def information_by_slot(
 
 
 @njit(nogil=True)
-def thin(points: F8, size: float, near: float, far: float, out: I8) -> int:
+def thin_kernel(points: F8, size: float, near: float, far: float, out: I8) -> int:
     """Rows of the first point of each cube, of those with squared ranges between; how many. They keep their order."""
     bits = 4
     while (1 << bits) < 2 * len(points):

@@ -38,7 +38,7 @@ class LevelConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class NormalEquations:
     """Normal equations at a pose.
 
     Parameters
@@ -127,23 +127,23 @@ class CellMap:
             kernels.score_rotations(self.cells, points, R[k : k + step], t, self.config.size, sigma, out[k : k + step])
         return out
 
-    def fit(self, points: Array, R: Array, t: Array, scale: float) -> Fit:
+    def fit(self, points: Array, R: Array, t: Array, scale: float) -> NormalEquations:
         """Normal equations of points ``(n, 3)`` in the body, at a pose."""
         self.room(len(points))
         out = np.empty((6, 6)), np.empty(6), np.empty(13)
-        kernels.normal_equations(self.cells, points, (R, t), self.config.size, scale, *out)
+        kernels.cell_normal_equations(self.cells, points, (R, t), self.config.size, scale, *out)
         return _fit(len(points), *out)
 
     def descend(
         self, points: Array, R: Array, t: Array, scale: float, prior: Array, still: tuple[float, float], most: int
-    ) -> Fit:
+    ) -> NormalEquations:
         """Gauss–Newton steps, at most so many, of a pose that is improved in place (see `cell_kernels.descend`)."""
         out = np.empty((6, 6)), np.empty(6), np.empty(13)
         start, size, done = (R.copy(), t.copy(), prior), self.config.size, -1
         while done < 0:
             self.room(2 * len(points))
             most += done + 1
-            done = kernels.descend(self.cells, points, (R, t), start, size, scale, (*still, most), out)
+            done = kernels.descend_pose(self.cells, points, (R, t), start, size, scale, (*still, most), out)
         return _fit(len(points), *out)
 
     def known(self, points: Array) -> npt.NDArray[np.bool_]:
@@ -159,9 +159,9 @@ class CellMap:
         return H, M, G
 
 
-def _fit(n: int, H: Array, g: Array, told: Array) -> Fit:
+def _fit(n: int, H: Array, g: Array, told: Array) -> NormalEquations:
     near = max(told[1], 1.0)
-    return Fit(
+    return NormalEquations(
         H, g, _every(told[3:]), told[0] / max(n, 1), told[1] / max(n, 1), told[0] / near, told[2] / max(told[0], 1e-12)
     )
 
@@ -201,12 +201,14 @@ def _empty(blocks: int, rows: int) -> kernels.Cells:
     )
 
 
-def thin(points: Array, size: float, ranges: tuple[float, float] = (0.0, np.inf)) -> npt.NDArray[np.int64]:
+def first_rows_by_cube(
+    points: Array, size: float, ranges: tuple[float, float] = (0.0, np.inf)
+) -> npt.NDArray[np.int64]:
     """Rows of the first point of each cube of edge ``size``, of the points within ranges."""
     rows = np.empty(len(points), np.int64)
-    return rows[: kernels.thin(points, size, ranges[0] ** 2, ranges[1] ** 2, rows)]
+    return rows[: kernels.thin_kernel(points, size, ranges[0] ** 2, ranges[1] ** 2, rows)]
 
 
-def evenly(n: int, most: int) -> npt.NDArray[np.int64]:
+def evenly_spaced_rows(n: int, most: int) -> npt.NDArray[np.int64]:
     """At most so many of n rows, spread over all."""
     return np.arange(n, dtype=np.int64) if n <= most else np.arange(most, dtype=np.int64) * n // most

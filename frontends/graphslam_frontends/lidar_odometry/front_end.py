@@ -14,26 +14,33 @@ import numpy as np
 from graphslam.core import se3
 from graphslam.core.dense import CloudMap
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Odometry, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.base import FrontEnd, Watch
-from graphslam_frontends.lidar_odometry.cells import evenly
+from graphslam_frontends.lidar_odometry.cells import evenly_spaced_rows
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam_frontends.lidar_odometry.inertial import USUAL, Inertial, Readings, Tilt, tilt_of, upright
-from graphslam_frontends.lidar_odometry.odometry import FEW, MAPPED, LidarOdometry, Seen
-from graphslam_frontends.lidar_odometry.reckoned import Reckoned
+from graphslam_frontends.lidar_odometry.inertial import (
+    USUAL,
+    ImuReadings,
+    InertialPredictor,
+    PathGravity,
+    align_with_gravity,
+    gravity_along_path,
+)
+from graphslam_frontends.lidar_odometry.odometry import FEW, MAPPED, LidarOdometry, ScanResult
+from graphslam_frontends.lidar_odometry.wheel_prior import WheelMotionPrior
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
 
 BENT = 0.1
 """Way of points in the time from scan to scan from which it matters that they have no times [m]."""
@@ -113,7 +120,7 @@ class LidarFrontEndConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Follow:
+class FollowedScan:
     """A scan that was followed.
 
     Parameters
@@ -133,7 +140,7 @@ class Follow:
     joint: Array
     spread: Array
     points: Array
-    seen: Seen
+    seen: ScanResult
     timed: bool
     """Points have times of their own."""
 
@@ -153,7 +160,7 @@ class LidarFrontEnd(FrontEnd):
 
     def follow(
         self,
-        feed: Feed,
+        feed: RecordSource,
         *,
         seed: SeedTree,
         after: Submap | None = None,
@@ -173,10 +180,10 @@ class LidarFrontEnd(FrontEnd):
         yield from unit.rehearse(name)
         odometry = unit.odometry()
         odometry.reckoned = wheels.reckoned
-        seen: list[Follow] = []
+        seen: list[FollowedScan] = []
         self._made[:] = [feed, seen, unit, wheels.name]
         config = self.config.submap
-        kept: list[Follow] = []
+        kept: list[FollowedScan] = []
         k, key, way, told, mapped, most = -1, 0, 0.0, False, False, 0
         while True:
             while not feed.ended and (
@@ -193,7 +200,7 @@ class LidarFrontEnd(FrontEnd):
             wheels.hear(float(clouds.times[0]))
             seen.append(self._follow(odometry, clouds, 0))
             mapped, most = mapped or seen[-1].seen.state in MAPPED, max(most, seen[-1].seen.points)
-            feed.let_go(name, k + 1)
+            feed.discard_before(name, k + 1)
             if k == 0:
                 odometry.errors.begin()
             kept.append(seen[-1])
@@ -207,7 +214,7 @@ class LidarFrontEnd(FrontEnd):
                     origin = se3.se3_transform(clouds.T_base_sensor, clouds.origin)
                     base = kept[0].pose
                     if key == 0 and odometry.inertial is not None:
-                        base = upright(base, odometry.inertial.up)
+                        base = align_with_gravity(base, odometry.inertial.up)
                     yield _submap((name, unit.name, wheels.name), base, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
                 for i in range(k - n, k):  # what is in a submap is asked for once more, by a refinement
@@ -232,7 +239,7 @@ class LidarFrontEnd(FrontEnd):
         name, clouds = self._clouds(log)
         made = bool(self._made) and self._made[0].ended and self._made[0].log is log
         if not (made and len(self._made[1]) == len(clouds)):
-            feed = Feed(log)
+            feed = RecordSource(log)
             unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
             for _ in unit.rehearse(name):
                 pass
@@ -250,7 +257,7 @@ class LidarFrontEnd(FrontEnd):
         """Let go of the path and the scans of the last log."""
         self._made.clear()
 
-    def _stream(self, streams: SensorLog | Feed) -> str | None:
+    def _stream(self, streams: SensorLog | RecordSource) -> str | None:
         return self.config.stream or streams.of_type(PointClouds)
 
     def _named(self, where: str, name: str | None) -> str:
@@ -267,7 +274,7 @@ class LidarFrontEnd(FrontEnd):
         name = self._named(log.name, self._stream(log))
         return name, self._checked(name, log[name])
 
-    def _imu(self, feed: Feed, clouds: str) -> str | None:
+    def _imu(self, feed: RecordSource, clouds: str) -> str | None:
         """Name of the IMU that is taken: one that reads as soon as the first scans are made."""
         name = feed.of_type(Imu) if self.config.imu == "auto" else self.config.imu
         if name is None or name == "none":
@@ -278,7 +285,7 @@ class LidarFrontEnd(FrontEnd):
         scans = feed.part(clouds, 0, min(FIRST, feed.count(clouds))).times
         return name if len(stream.times) and len(scans) and stream.times[0] <= scans[-1] else None
 
-    def _wheels(self, feed: Feed, clouds: str) -> str | None:
+    def _wheels(self, feed: RecordSource, clouds: str) -> str | None:
         """Name of the odometry that is taken: one that tells motions as soon as the first scans are made."""
         asked = self.config.wheels
         name = feed.of_type(Odometry) if asked == "auto" else asked
@@ -292,14 +299,14 @@ class LidarFrontEnd(FrontEnd):
         level = some.shape[1] == 3 or np.abs(some[:, 2:5]).max(initial=0.0) <= LEVEL
         return name if len(some) and (level or asked != "auto") else None
 
-    def _follow(self, odometry: LidarOdometry, clouds: PointClouds, k: int) -> Follow:
+    def _follow(self, odometry: LidarOdometry, clouds: PointClouds, k: int) -> FollowedScan:
         seen = _step(odometry, clouds, k)
-        return Follow(
+        return FollowedScan(
             float(clouds.times[k]),
             odometry.pose,
             odometry.errors.joint,
             odometry.spread,
-            odometry.points[evenly(len(odometry.points), self.config.submap.points)],
+            odometry.points[evenly_spaced_rows(len(odometry.points), self.config.submap.points)],
             seen,
             clouds.ages(k) is not None,
         )
@@ -314,13 +321,13 @@ class _Heard(ABC):
         None: there is none, and nothing is waited for.
     """
 
-    def __init__(self, feed: Feed, name: str | None) -> None:
+    def __init__(self, feed: RecordSource, name: str | None) -> None:
         self.feed, self.name = feed, name
         self._heard, self._last = 0, -np.inf
 
     @property
     @abstractmethod
-    def listener(self) -> Readings | Reckoned | None:
+    def listener(self) -> ImuReadings | WheelMotionPrior | None:
         """What takes its records."""
 
     def reaches(self, scan: Stream) -> bool:
@@ -344,13 +351,13 @@ class _Heard(ABC):
 class _Unit(_Heard):
     """The IMU of a feed, if there is one, and what of it is known."""
 
-    def __init__(self, feed: Feed, name: str | None, config: LidarOdometryConfig) -> None:
+    def __init__(self, feed: RecordSource, name: str | None, config: LidarOdometryConfig) -> None:
         super().__init__(feed, name)
         self.config = config
-        self.inertial: Inertial | None = None
+        self.inertial: InertialPredictor | None = None
 
     @property
-    def listener(self) -> Readings | None:
+    def listener(self) -> ImuReadings | None:
         """The unit's readings."""
         return None if self.inertial is None else self.inertial.readings
 
@@ -368,7 +375,7 @@ class _Unit(_Heard):
         fitted: list[float] = []
         for trusted in (False, True):
             self._heard = self.feed.count(self.name)
-            self.inertial = Inertial(self._part(0, self._heard), trusted=trusted)
+            self.inertial = InertialPredictor(self._part(0, self._heard), trusted=trusted)
             odometry, overlaps = LidarOdometry(self.config, self.inertial), []
             for k in range(REHEARSED):
                 while not self.feed.ended and (
@@ -386,52 +393,52 @@ class _Unit(_Heard):
             if self.inertial.believed and self.inertial.known and fitted[-1] >= fitted[0]:
                 self.inertial.rewind()
                 return
-        self.inertial = Inertial(self._part(0, self._heard))  # it may be believed later
+        self.inertial = InertialPredictor(self._part(0, self._heard))  # it may be believed later
 
     def odometry(self) -> LidarOdometry:
         """At its start."""
         return LidarOdometry(self.config, self.inertial)
 
-    def tilt(self, log: SensorLog, times: Array, poses: Array) -> Tilt | None:
+    def tilt(self, log: SensorLog, times: Array, poses: Array) -> PathGravity | None:
         """Gravity along a path, by all readings."""
         if self.name is None or self.inertial is None:
             return None
-        self.inertial.readings = Readings(log[self.name])
-        return tilt_of(self.inertial, times, poses)
+        self.inertial.readings = ImuReadings(log[self.name])
+        return gravity_along_path(self.inertial, times, poses)
 
 
 class _Wheels(_Heard):
     """The odometry of a feed, if there is one that is taken."""
 
-    def __init__(self, feed: Feed, name: str | None) -> None:
+    def __init__(self, feed: RecordSource, name: str | None) -> None:
         super().__init__(feed, name)
-        self.reckoned = None if name is None else Reckoned(self._part(0, 0))
+        self.reckoned = None if name is None else WheelMotionPrior(self._part(0, 0))
 
     @property
-    def listener(self) -> Reckoned | None:
+    def listener(self) -> WheelMotionPrior | None:
         """What tells motions by it."""
         return self.reckoned
 
 
-def odometry_of(clouds: PointClouds, config: LidarOdometryConfig, imu: Imu | None = None) -> LidarOdometry:
+def start_odometry(clouds: PointClouds, config: LidarOdometryConfig, imu: Imu | None = None) -> LidarOdometry:
     """LiDAR odometry at its start.
 
     With an IMU, the first scans are followed to learn its bias, the velocity and gravity, and whether it is to be
     believed; then they are to be followed anew, so that not even the first of them is bent.
     """
     streams: dict[str, Stream] = {"clouds": clouds} if imu is None else {"clouds": clouds, "imu": imu}
-    unit = _Unit(Feed(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
+    unit = _Unit(RecordSource(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
     for _ in unit.rehearse("clouds"):
         pass
     return unit.odometry()
 
 
-def _step(odometry: LidarOdometry, clouds: Any, k: int) -> Seen:
+def _step(odometry: LidarOdometry, clouds: Any, k: int) -> ScanResult:
     points = se3.se3_transform(clouds.T_base_sensor, clouds.cloud(k))
     return odometry.step(points, float(clouds.times[k]), clouds.ages(k))
 
 
-def _bent(key: int, kept: list[Follow]) -> list[Finding]:
+def _bent(key: int, kept: list[FollowedScan]) -> list[Finding]:
     """Do points without times lie on a scan that its motion has bent?"""
     worst = 0.0
     for a, b in pairwise(kept):
@@ -449,7 +456,7 @@ def _bent(key: int, kept: list[Follow]) -> list[Finding]:
     return [Finding("look", "points-without-times", text)]
 
 
-def _uneven(key: int, kept: list[Follow]) -> list[Finding]:
+def _uneven(key: int, kept: list[FollowedScan]) -> list[Finding]:
     """Does the motion change so much from scan to scan that scans straightened by an even one stay bent?
 
     If the velocity changes evenly over a scan, by Δ in all, points in its middle are off by Δ / 8 times its duration.
@@ -471,7 +478,7 @@ def _uneven(key: int, kept: list[Follow]) -> list[Finding]:
     return [Finding("bad", "uneven-motion", text)]
 
 
-def _stamped(made: list[Follow]) -> tuple[Array, Array]:
+def _stamped(made: list[FollowedScan]) -> tuple[Array, Array]:
     """Stamps and poses of the scans that were matched."""
     some = [f for f in made if f.seen.state in MAPPED]
     return np.array([f.time for f in some]), np.array([f.pose for f in some]).reshape(-1, 7)
@@ -480,7 +487,7 @@ def _stamped(made: list[Follow]) -> tuple[Array, Array]:
 def _submap(
     names: tuple[str, str | None, str | None],
     base: Array,
-    kept: list[Follow],
+    kept: list[FollowedScan],
     origin: Array,
     config: LidarSubmapConfig,
     key: int,
@@ -542,13 +549,15 @@ def _submap(
         grid=grid,
         cloud=cloud,
         uses=frozenset(n for n, used in ((names[0], True), (names[2], bridged)) if n is not None and used),
-        aids=frozenset(n for n, of in ((names[1], aided), (names[2], watched and not bridged)) if n is not None and of),
+        assisting_streams=frozenset(
+            n for n, of in ((names[1], aided), (names[2], watched and not bridged)) if n is not None and of
+        ),
         report=report,
     )
 
 
 def _findings(
-    key: int, kept: list[Follow], report: dict[str, Any], names: tuple[str | None, str | None]
+    key: int, kept: list[FollowedScan], report: dict[str, Any], names: tuple[str | None, str | None]
 ) -> list[Finding]:
     out, n = [], report["scans"]
     imu, wheels = names
@@ -582,9 +591,9 @@ def _steps(
     log: SensorLog,
     uses: frozenset[str],
     clouds: PointClouds,
-    made: list[Follow],
+    made: list[FollowedScan],
     config: LidarFrontEndConfig,
-    tilt: Tilt | None,
+    tilt: PathGravity | None,
 ) -> Steps:
     times = np.array([f.time for f in made])
     poses = np.array([f.pose for f in made])

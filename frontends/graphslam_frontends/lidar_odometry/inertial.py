@@ -50,7 +50,7 @@ GRAVITY_SIGMA = (1.0, 0.2)
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class InertialMotion:
     """The motion by readings alone, seen from the body at an anchor.
 
     Parameters
@@ -74,7 +74,7 @@ class Way:
         return np.concatenate([t * velocity + 0.5 * t**2 * gravity + self.p, self.q], axis=1)
 
 
-class Readings:
+class ImuReadings:
     """Readings of an IMU as the base would make them."""
 
     def __init__(self, imu: Imu) -> None:
@@ -91,7 +91,7 @@ class Readings:
         self.times = np.concatenate([self.times[a:], t])
         self.rate, self.force = np.concatenate([self.rate[a:], w]), np.concatenate([self.force[a:], f])
 
-    def way(self, anchor: float, at: Array, bias: Array) -> Way | None:
+    def way(self, anchor: float, at: Array, bias: Array) -> InertialMotion | None:
         """The motion at some times ``(m,)``, seen from the body at ``anchor``; None where readings are missing."""
         first, last = min(anchor, float(at.min())), max(anchor, float(at.max()))
         t = self.times
@@ -107,7 +107,7 @@ class Readings:
         force = np.stack([np.interp(knots, t[some], x) for x in self._at_base(some).T], axis=1)
         dt = np.diff(knots)[:, None]
         turn = 0.5 * (rate[1:] + rate[:-1]) * dt
-        q = running(se3.so3_exp(turn))
+        q = cumulative_products(se3.so3_exp(turn))
         # a force acts, on the average, through the attitude half-way
         f = se3.quat_rotate(se3.quat_multiply(q[:-1], se3.so3_exp(0.5 * turn)), 0.5 * (force[1:] + force[:-1]))
         v = np.concatenate([np.zeros((1, 3)), np.cumsum(f * dt, axis=0)])
@@ -115,7 +115,7 @@ class Readings:
         j, k = int(np.searchsorted(knots, anchor)), np.searchsorted(knots, at)
         back = q[j] * [-1.0, -1.0, -1.0, 1.0]
         since = (knots[k] - knots[j])[:, None]
-        return Way(
+        return InertialMotion(
             since[:, 0],
             se3.quat_multiply(back, q[k]),
             se3.quat_rotate(back, v[k] - v[j]),
@@ -143,7 +143,7 @@ def _turned(imu: Imu) -> tuple[Array, Array, Array]:
     return imu.times, se3.quat_rotate(q, imu.angular_rate), se3.quat_rotate(q, imu.specific_force)
 
 
-def running(turns: Array) -> Array:
+def cumulative_products(turns: Array) -> Array:
     """Products ``(n + 1, 4)`` of the first 0, 1, 2 … of n turns ``(n, 4)``."""
     q, step = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], turns]), 1
     while step < len(q):
@@ -152,12 +152,14 @@ def running(turns: Array) -> Array:
     return np.asarray(se3.quat_normalize(q))
 
 
-def fit(way: Way, positions: Array, variance: Array, gravity: Array, sigma: float) -> tuple[Array, Array, Array]:
+def fit_velocity_gravity(
+    way: InertialMotion, positions: Array, variance: Array, gravity: Array, sigma: float
+) -> tuple[Array, Array, Array]:
     """Velocity and gravity in the body at the anchor that positions ``(m, 3)`` there agree with.
 
     Parameters
     ----------
-    way : Way
+    way : InertialMotion
         At the times of the positions.
     positions : (m, 3)
     variance : (m,)
@@ -180,7 +182,7 @@ def fit(way: Way, positions: Array, variance: Array, gravity: Array, sigma: floa
     return np.asarray(x[1]), np.asarray(x[2]), np.asarray(C)
 
 
-class Inertial:
+class InertialPredictor:
     """Learns what a unit does not know, and tells motions.
 
     Parameters
@@ -197,7 +199,7 @@ class Inertial:
     """
 
     def __init__(self, imu: Imu, *, trusted: bool = False) -> None:
-        self.readings, self.trusted = Readings(imu), trusted
+        self.readings, self.trusted = ImuReadings(imu), trusted
         n = imu.noise
         self._bias_var = max(n.gyro_bias, 1e-6) ** 2
         self.bias, self.bias_var = np.zeros(3), self._bias_var
@@ -293,7 +295,7 @@ class Inertial:
         self.kept.clear()
         self.known = False
 
-    def _compare(self, dt: float, made: Array, way: Way, even: Array) -> None:
+    def _compare(self, dt: float, made: Array, way: InertialMotion, even: Array) -> None:
         """The bias of the gyro by a turn that scans know (a Kalman filter), and who told the turn better."""
         off = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], way.q[0])))
         worse = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], even[3:])))
@@ -325,12 +327,12 @@ class Inertial:
             guess, sigma = -way.v[0] / way.seconds[0], GRAVITY_SIGMA[0]
         there = se3.se3_between(np.broadcast_to(pose, (len(at), 7)), np.array([p for _, p in self.kept]))[:, :3]
         variance = self.readings.doubt(way.seconds, float(np.sqrt(self.bias_var)))
-        self.velocity, self.gravity, self.cov = fit(way, there, variance, guess, sigma)
+        self.velocity, self.gravity, self.cov = fit_velocity_gravity(way, there, variance, guess, sigma)
         self.known = True
         self._up = se3.quat_rotate(pose[3:], -self.gravity / np.linalg.norm(self.gravity))
 
 
-def upright(pose: Array, up: Array | None) -> Array:
+def align_with_gravity(pose: Array, up: Array | None) -> Array:
     """A pose ``(7,)`` stood upright, where ``up`` ``(3,)`` is known in its frame: place and heading are kept."""
     if up is None:
         return pose
@@ -341,7 +343,7 @@ def upright(pose: Array, up: Array | None) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Tilt:
+class PathGravity:
     """Gravity along a path.
 
     Parameters
@@ -367,12 +369,12 @@ class Tilt:
         return np.stack([np.arctan2(y, z), -np.arcsin(np.clip(x, -1.0, 1.0))], axis=1)
 
 
-def tilt_of(inertial: Inertial, times: Array, poses: Array) -> Tilt | None:
+def gravity_along_path(inertial: InertialPredictor, times: Array, poses: Array) -> PathGravity | None:
     """Gravity along a path, by the positions and the readings half a window before and after.
 
     Parameters
     ----------
-    inertial : Inertial
+    inertial : InertialPredictor
         That went along.
     times : (n,)
         Of scans that were matched.
@@ -380,7 +382,7 @@ def tilt_of(inertial: Inertial, times: Array, poses: Array) -> Tilt | None:
 
     Returns
     -------
-    Tilt or None
+    PathGravity or None
         None: the unit is not believed, there is too little of it, or the body hangs on its side, where roll and pitch
         are none.
     """
@@ -401,7 +403,7 @@ def tilt_of(inertial: Inertial, times: Array, poses: Array) -> Tilt | None:
         guess = -(way.v[-1] - way.v[0]) / span
         there = se3.se3_between(np.broadcast_to(poses[k], (len(some), 7)), poses[some])[:, :3]
         variance = readings.doubt(way.seconds, float(np.sqrt(inertial.bias_var)))
-        _, gravity, C = fit(way, there, variance, guess, GRAVITY_SIGMA[0])
+        _, gravity, C = fit_velocity_gravity(way, there, variance, guess, GRAVITY_SIGMA[0])
         at.append(t)
         ups.append(se3.quat_rotate(poses[k, 3:], -gravity / np.linalg.norm(gravity)))
         variances.append(C[2, 2] + noise.accelerometer**2 / span)
@@ -409,5 +411,5 @@ def tilt_of(inertial: Inertial, times: Array, poses: Array) -> Tilt | None:
         return None
     lasting = noise.accelerometer_bias
     sigma = float(np.sqrt(np.median(variances) + lasting**2)) / GRAVITY
-    out = Tilt(np.array(at), np.array(ups), sigma, 0.5 * WINDOW)
+    out = PathGravity(np.array(at), np.array(ups), sigma, 0.5 * WINDOW)
     return None if np.abs(out.at(times, poses)[:, 1]).max() > ON_ITS_SIDE else out

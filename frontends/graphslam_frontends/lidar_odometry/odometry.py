@@ -18,12 +18,18 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.geometry import Array
-from graphslam_frontends.lidar_odometry.cells import CellMap, Fit, LevelConfig, evenly, thin
+from graphslam_frontends.lidar_odometry.cells import (
+    CellMap,
+    LevelConfig,
+    NormalEquations,
+    evenly_spaced_rows,
+    first_rows_by_cube,
+)
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam_frontends.lidar_odometry.inertial import Inertial
-from graphslam_frontends.lidar_odometry.joint import JointErrors
-from graphslam_frontends.lidar_odometry.reckoned import Reckoned
-from graphslam_frontends.scan_window.tracker import directions
+from graphslam_frontends.lidar_odometry.inertial import InertialPredictor
+from graphslam_frontends.lidar_odometry.wheel_prior import WheelMotionPrior
+from graphslam_frontends.lidar_odometry.window_covariance import WindowCovariance
+from graphslam_frontends.scan_window.tracker import direction_strengths
 
 Index = npt.NDArray[np.int64]
 
@@ -94,7 +100,7 @@ GIVEN_UP = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ScanResult:
     """What came of a scan.
 
     Parameters
@@ -142,7 +148,7 @@ SPREADS = _spreads()
 
 
 @dataclass(frozen=True, slots=True)
-class Raw:
+class RawScan:
     """Points as they were measured while the body moved.
 
     Parameters
@@ -174,9 +180,9 @@ class LidarOdometry:
 
     Parameters
     ----------
-    inertial : Inertial, optional
+    inertial : InertialPredictor, optional
         Tells where a match begins and how a scan is bent, as long as it is believed; an even motion does otherwise.
-    reckoned : Reckoned, optional
+    reckoned : WheelMotionPrior, optional
         Odometry: where nothing is matched, and where a match begins if no IMU tells it.
 
     Attributes
@@ -187,11 +193,14 @@ class LidarOdometry:
         Of the last scan, thinned, in the body at its stamp.
     spread : (6, 6)
         Covariance of the error of the last prediction, right tangent.
-    errors : JointErrors
+    errors : WindowCovariance
     """
 
     def __init__(
-        self, config: LidarOdometryConfig, inertial: Inertial | None = None, reckoned: Reckoned | None = None
+        self,
+        config: LidarOdometryConfig,
+        inertial: InertialPredictor | None = None,
+        reckoned: WheelMotionPrior | None = None,
     ) -> None:
         self.config, self.inertial, self.reckoned = config, inertial, reckoned
         last = len(config.levels) - 1
@@ -213,7 +222,7 @@ class LidarOdometry:
         self.points, self.spread = np.zeros((0, 3)), np.zeros((6, 6))
         self.changes: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
         self.missed: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
-        self.errors = JointErrors()
+        self.errors = WindowCovariance()
         self.lost, self.loose, self.held = 0, 1, 0
         self.first = 0
         side = range(-SEARCH_SIDE, SEARCH_SIDE + 1)
@@ -235,7 +244,7 @@ class LidarOdometry:
         ratio = min(dt / self.dt, 2.0) if self.dt > 0 and np.isfinite(dt) else 0.0
         return np.asarray(se3.se3_exp(self.twist * ratio))
 
-    def step(self, cloud: Array, time: float, ages: Array | None = None) -> Seen:
+    def step(self, cloud: Array, time: float, ages: Array | None = None) -> ScanResult:
         """Match the next scan, and put it into the map.
 
         Parameters
@@ -260,15 +269,15 @@ class LidarOdometry:
                 Q = np.diag(np.repeat(self.reckoned.variances(told[1]), 3))
                 led = ahead is None and (self.lost > 0 or self.reckoned.better)
         predicted = ahead if ahead is not None else bridge if led and bridge is not None else even
-        rows = thin(np.ascontiguousarray(cloud), c.spacing, (c.min_range, c.max_range))
-        kept = rows[evenly(len(rows), c.most_kept)]
+        rows = first_rows_by_cube(np.ascontiguousarray(cloud), c.spacing, (c.min_range, c.max_range))
+        kept = rows[evenly_spaced_rows(len(rows), c.most_kept)]
         raw = self._raw(cloud[kept], None if ages is None or not c.deskew else ages[kept], time)
         dt = time - self.time if np.isfinite(self.time) else 0.0
         self._since(raw, time)
-        chosen = evenly(len(kept), c.most_points)
+        chosen = evenly_spaced_rows(len(kept), c.most_points)
         points = self._unbent(raw, predicted, time)[chosen]
         if self.scan == self.first:
-            seen = Seen(len(points), np.nan, 0, "first" if len(points) >= FEW else "empty", False)
+            seen = ScanResult(len(points), np.nan, 0, "first" if len(points) >= FEW else "empty", False)
             self.first += len(points) < FEW
             fit = None
             if bridge is not None:
@@ -317,7 +326,7 @@ class LidarOdometry:
                     level.keep_since(since)
         return seen
 
-    def _bent(self, raw: Raw) -> Array:
+    def _bent(self, raw: RawScan) -> Array:
         """Covariance of what an uneven motion within a scan does to its pose.
 
         The motion within a scan is off the mean one by half of what it changes by from one interval to the next.
@@ -332,7 +341,7 @@ class LidarOdometry:
         turn2, shift2 = 0.25 * np.mean(self.changes, axis=0) * float(np.mean(raw.ages)) ** 2
         return np.diag([turn2] * 3 + [shift2] * 3)
 
-    def _since(self, raw: Raw, time: float) -> None:
+    def _since(self, raw: RawScan, time: float) -> None:
         """Since when the motion is taken to be even: over two sweeps or more.
 
         If a scan lasts until the next, an even motion from the last pose alone would answer an error of that pose by
@@ -344,11 +353,11 @@ class LidarOdometry:
         while len(self.recent) > 1 and time - self.recent[1][0] >= span:
             self.recent.popleft()
 
-    def _raw(self, points: Array, ages: Array | None, time: float) -> Raw:
+    def _raw(self, points: Array, ages: Array | None, time: float) -> RawScan:
         then = None if ages is None or self.inertial is None else self.inertial.within(time, ages)
-        return Raw(points, ages, None if then is None else np.asarray(se3.se3_transform(then, points)))
+        return RawScan(points, ages, None if then is None else np.asarray(se3.se3_transform(then, points)))
 
-    def _unbent(self, raw: Raw, pose: Array, time: float) -> Array:
+    def _unbent(self, raw: RawScan, pose: Array, time: float) -> Array:
         """Points of a scan where the body stands at ``pose`` (7,), at its stamp."""
         if raw.straight is not None:
             return raw.straight
@@ -367,14 +376,14 @@ class LidarOdometry:
 
     def _doubt(
         self,
-        raw: Raw,
+        raw: RawScan,
         points: Array,
         before: Array,
         predicted: Array,
         even: Array,
         dt: float,
-        fit: Fit | None,
-        seen: Seen,
+        fit: NormalEquations | None,
+        seen: ScanResult,
         reckoned: Array | None = None,
     ) -> None:
         """How far the pose of now is off, jointly with those of the window.
@@ -414,7 +423,7 @@ class LidarOdometry:
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
             self.agreeing.append(float(np.trace(np.linalg.solve(E, G.T @ G))) / 6.0)
             M *= LASTING * float(np.mean(self.agreeing))
-            F = trusted(fit.H, fit.every)
+            F = observable_gradient(fit.H, fit.every)
             H, M = F @ H, F @ M @ F.T
         self.errors.step(self.pose, motion, Q, H, M, self._bent(raw))
 
@@ -429,13 +438,13 @@ class LidarOdometry:
 
     def _match(
         self,
-        raw: Raw,
+        raw: RawScan,
         chosen: Index,
         predicted: Array,
         bridge: Array | None,
         told: Array | None,
         time: float,
-    ) -> tuple[Array, Fit | None, Seen]:
+    ) -> tuple[Array, NormalEquations | None, ScanResult]:
         """Pose of a scan, the fit there, and what came of it.
 
         Parameters
@@ -453,8 +462,8 @@ class LidarOdometry:
         points = self._unbent(raw, predicted, time)[chosen]
         stands = predicted if bridge is None else bridge
         if len(points) < FEW:
-            return stands, None, Seen(len(points), 0.0, 6, "empty", False)
-        few = points[evenly(len(points), SEARCHED)]
+            return stands, None, ScanResult(len(points), 0.0, 6, "empty", False)
+        few = points[evenly_spaced_rows(len(points), SEARCHED)]
         top = self.levels[:-1] or self.levels
         start, coarse = self._descend(points, predicted, top)
         searched = False
@@ -482,9 +491,9 @@ class LidarOdometry:
                 spread = self.spread if told is None else told
                 state = "new space" if fits and not _far(stands, pose, spread) else "lost"
         if state == "lost":
-            return stands, None, Seen(len(points), fit.overlap, 6, state, searched)
+            return stands, None, ScanResult(len(points), fit.overlap, 6, state, searched)
         if fit.known < LITTLE:
-            return start if bridge is None else bridge, None, Seen(len(points), fit.overlap, 6, state, searched)
+            return start if bridge is None else bridge, None, ScanResult(len(points), fit.overlap, 6, state, searched)
         free, (pose, unheld) = pose, self._hold(pose, stands, fit)
         if unheld and bridge is None and len(self.missed) < 3:
             # nobody knows yet how it moves: rest is believed where the scan fits there as well
@@ -494,10 +503,12 @@ class LidarOdometry:
         if state != "new space":
             self.overlaps.append(fit.overlap)
             self.qualities.append(fit.quality)
-            self.coarse.append(top[-1].fit(points[evenly(len(points), COARSE_POINTS)], *_split(pose), SCALE).overlap)
-        return pose, fit, Seen(len(points), fit.overlap, unheld, state, searched)
+            self.coarse.append(
+                top[-1].fit(points[evenly_spaced_rows(len(points), COARSE_POINTS)], *_split(pose), SCALE).overlap
+            )
+        return pose, fit, ScanResult(len(points), fit.overlap, unheld, state, searched)
 
-    def _finish(self, raw: Raw, chosen: Index, pose: Array, time: float) -> tuple[Array, Array, Fit]:
+    def _finish(self, raw: RawScan, chosen: Index, pose: Array, time: float) -> tuple[Array, Array, NormalEquations]:
         """Match on the finest level: pose, points of the scan where that pose says they were measured, fit."""
         for _ in range(MOST_DESKEWED):
             points = self._unbent(raw, pose, time)[chosen]
@@ -521,7 +532,7 @@ class LidarOdometry:
         off = se3.se3_log(se3.se3_between(predicted, start))
         return bool(np.linalg.norm(off[:3]) < NEAR[0] and np.linalg.norm(off[3:]) < NEAR[1])
 
-    def _descend(self, points: Array, pose: Array, levels: list[CellMap]) -> tuple[Array, Fit]:
+    def _descend(self, points: Array, pose: Array, levels: list[CellMap]) -> tuple[Array, NormalEquations]:
         """Gauss–Newton on one level after the other; on coarse ones the start stands along what no surface holds."""
         fit = None
         for level in levels:
@@ -531,7 +542,7 @@ class LidarOdometry:
                 fit = level.descend(points, R, t, SCALE, prior, STILL, MOST_STEPS)
                 pose = np.concatenate([t, se3.matrix_to_quat(R)])
                 continue
-            some, size = points[evenly(len(points), COARSE_POINTS)], level.config.size
+            some, size = points[evenly_spaced_rows(len(points), COARSE_POINTS)], level.config.size
             still = (0.002 * size, 0.01 * size)
             fit = level.descend(some, R, t, SCALE, 1e-3 * np.eye(6), still, MOST_STEPS)
             pose, _ = self._hold(np.concatenate([t, se3.matrix_to_quat(R)]), pose, fit)
@@ -562,9 +573,9 @@ class LidarOdometry:
                 out.append((fit.overlap, pose))
         return out
 
-    def _hold(self, pose: Array, predicted: Array, fit: Fit) -> tuple[Array, int]:
+    def _hold(self, pose: Array, predicted: Array, fit: NormalEquations) -> tuple[Array, int]:
         """Take the prediction along directions that no surface holds, and tell how many these are."""
-        P = held(fit.H, fit.every)
+        P = observable_projection(fit.H, fit.every)
         unheld = 6 - round(float(np.trace(P)))
         if unheld:
             xi = P @ np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
@@ -579,7 +590,7 @@ def _far(predicted: Array, pose: Array, spread: Array) -> bool:
     return bool(np.linalg.norm(off[:3]) > NEAR[0] + turn or np.linalg.norm(off[3:]) > NEAR[1] + shift)
 
 
-def held(H: Array, every: Array) -> Array:
+def observable_projection(H: Array, every: Array) -> Array:
     """Projection ``(6, 6)`` of motions onto the directions that surfaces hold.
 
     Parameters
@@ -594,7 +605,7 @@ def held(H: Array, every: Array) -> Array:
     return np.asarray(U @ U.T @ B)
 
 
-def trusted(H: Array, every: Array) -> Array:
+def observable_gradient(H: Array, every: Array) -> Array:
     """What ``(6, 6)`` takes a gradient to that part of it that is not pretended by noise of the normals."""
     values, V, B = _directions(H, every)
     share = np.maximum(1.0 - PRETENDED / np.maximum(values, 1e-9), 0.0)
@@ -604,7 +615,7 @@ def trusted(H: Array, every: Array) -> Array:
 def _directions(H: Array, every: Array) -> tuple[Array, Array, Array]:
     every = 1.01 * every + np.eye(6)
     B = NORMAL_SIGMA**2 * (every - H) + 1e-9 * every
-    return *directions(H, every, NORMAL_SIGMA), B
+    return *direction_strengths(H, every, NORMAL_SIGMA), B
 
 
 def _split(pose: Array) -> tuple[Array, Array]:

@@ -21,10 +21,7 @@ from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry, VelocityControls, check_times
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
-from graphslam_frontends.odometry.drift import DriftModel
-from graphslam_frontends.odometry.gaps import Gaps, find_gaps
-from graphslam_frontends.odometry.reckoned import (
+from graphslam_frontends.odometry.dead_reckoned_path import (
     FADING,
     GYRO,
     LASTING,
@@ -32,13 +29,16 @@ from graphslam_frontends.odometry.reckoned import (
     PSI,
     SCALE,
     STATES,
-    LastingErrors,
-    Reckoned,
+    DeadReckonedPath,
+    DeadReckoningErrorModel,
     euler_quat,
     tangent_of_state,
 )
+from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
+from graphslam_frontends.odometry.drift import DriftModel
+from graphslam_frontends.odometry.gaps import Gaps, find_gaps
 
-__all__ = ["DeadReckoningNoise", "DriftModel", "dead_reckon", "reckon"]
+__all__ = ["DeadReckoningNoise", "DriftModel", "imu_wheel_increments", "integrate_imu_and_wheels"]
 
 _STEEPEST = float(np.deg2rad(80.0))  # heading means nothing on a wall
 
@@ -79,14 +79,14 @@ class DeadReckoningNoise:
                 raise ConfigError(f"dead reckoning: {name} = {value}; wanted {'> 0' if positive else '≥ 0'}")
 
 
-def dead_reckon(
+def imu_wheel_increments(
     imu: Imu, wheels: VelocityControls, times: npt.ArrayLike, noise: DeadReckoningNoise | None = None
 ) -> Odometry:
-    """The increments of :func:`reckon`, with the covariance of what is new in each."""
-    return reckon(imu, wheels, times, noise).odometry
+    """The increments of :func:`integrate_imu_and_wheels`, with the covariance of what is new in each."""
+    return integrate_imu_and_wheels(imu, wheels, times, noise).odometry
 
 
-def reckon(
+def integrate_imu_and_wheels(
     imu: Imu,
     wheels: VelocityControls,
     times: npt.ArrayLike,
@@ -96,7 +96,7 @@ def reckon(
     longest: float = 20.0,
     where: str = "log",
     drops: DropCounter | None = None,
-) -> Reckoned:
+) -> DeadReckonedPath:
     """Dead-reckon a base at ``times``.
 
     Parameters
@@ -188,7 +188,7 @@ def reckon(
     increments[1:] = se3.se3_between(poses[:-1], poses[1:])
     covariances = np.tile(np.diag(floor**2), (len(t), 1, 1))
     covariances[1:] += _white(poses, F, Q, lasting)
-    return Reckoned(
+    return DeadReckonedPath(
         odometry=Odometry(times=t, increments=increments, covariances=covariances),
         poses=poses,
         path=path,
@@ -240,7 +240,9 @@ def _tilt(up: Array) -> Array:
     return np.column_stack([np.arctan2(u[:, 1], u[:, 2]), -np.arcsin(np.clip(u[:, 0], -1.0, 1.0))])
 
 
-def _up(imu: Imu, wheels: VelocityControls, rate: Array, noise: DeadReckoningNoise) -> tuple[Array, LastingErrors]:
+def _up(
+    imu: Imu, wheels: VelocityControls, rate: Array, noise: DeadReckoningNoise
+) -> tuple[Array, DeadReckoningErrorModel]:
     """Where up is in the base at the IMU's records ``(n, 3)``, and the errors that last; ``rate``: base frame."""
     n = imu.noise
     common: dict[str, Any] = {
@@ -253,7 +255,7 @@ def _up(imu: Imu, wheels: VelocityControls, rate: Array, noise: DeadReckoningNoi
         r, p = imu.attitude.T
         up = np.column_stack([-np.sin(p), np.sin(r) * np.cos(p), np.cos(r) * np.cos(p)])
         lasts = min(noise.attitude_bias, n.attitude)
-        lasting = LastingErrors(
+        lasting = DeadReckoningErrorModel(
             **common,
             attitude=float(np.sqrt(n.attitude**2 - lasts**2)),
             attitude_time=max(n.attitude_time, 1e-3),
@@ -287,7 +289,7 @@ def _up(imu: Imu, wheels: VelocityControls, rate: Array, noise: DeadReckoningNoi
     # that is off lasts; what the bias of the gyro does is in the transition
     T = noise.filter_time
     fading = n.gyro**2 * T / 2.0 + (n.accelerometer / GRAVITY) ** 2 / (2.0 * T) + (noise.wheel / (GRAVITY * T)) ** 2
-    return up, LastingErrors(
+    return up, DeadReckoningErrorModel(
         **common,
         attitude=float(np.sqrt(fading)),
         attitude_time=T,
@@ -332,7 +334,7 @@ def _fine_steps(knots: Array, tilt: Array, rate: Array, speed: Array) -> _Fine:
     return _Fine(h, g, g_tilt, moved, pitched, axes, w[:, 2], poses, np.zeros((len(h), 4)))
 
 
-def _transitions(fine: _Fine, at: npt.NDArray[np.intp], lasting: LastingErrors) -> tuple[Array, Array]:
+def _transitions(fine: _Fine, at: npt.NDArray[np.intp], lasting: DeadReckoningErrorModel) -> tuple[Array, Array]:
     """Transition and noise ``(n, 12, 12)`` of the error state between the knots ``at`` ``(n,)``.
 
     All intervals advance together, one fine step of each at a time.
@@ -348,7 +350,7 @@ def _transitions(fine: _Fine, at: npt.NDArray[np.intp], lasting: LastingErrors) 
     return F, Q
 
 
-def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], lasting: LastingErrors) -> tuple[Array, Array]:
+def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], lasting: DeadReckoningErrorModel) -> tuple[Array, Array]:
     """Transition and noise ``(k, 12, 12)`` of the fine steps ``i`` ``(k,)``, first order about the middle."""
     h = fine.h[i]
     A, N = np.tile(np.eye(STATES), (len(i), 1, 1)), np.zeros((len(i), STATES, STATES))
@@ -378,7 +380,7 @@ def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], lasting: LastingError
     return A, N
 
 
-def _white(poses: Array, F: Array, Q: Array, lasting: LastingErrors) -> Array:
+def _white(poses: Array, F: Array, Q: Array, lasting: DeadReckoningErrorModel) -> Array:
     """Covariances ``(n - 1, 6, 6)`` of increments from body to body, without the errors that last."""
     P = np.zeros((len(F) - 1, STATES + 2, STATES + 2))
     pick = np.vstack([np.eye(STATES), np.eye(STATES)[FADING]])[:, FADING]

@@ -199,7 +199,7 @@ def _list_clouds(
     return _Clouds(clouds, record, row.astype(np.int64), clouds.times[record], max_range, sigma, clouds.times[again])
 
 
-def spread(n: int, most: int) -> Index:
+def stratified_indices(n: int, most: int) -> Index:
     """``most`` of ``n`` numbers, rising, one from each of as many equal stretches; all if there are no more.
 
     Inside its stretch the number moves by the golden ratio, so that the choice does not fall into step with the beams
@@ -214,7 +214,7 @@ def spread(n: int, most: int) -> Index:
     return np.asarray(edges + (offset * width).astype(np.int64), dtype=np.int64)
 
 
-def assign(beam_times: Array, step_times: Array, begin: float) -> Index:
+def assign_steps(beam_times: Array, step_times: Array, begin: float) -> Index:
     """Step ``(q,)`` that each beam belongs to: the first that ends at its stamp or after; -1 outside.
 
     Parameters
@@ -228,7 +228,7 @@ def assign(beam_times: Array, step_times: Array, begin: float) -> Index:
     return np.where((beam_times < begin) | (step == len(step_times)), -1, step).astype(np.int64)
 
 
-def deskew(
+def deskew_beams(
     path: Trajectory, step_poses: Array, step: Index, times: Array, origins: Array, ends: Array
 ) -> tuple[Array, Array]:
     """Move beams from the base at their own time to the base at the end of their step.
@@ -240,7 +240,7 @@ def deskew(
     step_poses : (n, 7) or (n, 3)
         Same frame.
     step, times : (q,)
-        The step follows from the time, as of :func:`assign`.
+        The step follows from the time, as of :func:`assign_steps`.
     origins, ends : (q, dim)
 
     Returns

@@ -18,7 +18,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 
 
-class PathErrors(Protocol):
+class IntervalCovariance(Protocol):
     """Knows how far off dead reckoning may be over an interval of steps, errors that last included."""
 
     def between(
@@ -33,7 +33,7 @@ class DriftModel:
     """Covariance at the end of a path of length L: each variance is ``start² + walk² L + (scale L)²``.
 
     The defaults are those of what a particle filter leaves of dead reckoning: pieces of 5 to 80 m of the paths of 20
-    particles in simulated garages. :func:`calibrate` makes a model for one's own sensors.
+    particles in simulated garages. :func:`calibrate_drift` makes a model for one's own sensors.
     """
 
     dim: int = 3
@@ -166,8 +166,8 @@ def _fit_variance(L: Array, variance: Array, floor: float, known: Array | float 
     return max(float(start), floor), float(walk), float(scale)
 
 
-def calibrate(
-    errors: PathErrors,
+def calibrate_drift(
+    errors: IntervalCovariance,
     path_length: Array,
     *,
     lengths: Sequence[float] = (5.0, 10.0, 20.0, 40.0, 60.0),
@@ -178,7 +178,7 @@ def calibrate(
 
     Parameters
     ----------
-    errors : PathErrors
+    errors : IntervalCovariance
         Covariance of dead reckoning between any two steps, as of :class:`~graphslam_frontends.odometry.steps.Steps`.
     path_length : (n,)
         Metres driven until each step, not falling.

@@ -47,13 +47,15 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
     spacing = np.diff(known)
     usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else limit
     k = np.flatnonzero((spacing > max(3.0 * usual, 0.05)) & (known[1:] > begin) & (known[:-1] < end))
-    refuse_long(known, k, limit, where)
+    refuse_long_gaps(known, k, limit, where)
     if drops is not None:
         drops.drop(where, "gap bridged", len(k))
     return Gaps(known[k], known[k + 1])
 
 
-def refuse_long(stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION) -> None:
+def refuse_long_gaps(
+    stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION
+) -> None:
     """Raise if a gap, given by the record before it, is longer than ``limit`` seconds, which ``option`` sets."""
     spacing = np.diff(stamps)
     if len(gaps) and spacing[gaps].max() > limit:

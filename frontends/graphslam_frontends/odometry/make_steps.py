@@ -18,7 +18,15 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LaserScans
-from graphslam_frontends.odometry.deskew import BeamSource, Index, assign, beam_source, cut_beams, deskew, spread
+from graphslam_frontends.odometry.deskew import (
+    BeamSource,
+    Index,
+    assign_steps,
+    beam_source,
+    cut_beams,
+    deskew_beams,
+    stratified_indices,
+)
 from graphslam_frontends.odometry.scan_matching import match_neighbours
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.step_motion import MotionSource, motion_source
@@ -78,7 +86,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
     times, begin = _stamps(log[names[0]], np.append(beam_times[inside], skipped), source, config)
     motion = source.solve(times, np.unique(np.append(beam_times[inside], begin)), count)
 
-    step = assign(beam_times, times, begin)
+    step = assign_steps(beam_times, times, begin)
     step[~inside] = -1
     if config.silent == "unknown":
         silent = np.concatenate([~s.beams(np.arange(len(s.times)))[2] for s in sources]) & inside
@@ -88,7 +96,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
     count.drop(", ".join(names), f"beams thinned out ({config.most_points} per step kept)", thinned)
     count.drop("steps", "step without a beam (kept)", int(np.sum(np.diff(offsets) == 0)))
     origins, ends, met = _beams(sources, chosen, config)
-    origins, ends = deskew(motion.path, motion.poses, step[chosen], beam_times[chosen], origins, ends)
+    origins, ends = deskew_beams(motion.path, motion.poses, step[chosen], beam_times[chosen], origins, ends)
     for what, n in count.counts.items():
         _log.info("%s: %s: %d", log.name, what, n)
     if drops is not None:
@@ -192,7 +200,7 @@ def _choose(step: Index, n: int, most: int) -> tuple[Index, Index, int]:
     """Numbers of the beams kept, by step ``(k,)``; offsets ``(n + 1,)``; how many were left out."""
     order = np.argsort(step, kind="stable")
     bounds = np.searchsorted(step[order], np.arange(n + 1))
-    kept = [order[a:b][spread(int(b - a), most)] for a, b in pairwise(bounds)]
+    kept = [order[a:b][stratified_indices(int(b - a), most)] for a, b in pairwise(bounds)]
     offsets = np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.int64)
     chosen = np.concatenate(kept) if kept else np.zeros(0, dtype=np.int64)
     return chosen.astype(np.int64), offsets, int(bounds[-1] - bounds[0] - offsets[-1])

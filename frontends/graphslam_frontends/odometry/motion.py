@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import SensorLog
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls, check_times
 from graphslam_frontends.odometry.motion_kernels import (
     FRONT_STEER,
@@ -104,13 +104,13 @@ def motion_stream(log: SensorLog) -> tuple[str, Motion]:
     return name, log[name]
 
 
-def motion_stream_name(log: SensorLog | Feed) -> str | None:
+def motion_stream_name(log: SensorLog | RecordSource) -> str | None:
     """Name of the stream to dead-reckon from; None: there is none."""
     found = (log.of_type(kind) for kind in (SteeringControls, VelocityControls, Odometry))
     return next((name for name in found if name is not None), None)
 
 
-def dead_reckoning(
+def dead_reckoned_increments(
     log: SensorLog, times: npt.ArrayLike, noise: MotionNoise, *, hold: float = 0.0
 ) -> tuple[Odometry, str]:
     """Increments between consecutive ``times`` from the log's motion stream, and that stream's name.

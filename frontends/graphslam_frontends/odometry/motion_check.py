@@ -24,10 +24,10 @@ import numpy as np
 from graphslam.core.findings import Finding, Level
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.registration.config import Gates, RegistrationConfig
-from graphslam.registration.register import Registration, distinct, register_starts
+from graphslam.registration.config import RegistrationConfig, RegistrationGates
+from graphslam.registration.register import Registration, distinct_registrations, register_starts
 from graphslam.registration.target import Target
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.steps import Steps
 
 PAIRS = 36
@@ -36,7 +36,7 @@ POINTS = 900
 """Points of a cloud that is matched, at most."""
 MATCHING = RegistrationConfig(
     radii=(1.0, 0.5), near=0.25, floor_sigma=0.01, floor_turn=0.003, max_shift=6.0, max_turn=1.6,
-    gates=Gates(
+    gates=RegistrationGates(
         fitness=0.55, fitness_alone=0.7, fitness_upright=0.45, degeneracy=1e-3, degeneracy_planar=1e-3, tilt=np.pi
     ),
 )  # fmt: skip
@@ -58,7 +58,7 @@ STEP = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class FittedCoefficient:
     """A coefficient and its standard error."""
 
     value: float
@@ -75,7 +75,7 @@ class MotionCheck:
         Pairs.
     least_share : float
         Of the pairs tried, for scans to be alike.
-    fits : dict of str to Fit
+    fits : dict of str to FittedCoefficient
         ``distance`` and ``turn`` (scans over odometry); where the scanner really is, as against its mounting: ``yaw``,
         ``pitch``, ``tilt`` [rad], ``ahead``, ``left`` [m]; ``lag`` [s]. What the drive does not show is not there.
     moved, turned : (float, float)
@@ -84,7 +84,7 @@ class MotionCheck:
 
     tried: int
     matched: int
-    fits: dict[str, Fit]
+    fits: dict[str, FittedCoefficient]
     least_share: float = UNLIKE
     moved: tuple[float, float] = (0.0, 0.0)
     turned: tuple[float, float] = (0.0, 0.0)
@@ -103,7 +103,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
     pairs = _pairs(steps, seconds)
     share = UNLIKE if seconds > 0 or steps.dim == 2 else UNLIKE_NARROW
     group = group_of(steps.odometry.increments)
-    path = chain(steps.odometry)
+    path = chain_odometry(steps.odometry)
     rows: list[tuple[float, float, Array, Array, Array]] = []
     clouds: dict[tuple[int, int], Target] = {}
     for (a0, a1), (b0, b1) in pairs:
@@ -122,7 +122,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
     var = np.array([np.diag(r[4]) for r in rows])
     heading = group.heading
     x = 0 if group.dim == 2 else 3
-    fits: dict[str, Fit] = {}
+    fits: dict[str, FittedCoefficient] = {}
     drive, turn = o[:, x], o[:, heading]
     if np.sqrt(np.mean(drive**2)) > 5.0 * STEP:
         columns = [drive, turn] if np.ptp(turn) > 0.2 else [drive]
@@ -131,13 +131,16 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
         scale = ahead[0].value if abs(ahead[0].value) > 0.2 else 1.0
         # what goes sideways and up by the odometry, too, as a body that is carried does, is no error
         side = _regress(columns, m[:, x + 1] - scale * o[:, x + 1], var[:, x + 1], STEP)
-        fits["yaw"] = Fit(-side[0].value / scale, side[0].sigma / abs(scale))
+        fits["yaw"] = FittedCoefficient(-side[0].value / scale, side[0].sigma / abs(scale))
         if len(columns) > 1:
             # the stated place is off by (ex, ey): the base that scans see is swung by it
-            fits["ahead"], fits["left"] = Fit(side[1].value, side[1].sigma), Fit(-ahead[1].value, ahead[1].sigma)
+            fits["ahead"], fits["left"] = (
+                FittedCoefficient(side[1].value, side[1].sigma),
+                FittedCoefficient(-ahead[1].value, ahead[1].sigma),
+            )
         if group.dim == 3:
             up = _regress([drive], m[:, 5] - scale * o[:, 5], var[:, 5], STEP)[0]
-            fits["pitch"] = Fit(up.value / scale, up.sigma / abs(scale))
+            fits["pitch"] = FittedCoefficient(up.value / scale, up.sigma / abs(scale))
     if np.sqrt(np.mean(turn**2)) > 5.0 * STEP / 3.0 and np.ptp(turn) > 0.2:
         seconds_of = end - begin
         fits["turn"] = _regress([turn, seconds_of], m[:, heading], var[:, heading], STEP / 3.0)[0]
@@ -146,7 +149,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
             worst = max(across, key=lambda f: abs(f.value) - SURE * f.sigma)
             fits["tilt"] = worst
         if seconds > 0 and (sigma := _mirrored(steps, pairs)) is not None:
-            fits["turn"] = Fit(-1.0, sigma)
+            fits["turn"] = FittedCoefficient(-1.0, sigma)
         lag = _lag(path.times, _headings(steps), begin, end, m[:, heading], var[:, heading])
         if lag is not None and abs(fits["turn"].value - 1.0) < 0.5:
             fits["lag"] = lag
@@ -240,13 +243,13 @@ def _match(source: Target, target: Target, T: Array, matching: RegistrationConfi
                 y = xi.copy()
                 y[0 if group.dim == 2 else 3] = metres
                 ways.append(group.exp(y))
-            found = distinct([*found, *register_starts(source, target, ways, matching)])
+            found = distinct_registrations([*found, *register_starts(source, target, ways, matching)])
     else:
         found = register_starts(source, target, [T, scaled(0.0, 0.0)], matching, apart=(0.2, 0.05))
         if len(found) != 1:
             more = [scaled(*v) for v in ((1.0, 0.0), (1.0, -1.0), (-1.0, 1.0), (0.4, 1.0), (2.0, 1.0))]
             again = register_starts(source, target, more, matching, apart=(0.2, 0.05))
-            found = distinct([*found, *again], (0.2, 0.05))
+            found = distinct_registrations([*found, *again], (0.2, 0.05))
     return found[0] if found and found[0].accepted else None
 
 
@@ -262,7 +265,7 @@ def _mirrored(steps: Steps, pairs: list[tuple[tuple[int, int], tuple[int, int]]]
     for sign in (1.0, -1.0):
         xi = np.asarray(group.log(steps.odometry.increments))
         xi[:, group.heading] *= sign
-        paths.append(chain(replace(steps.odometry, increments=group.exp(xi))).poses)
+        paths.append(chain_odometry(replace(steps.odometry, increments=group.exp(xi))).poses)
     heading = _headings(steps)
     turn = np.array([abs(heading[b[1] - 1] - heading[a[1] - 1]) for a, b in pairs])
     better = []
@@ -284,7 +287,7 @@ def _mirrored(steps: Steps, pairs: list[tuple[tuple[int, int], tuple[int, int]]]
     return max(float(sigma), 0.01) if mean > max(SURE * sigma, 0.05) else None
 
 
-def _regress(columns: list[Array], y: Array, variance: Array, floor: float) -> list[Fit]:
+def _regress(columns: list[Array], y: Array, variance: Array, floor: float) -> list[FittedCoefficient]:
     """Weighted regression of ``y`` on columns, bad rows weighed down (Cauchy); σ from what is left."""
     X = np.column_stack(columns)
     w = 1.0 / (variance + floor**2)
@@ -300,7 +303,7 @@ def _regress(columns: list[Array], y: Array, variance: Array, floor: float) -> l
     A = np.asarray(np.linalg.pinv((X * (w * robust)[:, None]).T @ X))
     P: Array = A @ (g.T @ g) @ A * len(y) / max(len(y) - X.shape[1], 1)  # sandwich: whatever the noise is like
     P = np.maximum(np.diag(P), np.diag(A) * min(scale, 1.0) ** 2)
-    return [Fit(float(b), float(np.sqrt(p))) for b, p in zip(beta, P)]
+    return [FittedCoefficient(float(b), float(np.sqrt(p))) for b, p in zip(beta, P)]
 
 
 def _headings(steps: Steps) -> Array:
@@ -308,7 +311,9 @@ def _headings(steps: Steps) -> Array:
     return np.cumsum(group.log(steps.odometry.increments)[:, group.heading])
 
 
-def _lag(times: Array, heading: Array, begin: Array, end: Array, turn: Array, variance: Array) -> Fit | None:
+def _lag(
+    times: Array, heading: Array, begin: Array, end: Array, turn: Array, variance: Array
+) -> FittedCoefficient | None:
     """By how much scans are later than the motion [s]: the shift that explains the matched turns best."""
     w = 1.0 / (variance + (STEP / 3.0) ** 2)
     shifts = np.arange(-2.0, 2.001, 0.05)
@@ -329,7 +334,7 @@ def _lag(times: Array, heading: Array, begin: Array, end: Array, turn: Array, va
     if curve <= 0.0:
         return None
     shift = float(shifts[k]) - 0.5 * 0.05 * float(cost[k + 1] - cost[k - 1]) / max(curve * 0.05**2, 1e-12)
-    return Fit(shift, float(np.sqrt(2.0 * noise / curve)))
+    return FittedCoefficient(shift, float(np.sqrt(2.0 * noise / curve)))
 
 
 def motion_findings(found: MotionCheck) -> list[Finding]:
@@ -410,7 +415,7 @@ def _turn_cause(ratio: float) -> str:
     return "the yaw rate is scaled or saturated, or the scanner's mounting is wrong"
 
 
-def spin_of(rates: Array | None) -> float:
+def half_turn_seconds(rates: Array | None) -> float:
     """Seconds of half a turn of a head that spins at ``rates`` [rad/s]; 0 of one that stands."""
     rate = float(np.median(np.abs(rates))) if rates is not None and len(rates) else 0.0
     return float(np.pi / rate) if rate > 0.05 else 0.0

@@ -17,8 +17,14 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls
-from graphslam_frontends.odometry.gaps import refuse_long
-from graphslam_frontends.odometry.motion import HEADING_UNKNOWN, Motion, MotionNoise, dead_reckoning, motion_stream
+from graphslam_frontends.odometry.gaps import refuse_long_gaps
+from graphslam_frontends.odometry.motion import (
+    HEADING_UNKNOWN,
+    Motion,
+    MotionNoise,
+    dead_reckoned_increments,
+    motion_stream,
+)
 from graphslam_frontends.odometry.recorded import BRIDGED
 
 SHORTEST = 1.0
@@ -58,7 +64,7 @@ class MotionGap:
         return {k: float(getattr(self, k)) for k in self.__dataclass_fields__ if k != "usual"}
 
 
-def bridged_reckoning(
+def dead_reckon_over_gaps(
     log: SensorLog, times: Array, noise: MotionNoise, *, hold: float, limit: float, drops: DropCounter
 ) -> tuple[Odometry, str, list[MotionGap]]:
     """Dead reckoning (:mod:`graphslam_frontends.odometry.motion`) with the gaps of the motion bridged by this model.
@@ -86,7 +92,7 @@ def bridged_reckoning(
         motion = _filled(motion, gap)
     if gaps:
         log = replace(log, streams={**log.streams, name: motion})
-    odometry, name = dead_reckoning(log, times, noise, hold=hold)
+    odometry, name = dead_reckoned_increments(log, times, noise, hold=hold)
     return replace(odometry, covariances=_widened(odometry, gaps)) if gaps else odometry, name, gaps
 
 
@@ -115,11 +121,11 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
         if spacing[i] > 3.0 * usual:
             gaps.append(i)
             out.append(_gap(motion.take(slice(0, known)), float(stamps[i]), float(stamps[i + 1]), usual))
-    refuse_long(stamps, np.array(gaps, dtype=np.int64), limit, where, option="frontend.longest_gap")
+    refuse_long_gaps(stamps, np.array(gaps, dtype=np.int64), limit, where, option="frontend.longest_gap")
     return out
 
 
-def certain_until(motion: Motion) -> float:
+def final_until(motion: Motion) -> float:
     """Until when nothing that is still to come changes what :func:`find_motion_gaps` says of the motion [s]."""
     stamps = motion.times
     if len(stamps) < 2:
@@ -128,7 +134,7 @@ def certain_until(motion: Motion) -> float:
     return float(stamps[open_gaps[0]] if len(open_gaps) else stamps[-1])
 
 
-def rates(motion: Motion) -> tuple[Array, Array, Array]:
+def motion_rates(motion: Motion) -> tuple[Array, Array, Array]:
     """Speed along x ``(n,)`` [m/s] and yaw rate ``(n,)`` [rad/s] of all records, and since when they hold [s]."""
     if isinstance(motion, VelocityControls):
         return motion.speed, motion.yaw_rate, motion.times
@@ -144,7 +150,7 @@ def rates(motion: Motion) -> tuple[Array, Array, Array]:
 
 
 def _gap(motion: Motion, begin: float, end: float, usual: float) -> MotionGap:
-    speed, rate, since = rates(motion)
+    speed, rate, since = motion_rates(motion)
     known = np.ones(len(since), dtype=np.bool_)
     over = -1
     if isinstance(motion, Odometry):  # the record that ends the gap

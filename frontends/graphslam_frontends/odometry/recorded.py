@@ -13,7 +13,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry, check_times
 from graphslam.core.se3 import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.gaps import Gaps, refuse_long
+from graphslam_frontends.odometry.gaps import Gaps, refuse_long_gaps
 from graphslam_frontends.odometry.motion import MotionNoise, recorded_odometry
 
 BRIDGED = 0.2
@@ -67,14 +67,14 @@ class RecordedErrors:
         for k in range(start + 1, end + 1):
             step = o.increments[k]
             back = g.adjoint(g.inverse(step))
-            J = back @ J + lasting_effect(step, float(o.times[k] - o.times[k - 1]))
+            J = back @ J + bias_effect(step, float(o.times[k] - o.times[k - 1]))
             P = back @ P @ back.T + o.covariances[k]
             T = g.compose(T, step)
         P = P + J @ np.diag([self.yaw_bias**2, self.scale**2]) @ J.T
         return T, 0.5 * (P + P.T)
 
 
-def lasting_effect(step: Array, seconds: float) -> Array:
+def bias_effect(step: Array, seconds: float) -> Array:
     """Right-tangent error ``(d, 2)`` of a motion per unit of yaw rate [rad/s] and of scale, constant during it."""
     g = group_of(step)
     xi = g.log(step)
@@ -93,7 +93,7 @@ def add_yaw_bias(odometry: Odometry, rate: float) -> Odometry:
     return replace(odometry, increments=g.exp(xi))
 
 
-def chain(odometry: Odometry) -> Trajectory:
+def chain_odometry(odometry: Odometry) -> Trajectory:
     """Poses ``(n, 3 | 7)`` of recorded increments in the frame of the first record's pose."""
     poses = odometry.increments.copy()
     g = group_of(poses)
@@ -104,7 +104,9 @@ def chain(odometry: Odometry) -> Trajectory:
     return Trajectory(odometry.times, poses)
 
 
-def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter | None = None) -> tuple[Odometry, Gaps]:
+def bridge_gap(
+    odometry: Odometry, limit: float, *, where: str, drops: DropCounter | None = None
+) -> tuple[Odometry, Gaps]:
     """Records of odometry that span a gap, made less certain; and the gaps.
 
     A record tells the whole motion over its time, however long, but not how it went meanwhile: cut into pieces its
@@ -117,7 +119,7 @@ def bridge(odometry: Odometry, limit: float, *, where: str, drops: DropCounter |
         return odometry, Gaps()
     spacing = np.diff(odometry.times)
     k = np.flatnonzero(spacing > max(3.0 * float(np.median(spacing)), 1.0))
-    refuse_long(odometry.times, k, limit, where)
+    refuse_long_gaps(odometry.times, k, limit, where)
     if drops is not None:
         drops.drop(where, "gap bridged", len(k))
     g = group_of(odometry.increments)

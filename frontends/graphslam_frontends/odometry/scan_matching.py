@@ -62,7 +62,7 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
         if target is not None:
             found = register(here, target, T, MATCHING)
             if found.converged and found.fitness >= FITNESS:
-                fused, Q = fuse(T, P, found.T_target_source, found.covariance)
+                fused, Q = fuse_motions(T, P, found.T_target_source, found.covariance)
                 increments[k] = se2_between(before, fused)
                 covariances[k] = Q
             else:
@@ -74,7 +74,7 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
     return replace(steps, odometry=motion, errors=None, recorded=o)
 
 
-def fuse(T: Array, P: Array, T_match: Array, R: Array) -> tuple[Array, Array]:
+def fuse_motions(T: Array, P: Array, T_match: Array, R: Array) -> tuple[Array, Array]:
     """Two estimates of one motion ``(3,)`` with covariances ``(3, 3)`` as one, in the tangent of the first."""
     gain = P @ np.linalg.inv(P + R)
     x = gain @ se2_log(se2_between(T, T_match))

@@ -16,11 +16,11 @@ from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.submap import Submap
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.motion_check import check_motion, motion_findings, spin_of
+from graphslam_frontends.odometry.motion_check import check_motion, half_turn_seconds, motion_findings
 from graphslam_frontends.odometry.scan_matching import match_neighbours
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
@@ -31,14 +31,14 @@ LONG = 2.0
 """Stretches without a correction that are shorter are what the filter's own walks are for [s]."""
 
 
-def checked_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None = None) -> Steps:
+def check_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None = None) -> Steps:
     """Steps of a log as a front end on grids takes them: of scans that see something, and held against the motion."""
     count = DropCounter()
     steps = make_steps(log, replace(config, match_scans=False), drops=count)
     if drops is not None:
         drops.counts.update(count.counts)
     require_returns(steps, count)
-    spins = [spin_of(s.spin_rate) for s in log.streams.values() if isinstance(s, RangeScans)]
+    spins = [half_turn_seconds(s.spin_rate) for s in log.streams.values() if isinstance(s, RangeScans)]
     found = tuple(motion_findings(check_motion(steps, max(spins, default=0.0))))
     if config.match_scans:  # after the check: what is fused with the scans agrees with them
         steps = match_neighbours(steps, drops=drops)
@@ -62,7 +62,7 @@ def require_returns(steps: Steps, drops: DropCounter | None = None) -> None:
     )
 
 
-def uncorrected(steps: Steps) -> list[tuple[int, int]]:
+def unobserved_stretches(steps: Steps) -> list[tuple[int, int]]:
     """Stretches ``(first, last)`` of steps, both inclusive and at least :data:`LONG`, whose motion no scan corrects.
 
     Steps with fewer than :data:`FEW` returns, and steps in a gap of the motion.
@@ -81,13 +81,13 @@ def uncorrected(steps: Steps) -> list[tuple[int, int]]:
     return out
 
 
-def uncorrected_covariance(steps: Steps, stretches: list[tuple[int, int]], path: Array, first: int, last: int) -> Array:
+def unobserved_covariance(steps: Steps, stretches: list[tuple[int, int]], path: Array, first: int, last: int) -> Array:
     """What stretches without a correction add at the end of a path: covariance ``(d, d)``, right tangent.
 
     Parameters
     ----------
     stretches : list of (first, last)
-        Of :func:`uncorrected`.
+        Of :func:`unobserved_stretches`.
     path : (last - first + 1, 7) or (…, 3)
         Poses at the steps ``first`` to ``last``.
     """
@@ -97,15 +97,15 @@ def uncorrected_covariance(steps: Steps, stretches: list[tuple[int, int]], path:
         a, b = max(begin, first + 1), min(end, last)
         if a > b:
             continue
-        P, there = reckoned_covariance(steps, a - 1, b), path[b - first]
+        P, there = dead_reckoning_covariance(steps, a - 1, b), path[b - first]
         if group.dim == 3 and steps.tilt is not None:
-            there = level(there)
+            there = remove_roll_pitch(there)
         A = group.adjoint(group.between(path[-1], there))
         total += A @ P @ A.T
     return 0.5 * (total + total.T)
 
 
-def reckoned_covariance(steps: Steps, start: int, end: int, *, level_end: bool = True) -> Array:
+def dead_reckoning_covariance(steps: Steps, start: int, end: int, *, level_end: bool = True) -> Array:
     """Covariance of dead reckoning from step ``start`` to step ``end``, right tangent.
 
     As the source of the motion states it, with what lasts; else of the increments, as if nothing did.
@@ -140,7 +140,7 @@ def scan_findings(steps: Steps) -> list[Finding]:
             "bridged with the usual motion of the robot; the covariances are increased accordingly."
         )
         out.append(Finding("look", "motion-gap", text))
-    stretches = uncorrected(steps)
+    stretches = unobserved_stretches(steps)
     blind = [s for s in stretches if not _in_gap(steps, s)]
     if blind:
         seconds = sum(float(steps.times[b] - steps.times[a - 1]) for a, b in blind)

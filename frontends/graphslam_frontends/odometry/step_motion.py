@@ -14,13 +14,13 @@ from graphslam.core.imu import Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.grid.motion import tilts
+from graphslam_frontends.grid.motion import roll_pitch_of
 from graphslam_frontends.odometry.calibration import without_yaw_per_metre
-from graphslam_frontends.odometry.dead_reckoning import reckon
-from graphslam_frontends.odometry.drift import PathErrors
+from graphslam_frontends.odometry.dead_reckoning import integrate_imu_and_wheels
+from graphslam_frontends.odometry.drift import IntervalCovariance
 from graphslam_frontends.odometry.gaps import Gaps, find_gaps
 from graphslam_frontends.odometry.motion import steering_odometry, velocity_odometry
-from graphslam_frontends.odometry.recorded import RecordedErrors, add_yaw_bias, bridge, chain, cut_odometry
+from graphslam_frontends.odometry.recorded import RecordedErrors, add_yaw_bias, bridge_gap, chain_odometry, cut_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
 
@@ -41,7 +41,7 @@ class StepMotion:
     odometry: Odometry
     poses: Array
     path: Trajectory
-    errors: PathErrors
+    errors: IntervalCovariance
     tilt: Array | None = None
     tilt_sigma: float = 0.0
     tilt_time: float = 1.0
@@ -125,7 +125,7 @@ def _inertial(
 
     def solve(times: Array, further: Array, drops: DropCounter | None) -> StepMotion:
         since = min(float(times[0]), float(further.min(initial=times[0])))
-        r = reckon(
+        r = integrate_imu_and_wheels(
             imu, wheels, times, config.noise, since=since, longest=config.longest_record, where=log.name, drops=drops
         )
         lasting = r.lasting
@@ -160,15 +160,15 @@ def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig)
         raise MissingDataError("odometry has a single record: no motion", where=f"{log.name}/{name}")
     if config.yaw_per_metre:
         odometry = without_yaw_per_metre(odometry, config.yaw_per_metre, where=f"{log.name}/{name}")
-    upright = chain(odometry)
+    upright = chain_odometry(odometry)
     if config.odometry_tilt_sigma and upright.dim == 2:
         raise ConfigError(f"{log.name}/{name}: odometry in the plane has no roll and pitch")
     if config.yaw_bias:
         odometry = add_yaw_bias(odometry, config.yaw_bias)
-    whole = chain(odometry) if config.yaw_bias else upright
+    whole = chain_odometry(odometry) if config.yaw_bias else upright
 
     def solve(times: Array, _: Array, drops: DropCounter | None) -> StepMotion:
-        sure, gaps = bridge(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
+        sure, gaps = bridge_gap(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
         cut = cut_odometry(sure, times, config.controls)
         poses = whole.interpolate(times)
         motion = StepMotion(odometry=cut, poses=poses, path=whole, errors=_errors(cut, config), gaps=gaps)
@@ -176,7 +176,7 @@ def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig)
             return motion
         return replace(
             motion,
-            tilt=tilts(upright.interpolate(times)),
+            tilt=roll_pitch_of(upright.interpolate(times)),
             tilt_sigma=config.odometry_tilt_sigma,
             tilt_time=config.odometry_tilt_time,
         )
@@ -201,8 +201,8 @@ def _controlled(
         span = (float(times[0]), float(times[-1]))
         where = f"{log.name}/{name}"
         gaps = find_gaps(controls.times, *span, config.longest_record, where=where, drops=drops)
-        odometry = doubted(dead_reckoned(times), controls, gaps)
-        path = chain(dead_reckoned(np.union1d(times, further)))
+        odometry = inflate_over_gaps(dead_reckoned(times), controls, gaps)
+        path = chain_odometry(dead_reckoned(np.union1d(times, further)))
         poses = path.poses[np.searchsorted(path.times, times)]
         if len(times) > 1 and not np.all(np.isfinite(poses)):
             raise DataError("dead reckoning is not finite", where=where)
@@ -212,7 +212,7 @@ def _controlled(
     return MotionSource((name,), 2, float(controls.times[0]), end, solve)
 
 
-def doubted(odometry: Odometry, controls: VelocityControls | SteeringControls, gaps: Gaps) -> Odometry:
+def inflate_over_gaps(odometry: Odometry, controls: VelocityControls | SteeringControls, gaps: Gaps) -> Odometry:
     """Increments in the plane whose covariances hold what a robot can have done in the gaps of its controls.
 
     The last control before a gap is held. Its σ, constant in the gap, is how far speeds and turns of the log are from

@@ -13,7 +13,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.records import Odometry, check_times
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.drift import PathErrors
+from graphslam_frontends.odometry.drift import IntervalCovariance
 from graphslam_frontends.odometry.gaps import Gaps
 
 
@@ -46,7 +46,7 @@ class Steps:
         σ of its error [rad], and the time over which errors stay alike [s].
     uses : frozenset of str
         Streams of the log that are inside.
-    errors : PathErrors or None
+    errors : IntervalCovariance or None
         Honest covariance of dead reckoning over any interval, where the source of the motion lets it be known.
     gaps : Gaps
         In the records of the motion, which is a guess there.
@@ -71,7 +71,7 @@ class Steps:
     uses: frozenset[str] = frozenset()
     name: str = "steps"
     truth: Trajectory | None = None
-    errors: PathErrors | None = None
+    errors: IntervalCovariance | None = None
     gaps: Gaps = field(default_factory=Gaps)
     findings: tuple[Finding, ...] = ()
     recorded: Odometry | None = None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam.registration.surfaces import SurfaceConfig
+from graphslam.registration.surfaces import SurfaceFitConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class ScanWindowConfig:
     """… and one whose residuals are spread wider than this [m]."""
     surprise: float = 40.0
     """… and one whose correction is this far from what the motion allows (χ² of up to six degrees of freedom)."""
-    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
     """What counts as a surface."""
 
     def __post_init__(self) -> None:

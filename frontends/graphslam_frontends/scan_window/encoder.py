@@ -20,7 +20,7 @@ from graphslam.core.se3 import quat_to_matrix
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.config import ScanWindowConfig
-from graphslam_frontends.scan_window.tracker import Tracker
+from graphslam_frontends.scan_window.tracker import ScanToWindowOdometry
 
 UPRIGHT = 0.9
 """Cosine of the tilt up to which the axis of a head counts as upright."""
@@ -91,7 +91,7 @@ def encoder_offset(
     found = 0.0
     for _ in range(_ROUNDS):
         turned = replace(part, streams={**part.streams, stream: replace(head, spin=head.spin - found)})
-        tracker = Tracker(make_steps(turned, config), window or ScanWindowConfig())
+        tracker = ScanToWindowOdometry(make_steps(turned, config), window or ScanWindowConfig())
         seen = [tracker.step().lost == "" for _ in range(len(tracker.steps))]
         if np.mean(seen) < 0.3:
             raise DataError(

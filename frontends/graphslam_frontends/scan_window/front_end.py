@@ -13,7 +13,7 @@ from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -25,9 +25,9 @@ from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.config import ScanWindowConfig
 from graphslam_frontends.scan_window.encoder import encoder_findings
-from graphslam_frontends.scan_window.exits import relative_covariance
-from graphslam_frontends.scan_window.followed import once
-from graphslam_frontends.scan_window.tracker import Found, Tracker
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
+from graphslam_frontends.scan_window.scan_odometry_steps import refuse_fused_steps
+from graphslam_frontends.scan_window.tracker import ScanMatch, ScanToWindowOdometry
 from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 LAST = "end-of-log"
@@ -83,7 +83,7 @@ class ScanWindowFrontEndConfig:
     """How the path is cut, and what the maps are made of."""
 
     def __post_init__(self) -> None:
-        once(self.steps)
+        refuse_fused_steps(self.steps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ class ScanWindow(StepwiseFrontEnd):
         """See :class:`~graphslam_frontends.base.FrontEnd`."""
         first = 0 if after is None else after.key + 1
         c = self.config
-        for s in window_submaps(self.steps(log, drops=drops), c.window, c.submap, first_key=first):
+        for s in scan_window_submaps(self.steps(log, drops=drops), c.window, c.submap, first_key=first):
             if s.report["ended"] == LAST:
                 found = encoder_findings(log, c.steps, c.window, s.report["askew"], s.report["askew_sigma"])
                 rows = [*s.report.get("findings", []), *(f.as_row() for f in found)]
@@ -119,7 +119,7 @@ class ScanWindow(StepwiseFrontEnd):
             yield s
 
 
-def window_submaps(
+def scan_window_submaps(
     steps: Steps, window: ScanWindowConfig, config: WindowSubmapConfig, *, first_key: int = 0
 ) -> Iterator[Submap]:
     """Submaps of scan-to-window odometry, in order.
@@ -132,7 +132,7 @@ def window_submaps(
     n = len(steps)
     if n < 2:
         raise DataError("too few steps for a submap", where=steps.name, got=n, wanted="at least 2")
-    tracker, way = Tracker(steps, window), steps.path_length
+    tracker, way = ScanToWindowOdometry(steps, window), steps.path_length
     start, key, states = 0, 0, []
     for k in range(n):
         found = tracker.step()
@@ -152,11 +152,11 @@ def window_submaps(
 def _submap(
     steps: Steps,
     interval: tuple[int, int],
-    states: list[tuple[Array, Array, Found]],
+    states: list[tuple[Array, Array, ScanMatch]],
     config: WindowSubmapConfig,
     key: int,
     ended: str,
-    tracker: Tracker,
+    tracker: ScanToWindowOdometry,
 ) -> Submap:
     start, end = interval
     gravity = steps.tilt is not None
@@ -196,12 +196,12 @@ def _base(body: Array, lift: float, gravity: bool) -> Array:
     """The frame of a submap that begins at a body."""
     if not gravity:
         return body
-    base = level(body)
+    base = remove_roll_pitch(body)
     base[2] -= lift
     return base
 
 
-def _summary(found: list[Found]) -> dict[str, Any]:
+def _summary(found: list[ScanMatch]) -> dict[str, Any]:
     """What scans said, in figures."""
     lost = Counter(f.lost for f in found if f.lost and f.lost != "start")
     spreads = [f.spread for f in found if np.isfinite(f.spread)]

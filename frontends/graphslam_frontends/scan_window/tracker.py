@@ -29,11 +29,11 @@ from scipy.spatial import cKDTree
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.registration.plane_kernels import Pairs, nothing_feigned, plane_blocks, plane_residuals
+from graphslam.registration.plane_kernels import PlanePairs, no_noise_correction, plane_blocks, plane_residuals
 from graphslam.registration.surfaces import fit_places, rotations, thin_places
-from graphslam_frontends.grid.motion import tilted
-from graphslam_frontends.grid.weights import spread
-from graphslam_frontends.odometry.lasting import lasting_sigmas
+from graphslam_frontends.grid.motion import with_roll_pitch
+from graphslam_frontends.grid.weights import evenly_spaced_indices
+from graphslam_frontends.odometry.bias_sigmas import bias_sigmas
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.config import ScanWindowConfig
 
@@ -50,7 +50,7 @@ TOLD = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ScanMatch:
     """What the scan of a step said.
 
     Parameters
@@ -74,14 +74,14 @@ class Found:
     lost: str
 
 
-class Tracker:
+class ScanToWindowOdometry:
     """Follows the steps of a log one by one."""
 
     def __init__(self, steps: Steps, config: ScanWindowConfig) -> None:
         self.steps, self.config = steps, config
         self.group = g = group_of(steps.odometry.increments)
         self.gravity = steps.tilt is not None
-        self.sigmas = s = lasting_sigmas(steps)
+        self.sigmas = s = bias_sigmas(steps)
         w, self.w = g.dof, g.dof
         # lasting states: yaw bias, scale, side (, rise (, constant roll and pitch, fading roll and pitch))
         prior = [s.yaw_bias, s.scale, s.direction]
@@ -104,7 +104,7 @@ class Tracker:
         self.pose = np.array(g.identity)
         if self.gravity:
             assert steps.tilt is not None
-            self.pose = tilted(self.pose[None], steps.tilt[:1])[0]
+            self.pose = with_roll_pitch(self.pose[None], steps.tilt[:1])[0]
         # the window: steps by slot, points of a slot in as many rows as the longest scan has
         self.rows = max(int(np.diff(steps.offsets).max(initial=1)), 1)
         self.points = np.zeros(((self.slots + 2) * self.rows, g.dim))
@@ -126,7 +126,7 @@ class Tracker:
 
     # --- one step ----------------------------------------------------------------------------------------------------
 
-    def step(self) -> Found:
+    def step(self) -> ScanMatch:
         """Follow the next step of the log."""
         self.k += 1
         if self.k:
@@ -154,7 +154,7 @@ class Tracker:
         k, g, w, x = self.k, self.group, self.w, self.x
         u, dt = self.steps.odometry.increments[k], float(self.steps.times[k] - self.steps.times[k - 1])
         m = self.motion_states
-        B = effects(u, dt)
+        B = bias_effects(u, dt)
         step = g.compose(u, g.exp(B @ self.lasting[:m]))
         Q = np.zeros((x, x))
         C = self.steps.odometry.covariances[k].copy()
@@ -181,7 +181,7 @@ class Tracker:
     def _level(self) -> None:
         """Roll and pitch as gravity tells them, with their constant and their fading error."""
         assert self.steps.tilt is not None
-        seen, D = se3.roll_pitch(self.pose[None])
+        seen, D = se3.roll_pitch_jacobian(self.pose[None])
         H = np.zeros((2, self.x))
         H[:, :6] = D[0]
         H[:, -4:-2] = H[:, -2:] = np.eye(2)
@@ -230,15 +230,15 @@ class Tracker:
 
     # --- the scan ----------------------------------------------------------------------------------------------------
 
-    def _see(self) -> Found:
+    def _see(self) -> ScanMatch:
         points, origins, returns = self.steps.scan(self.k)
         hit = np.flatnonzero(returns)
-        p = hit[spread(len(hit), self.config.points)]
+        p = hit[evenly_spaced_indices(len(hit), self.config.points)]
         if self.tree is None:
-            return Found(0, np.nan, np.nan, 0.0, "start")
+            return ScanMatch(0, np.nan, np.nan, 0.0, "start")
         c, g, w = self.config, self.group, self.w
         if len(p) < c.least_points:
-            return Found(len(p), 0.0, np.nan, 0.0, "points")
+            return ScanMatch(len(p), 0.0, np.nan, 0.0, "points")
         first = self.NOW * self.rows
         source = first + np.arange(len(p))
         self.points[source], self.origins[source] = points[p], origins[p]
@@ -257,9 +257,9 @@ class Tracker:
             near, q, slot = near[facing], q[facing], slot[facing]
             overlap = len(near) / len(p)
             if len(near) < c.least_points or overlap < c.least_overlap:
-                return Found(len(near), overlap, np.nan, 0.0, "overlap")
+                return ScanMatch(len(near), overlap, np.nan, 0.0, "overlap")
             n = len(near)
-            pairs = Pairs(source[near], q, np.full(n, self.NOW), slot)
+            pairs = PlanePairs(source[near], q, np.full(n, self.NOW), slot)
             r = np.empty(n)
             plane_residuals(pairs, self.R, self.t, self.points, self.normals, r)
             scatter = 1.4826 * float(np.median(np.abs(r)))
@@ -268,9 +268,9 @@ class Tracker:
             slots = np.unique(slot)
             L, G, b = self._blocks(pairs, information, slots)
             # what is measured: Jᵀ Λ r, of as many directions as surfaces hold, each of unit noise
-            every = every_direction(points[p][near], information)
+            every = full_rank_information(points[p][near], information)
             seen = np.stack([L, every])
-            M = held_directions(L, every, c.normal_sigma, self._unheld(lately + seen))
+            M = observable_directions(L, every, c.normal_sigma, self._unheld(lately + seen))
             H = np.zeros((len(M), self.x))
             H[:, :w] = M @ L @ g.adjoint(g.exp(-d[:w]))  # from the axes of the pose before corrections
             y = M @ (L @ d[:w] - b)
@@ -281,11 +281,11 @@ class Tracker:
         self._lately, self._seen_at = (1.0 - self.config.spacing / self.lay) * lately + seen, pose
         if not lost:
             self._correct(gain, y)
-        return Found(n, overlap, scatter, surprise, lost)
+        return ScanMatch(n, overlap, scatter, surprise, lost)
 
     def _unheld(self, seen: Array) -> Array:
         """Directions ``(w, m)`` that nothing has held lately, this scan included: along a corridor, say."""
-        values, V = directions(seen[0], seen[1], self.config.normal_sigma)
+        values, V = direction_strengths(seen[0], seen[1], self.config.normal_sigma)
         return V[:, values <= CLEARLY]
 
     def _seen(self, pose: Array) -> Array:
@@ -293,7 +293,7 @@ class Tracker:
         A = self.group.adjoint(self.group.between(self._seen_at, pose))
         return np.asarray(A.T @ self._lately @ A)
 
-    def _blocks(self, pairs: Pairs, information: Array, slots: Index) -> tuple[Array, Array, Array]:
+    def _blocks(self, pairs: PlanePairs, information: Array, slots: Index) -> tuple[Array, Array, Array]:
         """Information of the pose of now ``(w, w)``, with the slots ``(w, w·s)``, and ``Jᵀ Λ r`` ``(w,)``."""
         w, m = self.w, self.slots + 2
         H, g = np.zeros(2 * m * w * w), np.zeros((m, w))
@@ -302,7 +302,7 @@ class Tracker:
         begin = np.arange(m, dtype=np.int64) * w * w
         plane_blocks(
             pairs, (self.R, self.t), (self.points, self.normals), information,
-            (begin, m * w * w + begin[pairs.j], rank), nothing_feigned(self.group.dim), H, g,
+            (begin, m * w * w + begin[pairs.j], rank), no_noise_correction(self.group.dim), H, g,
         )  # fmt: skip
         blocks = H.reshape(2, m, w, w)
         return blocks[0, self.NOW], np.concatenate(list(blocks[1, slots]), axis=1), g[self.NOW]
@@ -381,7 +381,7 @@ class Tracker:
         self.tree = cKDTree(self._world(self.tree_rows)[0]) if len(self.tree_rows) else None
 
 
-def every_direction(points: Array, information: Array) -> Array:
+def full_rank_information(points: Array, information: Array) -> Array:
     """Information ``(w, w)`` of points ``(k, d)``, frame of the body, that would hold it along every axis."""
     d = points.shape[1]
     first, second = information @ points, (points.T * information) @ points
@@ -398,7 +398,7 @@ def every_direction(points: Array, information: Array) -> Array:
     return out
 
 
-def directions(information: Array, every: Array, sigma: float) -> tuple[Array, Array]:
+def direction_strengths(information: Array, every: Array, sigma: float) -> tuple[Array, Array]:
     """By how many times surfaces hold a body better than noise of their normals would pretend to, and where to.
 
     Normals are found among points that are themselves noisy. Those of a straight wall are therefore turned a little to
@@ -410,7 +410,7 @@ def directions(information: Array, every: Array, sigma: float) -> tuple[Array, A
     information : (w, w)
         ``Jᵀ Λ J`` of points on their surfaces.
     every : (w, w)
-        Of :func:`every_direction`: what the same points would say with their normals turned anyhow.
+        Of :func:`full_rank_information`: what the same points would say with their normals turned anyhow.
     sigma : float
         Of a normal [rad].
 
@@ -425,13 +425,13 @@ def directions(information: Array, every: Array, sigma: float) -> tuple[Array, A
     return values, V
 
 
-def held_directions(information: Array, every: Array, sigma: float, unheld: Array) -> Array:
+def observable_directions(information: Array, every: Array, sigma: float, unheld: Array) -> Array:
     """Rows ``(m, w)`` that take ``Jᵀ Λ r`` to m ≤ w numbers of unit noise, of the directions that surfaces hold.
 
     Parameters
     ----------
     information, every, sigma
-        Of one scan, as in :func:`directions`.
+        Of one scan, as in :func:`direction_strengths`.
     unheld : (w, k)
         Directions that are given up first, whatever this scan says of them: they are solved for and forgotten. One scan
         alone has them a little askew, and would say across what it must not say along.
@@ -442,13 +442,13 @@ def held_directions(information: Array, every: Array, sigma: float, unheld: Arra
         B = information @ unheld
         given_up -= B @ np.linalg.solve(unheld.T @ B, unheld.T)
     left = given_up @ information
-    values, V = directions(0.5 * (left + left.T), every, sigma)
+    values, V = direction_strengths(0.5 * (left + left.T), every, sigma)
     held = values > CLEARLY
     held[:u] = False
     return np.asarray((V[:, held] / np.sqrt(values[held])).T @ given_up)
 
 
-def effects(u: Array, dt: float) -> Array:
+def bias_effects(u: Array, dt: float) -> Array:
     """What errors that last take off a motion ``u``: ``(d, 3|4)``, for a yaw bias, a scale, and a direction.
 
     The odometry is measured = true × (1 + scale), led astray to the right (and in space downwards) by the direction,
@@ -468,7 +468,7 @@ def effects(u: Array, dt: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Track:
+class TrackedPath:
     """A tracked path.
 
     Parameters
@@ -485,12 +485,12 @@ class Track:
     poses: Array
     joints: Array
     lasting: Array
-    found: tuple[Found, ...]
+    found: tuple[ScanMatch, ...]
 
 
-def track(steps: Steps, config: ScanWindowConfig, starts: Iterable[int] = ()) -> Track:
+def track_steps(steps: Steps, config: ScanWindowConfig, starts: Iterable[int] = ()) -> TrackedPath:
     """Follow all steps; submaps begin at the first step and at the steps ``starts``."""
-    t = Tracker(steps, config)
+    t = ScanToWindowOdometry(steps, config)
     n, begins = len(steps), {0, *starts}
     poses, joints = np.empty((n, t.group.size)), np.empty((n, 2 * t.w, 2 * t.w))
     lasting, found = np.empty((n, len(t.lasting))), []
@@ -501,4 +501,4 @@ def track(steps: Steps, config: ScanWindowConfig, starts: Iterable[int] = ()) ->
         poses[k], joints[k], lasting[k] = t.pose, t.joint, t.lasting
         if k in begins:
             t.begin()
-    return Track(poses, joints, lasting, tuple(found))
+    return TrackedPath(poses, joints, lasting, tuple(found))

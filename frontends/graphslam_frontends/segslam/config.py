@@ -96,7 +96,7 @@ class SegmentationConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WinnowConfig:
+class SegmentCandidateConfig:
     """Which earlier segments are worth matching (A10)."""
 
     gap: float = 40.0
@@ -302,7 +302,7 @@ class SegSlamConfig:
 
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     """When a segment ends."""
-    winnowing: WinnowConfig = field(default_factory=WinnowConfig)
+    winnowing: SegmentCandidateConfig = field(default_factory=SegmentCandidateConfig)
     """Which segments are tried."""
     search: CandidateSearch = field(default_factory=CandidateSearch)
     """How a match is searched."""

@@ -104,7 +104,7 @@ def exit_covariance(
 
 
 @dataclass(frozen=True, slots=True)
-class Nees:
+class ExitNees:
     """Normalised squared errors of exits.
 
     Parameters
@@ -135,7 +135,7 @@ def exit_nees(
     truths: ArrayLike,
     *,
     components: npt.ArrayLike | None = None,
-) -> Nees:
+) -> ExitNees:
     """Are the covariances of exits honest?
 
     Parameters
@@ -153,4 +153,4 @@ def exit_nees(
     e = group.log(group.between(T, truths))[:, keep]
     P = np.asarray(covariances, dtype=np.float64)[:, keep[:, None], keep[None, :]]
     values = np.einsum("ni,ni->n", e, np.linalg.solve(P, e[..., None])[..., 0])
-    return Nees(values, len(keep), e)
+    return ExitNees(values, len(keep), e)

@@ -11,15 +11,15 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.odometry.scan_use import with_findings
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.config import ScanWindowConfig
-from graphslam_frontends.scan_window.followed import followed, once
+from graphslam_frontends.scan_window.scan_odometry_steps import odometry_from_scans, refuse_fused_steps
 from graphslam_frontends.segslam.config import SegSlamConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
-from graphslam_frontends.segslam.submaps import drift_by_path, settle, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, submaps_of_segments
 from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 
@@ -40,7 +40,7 @@ class SegSlamFrontEndConfig:
 
     def __post_init__(self) -> None:
         if self.segslam.inside == "scan-window":
-            once(self.steps)
+            refuse_fused_steps(self.steps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class SegSlam(StepwiseFrontEnd):
     ) -> Iterator[Submap]:
         """See :class:`~graphslam_frontends.base.FrontEnd`: the chain of the best particle, segment by segment."""
         result = self.result(log, seed=seed, drops=drops, watch=watch)
-        for submap in settled(result, self.config.drift, self.config.segslam):
+        for submap in submaps_of_best_particle(result, self.config.drift, self.config.segslam):
             if submap.key == 0:
                 submap = with_findings(submap, result.steps)
             if after is None or submap.key > after.key:
@@ -80,11 +80,11 @@ class SegSlam(StepwiseFrontEnd):
         c, steps, filter = self.config, self.steps(log, drops=drops), self.config.filter
         if c.segslam.inside == "scan-window":
             # one path for all: what it leaves to sample is less than a map can tell apart
-            steps, filter = followed(steps, c.window), replace(filter, walk_scale=0.0, motion_scale=0.0)
+            steps, filter = odometry_from_scans(steps, c.window), replace(filter, walk_scale=0.0, motion_scale=0.0)
         return run_segslam(steps, filter, c.segslam, seed.child(0), watch=watch)
 
 
-def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) -> list[Submap]:
+def submaps_of_best_particle(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) -> list[Submap]:
     """Submaps of the best particle's chain.
 
     Parameters
@@ -93,8 +93,8 @@ def settled(result: SegSlamResult, drift: FilterDrift, config: SegSlamConfig) ->
         Errors that all particles share.
     """
     segmap, steps = result.segmap, result.steps
-    chain = settled_chain(segmap, int(result.closed[result.best]))
-    return settle(
+    chain = common_ancestor_chain(segmap, int(result.closed[result.best]))
+    return submaps_of_segments(
         segmap,
         chain,
         drift_by_path(segmap, chain, drift, steps),

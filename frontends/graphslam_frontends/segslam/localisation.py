@@ -20,13 +20,13 @@ from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
 from graphslam.evidence.queries import cast_grids
 from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
 from graphslam_frontends.segslam.config import LocalisationConfig
-from graphslam_frontends.segslam.segmentation import Window
+from graphslam_frontends.segslam.segmentation import LookAheadWindow
 
 _SHRINK = 0.95  # of the cloud about its mean before it is blurred to its old size (Liu & West 2001)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Localisation:
+class ScanLocalisation:
     """Where a scan lies in a map.
 
     Parameters
@@ -50,16 +50,16 @@ class Localisation:
     effective: float
 
 
-def localise(
+def localise_in_map(
     grid: EvidenceGrid,
     T_start: ArrayLike,
-    window: Window,
+    window: LookAheadWindow,
     max_range: float,
     rng: np.random.Generator,
     config: LocalisationConfig,
     *,
     threads: int = 1,
-) -> Localisation:
+) -> ScanLocalisation:
     """Draw poses around a start, weigh and resample them a few times, and say what is left.
 
     The likelihood is spent in equal parts, one a round, so that all rounds together count the scan once; between them
@@ -101,7 +101,7 @@ def localise(
     covariance = pose_scatter(poses, mean, w)
     P = covariance[g.position, g.position]
     spread = max(float(np.linalg.det(P)), 0.0) ** (0.5 / g.dim)
-    return Localisation(
+    return ScanLocalisation(
         pose=mean,
         covariance=0.5 * (covariance + covariance.T),
         error=range_error(grid, mean, window, max_range, clip=config.clip * config.cast_sigma),
@@ -110,7 +110,7 @@ def localise(
     )
 
 
-def range_error(grid: EvidenceGrid, pose: Array, window: Window, max_range: float, *, clip: float) -> float:
+def range_error(grid: EvidenceGrid, pose: Array, window: LookAheadWindow, max_range: float, *, clip: float) -> float:
     """Mean squared difference of measured and expected ranges [m²], each at most ``clip`` [m]; eq. 19's err_X.
 
     Where the map expects nothing, the difference is ``clip``. NaN without any beam.

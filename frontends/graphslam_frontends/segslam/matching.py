@@ -20,17 +20,17 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
-from graphslam.registration.register import Registration, distinct, register_starts
+from graphslam.registration.register import Registration, distinct_registrations, register_starts
 from graphslam.registration.search import correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
-from graphslam_frontends.segslam.choice import NULL, Proposal, judge
+from graphslam_frontends.segslam.candidate_selection import CandidateSelection, SegmentCandidates, select_candidates
 from graphslam_frontends.segslam.config import SegSlamConfig
-from graphslam_frontends.segslam.localisation import localise
-from graphslam_frontends.segslam.sampling import draw_weights, grow, root_of_particle
-from graphslam_frontends.segslam.segmap import NEW, Entry, SegMap
-from graphslam_frontends.segslam.window import Ahead
-from graphslam_frontends.segslam.winnowing import Candidates, Winnowed, winnow
+from graphslam_frontends.segslam.localisation import localise_in_map
+from graphslam_frontends.segslam.match_posterior import NULL, Proposal, match_posterior
+from graphslam_frontends.segslam.sampling import draw_weights, grow_sample, root_of_particle
+from graphslam_frontends.segslam.segmap import NEW, SegMap, SegmentEntry
+from graphslam_frontends.segslam.window import LookAheadScan
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -41,7 +41,7 @@ POINT_BYTES = 1250
 """Of one point of such a cloud, with its covariance and its places in two trees."""
 
 
-class Recent(dict[K, V]):
+class RecentCache(dict[K, V]):
     """What was made, by what it was made of; what was asked for longest ago goes first, and is made again.
 
     Parameters
@@ -74,12 +74,12 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Attempt:
+class MatchAttempt:
     """What one attempt at one step came to.
 
     Parameters
     ----------
-    entries : tuple of N (Entry or None)
+    entries : tuple of N (SegmentEntry or None)
         How each particle enters an older map; None: not at all.
     candidates : tuple of int
         Segments that were asked for, by any particle.
@@ -94,7 +94,7 @@ class Attempt:
     """
 
     step: int
-    entries: tuple[Entry | None, ...]
+    entries: tuple[SegmentEntry | None, ...]
     candidates: tuple[int, ...] = ()
     searches: int = 0
     registrations: int = 0
@@ -132,23 +132,23 @@ class Matcher:
 
     def __init__(self, segmap: SegMap, config: SegSlamConfig, max_range: float, *, threads: int = 1) -> None:
         self.segmap, self.config, self.max_range, self.threads = segmap, config, max_range, threads
-        self.winnowed = Winnowed()
+        self.winnowed = CandidateSelection()
         self.seconds = 0.0
         # what a closed map is matched by: made when it is first asked for
-        self._targets: Recent[int, Target | None] = Recent(lambda t: 0 if t is None else POINT_BYTES * len(t))
+        self._targets: RecentCache[int, Target | None] = RecentCache(lambda t: 0 if t is None else POINT_BYTES * len(t))
         # fine and coarse, of one of all particles' maps of the same steps
-        self._fields: Recent[tuple[int, int], tuple[SearchField, SearchField]] = Recent(
+        self._fields: RecentCache[tuple[int, int], tuple[SearchField, SearchField]] = RecentCache(
             lambda pair: pair[0].nbytes + pair[1].nbytes
         )
 
-    def attempt(self, step: int, poses: Array, ahead: Ahead, seed: SeedTree) -> Attempt:
+    def attempt(self, step: int, poses: Array, ahead: LookAheadScan, seed: SeedTree) -> MatchAttempt:
         """Try to match all particles, and draw.
 
         Parameters
         ----------
         poses : (N, 7) or (N, 3)
             ``T_segment_body``.
-        ahead : Ahead
+        ahead : LookAheadScan
             The window of this step; with one that is not full, nothing is matched.
         seed : SeedTree
             Of this attempt alone.
@@ -159,8 +159,8 @@ class Matcher:
         finally:
             self.seconds += time.perf_counter() - begin
 
-    def _attempt(self, step: int, poses: Array, ahead: Ahead, seed: SeedTree) -> Attempt:
-        nothing = Attempt(step=step, entries=(None,) * len(poses))
+    def _attempt(self, step: int, poses: Array, ahead: LookAheadScan, seed: SeedTree) -> MatchAttempt:
+        nothing = MatchAttempt(step=step, entries=(None,) * len(poses))
         segmap, config = self.segmap, self.config
         alive = segmap.alive
         ended = segmap.times[segmap.table.end[alive]]
@@ -174,16 +174,16 @@ class Matcher:
             return nothing
         results, searches, registrations = self._register(source, asked)
         proposals = [self._proposals(c, results, ahead, seed.child("localise", i)) for i, c in enumerate(asked)]
-        judged = [judge(p, config.choice, config.registration) for p in proposals]
+        judged = [match_posterior(p, config.choice, config.registration) for p in proposals]
         uniform = seed.child("draw").generator().random(len(poses))
-        entries: list[Entry | None] = []
+        entries: list[SegmentEntry | None] = []
         why: Counter[str] = Counter()
         for j, u in zip(judged, uniform.tolist()):
             k = j.draw(u) if len(j.proposals) else NULL
             entries.append(None if k == NULL else j.entry(k, config.choice))
             why.update({name: n for name, n in j.counts().items() if name != "accepted"})
         best = [r.best_fitness for found in results.values() for r in found]
-        return Attempt(
+        return MatchAttempt(
             step=step,
             entries=tuple(self._spread(entries, seed)),
             candidates=tuple(sorted({int(s) for c in asked for s in c.segments})),
@@ -196,23 +196,23 @@ class Matcher:
 
     # --- candidates ------------------------------------------------------------------------------------------
 
-    def _candidates(self, step: int, poses: Array, seed: SeedTree) -> list[Candidates]:
+    def _candidates(self, step: int, poses: Array, seed: SeedTree) -> list[SegmentCandidates]:
         """What each particle asks for. Particles that came the same way share a map sample."""
         segmap, config = self.segmap, self.config
         groups: dict[tuple[int, int, int], list[int]] = {}
         for i, entry in enumerate(segmap.entries):
             groups.setdefault((id(entry), int(segmap.start[i]), int(segmap.previous[i])), []).append(i)
         weights = draw_weights(segmap)
-        out: dict[int, Candidates] = {}
+        out: dict[int, SegmentCandidates] = {}
         for number, members in enumerate(groups.values()):
             rng = seed.child("sample", number).generator()
-            sample = grow(
+            sample = grow_sample(
                 segmap, root_of_particle(segmap, members[0], step), rng, weights=weights,
                 local_length=config.winnowing.local_length,
             )  # fmt: skip
             entry = segmap.entries[members[0]]
             held = self._held(-1 if entry is None or entry.kind == NEW else entry.source)
-            found = winnow(
+            found = select_candidates(
                 segmap, sample, poses[members], step, config.winnowing, exclude=held, tally=self.winnowed
             )  # fmt: skip
             out.update(zip(members, found))
@@ -228,7 +228,9 @@ class Matcher:
 
     # --- search and registration -----------------------------------------------------------------------------
 
-    def _register(self, source: Array, asked: list[Candidates]) -> tuple[dict[int, list[Registration]], int, int]:
+    def _register(
+        self, source: Array, asked: list[SegmentCandidates]
+    ) -> tuple[dict[int, list[Registration]], int, int]:
         """Results by map, and how many searches and registrations they took."""
         s, gates = self.config.search, self.config.registration.gates
         # the body may be tilted: what tilts against the prediction is refused later
@@ -265,7 +267,7 @@ class Matcher:
                     top = found[0].best_fitness if found else 0.0
                     near = [r.T_target_source for r in found if r.best_fitness >= top - self.config.choice.rivals]
                     alike.append((T, radius, near))
-                results[m] = distinct(results.get(m, []) + found)
+                results[m] = distinct_registrations(results.get(m, []) + found)
         return results, searches, registrations
 
     def _begin(self, segment: int) -> int:
@@ -312,14 +314,14 @@ class Matcher:
     # --- what is drawn ---------------------------------------------------------------------------------------
 
     def _proposals(
-        self, c: Candidates, results: dict[int, list[Registration]], ahead: Ahead, seed: SeedTree
+        self, c: SegmentCandidates, results: dict[int, list[Registration]], ahead: LookAheadScan, seed: SeedTree
     ) -> list[Proposal]:
         out: list[Proposal] = []
         for k, segment in enumerate(c.segments.tolist()):
             for r in results.get(int(self.segmap.table.map[segment]), []):
                 local = None
                 if self.config.choice.method != "registration" and r.accepted:
-                    local = localise(
+                    local = localise_in_map(
                         self.segmap.map_of(segment)[0], r.T_target_source, ahead.window, self.max_range,
                         seed.child(len(out)).generator(), self.config.localisation, threads=self.threads,
                     )  # fmt: skip
@@ -335,17 +337,19 @@ class Matcher:
                 )
         return out
 
-    def _spread(self, entries: list[Entry | None], seed: SeedTree) -> list[Entry | None]:
+    def _spread(self, entries: list[SegmentEntry | None], seed: SeedTree) -> list[SegmentEntry | None]:
         """Particles that drew one match stand where its covariance may have them, not all at one place."""
         group, n = self.segmap.group, len(entries)
         if n == 1:
             return entries
         normal = seed.child("entry").generator().standard_normal((n, group.dof))
-        out: list[Entry | None] = []
+        out: list[SegmentEntry | None] = []
         for e, x in zip(entries, normal):
             if e is None or e.covariance is None:
                 out.append(e)
                 continue
             moved = group.compose(e.T_entry, group.exp(np.linalg.cholesky(e.covariance) @ x))
-            out.append(Entry(T_entry=moved, kind=e.kind, source=e.source, covariance=e.covariance, fitness=e.fitness))
+            out.append(
+                SegmentEntry(T_entry=moved, kind=e.kind, source=e.source, covariance=e.covariance, fitness=e.fitness)
+            )
         return out

@@ -16,7 +16,7 @@ from graphslam_frontends.segslam.segmap import SegMap
 Ints = npt.NDArray[np.int64]
 
 
-def seams(segmap: SegMap, sample: MapSample) -> list[tuple[int, int, Array]]:
+def find_seams(segmap: SegMap, sample: MapSample) -> list[tuple[int, int, Array]]:
     """Where segments follow each other in time that the sample did not link, and what is missing between them.
 
     Returns
@@ -39,11 +39,11 @@ def seams(segmap: SegMap, sample: MapSample) -> list[tuple[int, int, Array]]:
     return found
 
 
-def concatenate(segmap: SegMap, sample: MapSample, open_path: Array | None = None) -> Trajectory:
+def concatenate_segments(segmap: SegMap, sample: MapSample, open_path: Array | None = None) -> Trajectory:
     """The path of a sample in the frame of its root (A6, eq. 11–12).
 
     A boundary stands in two segments; its pose is that of the exit. Where two fronts of the growth met there is a
-    seam, over which the path jumps by what the loops do not close; see :func:`seams`.
+    seam, over which the path jumps by what the loops do not close; see :func:`find_seams`.
 
     Parameters
     ----------

@@ -8,11 +8,11 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam_frontends.segslam.segmap import SegMap
-from graphslam_frontends.segslam.submaps import base_of, settled_chain
+from graphslam_frontends.segslam.submaps import common_ancestor_chain, segment_base
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class SegSlamProgress:
     """A look at a run. Of use until the next step only: the SegMap goes on.
 
     Parameters
@@ -34,7 +34,7 @@ class Progress:
     @property
     def segments(self) -> int:
         """Segments of the best particle's chain that are closed."""
-        return 0 if self.last < 0 else len(settled_chain(self.segmap, self.last))
+        return 0 if self.last < 0 else len(common_ancestor_chain(self.segmap, self.last))
 
     def paths(self) -> list[Array]:
         """Paths ``(n, 7|3)`` of the closed segments of the best particle's chain, in the frame of the first base.
@@ -45,10 +45,10 @@ class Progress:
             return []
         g, out = self.segmap.group, []
         base = g.identity
-        for i in settled_chain(self.segmap, self.last).tolist():
+        for i in common_ancestor_chain(self.segmap, self.last).tolist():
             s = self.segmap[i]
-            entry = base_of(self.segmap, s.T_entry)
+            entry = segment_base(self.segmap, s.T_entry)
             local = g.compose(np.broadcast_to(g.inverse(entry), s.path.shape), s.path)
             out.append(g.compose(np.broadcast_to(base, local.shape), local))
-            base = g.compose(base, g.between(entry, base_of(self.segmap, s.T_exit)))
+            base = g.compose(base, g.between(entry, segment_base(self.segmap, s.T_exit)))
         return out

@@ -12,13 +12,13 @@ from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.grid.ancestry import Ancestry
-from graphslam_frontends.grid.filter import Tally
+from graphslam_frontends.grid.filter import FilterCounts
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.segslam.matching import Attempt
-from graphslam_frontends.segslam.paths import concatenate
-from graphslam_frontends.segslam.sampling import MapSample, draw_weights, grow, root_of_segment
+from graphslam_frontends.segslam.candidate_selection import CandidateSelection
+from graphslam_frontends.segslam.matching import MatchAttempt
+from graphslam_frontends.segslam.paths import concatenate_segments
+from graphslam_frontends.segslam.sampling import MapSample, draw_weights, grow_sample, root_of_segment
 from graphslam_frontends.segslam.segmap import SegMap
-from graphslam_frontends.segslam.winnowing import Winnowed
 
 Ints = npt.NDArray[np.int64]
 
@@ -79,10 +79,10 @@ class SegSlamResult:
     resampled: npt.NDArray[np.bool_]
     ancestry: Ancestry
     scores: tuple[ScoreLine, ...]
-    attempts: tuple[Attempt, ...]
+    attempts: tuple[MatchAttempt, ...]
     boundaries: tuple[Boundary, ...]
-    winnowed: Winnowed
-    tally: Tally
+    winnowed: CandidateSelection
+    tally: FilterCounts
     seconds: dict[str, float]
     step_seconds: Array
     used_bytes: int
@@ -103,12 +103,12 @@ class SegSlamResult:
         """
         at = int(self.closed[self.best if particle is None else particle])
         rng = self.seed.child("map-sample", number).generator()
-        return grow(self.segmap, root_of_segment(self.segmap, at), rng, weights=draw_weights(self.segmap))
+        return grow_sample(self.segmap, root_of_segment(self.segmap, at), rng, weights=draw_weights(self.segmap))
 
     def trajectory(self, number: int = 0, particle: int | None = None) -> Trajectory:
         """The whole path of a map sample in the frame of its first segment (A6)."""
         s = self.sample(number, particle)
-        path = concatenate(self.segmap, s)
+        path = concatenate_segments(self.segmap, s)
         group = self.segmap.group
         first = int(s.in_time[0])
         return path.transformed(group.inverse(s.poses[first]))

@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, wrap_angle
-from graphslam.core.poses import frame_between, heading_of, upright
-from graphslam_frontends.segslam.segmap import NEW, Entry, SegMap
+from graphslam.core.poses import frame_between, heading_of, level_poses
+from graphslam_frontends.segslam.segmap import NEW, SegMap, SegmentEntry
 
 Ints = npt.NDArray[np.int64]
 
@@ -69,7 +69,7 @@ class MapSample:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Root:
+class SampleRoot:
     """Where a sample begins: use :func:`root_of_particle` or :func:`root_of_segment`."""
 
     segment: int
@@ -82,32 +82,32 @@ class Root:
     link: Array | None
 
 
-def root_of_particle(segmap: SegMap, particle: int, step: int) -> Root:
+def root_of_particle(segmap: SegMap, particle: int, step: int) -> SampleRoot:
     """The segment a particle is in, at the step of now."""
     if not 0 <= particle < segmap.particles or segmap.entries[particle] is None:
         raise DataError(f"particle {particle} is in no segment", wanted="one that entered a segment and did not leave")
-    e = cast(Entry, segmap.entries[particle])
+    e = cast(SegmentEntry, segmap.entries[particle])
     start = int(segmap.start[particle])
     if not start <= step < len(segmap.times):
         raise DataError("a sample cannot begin before its segment did", got=step, wanted=f"≥ {start}")
-    return Root(
+    return SampleRoot(
         segment=OPEN, start=start, end=step, anchor=step, entry=e.T_entry, exit=None,
         source=-1 if e.kind == NEW else e.source, link=segmap.links[particle],
     )  # fmt: skip
 
 
-def root_of_segment(segmap: SegMap, index: int) -> Root:
+def root_of_segment(segmap: SegMap, index: int) -> SampleRoot:
     """A closed segment, seen from its end."""
     s = segmap[index]
-    return Root(
+    return SampleRoot(
         segment=s.index, start=s.interval[0], end=s.interval[1], anchor=s.interval[1], entry=s.T_entry, exit=s.T_exit,
         source=s.source, link=segmap.table.link[s.index],
     )  # fmt: skip
 
 
-def grow(
+def grow_sample(
     segmap: SegMap,
-    root: Root,
+    root: SampleRoot,
     rng: np.random.Generator,
     *,
     weights: Array | None = None,
@@ -132,7 +132,7 @@ def grow(
         … nor from those this many links away; 0 = full.
     """
     w = None if weights is None else np.asarray(weights, dtype=np.float64)
-    return grow_by(
+    return grow_sample_by(
         segmap,
         root,
         lambda n: rng.permutation(n).tolist() if n > 1 else [0],
@@ -163,7 +163,7 @@ def draw_weights(segmap: SegMap) -> Array:
     return out
 
 
-def probabilities(fits: Ints, weights: Array | None) -> Array:
+def segment_probabilities(fits: Ints, weights: Array | None) -> Array:
     """Of the segments that fit ``(k,)``; equal without weights, and where all weigh nothing."""
     w = np.ones(len(fits)) if weights is None else np.asarray(weights, dtype=np.float64)[fits]
     return np.asarray(w / w.sum()) if w.sum() > 0 else np.full(len(fits), 1.0 / len(fits))
@@ -174,21 +174,21 @@ def _draw(fits: Ints, weights: Array | None, rng: np.random.Generator) -> int:
         return 0
     if weights is None:
         return int(rng.integers(len(fits)))
-    p = probabilities(fits, weights)
+    p = segment_probabilities(fits, weights)
     # rounding must not choose one without weight
     return int(min(np.searchsorted(np.cumsum(p), rng.random(), side="right"), np.flatnonzero(p)[-1]))
 
 
-def grow_by(
+def grow_sample_by(
     segmap: SegMap,
-    root: Root,
+    root: SampleRoot,
     order: Callable[[int], list[int]],
     choose: Callable[[Ints], int],
     *,
     local_length: float = 0.0,
     local_depth: int = 0,
 ) -> MapSample:
-    """As :func:`grow`, with the two kinds of choice given.
+    """As :func:`grow_sample`, with the two kinds of choice given.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ _BEFORE, _AFTER = 0, 1
 class _Free:
     """Frames of a sample as whole poses: where gravity is not known."""
 
-    def __init__(self, segmap: SegMap, root: Root) -> None:
+    def __init__(self, segmap: SegMap, root: SampleRoot) -> None:
         self.g, self.t, self.root = segmap.group, segmap.table, root
         self.at = [self.g.identity]
 
@@ -334,7 +334,7 @@ class _Free:
 class _Upright:
     """Frames of a sample by position and heading: those between level frames, ten times as fast as whole poses."""
 
-    def __init__(self, segmap: SegMap, root: Root) -> None:
+    def __init__(self, segmap: SegMap, root: SampleRoot) -> None:
         self.t, self.dim, self.root = segmap.table, segmap.group.dim, root
         self.at = [(0.0, 0.0, 0.0, 0.0)]
 
@@ -371,7 +371,7 @@ class _Upright:
         """``(m, 7)`` or ``(m, 3)``."""
         p = np.array(self.at)
         if self.dim == 3:
-            return upright(p[:, :3], p[:, 3])
+            return level_poses(p[:, :3], p[:, 3])
         return np.stack([p[:, 0], p[:, 1], wrap_angle(p[:, 3])], axis=1)
 
 

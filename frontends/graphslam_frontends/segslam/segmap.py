@@ -19,15 +19,15 @@ import numpy.typing as npt
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array
-from graphslam.core.poses import SE2, SE3, Group, normalised
+from graphslam.core.poses import SE2, SE3, Group, normalise_weights
 from graphslam.core.records import check_times
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam_frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Entry, Segment, check_path
-from graphslam_frontends.segslam.store import Maps, Table
+from graphslam_frontends.segslam.segment import KINDS, MATCH, NEW, SAME, Segment, SegmentEntry, check_path
+from graphslam_frontends.segslam.store import SegmentMaps, SegmentTable
 
 Ints = npt.NDArray[np.int64]
 
-__all__ = ["KINDS", "MATCH", "NEW", "SAME", "Entry", "SegMap", "Segment"]
+__all__ = ["KINDS", "MATCH", "NEW", "SAME", "SegMap", "Segment", "SegmentEntry"]
 
 _NOBODY: Ints = np.zeros(0, np.int64)
 
@@ -63,10 +63,10 @@ class SegMap:
         self.gravity = bool(gravity) and dim == 3
         self.lift = float(lift) if self.gravity else 0.0
         self.particles = int(particles)
-        self.table = Table(self.group.size)
-        self.maps = Maps(self.group)
+        self.table = SegmentTable(self.group.size)
+        self.maps = SegmentMaps(self.group)
         # the open segment of each particle: how it was entered, since which boundary, after which closed segment
-        self.entries: list[Entry | None] = [None] * self.particles
+        self.entries: list[SegmentEntry | None] = [None] * self.particles
         self.links: list[Array] = [self.group.identity] * self.particles
         self.start: Ints = np.zeros(self.particles, np.int64)
         self.previous: Ints = np.full(self.particles, -1, np.int64)
@@ -106,13 +106,13 @@ class SegMap:
     # --- life of the current segments ------------------------------------------------------------------------
 
     def open(
-        self, step: int, entries: Sequence[Entry], which: Iterable[int] | None = None
+        self, step: int, entries: Sequence[SegmentEntry], which: Iterable[int] | None = None
     ) -> list[EvidenceGrid | None]:
         """Particles enter segments at a boundary.
 
         Parameters
         ----------
-        entries : sequence of Entry
+        entries : sequence of SegmentEntry
             One for each particle, in its order.
         which : iterable of int, optional
             The particles; default all.
@@ -186,7 +186,7 @@ class SegMap:
         """
         chosen = self._which(which, len(grids), "grids")
         self._which(which, len(paths), "paths")
-        w = normalised(weights, self.particles)
+        w = normalise_weights(weights, self.particles)
         last = len(self.times) - 1
         rows = [
             check_path(path, self.entries[p], p, (int(self.start[p]), step), last) for p, path in zip(chosen, paths)
@@ -194,7 +194,7 @@ class SegMap:
         known: dict[tuple[Any, ...], int] = {}
         out = np.empty(len(chosen), np.int64)
         for k, (p, grid, path) in enumerate(zip(chosen, grids, rows)):
-            e = cast(Entry, self.entries[p])
+            e = cast(SegmentEntry, self.entries[p])
             key = (int(self.start[p]), e.kind, e.source, int(self.previous[p]), path.tobytes())
             i = known.get(key, -1)
             if i < 0:
@@ -315,7 +315,7 @@ class SegMap:
 
     # --- inside ----------------------------------------------------------------------------------------------
 
-    def _append(self, p: int, step: int, e: Entry, grid: EvidenceGrid, path: Array) -> int:
+    def _append(self, p: int, step: int, e: SegmentEntry, grid: EvidenceGrid, path: Array) -> int:
         interval = (int(self.start[p]), step)
         scans = {interval}
         if e.kind != NEW:  # a copy: what its source held is in it, also if that was pruned since
@@ -351,7 +351,7 @@ class SegMap:
             raise DataError(f"{what} do not belong to the particles", got=n, wanted=f"one each of {len(chosen)}")
         return chosen
 
-    def _check_entry(self, p: int, e: Entry) -> Array:
+    def _check_entry(self, p: int, e: SegmentEntry) -> Array:
         """Raise if a particle cannot enter so; ``T_segment_source`` between the frames."""
         T = np.asarray(e.T_entry, dtype=np.float64)
         if T.shape != (self.group.size,) or not np.all(np.isfinite(T)):

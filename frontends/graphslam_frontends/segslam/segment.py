@@ -17,7 +17,7 @@ KINDS = ("new", "match", "same")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
+class SegmentEntry:
     """How one particle enters a segment.
 
     Parameters
@@ -84,13 +84,13 @@ class Segment:
     locked: bool
 
 
-def check_path(path: Any, entry: Entry | None, particle: int, interval: tuple[int, int], last: int) -> Array:
+def check_path(path: Any, entry: SegmentEntry | None, particle: int, interval: tuple[int, int], last: int) -> Array:
     """The path of a particle through a segment that it leaves ``(n, 7)`` or ``(n, 3)``, in the frame of that segment.
 
     Parameters
     ----------
     path : (n, 7) or (n, 3)
-    entry : Entry or None
+    entry : SegmentEntry or None
         How the particle entered.
     interval : (start, end)
         Steps.

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.poses import group_of, normalised
+from graphslam.core.poses import group_of, normalise_weights
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import CastLikelihood
 from graphslam.evidence.queries import cast_grids
@@ -27,7 +27,7 @@ Scan = tuple[Array, Array, npt.NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Window:
+class LookAheadWindow:
     """Beams of the look-ahead window in the frame of the body before it, carried there by dead reckoning (A8).
 
     Parameters
@@ -45,15 +45,15 @@ class Window:
     def __len__(self) -> int:
         return len(self.points)
 
-    def thinned(self, most: int) -> Window:
+    def thinned(self, most: int) -> LookAheadWindow:
         """At most so many of its points, evenly spread."""
         if len(self) <= most:
             return self
         rows = np.linspace(0, len(self) - 1, most).astype(np.int64)
-        return Window(points=self.points[rows], origins=self.origins[rows], beams=self.beams)
+        return LookAheadWindow(points=self.points[rows], origins=self.origins[rows], beams=self.beams)
 
 
-def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float) -> Window:
+def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float) -> LookAheadWindow:
     """Bring the scans of a window into one frame.
 
     Parameters
@@ -69,7 +69,7 @@ def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float
     if len(u) != len(scans):
         raise DataError("a window needs one increment for each scan", got=len(u), wanted=len(scans))
     if not scans:
-        return Window(points=np.zeros((0, g.dim)), origins=np.zeros((0, g.dim)), beams=0)
+        return LookAheadWindow(points=np.zeros((0, g.dim)), origins=np.zeros((0, g.dim)), beams=0)
     T = np.empty_like(u)
     for k, step in enumerate(u):
         T[k] = step if k == 0 else g.compose(T[k - 1], step)
@@ -77,11 +77,11 @@ def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float
     ranges = np.linalg.norm(p - o, axis=1)
     use = np.asarray(returns, dtype=bool) & (ranges < max_range) & (ranges > 0.0)
     at = np.repeat(T, [len(scan[0]) for scan in scans], axis=0)[use]
-    return Window(points=g.transform(at, p[use]), origins=g.transform(at, o[use]), beams=len(p))
+    return LookAheadWindow(points=g.transform(at, p[use]), origins=g.transform(at, o[use]), beams=len(p))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Score:
+class WindowScore:
     """How well maps foretell a window.
 
     Parameters
@@ -104,7 +104,7 @@ class Score:
 def predictive_score(
     grids: Sequence[EvidenceGrid],
     poses: ArrayLike,
-    window: Window,
+    window: LookAheadWindow,
     max_range: float,
     *,
     weights: ArrayLike | None = None,
@@ -112,7 +112,7 @@ def predictive_score(
     sigma: float = 0.3,
     clip: float = 3.0,
     threads: int = 1,
-) -> Score:
+) -> WindowScore:
     """Cast the beams of a look-ahead window in the particles' maps (A8).
 
     Parameters
@@ -131,10 +131,10 @@ def predictive_score(
         The result is the same for any number.
     """
     n = len(grids)
-    w = normalised(weights, n)
+    w = normalise_weights(weights, n)
     if not len(window):
         nan = np.full(n, np.nan)
-        return Score(shares=nan, log_likelihoods=nan, share=math.nan, log_likelihood=math.nan, beams=0)
+        return WindowScore(shares=nan, log_likelihoods=nan, share=math.nan, log_likelihood=math.nan, beams=0)
     rays = window.points - window.origins
     measured = np.linalg.norm(rays, axis=1)
     # a wall somewhat beyond the beam must still count as met, or the tolerance would be one-sided at the limit
@@ -144,7 +144,7 @@ def predictive_score(
         near = c.hit & (np.abs(c.ranges - measured) <= tolerance)
     shares = near.mean(axis=1)
     log_p = CastLikelihood(exponent=1.0, sigma=sigma, clip=clip).beams(c.ranges, c.status, measured, reach).mean(axis=1)
-    return Score(
+    return WindowScore(
         shares=shares,
         log_likelihoods=log_p,
         share=float(w @ shares),
@@ -153,7 +153,7 @@ def predictive_score(
     )
 
 
-def few(weights: Array, most: int) -> tuple[npt.NDArray[np.int64], Array]:
+def representative_particles(weights: Array, most: int) -> tuple[npt.NDArray[np.int64], Array]:
     """Which particles speak for all: at most so many, spread evenly over the weight, and the share of each.
 
     The weighted mean of anything over them is that over all, but for the spread within one ``most``-th of the weight.
@@ -182,7 +182,7 @@ def motion_error(lengths: ArrayLike, turns: ArrayLike, translation: ArrayLike, r
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Decision:
+class SegmentDecision:
     """Whether a segment ends here.
 
     Parameters
@@ -263,7 +263,7 @@ class Segmenter:
 
     def decide(
         self, time: float, length: float, turned: float = 0.0, score: float = math.nan, *, again: bool = False
-    ) -> Decision:
+    ) -> SegmentDecision:
         """Does the segment end here?
 
         Parameters
@@ -298,7 +298,7 @@ class Segmenter:
                 ends, why = False, "young"
             elif way < c.min_length:
                 ends, why = False, "short"
-        return Decision(
+        return SegmentDecision(
             ends=ends, why=why, score=score, best_score=self.best, seconds=seconds, length=way,
             new_ground=self.new_ground, error=error,
         )  # fmt: skip

@@ -19,19 +19,24 @@ from tqdm.auto import tqdm
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.config import SegSlamConfig
-from graphslam_frontends.segslam.matching import Attempt, Matcher
-from graphslam_frontends.segslam.progress import Progress
+from graphslam_frontends.segslam.matching import MatchAttempt, Matcher
+from graphslam_frontends.segslam.progress import SegSlamProgress
 from graphslam_frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
-from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
-from graphslam_frontends.segslam.segmentation import Decision, Segmenter, few, predictive_score
-from graphslam_frontends.segslam.window import Ahead, look_ahead
+from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, SegMap, SegmentEntry
+from graphslam_frontends.segslam.segmentation import (
+    SegmentDecision,
+    Segmenter,
+    predictive_score,
+    representative_particles,
+)
+from graphslam_frontends.segslam.window import LookAheadScan, gather_look_ahead
 
 Ints = npt.NDArray[np.int64]
 
@@ -59,7 +64,7 @@ def run_segslam(
     prune_every : int
         See :class:`~graphslam_frontends.grid.ancestry.Ancestry`.
     watch : callable, optional
-        Called with a :class:`~graphslam_frontends.segslam.progress.Progress` after every step; changes nothing.
+        Called with a :class:`~graphslam_frontends.segslam.progress.SegSlamProgress` after every step; changes nothing.
 
     Raises
     ------
@@ -78,7 +83,7 @@ def run_segslam(
     return run.result()
 
 
-def near(path: Array, T: Array, radius: float) -> npt.NDArray[np.bool_]:
+def near_pose(path: Array, T: Array, radius: float) -> npt.NDArray[np.bool_]:
     """Which poses of a path ``(n, 7)`` or ``(n, 3)`` are as near to a pose [m], in height too."""
     return np.asarray(np.linalg.norm((path - T)[:, : group_of(T).dim], axis=1) <= radius)
 
@@ -103,7 +108,7 @@ class _Run:
         )
         self.matcher = Matcher(self.segmap, config, steps.max_range, threads=filter.threads)
         self.segmenters = [self._segmenter(0) for _ in range(n)]
-        self.segmap.open(0, [Entry(T_entry=p, kind=NEW) for p in self.filter.particles.poses])
+        self.segmap.open(0, [SegmentEntry(T_entry=p, kind=NEW) for p in self.filter.particles.poses])
         self.ids = np.zeros(n, dtype=np.int64)  # of the open segments, counted as they are begun: tags of the ancestry
         self.begun = 1
         self.last_attempt = float(steps.times[0])
@@ -111,11 +116,11 @@ class _Run:
         self.step_seconds = np.zeros(len(steps))
         self.resampled = np.zeros(len(steps), dtype=np.bool_)
         self.scores: list[ScoreLine] = []
-        self.attempts: list[Attempt] = []
+        self.attempts: list[MatchAttempt] = []
         self.boundaries: list[Boundary] = []
         self.closed: Ints = np.full(n, -1, dtype=np.int64)
         self.seconds = {"score": 0.0, "match": 0.0, "segments": 0.0}  # wall time of what the filter does not count
-        self.ahead: Ahead | None = None
+        self.ahead: LookAheadScan | None = None
 
     # --- one step --------------------------------------------------------------------------------------------
 
@@ -152,7 +157,7 @@ class _Run:
         begin = time.perf_counter()
         chosen = np.flatnonzero(leaving).astype(np.int64)
         closed = self._close(k, chosen, why if ends.any() else "match")
-        entries: list[Entry] = []
+        entries: list[SegmentEntry] = []
         for p, i in zip(chosen.tolist(), closed.tolist()):
             entry = attempt.entries[p] if attempt else None
             entries.append(entry if entry is not None else self._goes_on(p, i, bool(ends[p])))
@@ -163,10 +168,10 @@ class _Run:
         self.matcher.forget()
         self.seconds["segments"] += time.perf_counter() - begin
 
-    def _look(self, k: int) -> Ahead:
+    def _look(self, k: int) -> LookAheadScan:
         """The window ahead, gathered once a step for scores and matches."""
         if self.ahead is None or self.ahead.step != k:
-            self.ahead = look_ahead(self.steps, k, self.config.segmentation.window)
+            self.ahead = gather_look_ahead(self.steps, k, self.config.segmentation.window)
         return self.ahead
 
     # --- when a segment ends ---------------------------------------------------------------------------------
@@ -187,7 +192,7 @@ class _Run:
             ahead, p = self._look(k), f.particles
             # half a window at the end of the log would be scored against maxima of whole ones
             if ahead.full:
-                rows, weights = few(p.weights, c.score_particles if together else n)
+                rows, weights = representative_particles(p.weights, c.score_particles if together else n)
                 score = predictive_score(
                     [p.grids[i] for i in rows], p.poses[rows], ahead.window.thinned(c.score_beams),
                     self.steps.max_range, weights=weights, tolerance=c.tolerance, sigma=c.score_sigma,
@@ -212,7 +217,7 @@ class _Run:
                 why = why or (decision.why if decision.ends else "")
         return ends, why
 
-    def _decision(self, i: int, k: int, now: float, score: float, particle: int) -> Decision:
+    def _decision(self, i: int, k: int, now: float, score: float, particle: int) -> SegmentDecision:
         again = score >= self.config.segmentation.known_score and self._been_here(k, particle)
         length, turned = float(self.path_length[k]), float(self.turned[k])
         return self.segmenters[i].decide(now, length, turned, score, again=again)
@@ -233,9 +238,9 @@ class _Run:
             if path is not None:
                 paths.append(path)
                 frames.append(T)
-        return any(bool(near(path, at, c.known_radius).any()) for path, at in zip(paths, frames))
+        return any(bool(near_pose(path, at, c.known_radius).any()) for path, at in zip(paths, frames))
 
-    def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> Attempt | None:
+    def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> MatchAttempt | None:
         """Try to enter older maps: every so often, and wherever a segment ends."""
         c = self.config
         if not ends.any() and now - self.last_attempt < c.choice.every - 1e-6:
@@ -268,18 +273,18 @@ class _Run:
         self.boundaries.append(Boundary(step=k, why=why, particles=len(chosen), segments=len(np.unique(closed))))
         return closed
 
-    def _goes_on(self, p: int, segment: int, ended: bool) -> Entry:
+    def _goes_on(self, p: int, segment: int, ended: bool) -> SegmentEntry:
         """Into a new map where the old one has ended; else with the map it has."""
         pose = self.filter.particles.poses[p]
         if not ended:
-            return Entry(T_entry=pose, kind=SAME, source=segment)
+            return SegmentEntry(T_entry=pose, kind=SAME, source=segment)
         if not self.segmap.gravity:
-            return Entry(T_entry=self.group.identity, kind=NEW)
-        T = self.group.between(level(pose), pose)
+            return SegmentEntry(T_entry=self.group.identity, kind=NEW)
+        T = self.group.between(remove_roll_pitch(pose), pose)
         T[2] += self.segmap.lift
-        return Entry(T_entry=T, kind=NEW)
+        return SegmentEntry(T_entry=T, kind=NEW)
 
-    def _enter(self, k: int, chosen: Ints, entries: Sequence[Entry]) -> None:
+    def _enter(self, k: int, chosen: Ints, entries: Sequence[SegmentEntry]) -> None:
         p = self.filter.particles
         grids = self.segmap.open(k, entries, chosen.tolist())
         empty = p.grids[0].empty()
@@ -309,11 +314,11 @@ class _Run:
             self.config.segmentation, float(self.steps.times[k]), float(self.path_length[k]), float(self.turned[k])
         )
 
-    def progress(self, k: int) -> Progress:
+    def progress(self, k: int) -> SegSlamProgress:
         """After step k."""
         best = self.filter.particles.best
         last = int(self.closed[best]) if k == len(self.steps) - 1 else int(self.segmap.previous[best])
-        return Progress(k + 1, len(self.steps), float(self.path_length[k]), self.segmap, last)
+        return SegSlamProgress(k + 1, len(self.steps), float(self.path_length[k]), self.segmap, last)
 
     # --- the end ---------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ Ints = npt.NDArray[np.int64]
 Scans = frozenset[tuple[int, int]]
 
 
-class Table:
+class SegmentTable:
     """Segments as columns; rows beyond :attr:`count` are not used, and are not alive.
 
     Parameters
@@ -123,7 +123,7 @@ def _by_value(column: Ints, rows: Ints) -> dict[int, Ints]:
     return dict(zip(values.tolist(), np.split(order, first[1:])))
 
 
-class Maps:
+class SegmentMaps:
     """Evidence grids that segments use, each until its last user is gone."""
 
     def __init__(self, group: Group) -> None:
@@ -157,7 +157,7 @@ class Maps:
         cast(EvidenceGrid, self.grids[m]).lock()
         self.locked[m] = True
 
-    def merge(self, table: Table, a: int, b: int, T_a_b: Array) -> int:
+    def merge(self, table: SegmentTable, a: int, b: int, T_a_b: Array) -> int:
         """One map of two; every user of the one that goes is moved to the other. See `SegMap.merge`."""
         if a == b:
             return a
@@ -173,7 +173,7 @@ class Maps:
             self.scans[a] |= self.scans[b]
         return self._move(table, b, a, T_a_b)
 
-    def _move(self, table: Table, gone: int, to: int, T_to_gone: Array) -> int:
+    def _move(self, table: SegmentTable, gone: int, to: int, T_to_gone: Array) -> int:
         moved = np.flatnonzero((table.map == gone) & table.alive)
         table.map[moved] = to
         table.T_map[moved] = self.group.compose(

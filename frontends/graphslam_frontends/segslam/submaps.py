@@ -16,14 +16,14 @@ import numpy.typing as npt
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import frame_between, group_of, level, normalised, pose_scatter
+from graphslam.core.poses import frame_between, group_of, normalise_weights, pose_scatter, remove_roll_pitch
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam_frontends.grid.filter_drift import FilterDrift, between_knots
-from graphslam_frontends.odometry.scan_use import reckoned_covariance, uncorrected, uncorrected_covariance
+from graphslam_frontends.grid.filter_error_model import FilterDrift, interpolate_covariances
+from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance, unobserved_covariance, unobserved_stretches
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.scan_window.followed import FollowedErrors
+from graphslam_frontends.scan_window.scan_odometry_steps import ScanOdometryErrors
 from graphslam_frontends.segslam.config import HandoverConfig
 from graphslam_frontends.segslam.covariance import exit_covariance
 from graphslam_frontends.segslam.sampling import MapSample, nearest_step
@@ -54,24 +54,24 @@ def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrif
     """What a filter of so many particles leaves of the errors along the paths of the segments of a chain.
 
     With the steps also the share that the filter passes on of what dead reckoning states of its own errors
-    (:class:`~graphslam_frontends.grid.filter_drift.Passed`), and all of it where no scan corrects it
+    (:class:`~graphslam_frontends.grid.filter_error_model.ErrorPassThrough`), and all of it where no scan corrects it
     (:mod:`graphslam_frontends.odometry.scan_use`). Steps that scan-to-window odometry followed state their own.
     """
-    if steps is not None and isinstance(steps.errors, FollowedErrors):
+    if steps is not None and isinstance(steps.errors, ScanOdometryErrors):
         steps.errors.prepare(segmap[int(i)].interval[0] for i in chain)
         return drift_by_errors(steps.errors, gravity=segmap.gravity)
     paths = {(s := segmap[int(i)]).interval[0]: s.path for i in chain}
     # a single particle corrects nothing anywhere
-    stretches = [] if steps is None or segmap.particles == 1 else uncorrected(steps)
+    stretches = [] if steps is None or segmap.particles == 1 else unobserved_stretches(steps)
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
         path, level_here = paths[start][: end - start + 1], segmap.gravity and level_end
         if steps is None:
             return model.covariance(path, segmap.particles, gravity=level_here)
-        reckoned = reckoned_covariance(steps, start, end, level_end=level_here)
+        reckoned = dead_reckoning_covariance(steps, start, end, level_end=level_here)
         tilt = None if steps.tilt is None else steps.tilt_sigma
         C = model.covariance(path, segmap.particles, gravity=level_here, reckoned=reckoned, told_tilt=tilt)
-        return C + uncorrected_covariance(steps, stretches, path, start, end)
+        return C + unobserved_covariance(steps, stretches, path, start, end)
 
     return drift
 
@@ -85,7 +85,7 @@ def drift_by_errors(errors: _Errors, *, gravity: bool) -> Drift:
     return drift
 
 
-def settled_chain(segmap: SegMap, last: int) -> Ints:
+def common_ancestor_chain(segmap: SegMap, last: int) -> Ints:
     """Segments from the first to ``last``, each beginning where the one before ends.
 
     The particle's own history as far as it is there, else the heaviest segment that fits (A6).
@@ -112,7 +112,7 @@ def sampled_chain(segmap: SegMap, sample: MapSample) -> Ints:
     return np.asarray(sample.segments[np.argsort(segmap.table.start[sample.segments])], np.int64)
 
 
-def settle(
+def submaps_of_segments(
     segmap: SegMap,
     chain: Sequence[int] | Ints,
     drift: Drift,
@@ -154,7 +154,7 @@ def settle(
     return out
 
 
-def base_of(segmap: SegMap, body: Array) -> Array:
+def segment_base(segmap: SegMap, body: Array) -> Array:
     """``T_segment_base`` of a body at its entry, or at its exit, where the next base is.
 
     The body itself, or where gravity is known level and on the lattice that maps are begun on: they need not be
@@ -162,7 +162,7 @@ def base_of(segmap: SegMap, body: Array) -> Array:
     """
     if not segmap.gravity:
         return np.array(body)
-    base = level(body)
+    base = remove_roll_pitch(body)
     base[..., 2] -= segmap.lift
     return base
 
@@ -172,14 +172,14 @@ def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array,
     g, t = segmap.group, segmap.table
     i = segmap.in_interval(interval)
     entry, exit = t.entry[i], t.exit[i]
-    base = level(entry) if segmap.gravity else entry
+    base = remove_roll_pitch(entry) if segmap.gravity else entry
     T = g.between(base, exit)
-    return (level(T) if segmap.gravity else T), _shares(t.weight[i])
+    return (remove_roll_pitch(T) if segmap.gravity else T), _shares(t.weight[i])
 
 
 def _shares(weights: Array) -> Array:
     """Weights that sum to one; equal where what is left of an interval weighs nothing."""
-    return normalised(weights if weights.sum() > 0 else None, len(weights))
+    return normalise_weights(weights if weights.sum() > 0 else None, len(weights))
 
 
 def _submap(
@@ -196,8 +196,8 @@ def _submap(
 ) -> Submap:
     g = segmap.group
     start, end = s.interval
-    base = base_of(segmap, s.T_entry)
-    exit_pose = g.between(base, base_of(segmap, s.T_exit))
+    base = segment_base(segmap, s.T_entry)
+    exit_pose = g.between(base, segment_base(segmap, s.T_exit))
     exits, weights = exits_of_interval(segmap, s.interval)
     D = drift(start, end, level_end=True)
     exit = exit_covariance(exits, exit_pose, s.length, lambda _: D, weights=weights, drift_scale=config.drift_scale)
@@ -255,13 +255,13 @@ def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, sc
     P = np.zeros((n, g.dof, g.dof))
     for k, wk in zip(i.tolist(), w.tolist()):
         path = cast(Array, t.paths[k])
-        base = base_of(segmap, path[0])
+        base = segment_base(segmap, path[0])
         e = g.log(g.between(poses, g.compose(g.inverse(base), path)))
         P += wk * e[:, :, None] * e[:, None, :]
     knots = np.unique(np.linspace(0, n - 1, min(KNOTS, n)).round().astype(np.int64))
     D = np.stack([drift(start, start + int(k), level_end=False) for k in knots])
     along = segmap.path_length[start : end + 1]
-    return P + scale * between_knots(knots, D, poses, along)
+    return P + scale * interpolate_covariances(knots, D, poses, along)
 
 
 def _matches(
@@ -332,12 +332,12 @@ def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Se
         there = cast(Array, t.paths[source])[step - int(t.start[source])]
         T_c_source = frame_between(c.path[step - c.interval[0]], there, gravity=segmap.gravity)
     here = g.compose(T_c_source, T_source_body)
-    return c, g.between(base_of(segmap, c.T_entry), base_of(segmap, here))
+    return c, g.between(segment_base(segmap, c.T_entry), segment_base(segmap, here))
 
 
 def _levelled(segmap: SegMap, entry: Array, covariance: Array) -> Array:
     """Covariance at the body → at the levelled base in the same place."""
     g = group_of(entry)
-    A = g.adjoint(g.between(base_of(segmap, entry), entry))
+    A = g.adjoint(g.between(segment_base(segmap, entry), entry))
     C = A @ covariance @ A.T
     return np.asarray(0.5 * (C + C.T))

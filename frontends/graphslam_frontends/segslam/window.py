@@ -13,13 +13,13 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam_frontends.grid.weights import spread
+from graphslam_frontends.grid.weights import evenly_spaced_indices
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.segslam.segmentation import Window, gather_window
+from graphslam_frontends.segslam.segmentation import LookAheadWindow, gather_window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ahead:
+class LookAheadScan:
     """What lies ahead of a step.
 
     Parameters
@@ -36,16 +36,16 @@ class Ahead:
     step: int
     last: int
     full: bool
-    window: Window
+    window: LookAheadWindow
 
     def source(self, most: int, radius: float) -> Array:
         """Points ``(k, dim)`` that beams met within a radius of the body, at most so many, evenly spread."""
         p = self.window.points
         rows = np.flatnonzero(np.linalg.norm(p, axis=1) <= radius)
-        return p[rows[spread(len(rows), most)]]
+        return p[rows[evenly_spaced_indices(len(rows), most)]]
 
 
-def look_ahead(steps: Steps, step: int, seconds: float) -> Ahead:
+def gather_look_ahead(steps: Steps, step: int, seconds: float) -> LookAheadScan:
     """The window ahead of a step: what beams met in the steps after it, up to so many seconds later.
 
     Parameters
@@ -60,10 +60,10 @@ def look_ahead(steps: Steps, step: int, seconds: float) -> Ahead:
     window = gather_window(
         steps.odometry.increments[rows.start : rows.stop], [steps.scan(k) for k in rows], steps.max_range
     )
-    return Ahead(step=step, last=last, full=bool(steps.times[-1] >= until - slack), window=window)
+    return LookAheadScan(step=step, last=last, full=bool(steps.times[-1] >= until - slack), window=window)
 
 
-def bring_up_to_date(steps: Steps, poses: Array, step: int, target: int) -> Array:
+def deskew_to_now(steps: Steps, poses: Array, step: int, target: int) -> Array:
     """Poses ``(n, 7)`` or ``(n, 3)`` at a later step, by dead reckoning from where the filter is."""
     group, out = group_of(poses), np.asarray(poses)
     for k in range(step + 1, target + 1):

@@ -84,13 +84,13 @@ def _options(
     log_to_stderr(verbose)
 
 
-cli_run.register(app)
-cli_calibrate.register(app)
-cli_join.register(app)
-cli_map.register(app)
-cli_sessions.register(app)
-cli_results.register(app)
-cli_tools.register(app)
+cli_run.add_run_commands(app)
+cli_calibrate.add_calibrate_command(app)
+cli_join.add_join_commands(app)
+cli_map.add_map_command(app)
+cli_sessions.add_session_commands(app)
+cli_results.add_result_commands(app)
+cli_tools.add_tool_commands(app)
 app.add_typer(cli_data.app, name="data")
 
 
@@ -103,12 +103,12 @@ def main() -> None:
         sys.exit(1)
     except (GraphSlamError, OSError, MemoryError, RecursionError, KeyboardInterrupt, Interrupted) as error:
         _end_bars()
-        typer.echo(f"graphslam: {one_line(error)}", err=True)
+        typer.echo(f"graphslam: {error_line(error)}", err=True)
         _drop_output()
         sys.exit(130 if isinstance(error, (KeyboardInterrupt, Interrupted)) else 1)
 
 
-def one_line(error: BaseException) -> str:
+def error_line(error: BaseException) -> str:
     """Message of an error: ours unchanged, those of the system with advice."""
     if isinstance(error, (KeyboardInterrupt, Interrupted)):
         return f"interrupted; {_go_on(sys.argv[1:])}"

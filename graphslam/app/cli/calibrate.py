@@ -7,17 +7,17 @@ from pathlib import Path
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, PRESET, READER, READER_OPTION, reader_options, run_options
-from graphslam.app.cli.terminal import emit
+from graphslam.app.cli.terminal import print_result
 from graphslam.core.atomic import atomic_open
 from graphslam.core.config import dump_toml
 
 
-def register(app: typer.Typer) -> None:
+def add_calibrate_command(app: typer.Typer) -> None:
     """Add the command to the command line."""
-    app.command()(calibrate)
+    app.command("calibrate")(calibrate_command)
 
 
-def calibrate(
+def calibrate_command(
     source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     frontend: str | None = typer.Option(None, help="Front end that reads the log. Default: by the streams of the log."),
     quick: bool = typer.Option(False, "--quick", help="Use a part of the log, as inside a run (some seconds)."),
@@ -51,4 +51,4 @@ def calibrate(
         with atomic_open(out, "w") as file:
             file.write(dump_toml({"calibrate": found.config()}))
         lines.append(f"written to {out}: graphslam run {source} --config {out}")
-    emit(found.as_dict() | {"out": None if out is None else str(out)}, "\n".join(lines), as_json=as_json)
+    print_result(found.as_dict() | {"out": None if out is None else str(out)}, "\n".join(lines), as_json=as_json)

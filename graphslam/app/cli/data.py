@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
-from graphslam.app.cli.terminal import emit, log_to_stderr, table
+from graphslam.app.cli.terminal import log_to_stderr, print_result, text_table
 from graphslam.core.errors import DataError, MissingDataError
 
 app = typer.Typer(
@@ -14,7 +14,7 @@ app = typer.Typer(
 
 
 @app.command("list")
-def list_data(as_json: bool = JSON) -> None:
+def list_command(as_json: bool = JSON) -> None:
     """List all data sets, and whether their files are on this machine."""
     from graphslam.io.cards import list_cards
     from graphslam.io.catalog import locate
@@ -37,15 +37,15 @@ def list_data(as_json: bool = JSON) -> None:
             }
         )
     text = [{**r, "here": "yes" if r["here"] else "no", "fetchable": "yes" if r["fetchable"] else "no"} for r in rows]
-    emit({"data": rows}, table(text), as_json=as_json)
+    print_result({"data": rows}, text_table(text), as_json=as_json)
 
 
-@app.command()
-def info(name: str, as_json: bool = JSON) -> None:
+@app.command("info")
+def info_command(name: str, as_json: bool = JSON) -> None:
     """Show one data set: contents, source, citation, licence terms and known problems."""
-    from graphslam.io.cards import card
+    from graphslam.io.cards import find_card
 
-    c = card(name)
+    c = find_card(name)
     value = {
         "name": c.name,
         "title": c.title,
@@ -64,41 +64,41 @@ def info(name: str, as_json: bool = JSON) -> None:
     }
     lines = [f"{k:14} {v}" for k, v in value.items() if k not in ("caveats", "files")]
     lines += [f"{'caveat':14} {v}" for v in c.caveats] + [f"{'file':14} {f.path} ({f.bytes} bytes)" for f in c.files]
-    emit(value, "\n".join(lines), as_json=as_json)
+    print_result(value, "\n".join(lines), as_json=as_json)
 
 
 @app.command("readers")
-def list_readers(
+def readers_command(
     name: str | None = typer.Argument(None, help="Name of one reader, for its options."), as_json: bool = JSON
 ) -> None:
     """List the readers, or the options of one reader."""
-    from graphslam.io.readers import reader, readers
+    from graphslam.io.readers import find_reader, list_readers
 
     if name is None:
-        rows = [{"name": n, "reads": r.says} for n, r in readers().items()]
-        emit({"readers": rows}, table(rows), as_json=as_json)
+        rows = [{"name": n, "reads": r.says} for n, r in list_readers().items()]
+        print_result({"readers": rows}, text_table(rows), as_json=as_json)
         return
-    r = reader(name)
+    r = find_reader(name)
     options = [
         {"option": o.name, "type": str(o.annotation), "default": None if o.default is None else str(o.default)}
         for o in r.options().values()
     ]
     value = {"name": name, "reads": r.says, "options": options}
-    emit(value, f"{name}: {r.says}\n{table(options, ['option', 'type', 'default'])}", as_json=as_json)
+    print_result(value, f"{name}: {r.says}\n{text_table(options, ['option', 'type', 'default'])}", as_json=as_json)
 
 
-@app.command()
-def fetch(name: str, as_json: bool = JSON) -> None:
+@app.command("fetch")
+def fetch_command(name: str, as_json: bool = JSON) -> None:
     """Find a data set on this machine, or download it and verify its checksums."""
-    from graphslam.io.fetch import fetch as fetch_files
+    from graphslam.io.fetch import fetch_dataset as fetch_files
 
     log_to_stderr(True)
     folder = fetch_files(name, progress=not as_json)
-    emit({"name": name, "folder": str(folder)}, str(folder), as_json=as_json)
+    print_result({"name": name, "folder": str(folder)}, str(folder), as_json=as_json)
 
 
-@app.command()
-def check(
+@app.command("check")
+def check_command(
     source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     reader: str | None = READER,
     reader_option: list[str] = READER_OPTION,
@@ -109,9 +109,9 @@ def check(
 
     Exit with 1 if there is an error.
     """
-    from graphslam.app.data_check import check_source, summary
+    from graphslam.app.data_check import check_source, check_summary
     from graphslam.io.cards import list_cards
-    from graphslam.io.catalog import check as check_files
+    from graphslam.io.catalog import check_files as check_files
 
     rows, bad = [], []
     card = next((c for c in list_cards() if c.name == source), None)
@@ -122,10 +122,10 @@ def check(
     readable = card is None or card.reader not in (None, "pose-network")
     found = [] if bad or not readable else check_source(source, reader=reader, **reader_options(reader_option))
     lines = [{"stream": n.stream, **n.finding.as_row()} for n in found]
-    text = [table(rows, ["file", "state"])] if rows else []
+    text = [text_table(rows, ["file", "state"])] if rows else []
     text += [f"  {n.finding.level or '-':5} {n.finding.text}" for n in found]
-    text += [summary(found)] if found else []
-    emit({"name": source, "files": rows, "lines": lines}, "\n".join(text), as_json=as_json)
+    text += [check_summary(found)] if found else []
+    print_result({"name": source, "files": rows, "lines": lines}, "\n".join(text), as_json=as_json)
     if bad:
         raise DataError(
             f"{len(bad)} of {len(rows)} files are missing or differ, first {bad[0].file.path}", where=source

@@ -9,20 +9,20 @@ from typing import Any
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
-from graphslam.app.cli.terminal import emit, table, verdict_text
+from graphslam.app.cli.terminal import print_result, text_table, verdict_text
 
 SUBMAP_POSES = typer.Option(
     None, "--submap-poses", help="Cut a pose-graph file into submaps with this number of poses."
 )
 
 
-def register(app: typer.Typer) -> None:
+def add_join_commands(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(join)
-    app.command()(compare)
+    app.command("join")(join_command)
+    app.command("compare")(compare_command)
 
 
-def join(
+def join_command(
     source: str = typer.Argument(
         ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
     ),
@@ -46,17 +46,17 @@ def join(
     """Join submaps into one map with one method, refine it, and check its covariances."""
     import numpy as np
 
-    from graphslam.app.compare import JSON_COLUMNS, join_json, keys_of
+    from graphslam.app.compare import JSON_COLUMNS, join_json, submap_keys
     from graphslam.app.join_verdict import join_headline, join_verdict
     from graphslam.app.submap_sources import submap_source
     from graphslam.core.trajectory import Trajectory
     from graphslam.io.joined_map import write_joined
-    from graphslam.join.registry import join as join_by
-    from graphslam.join.registry import methods_for, prepared
+    from graphslam.join.registry import join_by_method as join_by
+    from graphslam.join.registry import methods_for, prepare_submaps
 
     s = submap_source(source, submap_poses=submap_poses)
     factor = s.covariance_scale if scale is None else scale
-    material = prepared(s.material, associate=associate, covariance_scale=factor)
+    material = prepare_submaps(s.material, associate=associate, covariance_scale=factor)
     way = methods_for(material)
     filters = method in way.joiners
     estimate = own = join_by(
@@ -87,13 +87,13 @@ def join(
         )
     found = join_verdict(value["methods"][0], estimate, () if s.problem is None else s.problem.left_out)
     length = Trajectory(np.arange(len(estimate.poses), dtype=np.float64), estimate.poses).length()
-    said = join_headline(value["methods"][0], found, submaps=len(keys_of(material)), length=length)
+    said = join_headline(value["methods"][0], found, submaps=len(submap_keys(material)), length=length)
     value |= {"headline": said.text, "verdict": [f.as_row() for f in found]}
-    text = "\n".join([table(value["methods"], JSON_COLUMNS), *verdict_text(said, found)])
-    emit(value, text, as_json=as_json)
+    text = "\n".join([text_table(value["methods"], JSON_COLUMNS), *verdict_text(said, found)])
+    print_result(value, text, as_json=as_json)
 
 
-def compare(
+def compare_command(
     source: str = typer.Argument(
         ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
     ),
@@ -118,12 +118,12 @@ def compare(
     from graphslam.app.join_verdict import compare_verdict
     from graphslam.app.run.verdict import CONFIDENCE
     from graphslam.app.submap_sources import submap_source
-    from graphslam.evaluate.without_truth import two_sided
+    from graphslam.evaluate.residual_consistency import two_sided_bounds
 
     s = submap_source(source, submap_poses=submap_poses)
     options: dict[str, Any] = {"covariance_scale": s.covariance_scale if scale is None else scale}
     names = tuple(m.strip() for m in methods.split(",")) if methods else comparing.default_methods(s.material)
-    found = comparing.compare(
+    found = comparing.compare_methods(
         s.material,
         names,
         truth=s.truth,
@@ -136,15 +136,15 @@ def compare(
     value: dict[str, Any] = comparing.methods_json(found)
     if figure is not None:
         from graphslam.plots.comparison import comparison_figure
-        from graphslam.plots.save import save
+        from graphslam.plots.save import save_figure
 
-        save(comparison_figure(found), figure)
+        save_figure(comparison_figure(found), figure)
     said = compare_verdict(value["methods"])
     value["verdict"] = [f.as_row() for f in said]
-    text = [table(comparing.comparison_rows(value["methods"])), *(f.text for f in said)]
+    text = [text_table(comparing.comparison_rows(value["methods"])), *(f.text for f in said)]
     if s.truth is None:
         text.append("NEES and CI: not tested — these submaps have no ground truth.")
     elif n := found["nees_dof"].iloc[0]:
-        low, high, _ = two_sided(1.0, float(n), CONFIDENCE)
+        low, high, _ = two_sided_bounds(1.0, float(n), CONFIDENCE)
         text.append(f"NEES/n of a consistent map: [{low:.3g}, {high:.3g}] in 95 % of the runs (n = {n}).")
-    emit(value, "\n".join(text), as_json=as_json)
+    print_result(value, "\n".join(text), as_json=as_json)

@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
-from graphslam.app.cli.terminal import emit, table
+from graphslam.app.cli.terminal import print_result, text_table
 from graphslam.core.errors import ConfigError
 
 CANDIDATES = (
@@ -17,12 +17,12 @@ CANDIDATES = (
 )
 
 
-def register(app: typer.Typer) -> None:
+def add_map_command(app: typer.Typer) -> None:
     """Add the command to the command line."""
-    app.command("map")(make_map)
+    app.command("map")(map_command)
 
 
-def make_map(
+def map_command(
     run: Path = typer.Argument(..., help="Folder of a finished run of dense submaps (evidence grids or clouds)."),
     grid: bool = typer.Option(False, "--grid", help="Write also the evidence grid, map.grid.npz."),
     minimum_entropy: bool = typer.Option(
@@ -87,12 +87,12 @@ def make_map(
     )  # fmt: skip
     value: dict[str, Any] = made.map.facts()
     rows = [{"what": k, "value": v} for k, v in value.items() if isinstance(v, (int, float)) and k != "dim"]
-    text = table(rows)
+    text = text_table(rows)
     found = made.clearest
     if found is not None:
         rows = found.choice.rows()
         value |= {"candidates": rows, "chosen_because": found.choice.why(), "left_out": found.left_out}
-        text += f"\n\n{table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {found.choice.why()}"
+        text += f"\n\n{text_table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {found.choice.why()}"
         if found.choice.scale > 1.0:
             text += (
                 f"\nevery χ² was divided by {found.choice.scale:.2f}, the smallest χ²/dof of the graphs with most "
@@ -110,7 +110,7 @@ def make_map(
     value |= {"out": str(run), "files": [str(p) for p in made.files], "figures": [str(p) for p in made.figures]}
     value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s, "move": made.map.move_s}
     text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; plots: {', '.join(p.name for p in made.figures)}"
-    emit(value, text, as_json=as_json)
+    print_result(value, text, as_json=as_json)
 
 
 def _make_terrain(run: Path, log: str | None, sensor_height: float | None, as_json: bool) -> None:
@@ -121,7 +121,9 @@ def _make_terrain(run: Path, log: str | None, sensor_height: float | None, as_js
     rows = [{"what": k, "value": v} for k, v in facts.items() if isinstance(v, (int, float, str))]
     rows += [{"what": f"cells {k}", "value": v} for k, v in facts["cells"].items()]
     facts |= {"files": [str(p) for p in files], "figures": [str(p) for p in figures]}
-    emit(facts, f"{table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json)
+    print_result(
+        facts, f"{text_table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json
+    )
 
 
 def _make_surface(run: Path, log: str | None, voxel: float, colour: str, as_json: bool) -> None:
@@ -134,4 +136,6 @@ def _make_surface(run: Path, log: str | None, voxel: float, colour: str, as_json
     facts = found.facts()
     rows = [{"what": k, "value": v} for k, v in facts.items() if isinstance(v, (int, float, str))]
     facts |= {"files": [str(p) for p in files], "figures": [str(p) for p in figures]}
-    emit(facts, f"{table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json)
+    print_result(
+        facts, f"{text_table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json
+    )

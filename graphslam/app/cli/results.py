@@ -7,19 +7,19 @@ from pathlib import Path
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
-from graphslam.app.cli.terminal import emit, table
+from graphslam.app.cli.terminal import print_result, text_table
 
 SHOWN = ("loop", "verdict", "source", "submap_i", "submap_j", "fitness", "chi2", "weight", "effect", "factor_id", "why")
 
 
-def register(app: typer.Typer) -> None:
+def add_result_commands(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(loops)
-    app.command()(report)
-    app.command()(export)
+    app.command("loops")(loops_command)
+    app.command("report")(report_command)
+    app.command("export")(export_command)
 
 
-def loops(
+def loops_command(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
     history: bool = typer.Option(False, help="Show all decisions, also replaced ones."),
     every: bool = typer.Option(False, "--all", help="Show also the candidates that the registration rejected."),
@@ -49,13 +49,13 @@ def loops(
     shown = rows if every or as_json else [r for r in rows if not str(r["why"]).startswith("registration")]
     hidden = len(rows) - len(shown)
     said = ", ".join(f"{n} {verdict}" for verdict, n in sorted(counts.items())) or "none"
-    text = f"{table(shown, SHOWN)}\nloops: {said}"
+    text = f"{text_table(shown, SHOWN)}\nloops: {said}"
     if hidden:
         text += f"; {hidden} refused by their registration are not shown (--all)"
-    emit({"run": str(run), "counts": counts, "loops": rows}, text, as_json=as_json)
+    print_result({"run": str(run), "counts": counts, "loops": rows}, text, as_json=as_json)
 
 
-def report(
+def report_command(
     run: Path = typer.Argument(..., help="Folder of run, demo or merge; the run may be unfinished."),
     out: Path | None = typer.Option(None, help="HTML file to write. Default: report.html in the folder."),
     show: bool = typer.Option(False, "--open", help="Open the page in the browser."),
@@ -75,10 +75,10 @@ def report(
         if not webbrowser.open(file.resolve().as_uri()):
             lines.append("no browser found; open the file by hand")
     value = {"run": str(run), "page": str(file), "kind": made.kind, "bytes": size, "missing": made.problems}
-    emit(value, "\n".join(lines), as_json=as_json)
+    print_result(value, "\n".join(lines), as_json=as_json)
 
 
-def export(
+def export_command(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
     format: str = typer.Option(
         "kml",
@@ -106,4 +106,4 @@ def export(
 
     place = None if datum is None else parse_datum(datum)
     file = export_run(run, place, format=format, heading=heading, confidence=confidence, out=out)
-    emit({"file": str(file), "format": format}, f"written to {file}", as_json=as_json)
+    print_result({"file": str(file), "format": format}, f"written to {file}", as_json=as_json)

@@ -8,8 +8,8 @@ from typing import Any
 
 import typer
 
-from graphslam.app.cli.terminal import emit, table, verdict_text
-from graphslam.core.config import merge, parse_setting, read_toml
+from graphslam.app.cli.terminal import print_result, text_table, verdict_text
+from graphslam.core.config import merge_options, parse_setting, read_toml
 from graphslam.core.reading import set_size_limit
 
 
@@ -57,14 +57,14 @@ SHORT = (
 EVERY = typer.Option(False, "--all", help="Print all metrics. Default: a summary.")
 
 
-def register(app: typer.Typer) -> None:
+def add_run_commands(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(run)
-    app.command()(demo)
-    app.command()(simulate)
+    app.command("run")(run_command)
+    app.command("demo")(demo_command)
+    app.command("simulate")(simulate_command)
 
 
-def run(
+def run_command(
     source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
     frontend: str | None = typer.Option(
         None, help="Name of the front end that makes submaps from the log. Default: by the streams of the log."
@@ -122,9 +122,9 @@ def run(
 
         joined = continue_runs(saved, result, out=out / "continued")
         value["continued"] = joined.report
-        text += "\n".join(["", *figures(joined, every), ""])
+        text += "\n".join(["", *metric_lines(joined, every), ""])
         text += f"{joined!r}, in {out / 'continued'}: report in {out / 'continued' / 'report.html'}"
-    emit(value, text, as_json=as_json)
+    print_result(value, text, as_json=as_json)
 
 
 def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
@@ -132,22 +132,22 @@ def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
     values: dict[str, Any] = read_toml(config) if config else {}
     values.pop("run", None)  # an effective config.toml of another run may be given as it is
     for text in settings:
-        values = merge(values, parse_setting(text))
+        values = merge_options(values, parse_setting(text))
     return values
 
 
-def figures(result: Any, every: bool) -> list[str]:
+def metric_lines(result: Any, every: bool) -> list[str]:
     """Table of the metrics of a run, and how many of them are not shown."""
     rows = result.metrics.to_dict("records")
     shown = [r for r in rows if every or r["key"] in SHORT]
     left = len(rows) - len(shown)
     more = [f"({left} more metrics: --all, or metrics.json)"] if left else []
-    return [table(shown, ["key", "value", "unit"]), *more]
+    return [text_table(shown, ["key", "value", "unit"]), *more]
 
 
 def _summary(result: Any, out: Path, every: bool = False) -> str:
     dropped = result.report["records_dropped"]
-    lines = figures(result, every)
+    lines = metric_lines(result, every)
     lines += [f"dropped {n} {what}" for what, n in dropped.items()]
     lines += join_note(result)
     lines += ["", *verdict_text(result.headline, result.verdict), ""]
@@ -165,13 +165,13 @@ CAUSES = frozenset(
 def join_note(result: Any) -> list[str]:
     """What to do about submaps that fit each other worse or better than they say, beyond what chance does."""
     from graphslam.app.run.verdict import CERTAIN
-    from graphslam.evaluate.without_truth import two_sided
+    from graphslam.evaluate.residual_consistency import two_sided_bounds
 
     m = result.metrics.set_index("key")["value"]
     chi2, dof = m.get("join_chi2_per_dof"), m.get("join_dof", 0.0)
     if chi2 is None or not dof > 0:
         return []
-    low, high, said = two_sided(chi2, dof, CERTAIN)
+    low, high, said = two_sided_bounds(chi2, dof, CERTAIN)
     if said == "consistent":
         return []
     text = (
@@ -185,7 +185,7 @@ def join_note(result: Any) -> list[str]:
     return [f"{text}If there is no other cause, use --set backend.covariance_scale={scale:.2g}"]
 
 
-def demo(
+def demo_command(
     out: Path = typer.Option(Path("demo-run"), help="Folder for the results. An unfinished demo in it is resumed."),
     seed: int = typer.Option(0, help="Seed for sensor noise, clutter and the filter."),
     preset: str = typer.Option("garage", help="World of the demo: garage, or quick for a small one."),
@@ -198,17 +198,17 @@ def demo(
     result = run_demo(out, seed=seed, preset=preset, progress=not as_json)
     rows = result.metrics.to_dict("records")
     text = (
-        f"{chr(10).join(figures(result, every))}"
+        f"{chr(10).join(metric_lines(result, every))}"
         f"\n\n{chr(10).join(verdict_text(result.headline, result.verdict))}"
         f"\n\nplots: {', '.join(str(p) for p in sorted((out / 'figures').glob('*.png')))}"
         f"\nreport: {out / 'report.html'}"
         f"\nmap: {out / 'map.ply'} (points), {out / 'map.bt'} (OctoMap), floor plans {out}/map-level*.yaml"
     )
     value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}
-    emit(value, text, as_json=as_json)
+    print_result(value, text, as_json=as_json)
 
 
-def simulate(
+def simulate_command(
     world: str = typer.Argument(
         ..., help="Name of the world: landmark-field, point-field, garage, mine, building, court or campus."
     ),
@@ -251,4 +251,4 @@ def simulate(
         "streams": streams,
         "meta": log.meta,
     }
-    emit(value, f"{table(rows)}\n{log.duration:.1f} s written to {out}", as_json=as_json)
+    print_result(value, f"{text_table(rows)}\n{log.duration:.1f} s written to {out}", as_json=as_json)

@@ -8,16 +8,16 @@ from typing import cast
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
-from graphslam.app.cli.terminal import emit, table
+from graphslam.app.cli.terminal import print_result, text_table
 
 
-def register(app: typer.Typer) -> None:
+def add_session_commands(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(merge)
-    app.command()(localise)
+    app.command("merge")(merge_command)
+    app.command("localise")(localise_command)
 
 
-def merge(
+def merge_command(
     runs: list[Path] = typer.Argument(
         ..., help="Folders of at least two runs. The first pose of the first run is the origin."
     ),
@@ -52,11 +52,11 @@ def merge(
     )  # fmt: skip
     rows = merged.metrics.to_dict("records")
     where = f"report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}"
-    text = f"{table(rows, ['key', 'value', 'unit'])}\nwritten to {out}: {where}"
-    emit({"out": str(out), "metrics": rows, "report": merged.report}, text, as_json=as_json)
+    text = f"{text_table(rows, ['key', 'value', 'unit'])}\nwritten to {out}: {where}"
+    print_result({"out": str(out), "metrics": rows, "report": merged.report}, text, as_json=as_json)
 
 
-def localise(
+def localise_command(
     run: Path = typer.Argument(..., help="Folder of a run with dense submaps: the map."),
     source: str = typer.Argument(
         ..., help="Submaps to localise: folder of another run, folder of a log, or name of a data set."
@@ -77,7 +77,7 @@ def localise(
     found = find(run, taken, progress=not as_json)
     rows = found.rows()
     columns = ["submap_map", "submap_here", "score", "accepted", "why"]
-    text = f"{table(rows, columns)}\n{found!r}"
+    text = f"{text_table(rows, columns)}\n{found!r}"
     value = {
         "found": found.found,
         "why": found.why,
@@ -87,4 +87,4 @@ def localise(
         "end_covariance": found.end_covariance,
         "candidates": rows,
     }
-    emit(value, text, as_json=as_json)
+    print_result(value, text, as_json=as_json)

@@ -11,15 +11,15 @@ from typing import Any
 import typer
 
 from graphslam.core.findings import Finding
-from graphslam.core.json_file import finite
+from graphslam.core.json_file import json_values
 
 
-def emit(value: Mapping[str, Any], text: str, *, as_json: bool) -> None:
+def print_result(value: Mapping[str, Any], text: str, *, as_json: bool) -> None:
     """Print ``value`` as one JSON object, or ``text``."""
-    typer.echo(json.dumps(finite(value), allow_nan=False) if as_json else text)
+    typer.echo(json.dumps(json_values(value), allow_nan=False) if as_json else text)
 
 
-def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+def text_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
     """Rows as aligned text."""
     if not rows:
         return "(none)"

@@ -8,19 +8,19 @@ from typing import Any, Literal, cast, get_args
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
-from graphslam.app.cli.terminal import emit, table
+from graphslam.app.cli.terminal import print_result, text_table
 from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, UnknownNameError
 
 
-def register(app: typer.Typer) -> None:
+def add_tool_commands(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(solve)
-    app.command()(relax)
-    app.command("eval")(evaluate)
-    app.command()(doctor)
+    app.command("solve")(solve_command)
+    app.command("relax")(relax_command)
+    app.command("eval")(evaluate_command)
+    app.command("doctor")(doctor_command)
 
 
-def solve(
+def solve_command(
     file: str = typer.Argument(
         ..., help="Pose-graph file (.g2o, .graph or .txt, also .xz, .gz, .bz2), or DATA-SET/FILE."
     ),
@@ -45,25 +45,25 @@ def solve(
     as_json: bool = JSON,
 ) -> None:
     """Solve a pose-graph file, and check whether the solution is at its optimum."""
-    from graphslam.app.solve_file import solve_file
-    from graphslam.io.catalog import load
+    from graphslam.app.solve_file import solve_network_file
+    from graphslam.io.catalog import load_recording
 
     path = Path(file)
     if not path.is_file():
-        found = load(file)
+        found = load_recording(file)
         if not isinstance(found, Path) or not found.is_file():
             raise MissingDataError(
                 f"{file} is not a pose-graph file", wanted="a file, or data-set/file such as posegraphs/intel"
             )
         path = found
     names = None if starts is None else "all" if starts == "all" else starts.split(",")
-    value = solve_file(
+    value = solve_network_file(
         path, solver, repair=repair, create_missing=create_missing, out=out, starts=names, certificate=certify
     )
-    emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
+    print_result(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
 
 
-def relax(
+def relax_command(
     folder: Path = typer.Argument(..., help="Chain with loops in tiles: a folder that chain_to_disk wrote."),
     workers: int | None = typer.Option(None, help="Processes that share the tiles. Default: one tile after the other."),
     cluster: str | None = typer.Option(None, help="host:port of a Dask scheduler whose workers share the tiles."),
@@ -86,10 +86,10 @@ def relax(
         "largest_move": found.largest_move,
         "poses": found.names,
     }
-    emit(value, "\n".join(f"{k:20} {v}" for k, v in value.items() if k != "poses"), as_json=as_json)
+    print_result(value, "\n".join(f"{k:20} {v}" for k, v in value.items() if k != "poses"), as_json=as_json)
 
 
-def evaluate(
+def evaluate_command(
     estimate: Path = typer.Argument(..., help="Estimated path, a TUM file."),
     reference: Path = typer.Argument(..., help="Reference path, a TUM file."),
     align: str = typer.Option("se", help="Alignment before the error is measured: none, origin, se or sim."),
@@ -116,16 +116,16 @@ def evaluate(
     except DataError as error:  # a path shorter than delta still has an absolute error
         typer.echo(f"no relative error: {error}; choose another --delta", err=True)
     rows = [{"error": k, **v} for k, v in value.items() if v]
-    emit(value, table(rows), as_json=as_json)
+    print_result(value, text_table(rows), as_json=as_json)
 
 
-def doctor(as_json: bool = JSON) -> None:
+def doctor_command(as_json: bool = JSON) -> None:
     """Check the installation: versions, missing system libraries, and what to install."""
-    from graphslam.app.doctor import examine
+    from graphslam.app.doctor import examine_installation
 
-    findings = examine()
+    findings = examine_installation()
     rows = [{"check": f.name, "state": f.state, "detail": f.detail} for f in findings]
-    emit({"checks": rows}, table(rows), as_json=as_json)
+    print_result({"checks": rows}, text_table(rows), as_json=as_json)
     bad = [f for f in findings if f.state == "missing"]
     if bad:
         raise GraphSlamError(f"{len(bad)} required parts are missing: {', '.join(f.name for f in bad)}")

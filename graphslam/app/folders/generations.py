@@ -12,9 +12,10 @@ rename: whoever looks at the plain paths sees the old state or the new one. Link
 and lead nowhere until then; links to names that are gone are removed after it, then the generation before. A kill
 anywhere leaves one of both states, and remains that the next writer sweeps.
 
-Readers resolve ``current`` once (:func:`consistent`) and read everything from that folder. A folder of plain files was
-copied without its links, was written by an older version, or lies where there are no symbolic links: its readers hold
-the ids inside the files against each other (:func:`check_same`), and the first writer turns it into generations.
+Readers resolve ``current`` once (:func:`read_consistently`) and read everything from that folder. A folder of plain
+files was copied without its links, was written by an older version, or lies where there are no symbolic links: its
+readers hold the ids inside the files against each other (:func:`check_same`), and the first writer turns it into
+generations.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from graphslam.app.folders.lock import LOCK, is_lock, locked
+from graphslam.app.folders.lock import LOCK, is_lock, lock_folder
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.core.atomic import is_part, part_path, sweep_parts, sync
+from graphslam.core.atomic import is_part, part_path, sweep_parts, sync_to_disk
 from graphslam.core.errors import FormatError, GraphSlamError
 
 GENERATIONS, CURRENT = "generations", "current"
@@ -67,7 +68,7 @@ _LINK_NAMES = re.compile(r"(\.\./)*current/.+")
 T = TypeVar("T")
 
 
-class Generation(OutputFiles):
+class FolderTransaction(OutputFiles):
     """A state that is being written.
 
     Parameters
@@ -99,7 +100,7 @@ class Generation(OutputFiles):
             _link(self.before / name, target)
 
 
-def outputs(folder: str | os.PathLike[str]) -> Path:
+def current_outputs(folder: str | os.PathLike[str]) -> Path:
     """Where the files of the present state of a folder are: its generation, or itself where it has none."""
     home = Path(folder)
     target = _current(home)
@@ -110,17 +111,17 @@ def outputs(folder: str | os.PathLike[str]) -> Path:
     return home / target
 
 
-def consistent(folder: str | os.PathLike[str], read: Callable[[Path], T]) -> T:
+def read_consistently(folder: str | os.PathLike[str], read: Callable[[Path], T]) -> T:
     """Read files of one state: ``read`` gets the folder that holds them, again if another state was committed
     meanwhile."""
     while True:
-        root = outputs(folder)
+        root = current_outputs(folder)
         try:
             check_links(folder)
             return read(root)
         except (GraphSlamError, OSError):
             with contextlib.suppress(FormatError):
-                if outputs(folder) != root:
+                if current_outputs(folder) != root:
                     continue
             raise
 
@@ -165,7 +166,7 @@ def check_same(first: tuple[Path, Any], *others: tuple[Path, Any]) -> None:
 
 
 @contextmanager
-def new_generation(folder: str | os.PathLike[str]) -> Iterator[Generation]:
+def new_generation(folder: str | os.PathLike[str]) -> Iterator[FolderTransaction]:
     """Write a new state of a folder that is ours; it is committed when the block ends, and dropped if that raises.
 
     Parameters
@@ -174,19 +175,19 @@ def new_generation(folder: str | os.PathLike[str]) -> Iterator[Generation]:
         The caller has looked whether it is one of ours.
     """
     home = Path(folder)
-    with locked(home):
+    with lock_folder(home):
         check_links(home)
         linked = _has_links(home)
-        sweep(home)
+        remove_stale_files(home)
         if linked:
             _into_generations(home)
-            sweep(home)
+            remove_stale_files(home)
         before = _current(home)
         number = 1 + max([0, *(int(n) for n in _numbers(home))])
         staged = home / GENERATIONS / f"{number:06d}"
         staged.mkdir(parents=True)
         present = home / before if before is not None else home if _names(home, everything=False) else None
-        made = Generation(staged, home, present)
+        made = FolderTransaction(staged, home, present)
         try:
             yield made
         except BaseException:
@@ -194,9 +195,9 @@ def new_generation(folder: str | os.PathLike[str]) -> Iterator[Generation]:
             raise
         names = _names(staged, everything=True)
         for name in names:
-            sync(staged / name)
+            sync_to_disk(staged / name)
         for part in (*{(staged / n).parent for n in names}, staged, staged.parent):
-            sync(part)
+            sync_to_disk(part)
         (_commit if linked else _replace_plainly)(home, staged, names)
 
 
@@ -204,8 +205,8 @@ def _commit(home: Path, staged: Path, names: list[str]) -> None:
     for name in names:
         _point(home, name)
     _symlink(f"{GENERATIONS}/{staged.name}", home / CURRENT)  # the new state, from here on
-    sync(home)
-    sweep(home)
+    sync_to_disk(home)
+    remove_stale_files(home)
 
 
 def _replace_plainly(home: Path, staged: Path, names: list[str]) -> None:
@@ -218,10 +219,10 @@ def _replace_plainly(home: Path, staged: Path, names: list[str]) -> None:
     for name in gone:
         (home / name).unlink(missing_ok=True)
     shutil.rmtree(staged.parent, ignore_errors=True)
-    sync(home)
+    sync_to_disk(home)
 
 
-def sweep(folder: str | os.PathLike[str]) -> None:
+def remove_stale_files(folder: str | os.PathLike[str]) -> None:
     """Remove what killed writers left in a folder that is ours: halves of files, states that were never committed or
     are superseded, and links to files that are gone. The caller holds the lock."""
     home = Path(folder)
@@ -307,8 +308,8 @@ def _into_generations(home: Path) -> None:
         for name in names:
             (home / target / name).parent.mkdir(parents=True, exist_ok=True)
             _link(home / name, home / target / name)
-            sync(home / target / name)
-        sync(home / target)
+            sync_to_disk(home / target / name)
+        sync_to_disk(home / target)
         _symlink(target, home / CURRENT)
     for name in _names(home / target, everything=True):  # all of them plain, or some after a kill just here
         path = home / name

@@ -37,7 +37,7 @@ def make_folder(folder: str | os.PathLike[str]) -> Path:
 
 
 @contextmanager
-def locked(folder: str | os.PathLike[str]) -> Iterator[None]:
+def lock_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Hold a folder against other processes that would write into it; made if missing.
 
     The system gives the lock back when a process ends, however it ends. A thread may lock a folder again that it holds.
@@ -84,7 +84,7 @@ def _take(home: Path) -> Any:
 
 
 def is_lock(file: Path) -> bool:
-    """Is it a file that :func:`locked` made?"""
+    """Is it a file that :func:`lock_folder` made?"""
     with contextlib.suppress(OSError), open(file, "rb") as stream:
         return stream.read(len(_HEAD)) == _HEAD.encode()
     return False

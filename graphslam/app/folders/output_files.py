@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from graphslam.core.atomic import atomic_open
-from graphslam.core.json_file import finite
+from graphslam.core.json_file import json_values
 
 
 class OutputFiles:
@@ -30,7 +30,7 @@ class OutputFiles:
     def write_json(self, name: str, value: Any) -> None:
         """Write a JSON file; not-a-number becomes null."""
         with atomic_open(self.path / name, "w") as stream:
-            stream.write(json.dumps(finite(value), indent=1, allow_nan=False) + "\n")
+            stream.write(json.dumps(json_values(value), indent=1, allow_nan=False) + "\n")
 
     def write_lines(self, name: str, rows: Iterable[Mapping[str, Any]]) -> None:
         """Write JSON lines."""
@@ -50,4 +50,4 @@ class OutputFiles:
 
 def json_lines(rows: Iterable[Mapping[str, Any]]) -> str:
     """One JSON object a line."""
-    return "".join(json.dumps(finite(row), allow_nan=False) + "\n" for row in rows)
+    return "".join(json.dumps(json_values(row), allow_nan=False) + "\n" for row in rows)

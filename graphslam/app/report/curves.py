@@ -11,14 +11,14 @@ import numpy.typing as npt
 
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.packed import base64_floats, packed_points
-from graphslam.app.report.sections import figures_of
+from graphslam.app.report.sections import metrics_of_folder
 from graphslam.app.run.files import read_gps_residuals
 from graphslam.app.run.verdict import CONFIDENCE, class_rows
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.path_consistency import path_consistency
-from graphslam.evaluate.without_truth import two_sided
+from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.io.submap_store import read_truth
 from graphslam.io.tum import read_tum
 from graphslam.maps.global_map import GlobalMap
@@ -33,7 +33,7 @@ _ROW = ("low", "high")
 Rows = npt.NDArray[np.intp]
 
 
-def curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
+def report_curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     """Panels of a finished run, the most telling first; none where there is nothing to show.
 
     With truth: NEES by degree of freedom of every pose with the two-sided bounds of a single one, and its errors with
@@ -90,7 +90,7 @@ class _Axis:
         sigmas: Array | None = None,
         log: bool = False,
     ) -> dict[str, Any]:
-        keep = extremes(values, MOST)
+        keep = extreme_rows(values, MOST)
         piece = self.piece[keep]
         out: dict[str, Any] = {
             **{"name": name, "said": said, "unit": unit, "kind": kind, "colour": style.ESTIMATE, "log": log},
@@ -107,7 +107,7 @@ class _Axis:
         return out
 
 
-def extremes(values: Array, most: int) -> Rows:
+def extreme_rows(values: Array, most: int) -> Rows:
     """Rows of at most ``most`` of the values ``(n,)``: the ends, and of every so many the least and the largest."""
     n = len(values)
     if n <= most:
@@ -133,7 +133,7 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     if len(made.rows) < 2:
         return []
     axis, ratio = _Axis.of(m.trajectory, made.rows), made.nees / made.dof
-    low, high, _ = two_sided(1.0, made.dof, CONFIDENCE)
+    low, high, _ = two_sided_bounds(1.0, made.dof, CONFIDENCE)
     inside = float(np.mean((ratio >= low) & (ratio <= high)))
     said = (
         f"NEES of every pose (ground truth, first base fixed); {_BOUNDS} bounds of one pose with {made.dof} degrees of "
@@ -166,7 +166,7 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
     if found is not None:
         times, v, sigma, nis = found
         d, axis = v.shape[1], _Axis.at(path, times)
-        low, high, _ = two_sided(1.0, d, CONFIDENCE)
+        low, high, _ = two_sided_bounds(1.0, d, CONFIDENCE)
         inside = float(np.mean((nis / d >= low) & (nis / d <= high)))
         said = (
             f"Withheld GPS fixes against their prediction by the graph; {_BOUNDS} bounds of one fix "
@@ -209,7 +209,7 @@ def _kinds(folder: ReportFolder) -> list[dict[str, Any]]:
     """χ²/dof by kind of factor with its bounds."""
     rows = [
         {"name": str(r.get("class")), **{k: round(float(r[k]), 6) for k in _ROW}, "value": _six(r["chi2_per_dof"])}
-        for r in class_rows(figures_of(folder))
+        for r in class_rows(metrics_of_folder(folder))
         if all(isinstance(r.get(k), (int, float)) and np.isfinite(r[k]) for k in (*_ROW, "chi2_per_dof"))
     ]
     if not rows:

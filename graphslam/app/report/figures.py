@@ -8,11 +8,11 @@ import numpy as np
 
 from graphslam.app.report.curves import chart_of
 from graphslam.app.report.folder import ReportFolder
-from graphslam.app.report.markup import missing, note, picture, section
+from graphslam.app.report.markup import inline_picture, missing_note, page_section, remark
 from graphslam.app.run.files import read_map, read_merged_dense
 from graphslam.backend.sessions import SESSION
 from graphslam.core.errors import DataError, GraphSlamError
-from graphslam.core.markup import Markup, join
+from graphslam.core.markup import Markup, join_parts
 from graphslam.evaluate.consistency import Consistency, nees
 from graphslam.evaluate.path_consistency import map_errors
 from graphslam.io.submap_store import read_truth
@@ -38,7 +38,7 @@ MOST_NAMES = 60
 """More loops than these are drawn without their numbers."""
 
 
-def figures(folder: ReportFolder) -> Markup:
+def report_pictures(folder: ReportFolder) -> Markup:
     """Pictures, the map first."""
     made = dict(folder.figures())
     parts: list[Any] = []
@@ -48,20 +48,20 @@ def figures(folder: ReportFolder) -> Markup:
     at = order.index("submaps.png") + 1 if "submaps.png" in order else min(1, len(order))
     drawn = _drawn(folder)
     for name in order[:at]:
-        parts.append(picture(made[name], CAPTIONS[name]))
+        parts.append(inline_picture(made[name], CAPTIONS[name]))
     parts += drawn
     for name in [*levels, *order[at:], *rest, *(["progress.png"] if "progress.png" in made else [])]:
-        parts.append(picture(made[name], _caption(name)))
+        parts.append(inline_picture(made[name], _caption(name)))
     if not made:
-        parts.append(missing("plots of the run: figures/ has none."))
+        parts.append(missing_note("plots of the run: figures/ has none."))
     elif "map.png" not in made:
-        parts.append(missing("the map (figures/map.png)."))
+        parts.append(missing_note("the map (figures/map.png)."))
     if folder.kind == "run" and not any(n.startswith("fused") for n in made):
         said = folder.report.get(
             "map_left_out", "the submaps have no evidence grids or clouds, or no map was requested."
         )
-        parts.append(missing("a fused map: ", said))
-    return section("figures", "Figures", *parts)
+        parts.append(missing_note("a fused map: ", said))
+    return page_section("figures", "Figures", *parts)
 
 
 def _caption(name: str) -> str:
@@ -76,14 +76,16 @@ def _caption(name: str) -> str:
 def _drawn(folder: ReportFolder) -> list[Markup]:
     """Loops over the path, NEES submap by submap: from what the folder holds."""
     if folder.kind == "interrupted":
-        return [missing("loop closures on the path, and NEES by submap: the run is not finished.")]
+        return [missing_note("loop closures on the path, and NEES by submap: the run is not finished.")]
     if folder.kind == "merged":
         return _session_ties(folder)
     try:
         m = read_map(folder.path)
     except GraphSlamError as error:
         folder.problems["map.npz"] = _said(folder, error)
-        return [missing("loop closures on the path, and NEES by submap: map.npz ", folder.problems["map.npz"], ".")]
+        return [
+            missing_note("loop closures on the path, and NEES by submap: map.npz ", folder.problems["map.npz"], ".")
+        ]
     bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
     loops = _loops(folder, m.node_poses, m.trajectory.poses)
     return [*loops, *_nees(folder, m.node_poses, m.node_covariances, bases)]
@@ -92,11 +94,11 @@ def _drawn(folder: ReportFolder) -> list[Markup]:
 def _session_ties(folder: ReportFolder) -> list[Markup]:
     """Ties between sessions over the paths of both."""
     from graphslam.plots.loops import plot_loops
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
     ties = [e for e in folder.events or [] if e.get("event") == "between" and e.get("group") == SESSION]
     if not ties:
-        return [missing("loop closures between sessions: none from place recognition.")]
+        return [missing_note("loop closures between sessions: none from place recognition.")]
     try:
         nodes = read_merged_dense(folder.path)["nodes"]
         paths = [read_tum(f).positions[:, :2] for f in sorted(folder.path.glob("trajectory_*.tum"))]
@@ -105,8 +107,8 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
         ends = [(e["i"], e["j"], "accepted") for e in ties]
         ax = plot_loops(None, path, nodes, ends, title="loop closures between sessions, from above")
     except GraphSlamError as error:
-        return [missing("loop closures between sessions: ", _said(folder, error), ".")]
-    return [picture(png(ax), "Paths of the sessions in the common frame, and loop closures between them")]
+        return [missing_note("loop closures between sessions: ", _said(folder, error), ".")]
+    return [inline_picture(figure_png(ax), "Paths of the sessions in the common frame, and loop closures between them")]
 
 
 def _said(folder: ReportFolder, error: Exception) -> str:
@@ -116,7 +118,7 @@ def _said(folder: ReportFolder, error: Exception) -> str:
 
 def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Markup]:
     from graphslam.plots.loops import plot_loops
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
     n = len(nodes)
     rows = [r for r in folder.loop_rows if 0 <= r["i"] < n and 0 <= r["j"] < n]
@@ -127,29 +129,29 @@ def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Ma
         names = [r["loop"] for r in rows] if len(rows) <= MOST_NAMES else None
         ax = plot_loops(None, path, nodes, ends, names=names, title="loop closures, from above")
     except DataError as error:
-        return [missing("loop closures on the path: ", error, ".")]
-    out = [picture(png(ax), "Loop closures by their number in the ledger: accepted, undone, rejected")]
+        return [missing_note("loop closures on the path: ", error, ".")]
+    out = [inline_picture(figure_png(ax), "Loop closures by their number in the ledger: accepted, undone, rejected")]
     lost = len(folder.loop_rows) - len(rows)
-    return [*out, note(f"{lost} loop closures have no node to draw.")] if lost else out
+    return [*out, remark(f"{lost} loop closures have no node to draw.")] if lost else out
 
 
 def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, bases: np.ndarray) -> list[Markup]:
     try:
         truth = read_truth(folder.path)
         if truth is None:
-            return [missing("NEES by submap: no ground truth in the folder.")]
+            return [missing_note("NEES by submap: no ground truth in the folder.")]
         keys = np.array([int(e["key"]) for e in folder.submaps], dtype=np.int64)
         if len(bases) != len(keys) + 1:
             raise DataError("nodes do not match the submaps", got=len(bases) - 1, wanted=len(keys))
         here = np.isin(truth.keys, keys)
         if not np.any(here):
-            return [missing("NEES by submap: no ground truth for these submaps.")]
+            return [missing_note("NEES by submap: no ground truth for these submaps.")]
         end = bases[1 + np.searchsorted(keys, truth.keys[here])]
         d2 = nees(*map_errors(nodes[end], covariances[end], truth.exit_poses[here], chart_of(folder)))
     except (GraphSlamError, KeyError, TypeError, IndexError, ValueError) as error:
-        return [missing("NEES by submap: ", _said(folder, error), ".")]
+        return [missing_note("NEES by submap: ", _said(folder, error), ".")]
     from graphslam.plots.consistency import plot_consistency
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
     dof = covariances.shape[-1]
     made = Consistency(
@@ -160,6 +162,6 @@ def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, base
     )
     text = "NEES/n of the submap end poses (ground truth), with the 95 % bounds of a consistent run"
     return [
-        picture(png(ax), text),
-        note(join(["Errors of one run are correlated: neighbours are inside or outside together."])),
+        inline_picture(figure_png(ax), text),
+        remark(join_parts(["Errors of one run are correlated: neighbours are inside or outside together."])),
     ]

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
-from graphslam.app.report.markup import folded, missing, note, section
-from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, join, table
+from graphslam.app.report.markup import folded_section, missing_note, page_section, remark
+from graphslam.core.markup import Markup, Row, html_element, html_table, is_numeric, join_parts, value_text
 
 ORDER = ("accepted", "switched-off", "undone", "rejected")
 COLUMNS = {
@@ -20,44 +20,48 @@ COLUMNS = {
 """Keys as ``graphslam loops --json`` has them."""
 
 
-def loops(folder: ReportFolder) -> Markup:
+def loops_section(folder: ReportFolder) -> Markup:
     """Every loop with the decision in force: those in the graph, those taken out again, those refused."""
     title = "Loops"
     if folder.loops is None:
         why = folder.problems.get("events.jsonl", "does not say")
-        return section("loops", title, missing("the ledger of loops; events.jsonl ", why, "."), *_ties(folder))
+        return page_section(
+            "loops", title, missing_note("the ledger of loops; events.jsonl ", why, "."), *_ties(folder)
+        )
     if not folder.loop_rows:
-        return section("loops", title, _none(folder), *_ties(folder))
+        return page_section("loops", title, _none(folder), *_ties(folder))
     counts = folder.loops.counts()
     said = ", ".join(f"{counts[v]} {v}" for v in (*ORDER, *sorted(set(counts) - set(ORDER))) if v in counts)
     rows = sorted(folder.loop_rows, key=_rank)
     # what the registration itself refused is most of a long run, and least of what one looks for
     short = [r for r in rows if not str(r["why"]).startswith("registration")]
     hidden = [r for r in rows if str(r["why"]).startswith("registration")]
-    parts: list[Any] = [note(f"Loop closures: {len(rows)}; {said}. `graphslam loops` lists them; --undo removes one.")]
-    parts.append(_ledger(short) if short else note("Only those below."))
+    parts: list[Any] = [
+        remark(f"Loop closures: {len(rows)}; {said}. `graphslam loops` lists them; --undo removes one.")
+    ]
+    parts.append(_ledger(short) if short else remark("Only those below."))
     if hidden:
-        parts.append(folded(f"{len(hidden)} rejected by registration", _ledger(hidden)))
+        parts.append(folded_section(f"{len(hidden)} rejected by registration", _ledger(hidden)))
     parts += _history(folder)
     parts.append(
-        note(
+        remark(
             "χ²: against the graph without this loop closure. weight: of the robust kernel at the solution, 0 if it is "
             "not in the graph. effect: predicted and measured increase of the cost, and the part of earlier factors. "
             "– : not measured (front-end matches have a support and no registration). The gates are explained in the "
             "documentation of loop closures."
         )
     )
-    return section("loops", title, *parts, *_ties(folder))
+    return page_section("loops", title, *parts, *_ties(folder))
 
 
 def _none(folder: ReportFolder) -> Markup:
     backend = folder.config.get("backend", {})
     asked = backend.get("loops") is True if isinstance(backend, Mapping) else False
     if folder.kind == "merged":
-        return note("No loop closures within sessions. Loop closures between sessions are below.")
+        return remark("No loop closures within sessions. Loop closures between sessions are below.")
     if asked:
-        return note("No candidates were found.")
-    return note(
+        return remark("No candidates were found.")
+    return remark(
         "None: the search is off (backend.loops), and the front end gave no matches. Landmarks that are observed again "
         "close loops as factors of their submaps."
     )
@@ -69,7 +73,7 @@ def _rank(row: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _ledger(rows: list[dict[str, Any]]) -> Markup:
-    return table([Row(r, str(r["verdict"]), {"loop": r["loop"]}) for r in rows], COLUMNS, class_="loops")
+    return html_table([Row(r, str(r["verdict"]), {"loop": r["loop"]}) for r in rows], COLUMNS, class_="loops")
 
 
 def _history(folder: ReportFolder) -> list[Markup]:
@@ -85,7 +89,7 @@ def _history(folder: ReportFolder) -> list[Markup]:
         return []
     columns = {k: COLUMNS[k] for k in ("loop", "verdict", "chi2", "weight", "effect", "why")}
     of = sum(n > 1 for n in times.values())
-    return [folded(f"{of} loop closures with several decisions, in order", table(rows, columns))]
+    return [folded_section(f"{of} loop closures with several decisions, in order", html_table(rows, columns))]
 
 
 def _ties(folder: ReportFolder) -> list[Markup]:
@@ -101,23 +105,23 @@ def _ties(folder: ReportFolder) -> list[Markup]:
                 rows.append(Row({**c, "session": s.get("name"), "verdict": said}, said))
     if not rows:
         return [
-            element("h3", "Loop closures between sessions"),
-            note("No places were compared. See the sessions above."),
+            html_element("h3", "Loop closures between sessions"),
+            remark("No places were compared. See the sessions above."),
         ]
     columns = {
         **{"session": "session", "verdict": "verdict", "submap_map": "submap in the map", "submap_here": "submap here"},
         **{"i": "node i", "j": "node j", "source": "source", "score": "score", "why": "why", "gates": "gates"},
     }
-    return [element("h3", "Loop closures between sessions"), table(rows, columns, class_="ties")]
+    return [html_element("h3", "Loop closures between sessions"), html_table(rows, columns, class_="ties")]
 
 
-def hypotheses(folder: ReportFolder) -> Markup:
+def hypotheses_section(folder: ReportFolder) -> Markup:
     """Alternative graphs that were solved: topologies, or choices of matches and loops."""
     title = "Hypotheses and runners-up"
     found = {} if folder.clearest is None else folder.clearest
     candidates = [c for c in found.get("candidates", ()) if isinstance(c, Mapping)]
     if not candidates:
-        return section("hypotheses", title, missing("other hypotheses: none were solved in this folder."))
+        return page_section("hypotheses", title, missing_note("other hypotheses: none were solved in this folder."))
     columns = {
         **{"verdict": "verdict", "choice": "choice", "support": "support", "withdrawn": "entry withdrawn"},
         **{"submaps": "submaps", "entries": "entries", "matches": "matches", "loops": "loops"},
@@ -125,10 +129,10 @@ def hypotheses(folder: ReportFolder) -> Markup:
         **{"entropy": "entropy [nat m³]", "known_volume": "known [m³]", "why": "why"},
     }
     shown = {k: v for k, v in columns.items() if any(k in c for c in candidates)}
-    why = note(join(["Why: ", str(found.get("why", "not said")), "."]))
-    parts = [table(candidates, shown), why]
+    why = remark(join_parts(["Why: ", str(found.get("why", "not said")), "."]))
+    parts = [html_table(candidates, shown), why]
     entropy = found.get("refined_entropy")
-    if is_figure(entropy):
+    if is_numeric(entropy):
         text = "All are judged by the maps of their graphs; the chosen one was then refined by its scans: entropy "
-        parts.append(note(text, figure_text(entropy), "."))
-    return section("hypotheses", title, *parts)
+        parts.append(remark(text, value_text(entropy), "."))
+    return page_section("hypotheses", title, *parts)

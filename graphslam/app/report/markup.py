@@ -11,46 +11,46 @@ import json
 from importlib.resources import files
 from typing import Any
 
-from graphslam.core.markup import Markup, element, environment, join
+from graphslam.core.markup import Markup, html_element, join_parts, template_environment
 
 SCRIPTS = ("viewer.js", "curves.js")
 """Joined, the one script of a page."""
 
 
-def folded(summary: str, body: Markup) -> Markup:
+def folded_section(summary: str, body: Markup) -> Markup:
     """What is opened by hand."""
-    return element("details", element("summary", summary), body)
+    return html_element("details", html_element("summary", summary), body)
 
 
-def note(*text: Any) -> Markup:
+def remark(*text: Any) -> Markup:
     """A remark."""
-    return element("p", *text, class_="note")
+    return html_element("p", *text, class_="note")
 
 
-def missing(*text: Any) -> Markup:
+def missing_note(*text: Any) -> Markup:
     """That something is not there, and why."""
-    return element("p", "Missing: ", *text, class_="missing")
+    return html_element("p", "Missing: ", *text, class_="missing")
 
 
-def section(name: str, title: str, *parts: Any) -> Markup:
+def page_section(name: str, title: str, *parts: Any) -> Markup:
     """A part of the page, under a name that links lead to."""
-    return element("section", element("h2", title), join(parts, "\n"), id=name)
+    return html_element("section", html_element("h2", title), join_parts(parts, "\n"), id=name)
 
 
-def picture(png: bytes, caption: str) -> Markup:
+def inline_picture(png: bytes, caption: str) -> Markup:
     """A PNG inside the page."""
     src = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-    return element("figure", element("img", src=src, alt=caption), element("figcaption", caption))
+    return html_element("figure", html_element("img", src=src, alt=caption), html_element("figcaption", caption))
 
 
-def compact(value: Any) -> str:
+def compact_json(value: Any) -> str:
     """A value as one line of JSON."""
     return json.dumps(value, ensure_ascii=False, default=str)
 
 
-def page(**values: Any) -> str:
+def whole_page(**values: Any) -> str:
     """A whole page: ``title``, ``headline``, ``findings``, ``parts`` and ``scene`` in the template ``page.html``."""
-    pages = environment("graphslam.app.report")
+    pages = template_environment("graphslam.app.report")
     templates = files("graphslam.app.report") / "templates"
     viewer = "".join((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(viewer.encode()).digest()).decode("ascii")

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
-from graphslam.app.report.markup import missing, note, picture, section
-from graphslam.core.markup import Markup, is_figure, pairs, table
+from graphslam.app.report.markup import inline_picture, missing_note, page_section, remark
+from graphslam.core.markup import Markup, html_table, is_numeric, pair_list
 
 MEANING = {
     "scale": ("wheel scale, distance too long by", "share"),
@@ -28,17 +28,19 @@ BEFORE_AFTER = (
 )
 
 
-def refinement(folder: ReportFolder) -> Markup:
+def refinement_section(folder: ReportFolder) -> Markup:
     """The path of the graph and the refined one in figures, and what else the scans determined."""
     title = "Refinement by scans"
     found = folder.part("refine")
     if folder.kind != "run":
-        return section("refinement", title, note("Only for finished single runs."))
+        return page_section("refinement", title, remark("Only for finished single runs."))
     if not found:
-        return section("refinement", title, note("No refinement; the path is that of the graph. See the verdict."))
+        return page_section(
+            "refinement", title, remark("No refinement; the path is that of the graph. See the verdict.")
+        )
     m = folder.values()
     rows = [{"what": w, "graph": m[a], "refined": m[b]} for w, a, b in BEFORE_AFTER if a in m and b in m]
-    parts: list[Any] = [table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
+    parts: list[Any] = [html_table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
     parts += [_constants(found), *_bias(found)]
     rounds = found.get("rounds") or []
     columns = {
@@ -46,13 +48,13 @@ def refinement(folder: ReportFolder) -> Markup:
         **{"surface_sigma": "σ of a surface [m]", "pairs": "pairs", "passes": "of other traversals"},
         **{"spread": "residual spread [m]", "moved": "path moved by [m]"},
     }
-    parts.append(table(rounds, columns) if rounds else missing("rounds of the refinement."))
+    parts.append(html_table(rounds, columns) if rounds else missing_note("rounds of the refinement."))
     apart = found.get("left_apart") or []
     if apart:
         listed = {f"{k + 1}": f"{a:.1f} s and {b:.1f} s" for k, (a, b) in enumerate(apart[:20])}
-        parts += [note(f"Pairs of places in the graph that contradict the scans ({len(apart)}):"), pairs(listed)]
-    parts.append(note("The measurements of the refined path are listed under evidence."))
-    return section("refinement", title, *parts)
+        parts += [remark(f"Pairs of places in the graph that contradict the scans ({len(apart)}):"), pair_list(listed)]
+    parts.append(remark("The measurements of the refined path are listed under evidence."))
+    return page_section("refinement", title, *parts)
 
 
 def _constants(found: Mapping[str, Any]) -> Markup:
@@ -60,14 +62,14 @@ def _constants(found: Mapping[str, Any]) -> Markup:
     for name, entry in (found.get("constants") or {}).items():
         words, unit = MEANING.get(name, (name, ""))
         rows.append({"what": words, "value": entry["value"], "sigma": entry["sigma"], "unit": unit})
-    return table(rows, {"what": "systematic error", "value": "value", "sigma": "σ", "unit": "unit"})
+    return html_table(rows, {"what": "systematic error", "value": "value", "sigma": "σ", "unit": "unit"})
 
 
 def _bias(found: Mapping[str, Any]) -> list[Markup]:
-    knots = [k for k in found.get("yaw_bias") or [] if all(is_figure(v) for v in k)]
+    knots = [k for k in found.get("yaw_bias") or [] if all(is_numeric(v) for v in k)]
     if not knots:
         return []
     from graphslam.plots.refined import plot_yaw_bias
-    from graphslam.plots.save import png
+    from graphslam.plots.save import figure_png
 
-    return [picture(png(plot_yaw_bias(None, knots)), "Yaw rate bias at its knots")]
+    return [inline_picture(figure_png(plot_yaw_bias(None, knots)), "Yaw rate bias at its knots")]

@@ -6,44 +6,44 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from graphslam.app.folders.generations import Generation, consistent, name_inside, new_generation
-from graphslam.app.report.figures import figures
+from graphslam.app.folders.generations import FolderTransaction, name_inside, new_generation, read_consistently
+from graphslam.app.report.figures import report_pictures
 from graphslam.app.report.folder import Kind, read_folder
-from graphslam.app.report.loops import hypotheses, loops
-from graphslam.app.report.markup import page
-from graphslam.app.report.refinement import refinement
-from graphslam.app.report.scene import scene
+from graphslam.app.report.loops import hypotheses_section, loops_section
+from graphslam.app.report.markup import whole_page
+from graphslam.app.report.refinement import refinement_section
+from graphslam.app.report.scene import report_scene
 from graphslam.app.report.sections import (
-    events,
-    evidence,
-    graph,
-    metrics,
-    problems,
-    records,
-    times,
+    events_section,
+    evidence_section,
+    graph_section,
+    metrics_section,
+    problems_section,
+    records_section,
+    times_section,
     verdict_lines,
     what_was_run,
 )
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GraphSlamError, RunFolderError
-from graphslam.core.markup import element, plain
+from graphslam.core.markup import html_element, plain_text
 
 logger = logging.getLogger(__name__)
 
 PAGE = "report.html"
 _PARTS = {
-    "figures": figures,
-    "refinement": refinement,
+    "figures": report_pictures,
+    "refinement": refinement_section,
     "run": what_was_run,
-    "records": records,
-    "metrics": metrics,
-    "graph": graph,
-    "loops": loops,
-    "hypotheses": hypotheses,
-    "evidence": evidence,
-    "events": events,
-    "times": times,
-    "missing": problems,  # last: the others note what they did not find
+    "records": records_section,
+    "metrics": metrics_section,
+    "graph": graph_section,
+    "loops": loops_section,
+    "hypotheses": hypotheses_section,
+    "evidence": evidence_section,
+    "events": events_section,
+    "times": times_section,
+    "missing": problems_section,  # last: the others note what they did not find
 }
 _TITLES = {
     "run": "Report of a run",
@@ -70,7 +70,7 @@ class Report:
 
     def _repr_html_(self) -> str:
         """The page inside a notebook, apart from the notebook's own style and scripts."""
-        return element("iframe", srcdoc=self.html, style="width: 100%; height: 46rem; border: 0")
+        return html_element("iframe", srcdoc=self.html, style="width: 100%; height: 46rem; border: 0")
 
 
 def make_report(folder: str | Path) -> Report:
@@ -78,17 +78,17 @@ def make_report(folder: str | Path) -> Report:
 
     The same folder gives the same page. Two runs of the same configuration differ in its part ``times`` alone.
     """
-    return consistent(folder, lambda root: _page(Path(folder), root))
+    return read_consistently(folder, lambda root: _page(Path(folder), root))
 
 
 def _page(home: Path, root: Path) -> Report:
     found = read_folder(home, root)
     said, lines = verdict_lines(found)
-    shown = scene(found)
-    html = page(
-        title=plain(f"{_TITLES[found.kind]}: {found.name}"),
+    shown = report_scene(found)
+    html = whole_page(
+        title=plain_text(f"{_TITLES[found.kind]}: {found.name}"),
         headline=said,
-        findings=[replace(f, text=plain(f.text)) for f in lines],
+        findings=[replace(f, text=plain_text(f.text)) for f in lines],
         scene=shown,
         parts={name: part(found) for name, part in _PARTS.items()},
     )
@@ -129,7 +129,7 @@ def _save(report: Report, file: Path) -> Path:
     return file
 
 
-def report_beside(new: Generation) -> None:
+def add_report(new: FolderTransaction) -> None:
     """Write the page of a state that is being written; its failure is said, and undoes nothing."""
     try:
         _save(_page(new.home, new.path), new.path / PAGE)

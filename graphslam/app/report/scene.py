@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.report.curves import curves
+from graphslam.app.report.curves import report_curves
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.packed import base64_floats, packed_points, space
 from graphslam.app.run.files import read_gps_residuals, read_map
@@ -31,7 +31,7 @@ CHI2_95 = -2.0 * math.log(0.05)
 """Of two degrees of freedom: closed form."""
 
 
-def scene(folder: ReportFolder) -> dict[str, Any] | None:
+def report_scene(folder: ReportFolder) -> dict[str, Any] | None:
     """The layers of a finished run; None where there is no map to show.
 
     Returns
@@ -40,7 +40,7 @@ def scene(folder: ReportFolder) -> dict[str, Any] | None:
         ``dim``, ``layers``: each ``name``, ``kind`` (points, line, ellipses, loops), ``colour``, ``on``, and its data:
         ``xyz`` as base64 of float32 ``(n, 3)`` [m]; of ellipses ``cov`` as well, ``(n, 3)``: xx, xy, yy of the 95 %
         ellipse [m²]; of loops ``rows``: number, verdict, and both ends. ``curves``: panels of
-        :func:`~graphslam.app.report.curves.curves`.
+        :func:`~graphslam.app.report.curves.report_curves`.
     """
     if folder.kind != "run":
         return None
@@ -59,7 +59,7 @@ def scene(folder: ReportFolder) -> dict[str, Any] | None:
         name = style.ellipses("landmarks")
         layers.append(_ellipses(name, style.LANDMARK, m.landmarks, m.landmark_covariances))
     layers += [*above, *_loops(folder, m)]
-    return {"dim": m.dim, "layers": layers, "curves": curves(folder, m)}
+    return {"dim": m.dim, "layers": layers, "curves": report_curves(folder, m)}
 
 
 def _map(folder: ReportFolder) -> list[dict[str, Any]]:

@@ -9,15 +9,25 @@ from typing import Any
 import pandas as pd
 
 from graphslam.app.report.folder import ReportFolder
-from graphslam.app.report.markup import compact, folded, missing, note, section
+from graphslam.app.report.markup import compact_json, folded_section, missing_note, page_section, remark
 from graphslam.app.run.files import RESUMED
-from graphslam.app.run.summary import headline, summary
-from graphslam.app.run.verdict import CONFIDENCE, Figures, class_rows, verdict
+from graphslam.app.run.summary import headline, summarise_run
+from graphslam.app.run.verdict import CONFIDENCE, RunMetrics, class_rows, run_findings
 from graphslam.core.config import dump_toml
 from graphslam.core.findings import Finding
-from graphslam.core.markup import Markup, Row, element, figure_text, is_figure, items, join, pairs, table
+from graphslam.core.markup import (
+    Markup,
+    Row,
+    html_element,
+    html_table,
+    is_numeric,
+    item_list,
+    join_parts,
+    pair_list,
+    value_text,
+)
 from graphslam.evaluate.metrics import is_time
-from graphslam.evaluate.without_truth import two_sided
+from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.ledger import EXCLUSIVE
 
 BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is consistent"}
@@ -40,45 +50,48 @@ def what_was_run(folder: ReportFolder) -> Markup:
             "T_world_first_base": "first base (x y θ, or x y z qx qy qz qw)",
         }
         shown = {k: v for k, v in columns.items() if any(k in s for s in folder.sessions)}
-        parts += [pairs(facts), table(folder.sessions, shown) if shown else missing("sessions in merge.json.")]
-        parts.append(note("Options and versions are in the reports of the single runs."))
-        return section("run", "What was run", *parts)
+        parts += [
+            pair_list(facts),
+            html_table(folder.sessions, shown) if shown else missing_note("sessions in merge.json."),
+        ]
+        parts.append(remark("Options and versions are in the reports of the single runs."))
+        return page_section("run", "What was run", *parts)
     said = said if isinstance(said, dict) else {}
     names = ("source", "frontend", "solver", "seed")
-    parts.append(pairs({k: r.get(k, said.get(k)) for k in names}))
+    parts.append(pair_list({k: r.get(k, said.get(k)) for k in names}))
     if folder.kind == "interrupted":
-        parts.append(note(stopped(folder)))
+        parts.append(remark(stopping_line(folder)))
     versions = folder.part("versions")
-    parts.append(pairs(versions) if versions else missing("versions; ", _why(folder, "run.json")))
+    parts.append(pair_list(versions) if versions else missing_note("versions; ", _why(folder, "run.json")))
     if folder.config:
-        parts.append(folded("All options (config.toml)", element("pre", _toml(folder.config))))
+        parts.append(folded_section("All options (config.toml)", html_element("pre", _toml(folder.config))))
     else:
-        parts.append(missing("options; ", _why(folder, "config.toml")))
+        parts.append(missing_note("options; ", _why(folder, "config.toml")))
     if folder.part("source_meta"):
-        parts.append(folded("Metadata of the log", pairs(_flat(folder.part("source_meta")))))
-    return section("run", "What was run", *parts)
+        parts.append(folded_section("Metadata of the log", pair_list(_flat(folder.part("source_meta")))))
+    return page_section("run", "What was run", *parts)
 
 
-def records(folder: ReportFolder) -> Markup:
+def records_section(folder: ReportFolder) -> Markup:
     """What was read, what was dropped and why, what was flagged."""
     if folder.kind == "merged":
-        return section("records", "Records", note("A merge reads submaps, not records."))
+        return page_section("records", "Records", remark("A merge reads submaps, not records."))
     title = "Records read, dropped, flagged"
     if not folder.report:
         said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "run.json")
-        return section("records", title, missing("counts of records; ", said))
+        return page_section("records", title, missing_note("counts of records; ", said))
     read, dropped = folder.part("records_read"), folder.part("records_dropped")
     flagged = {k: v for k, v in folder.part("flagged_submaps").items() if k != "any"}
-    parts: list[Any] = [element("h3", "Read")]
+    parts: list[Any] = [html_element("h3", "Read")]
     rows = [{"stream": stream, "records": n, "used": _use(stream, folder.ledger)} for stream, n in read.items()]
-    parts.append(table(rows, ["stream", "records", "used"]) if rows else missing("counts of records read."))
-    parts.append(element("h3", "Dropped"))
+    parts.append(html_table(rows, ["stream", "records", "used"]) if rows else missing_note("counts of records read."))
+    parts.append(html_element("h3", "Dropped"))
     lines = [{"what": k, "records": v} for k, v in dropped.items()]
-    parts.append(table(lines, {"what": "stream and why", "records": "records"}) if lines else note("Nothing."))
-    parts.append(element("h3", "Submaps flagged by the front end"))
+    parts.append(html_table(lines, {"what": "stream and why", "records": "records"}) if lines else remark("Nothing."))
+    parts.append(html_element("h3", "Submaps flagged by the front end"))
     marks = [{"why": k, "submaps": v} for k, v in flagged.items()]
-    parts.append(table(marks, ["why", "submaps"]) if marks else note("None."))
-    return section("records", title, *parts)
+    parts.append(html_table(marks, ["why", "submaps"]) if marks else remark("None."))
+    return page_section("records", title, *parts)
 
 
 def _use(stream: str, ledger: pd.DataFrame | None) -> str:
@@ -88,12 +101,12 @@ def _use(stream: str, ledger: pd.DataFrame | None) -> str:
     return f"in {n} factor{'s' * (n != 1)}" if n else "in no factor (only for evaluation, or not used)"
 
 
-def metrics(folder: ReportFolder) -> Markup:
+def metrics_section(folder: ReportFolder) -> Markup:
     """Every figure but times, with its unit, which way is better, and bounds where it has some."""
     rows = [r for r in folder.metrics if not is_time(r.get("key")) and r.get("key") != RESUMED]
     if not rows:
         said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "metrics.json")
-        return section("metrics", "Metrics", missing("metrics; ", said))
+        return page_section("metrics", "Metrics", missing_note("metrics; ", said))
     bounds, folded_in = _bounds(folder.values())
     out = []
     for r in rows:
@@ -106,11 +119,11 @@ def metrics(folder: ReportFolder) -> Markup:
         **{"key": "metric", "value": "value", "unit": "unit", "direction": "direction"},
         **{"bounds": f"{CONFIDENCE * 100:g} % bounds", "said": "verdict"},
     }
-    return section(
+    return page_section(
         "metrics",
         "Metrics",
-        note("The metrics are explained in the documentation. – : no value."),
-        table(out, columns),
+        remark("The metrics are explained in the documentation. – : no value."),
+        html_table(out, columns),
     )
 
 
@@ -130,35 +143,35 @@ def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str
     for key in m:
         stem = key.removesuffix("_per_dof")
         if stem != key and stem.startswith("nees") and m.get(f"{stem}_dof", 0.0) > 0:
-            low, high, verdict = two_sided(m[key], m[f"{stem}_dof"], CONFIDENCE)
+            low, high, verdict = two_sided_bounds(m[key], m[f"{stem}_dof"], CONFIDENCE)
             out[key] = (f"{low:.3g} to {high:.3g}", verdict)
     return out, folded_in
 
 
-def times(folder: ReportFolder) -> Markup:
+def times_section(folder: ReportFolder) -> Markup:
     """Seconds of each stage: the one part of the page that differs when the same run is made again."""
     timed = [r for r in folder.metrics if is_time(r.get("key"))]
     seconds = {str(r["key"])[8:]: r.get("value") for r in timed if str(r["key"]).startswith("seconds_")}
     seconds = seconds or folder.part("seconds")
-    if not seconds and is_figure(folder.report.get("seconds")):  # of a merge by an older version
+    if not seconds and is_numeric(folder.report.get("seconds")):  # of a merge by an older version
         seconds = {"merge": folder.report["seconds"]}
     rows = [r for r in timed if not str(r["key"]).startswith("seconds_")]
     if not seconds and not rows:
         said = _UNFINISHED if folder.kind == "interrupted" else "not in the folder."
-        return section("times", "Times", missing("seconds of the stages; ", said))
-    parts: list[Any] = [table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
+        return page_section("times", "Times", missing_note("seconds of the stages; ", said))
+    parts: list[Any] = [html_table([{"stage": k, "seconds": v} for k, v in seconds.items()], ["stage", "seconds"])]
     if rows:
-        parts.append(table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
+        parts.append(html_table(rows, {"key": "metric", "value": "value", "unit": "unit"}))
     resumed = folder.values().get(RESUMED, folder.report.get(RESUMED))
-    if is_figure(resumed) and resumed:
-        parts.append(note(f"resumed run: {resumed:.0f} submaps were already finished."))
-    return section("times", "Times", *parts)
+    if is_numeric(resumed) and resumed:
+        parts.append(remark(f"resumed run: {resumed:.0f} submaps were already finished."))
+    return page_section("times", "Times", *parts)
 
 
-def graph(folder: ReportFolder) -> Markup:
+def graph_section(folder: ReportFolder) -> Markup:
     """Nodes, factors by kind, χ² by kind with two-sided bounds."""
     if folder.kind == "interrupted":
-        return section("graph", "Graph", missing("the graph; ", _UNFINISHED))
+        return page_section("graph", "Graph", missing_note("the graph; ", _UNFINISHED))
     m, g = folder.values(), folder.part("graph")
     facts = {
         "nodes": g.get("nodes"),
@@ -169,35 +182,35 @@ def graph(folder: ReportFolder) -> Markup:
         "objective Σ rᵀ P⁻¹ r": m.get("objective", m.get("join_chi2")),
         "gap to the batch optimum": m.get("gap"),
     }
-    parts: list[Any] = [pairs(facts)]
+    parts: list[Any] = [pair_list(facts)]
     if not g:
-        parts.append(missing("numbers of nodes and factors."))
-    rows = class_rows(figures_of(folder))
+        parts.append(missing_note("numbers of nodes and factors."))
+    rows = class_rows(metrics_of_folder(folder))
     if not rows:
-        return section("graph", "Graph", *parts, missing("χ² by class of factor."))
+        return page_section("graph", "Graph", *parts, missing_note("χ² by class of factor."))
     columns = {
         **{"class": "class of factor", "factors": "factors", "rows": "scalars", "dof": "dof", "chi2": "χ²"},
         **{"chi2_per_dof": "χ²/dof", "low": f"{CONFIDENCE * 100:g} % from", "high": "to", "verdict": "verdict"},
         **{"mean_weight": "mean weight", "least_weight": "least weight"},
     }
-    parts.append(table([Row(r, str(r.get("verdict", ""))) for r in rows], columns))
+    parts.append(html_table([Row(r, str(r.get("verdict", ""))) for r in rows], columns))
     parts.append(
-        note(
+        remark(
             "dof: number of scalars minus the unknowns determined by the class. χ²: without robust kernels. Weights: "
             "of the kernels. Above the bounds the assumed noise is too small, below them too large."
         )
     )
-    return section("graph", "Graph", *parts)
+    return page_section("graph", "Graph", *parts)
 
 
-def evidence(folder: ReportFolder) -> Markup:
+def evidence_section(folder: ReportFolder) -> Markup:
     """Which streams were spent where, and what was declared to be shared."""
     title = "Evidence: use of each stream"
     if folder.ledger is None:
-        return section("evidence", title, missing("the ledger of evidence; ", _why(folder, "ledger.csv")))
+        return page_section("evidence", title, missing_note("the ledger of evidence; ", _why(folder, "ledger.csv")))
     t = folder.ledger.assign(factor=[_kind_of_factor(f) for f in folder.ledger["factor"].astype(str)])
     if t.empty:
-        return section("evidence", title, note("No measurement was used."))
+        return page_section("evidence", title, remark("No measurement was used."))
     t["length"] = t["t_end"] - t["t_start"]
     groups = []
     for (stream, factor, kind), of in t.groupby(["stream", "factor", "kind"], sort=True):
@@ -210,13 +223,13 @@ def evidence(folder: ReportFolder) -> Markup:
         **{"stream": "stream", "factor": "used by", "factors": "factors", "kind": "kind", "first": "from [s]"},
         **{"last": "to [s]", "seconds": "seconds"},
     }
-    return section(
+    return page_section(
         "evidence",
         title,
-        table(groups, columns),
-        element("h3", "Declared exceptions"),
+        html_table(groups, columns),
+        html_element("h3", "Declared exceptions"),
         _exceptions(t),
-        note("Kind “measurement”: used once; a second use is rejected. All rows are in ledger.csv."),
+        remark("Kind “measurement”: used once; a second use is rejected. All rows are in ledger.csv."),
     )
 
 
@@ -225,7 +238,7 @@ def _exceptions(t: pd.DataFrame) -> Markup:
     rows = []
     for (kind, said), of in shared.groupby(["kind", "note"], sort=True):
         rows.append({"kind": kind, "factors": int(of["factor_id"].nunique()), "note": said})
-    return table(rows, {"kind": "kind", "factors": "factors", "note": "reason"}) if rows else note("None.")
+    return html_table(rows, {"kind": "kind", "factors": "factors", "note": "reason"}) if rows else remark("None.")
 
 
 def _kind_of_factor(label: str) -> str:
@@ -240,33 +253,33 @@ def _kind_of_factor(label: str) -> str:
     return " ".join(words) or label
 
 
-def events(folder: ReportFolder) -> Markup:
+def events_section(folder: ReportFolder) -> Markup:
     """What else was decided or dropped, one line an event; routine ones as counts."""
     if folder.events is None:
         said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "events.jsonl")
-        return section("events", "Events", missing("events; ", said))
+        return page_section("events", "Events", missing_note("events; ", said))
     counts = Counter(str(e.get("event", "?")) for e in folder.events)
     rows = [{"event": k, "times": n} for k, n in sorted(counts.items())]
     lines = [_line(e) for e in folder.events if str(e.get("event")) not in ROUTINE]
-    parts: list[Any] = [table(rows, ["event", "times"]) if rows else note("None.")]
+    parts: list[Any] = [html_table(rows, ["event", "times"]) if rows else remark("None.")]
     if lines:
-        listed = items(lines)
-        parts.append(listed if len(lines) <= 20 else folded(f"All {len(lines)} other events", listed))
+        listed = item_list(lines)
+        parts.append(listed if len(lines) <= 20 else folded_section(f"All {len(lines)} other events", listed))
     else:
-        parts.append(note("No other events."))
-    return section("events", "Events", *parts)
+        parts.append(remark("No other events."))
+    return page_section("events", "Events", *parts)
 
 
 def _line(event: Mapping[str, Any]) -> Markup:
-    facts = [f"{k} {figure_text(v)}" for k, v in event.items() if k != "event"]
-    return join([element("b", event.get("event", "?")), ": ", ", ".join(facts)])
+    facts = [f"{k} {value_text(v)}" for k, v in event.items() if k != "event"]
+    return join_parts([html_element("b", event.get("event", "?")), ": ", ", ".join(facts)])
 
 
-def problems(folder: ReportFolder) -> Markup:
+def problems_section(folder: ReportFolder) -> Markup:
     """What is not in the page, and why."""
-    lines = [join([element("code", name), " ", why]) for name, why in sorted(folder.problems.items())]
-    body = items(lines) if lines else note("Nothing.")
-    return section("missing", "What is missing", body)
+    lines = [join_parts([html_element("code", name), " ", why]) for name, why in sorted(folder.problems.items())]
+    body = item_list(lines) if lines else remark("Nothing.")
+    return page_section("missing", "What is missing", body)
 
 
 def _why(folder: ReportFolder, name: str) -> str:
@@ -284,33 +297,33 @@ def _flat(values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
         if isinstance(v, Mapping):
             out |= _flat(v, name)
         else:
-            out[name] = compact(v) if isinstance(v, list) else v
+            out[name] = compact_json(v) if isinstance(v, list) else v
     return out
 
 
-def figures_of(folder: ReportFolder) -> Figures:
+def metrics_of_folder(folder: ReportFolder) -> RunMetrics:
     """Input of the verdict."""
-    return Figures(folder.report, folder.values(), folder.events or [], folder.sessions)
+    return RunMetrics(folder.report, folder.values(), folder.events or [], folder.sessions)
 
 
 def verdict_lines(folder: ReportFolder) -> tuple[Finding, list[Finding]]:
     """First line of the verdict, and the others."""
     if folder.kind == "interrupted":
-        found = interrupted(folder)
-        return headline(found, [stopped(folder)]), found
-    found = verdict(figures_of(folder))
-    return summary(figures_of(folder), found), found
+        found = interruption_lines(folder)
+        return headline(found, [stopping_line(folder)]), found
+    found = run_findings(metrics_of_folder(folder))
+    return summarise_run(metrics_of_folder(folder), found), found
 
 
-def interrupted(folder: ReportFolder) -> list[Finding]:
+def interruption_lines(folder: ReportFolder) -> list[Finding]:
     """Lines of a run that was not finished."""
     return [
-        Finding("bad", "interrupted", f"run: not finished — {stopped(folder)}"),
+        Finding("bad", "interrupted", f"run: not finished — {stopping_line(folder)}"),
         Finding("", "resume", "resume: run the same command again (`graphslam run` with --resume)."),
     ]
 
 
-def stopped(folder: ReportFolder) -> str:
+def stopping_line(folder: ReportFolder) -> str:
     """Where an interrupted run stopped."""
     if not folder.submaps:
         return "it stopped before the first submap was finished."

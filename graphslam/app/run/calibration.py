@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.source import load_log_source
 from graphslam.calibrate.calibrate import calibrate_streams
-from graphslam.calibrate.corrections import CalibrateConfig, Corrections, calibrated
-from graphslam.calibrate.estimate import NAMES, SURE, Calibration, in_words
-from graphslam.calibrate.sighted import FULL, QUICK, Effort, calibrate_sightings
-from graphslam.calibrate.windows import Seen
-from graphslam.core.config import merge
+from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections
+from graphslam.calibrate.estimate import NAMES, SURE, Calibration, estimate_text
+from graphslam.calibrate.landmark_calibration import FULL, QUICK, CalibrationBudget, calibrate_sightings
+from graphslam.calibrate.windows import SightingLog
+from graphslam.core.config import merge_options
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, SteeringControls
-from graphslam.evaluate.without_truth import two_sided
+from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam_frontends.base import FrontEnd
-from graphslam_frontends.landmarks.config import LastingConfig, RbpfEkfConfig
+from graphslam_frontends.landmarks.config import RbpfEkfConfig, SensorBiasConfig
 from graphslam_frontends.landmarks.prepare import landmark_stream
 from graphslam_frontends.odometry.motion import motion_stream
 
@@ -43,7 +43,7 @@ CERTAIN, DISAGREE = 0.999, 1.5
 OWN = "noise and calibration: preset of this data set — not estimated from the log."
 
 
-def prepared(
+def apply_calibration(
     log: SensorLog, front: FrontEnd, config: CalibrateConfig, options: Mapping[str, Any], *, own: bool, seed: int
 ) -> tuple[SensorLog, CalibrateConfig, list[Finding], Calibration | None]:
     """The log with corrections, the calibration options, findings, and the estimate.
@@ -57,16 +57,16 @@ def prepared(
     """
     if config.given is not None:  # what a user wrote down stands before what would be estimated
         said = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
-        return calibrated(log, config.given), config, said, None
-    if config.use == "none" or not looks_at(front):
+        return apply_corrections(log, config.given), config, said, None
+    if config.use == "none" or not can_calibrate(front):
         return log, config, [], None
     if config.use == "auto" and own:
         return log, config, [Finding("", "calibrated", OWN)], None
     effort = replace(QUICK, poses=max(int(QUICK.poses * config.budget), 100))
     try:
-        found = calibration(log, front, effort, seed=seed)
-        given = chosen(found.corrections, front, options)
-        return calibrated(log, given), replace(config, given=given), found.findings(), found
+        found = calibrate_for_front_end(log, front, effort, seed=seed)
+        given = keep_user_settings(found.corrections, front, options)
+        return apply_corrections(log, given), replace(config, given=given), found.findings(), found
     except GraphSlamError as error:
         said = [Finding("", "calibrated", f"noise: default values — not estimated from the log: {error}.")]
         return log, config, said, None
@@ -115,13 +115,13 @@ def calibrate_log(
     """
     log = load_log_source(source, reader=reader, **(reader_options or {}))
     name = frontend or (LANDMARKS if log.of_type(LandmarkObservations) else SCANS)
-    options = merge(recommended(log, name, preset), config or {})
+    options = merge_options(recommended_options(log, name, preset), config or {})
     front = make_front_end(name, options.get("frontend", {}))
     with one_blas_thread():
-        return calibration(log, front, QUICK if quick else FULL, seed=seed)
+        return calibrate_for_front_end(log, front, QUICK if quick else FULL, seed=seed)
 
 
-def own_noise(options: Mapping[str, Any]) -> bool:
+def uses_preset_noise(options: Mapping[str, Any]) -> bool:
     """Does the noise of a preset count, or do figures that were estimated stand in its place?"""
     asked = options.get("calibrate", {})
     return not isinstance(asked, Mapping) or ("given" not in asked and asked.get("use", "auto") != "always")
@@ -137,7 +137,7 @@ def without_noise(suggested: Mapping[str, Any]) -> dict[str, Any]:
     return {**suggested, **{k: v for k, v in kept.items() if k in suggested}}
 
 
-def looks_at(front: FrontEnd) -> bool:
+def can_calibrate(front: FrontEnd) -> bool:
     """Does the front end read what can be calibrated: sightings of landmarks?"""
     return front_kind(front) is not None
 
@@ -150,7 +150,9 @@ def front_kind(front: FrontEnd) -> str | None:
     return "scans" if "steps" in hints else None
 
 
-def calibration(log: SensorLog, front: FrontEnd, effort: Effort, *, seed: int = 0) -> Calibration:
+def calibrate_for_front_end(
+    log: SensorLog, front: FrontEnd, effort: CalibrationBudget, *, seed: int = 0
+) -> Calibration:
     """What the log says of its noise, of the streams that the front end reads."""
     kind = front_kind(front)
     if kind is None:
@@ -158,7 +160,7 @@ def calibration(log: SensorLog, front: FrontEnd, effort: Effort, *, seed: int = 
     return calibrate_streams(log, kind, effort, front.config, seed=seed)
 
 
-def suited(
+def configure_for_calibration(
     front: FrontEnd, log: SensorLog, given: Corrections | None, found: Calibration | None, options: Mapping[str, Any]
 ) -> FrontEnd:
     """The front end with settings that go with noise which was estimated, where the user has not set them.
@@ -172,7 +174,7 @@ def suited(
     config: Any = front.config
     if given is not None and not contradicted and isinstance(config, RbpfEkfConfig):
         unset = config.lasting is None and "lasting" not in options.get("frontend", {})
-        return type(front)(config=replace(config, lasting=lasting_config(log, config))) if unset else front  # type: ignore[call-arg]
+        return type(front)(config=replace(config, lasting=sensor_bias_config(log, config))) if unset else front  # type: ignore[call-arg]
     if found is None or found.kind != "clouds" or found.corrections.along_metre is None:
         return front
     own = options.get("frontend", {})
@@ -181,7 +183,7 @@ def suited(
     return type(front)(config=replace(front.config, filter=replace(front.config.filter, walk_scale=0.0)))  # type: ignore[call-arg]
 
 
-def lasting_config(log: SensorLog, config: RbpfEkfConfig) -> LastingConfig:
+def sensor_bias_config(log: SensorLog, config: RbpfEkfConfig) -> SensorBiasConfig:
     """Which constant errors a log of landmarks may have.
 
     A vehicle that steers turns too much by the metre, a robot with a gyro or two driven wheels by the second. Ranges
@@ -194,10 +196,10 @@ def lasting_config(log: SensorLog, config: RbpfEkfConfig) -> LastingConfig:
     blind = not np.any(seen.has_bearing)
     ranges = {"distance_scale": TYRES, "range_scale": SCALE, "sensor_yaw": 0.0, "mount": 0.0} if blind else {}
     place = {} if blind or np.any(seen.T_base_sensor[:2] != 0.0) else {"mount": UNSAID}
-    return LastingConfig(**turn, **ranges, **place)
+    return SensorBiasConfig(**turn, **ranges, **place)
 
 
-def named_causes(
+def explain_disagreement(
     log: SensorLog, config: CalibrateConfig, chi2_per_dof: float | None, dof: float, *, ranges_corrected: bool
 ) -> list[Finding]:
     """Errors of the sensors that last, in a log that was mapped without calibration and whose submaps disagree.
@@ -212,25 +214,23 @@ def named_causes(
     name = log.of_type(LandmarkObservations)
     if config.given is not None or name is None or chi2_per_dof is None or not dof > 0:
         return []
-    if not chi2_per_dof > max(two_sided(chi2_per_dof, dof, CERTAIN)[1], DISAGREE):
+    if not chi2_per_dof > max(two_sided_bounds(chi2_per_dof, dof, CERTAIN)[1], DISAGREE):
         return []
     try:
-        found = calibrate_sightings(Seen.of(log, name, log[name]), QUICK)
+        found = calibrate_sightings(SightingLog.of(log, name, log[name]), QUICK)
     except GraphSlamError:
         return []
     own = ("range_scale", "range_offset") if ranges_corrected else ()
     out = []
     for e in found.estimates:
         if e.applied and e.name not in own:
-            text = (
-                f"{in_words(e.name, e.value, e.sigma)} — a cause of the disagreement between submaps (log-likelihood "
-            )
-            text += f"+{e.gain:.0f} nats). To do: --set calibrate.use=always, or `graphslam calibrate`."
+            text = f"{estimate_text(e.name, e.value, e.sigma)} — a cause of the disagreement between submaps "
+            text += f"(log-likelihood +{e.gain:.0f} nats). To do: --set calibrate.use=always, or `graphslam calibrate`."
             out.append(Finding("bad", "calibration", text))
     return out
 
 
-def lasting_facts(graph: PoseGraph) -> list[dict[str, Any]]:
+def bias_table(graph: PoseGraph) -> list[dict[str, Any]]:
     """Constant errors that were estimated with the map: name, value, σ, and σ beforehand, a row each."""
     out = []
     for robot, event in enumerate(e for e in graph.events if e["event"] == "lasting"):
@@ -240,20 +240,20 @@ def lasting_facts(graph: PoseGraph) -> list[dict[str, Any]]:
     return out
 
 
-def lasting_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
+def bias_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """What a verdict says of constant errors that were estimated with the map."""
     sure = [r for r in facts if abs(r["value"]) > SURE * r["sigma"]]
     wild = [r for r in sure if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
     if not facts:
         return []
-    said = [in_words(r["name"], r["value"], r["sigma"]) for r in sure]
+    said = [estimate_text(r["name"], r["value"], r["sigma"]) for r in sure]
     rest = [f"± {_sigma_in_words(r)}" for r in facts if r not in sure]
     text = f"systematic errors estimated with the map: {'; '.join(said) or 'none significant'}"
     text += f" — not significant: {', '.join(rest)}." if rest else "."
     text += " The covariances include their uncertainty."
     out = [Finding("", "lasting", text)]
     if wild:
-        text = f"{'; '.join(in_words(r['name'], r['value'], r['sigma']) for r in wild)} — implausibly large. "
+        text = f"{'; '.join(estimate_text(r['name'], r['value'], r['sigma']) for r in wild)} — implausibly large. "
         text += "To do: check unit, sign and mounting of the sensor; `graphslam data check`."
         out.append(Finding("bad", "lasting", text))
     return out
@@ -272,7 +272,7 @@ def _sigma_in_words(row: Mapping[str, Any]) -> str:
     return f"{s:.3f} m of the ranges" if name == "range_offset" else f"{100 * s:.2f} % of {NAMES[name]}"
 
 
-def chosen(c: Corrections, front: FrontEnd, options: Mapping[str, Any]) -> Corrections:
+def keep_user_settings(c: Corrections, front: FrontEnd, options: Mapping[str, Any]) -> Corrections:
     """What of a calibration is used where the user has set noise by hand."""
     own = options.get("frontend", {})
     if "motion" in own:

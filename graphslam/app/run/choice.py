@@ -30,7 +30,7 @@ NAMED = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class FrontEndChoice:
     """A front end, and why.
 
     Parameters
@@ -43,7 +43,7 @@ class Choice:
     why: str
 
 
-def choose_front_end(log: SensorLog) -> Choice:
+def choose_front_end(log: SensorLog) -> FrontEndChoice:
     """The front end for what a log holds."""
 
     def has(*kinds: type) -> bool:
@@ -51,19 +51,21 @@ def choose_front_end(log: SensorLog) -> Choice:
 
     moves = has(SteeringControls, VelocityControls, Odometry)
     if has(LandmarkObservations) and moves:
-        return Choice("rbpf-ekf", "landmark observations with odometry")
+        return FrontEndChoice("rbpf-ekf", "landmark observations with odometry")
     if has(SteeringControls) and has(LaserScans):
-        return Choice("rbpf-ekf", "planar laser of a car-like robot; trunks are detected in the scans")
+        return FrontEndChoice("rbpf-ekf", "planar laser of a car-like robot; trunks are detected in the scans")
     if has(RangeScans) and (moves or has(Imu)):
-        return Choice("segslam", "spinning scanners with odometry")
+        return FrontEndChoice("segslam", "spinning scanners with odometry")
     if has(PointClouds):
         if not any(isinstance(s, Odometry) and _in_space(s) for s in log.streams.values()):
-            return Choice("lidar-odometry", "point clouds of a 3-D LiDAR; the odometry is computed from them")
+            return FrontEndChoice("lidar-odometry", "point clouds of a 3-D LiDAR; the odometry is computed from them")
         if "clouds" in log.meta.get("unplaced", ()):
-            return Choice("lidar-odometry", "point clouds of a 3-D LiDAR with unknown mounting, so without odometry")
-        return Choice("segslam", "point clouds of a 3-D LiDAR with odometry")
+            return FrontEndChoice(
+                "lidar-odometry", "point clouds of a 3-D LiDAR with unknown mounting, so without odometry"
+            )
+        return FrontEndChoice("segslam", "point clouds of a 3-D LiDAR with odometry")
     if has(LaserScans) and moves:
-        return Choice("segslam", "planar laser with odometry")
+        return FrontEndChoice("segslam", "planar laser with odometry")
     held = ", ".join(f"{n} ({type(s).__name__}, {len(s.times)} records)" for n, s in log.streams.items()) or "nothing"
     raise MissingDataError("no front end can map this log", where=log.name, got=held, wanted=_wanted(log))
 

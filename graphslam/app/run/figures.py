@@ -13,10 +13,10 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.plots.refined import plot_before_after
-from graphslam.plots.save import save
+from graphslam.plots.residual_consistency import plot_innovations, plot_loop_matrix
+from graphslam.plots.save import save_figure
 from graphslam.plots.submaps import plot_submap_chain
 from graphslam.plots.trajectory import plot_gps_residuals
-from graphslam.plots.without_truth import plot_innovations, plot_loop_matrix
 
 
 def _as_solved(run: Run) -> list[Submap]:
@@ -40,20 +40,20 @@ def _as_solved(run: Run) -> list[Submap]:
 
 def save_figures(run: Run, folder: Path) -> list[Path]:
     """Map, submap chain, and GPS residuals, innovations and loops where there are any, as PNG files."""
-    made = [save(run.plot(), folder / "map.png")]
+    made = [save_figure(run.plot(), folder / "map.png")]
     submaps, bases = _as_solved(run), run.map.base_poses
     if run.map.dim == 3:
-        made.append(save(run.plot(plane="xz"), folder / "side.png"))
+        made.append(save_figure(run.plot(plane="xz"), folder / "side.png"))
         submaps, bases = [plan_submap(s) for s in submaps], plan_pose(bases)
     chain = plot_submap_chain(None, submaps, bases, title=f"{run.name}: submaps at their solved poses")
-    made.append(save(chain, folder / "submaps.png"))
+    made.append(save_figure(chain, folder / "submaps.png"))
     if run.graph_path is not None:
         ax = plot_before_after(None, run.graph_path, run.map.trajectory, truth=run.truth_path)
-        made.append(save(ax, folder / "refined.png"))
+        made.append(save_figure(ax, folder / "refined.png"))
     if run.gps:
-        made.append(save(plot_gps_residuals(None, dict(run.gps)), folder / "gps_residuals.png"))
+        made.append(save_figure(plot_gps_residuals(None, dict(run.gps)), folder / "gps_residuals.png"))
     if run.checks is not None and run.checks.gps is not None:
-        made.append(save(plot_innovations(None, run.checks.gps), folder / "gps_innovations.png"))
+        made.append(save_figure(plot_innovations(None, run.checks.gps), folder / "gps_innovations.png"))
     if run.checks is not None and run.checks.loops is not None:
-        made.append(save(plot_loop_matrix(None, run.checks.loops), folder / "loops.png"))
+        made.append(save_figure(plot_loop_matrix(None, run.checks.loops), folder / "loops.png"))
     return made

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from graphslam.app.folders.generations import check_same, consistent, outputs
+from graphslam.app.folders.generations import check_same, current_outputs, read_consistently
 from graphslam.core.atomic import read_json, read_npz
 from graphslam.core.config import read_toml
 from graphslam.core.errors import DataError, FormatError, RunFolderError
@@ -28,7 +28,7 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
 from graphslam.evaluate.metrics import FigureTable
-from graphslam.loops.ledger import EVENT, Decision, LoopLedger, ledger_of_events
+from graphslam.loops.ledger import EVENT, LoopDecision, LoopLedger, ledger_of_events
 from graphslam.maps.global_map import GlobalMap
 
 GENERATION_EVENT = "generation"
@@ -360,13 +360,13 @@ def read_fixes(root: Path) -> Gps | None:
 
 def loops_of_run(folder: str | Path) -> LoopLedger:
     """Ledger of all loops of a run: those that were decided on, then the front end's matches that were not."""
-    events = consistent(folder, lambda root: read_events(root, home=folder))
+    events = read_consistently(folder, lambda root: read_events(root, home=folder))
     return ledger_of_events(events, where=str(Path(folder) / "events.jsonl"))
 
 
-def undone_of_run(folder: str | Path) -> list[Decision]:
+def removed_loops_of_run(folder: str | Path) -> list[LoopDecision]:
     """Loops that were taken out of a finished run by hand; none where a run was not finished."""
-    if not (outputs(folder) / "events.jsonl").is_file():
+    if not (current_outputs(folder) / "events.jsonl").is_file():
         return []
     return [d for d in loops_of_run(folder).current() if d.verdict == "undone"]
 

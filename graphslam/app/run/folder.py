@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graphslam.app.folders.generations import check_links, is_empty, outputs, sweep
-from graphslam.app.folders.lock import locked, make_folder
+from graphslam.app.folders.generations import check_links, current_outputs, is_empty, remove_stale_files
+from graphslam.app.folders.lock import lock_folder, make_folder
 from graphslam.app.run.front_ends import RENAMED
 from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
-from graphslam.core.reading import inside
+from graphslam.core.reading import resolve_inside
 from graphslam.io.submap_store import GridLoader, SubmapStore
 
 logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ _ANOTHER = re.compile(r"submaps-(beaten|\d)")
 
 
 @dataclass(frozen=True, slots=True)
-class Settled:
+class SeedChoice:
     """Which draw of random numbers the submaps of a folder are, where there were several.
 
     Parameters
@@ -67,7 +67,7 @@ class RunFolder:
         make_folder(folder.path)
         if not (folder.path / CONFIG).is_file() and not is_empty(folder.path):  # before a lock is put there
             raise RunFolderError(f"{folder.path}: not empty and not a run folder; choose another --out")
-        with locked(folder.path):
+        with lock_folder(folder.path):
             check_links(folder.path)
             old = folder.path / CONFIG
             if folder._begun():
@@ -79,7 +79,7 @@ class RunFolder:
             else:
                 folder.describe(config)
             folder._undo_settling()
-            sweep(folder.path)
+            remove_stale_files(folder.path)
             yield folder
 
     def describe(self, config: Mapping[str, Any]) -> None:
@@ -91,7 +91,7 @@ class RunFolder:
         """Is there a run with anything to lose?"""
         if not (self.path / CONFIG).is_file():
             return False
-        return (outputs(self.path) / "run.json").is_file() or len(self.submaps) > 0
+        return (current_outputs(self.path) / "run.json").is_file() or len(self.submaps) > 0
 
     def _check_same(self, old: Path, config: Mapping[str, Any]) -> None:
         """A resumed run must be the run that was stopped."""
@@ -123,13 +123,13 @@ class RunFolder:
         """
         return SubmapStore(self.path / (SUBMAPS if draw is None else f"{SUBMAPS}-{draw}"), load_grid=load_grid)
 
-    def settled(self) -> Settled | None:
+    def settled(self) -> SeedChoice | None:
         """Which draw the submaps are, where several were made and one was chosen."""
-        file = inside(self.path, DRAWS, str(self.path))
+        file = resolve_inside(self.path, DRAWS, str(self.path))
         if not file.exists():
             return None
         said = read_json(file, fmt=_DRAWS_FORMAT, shape={"draw": int, "attempts": [{}]})
-        return Settled(said["draw"], said["attempts"])
+        return SeedChoice(said["draw"], said["attempts"])
 
     def settle(self, draw: int, attempts: list[dict[str, Any]]) -> None:
         """Keep the submaps of one draw as those of the run, and drop the others.

@@ -9,10 +9,10 @@ from typing import Any
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.choice import kind_preset
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.io.readers import readers
+from graphslam.io.readers import list_readers
 from graphslam_frontends.base import FrontEnd
 
 GROUP = "graphslam.frontends"
@@ -75,7 +75,7 @@ def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str,
             raise ConfigError(f"front end {name!r} is given as an object, which has its options; got also {options}")
         return front
     kind, config_type = _kind(front)
-    made = kind(config=build(config_type, options, "frontend"))
+    made = kind(config=build_config(config_type, options, "frontend"))
     if not isinstance(made, FrontEnd):
         raise ConfigError(
             f"front end {name!r} is none: {kind.__name__} does not inherit from graphslam_frontends.base.FrontEnd"
@@ -85,7 +85,7 @@ def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str,
     return made
 
 
-def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dict[str, Any]:
+def recommended_options(log: SensorLog, frontend: str, preset: str | None = None) -> dict[str, Any]:
     """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise.
 
     Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set, layouts of a simulated world
@@ -105,7 +105,7 @@ def recommended(log: SensorLog, frontend: str, preset: str | None = None) -> dic
     if simulated and registered and "motion" in typing.get_type_hints(_kind(frontend)[1]):
         scale = float(noise.get("scale", 1.0))
         motion = {"speed": noise["speed"] * scale, "steering": noise["steering"] * scale}
-        values = merge({"frontend": {"motion": motion}}, values)
+        values = merge_options({"frontend": {"motion": motion}}, values)
     return values
 
 
@@ -120,13 +120,14 @@ def named_preset(frontend: str, preset: str | None) -> dict[str, Any]:
 
 
 def preset_of(log: SensorLog, frontend: str) -> tuple[str, bool]:
-    """Name of the preset that :func:`recommended` takes, empty where there is none; and is it made for this very set?
+    """Name of the preset that :func:`recommended_options` takes, empty where there is none; and is it made for this
+    very set?
 
     That of a reader or of a kind of log says how it is read; its noise is that of other robots.
     """
     name = log.name.partition("/")[0]
     read: Any = log.meta.get("reader")
-    known = readers().get(read.get("name", "")) if isinstance(read, Mapping) else None
+    known = list_readers().get(read.get("name", "")) if isinstance(read, Mapping) else None
     there = cfg.preset_names(frontend)
     own = next((n for n in (name, name.rpartition("-")[0]) if n in there), "")
     kind = next((n for n in ("" if known is None else known.preset, kind_preset(log)) if n in there), "")

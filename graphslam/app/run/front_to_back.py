@@ -12,13 +12,13 @@ from tqdm import tqdm
 
 from graphslam.app.run.folder import RunFolder
 from graphslam.backend.back_end import BackEnd, Observer
-from graphslam.core.feed import Feed
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.shelved import load_shelved, shelved
+from graphslam.evidence.spilled_grid import load_spilled, spill_grid
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.solution import Solution
 from graphslam_frontends.base import FrontEnd
@@ -46,7 +46,7 @@ class ProgressBar(Observer):
 
 
 @dataclass(frozen=True, slots=True)
-class FrontEndWork:
+class FrontEndTiming:
     """What the front end did in this session.
 
     Parameters
@@ -62,7 +62,7 @@ class FrontEndWork:
     per_scan: Array
 
 
-class FrontToBack:
+class SubmapPipeline:
     """Feeds every submap to the back end as soon as the front end has made it of the records that have come.
 
     Parameters
@@ -77,7 +77,7 @@ class FrontToBack:
 
     def __init__(
         self,
-        feed: Feed,
+        feed: RecordSource,
         front: FrontEnd,
         back: BackEnd,
         seed: SeedTree,
@@ -93,7 +93,7 @@ class FrontToBack:
         settled = 0 if self.settled is None else self.settled.draw
         self.draw = settled if draw is None else draw
         of = None if self.draw == settled else self.draw
-        self.store = None if folder is None else folder.submaps_with(load_shelved if with_grids else None, draw=of)
+        self.store = None if folder is None else folder.submaps_with(load_spilled if with_grids else None, draw=of)
         self.submaps: list[Submap] = self.store.complete_prefix() if self.store is not None else []
         if self.store is not None:
             self.store.truncate(len(self.submaps))
@@ -117,7 +117,7 @@ class FrontToBack:
                 return
             if isinstance(submap.grid, EvidenceGrid):
                 submap.grid.pool.release_scratch()
-                submap = replace(submap, grid=shelved(submap.grid))
+                submap = replace(submap, grid=spill_grid(submap.grid))
             if self.store is not None:
                 self.store.append(submap)
             self.back.add(submap)
@@ -125,15 +125,15 @@ class FrontToBack:
             self._cost.append(self._since / max(int(submap.report.get("scans", 1)), 1))
             self._since = 0.0
 
-    def drawn_anew(self, back: BackEnd) -> FrontToBack:
+    def with_next_seed(self, back: BackEnd) -> SubmapPipeline:
         """The same log with the next draw of random numbers, for another back end."""
-        feed = Feed(self.feed.log)
-        return FrontToBack(feed, self.front, back, self._seed, self.folder, self._with_grids, self.draw + 1)
+        feed = RecordSource(self.feed.log)
+        return SubmapPipeline(feed, self.front, back, self._seed, self.folder, self._with_grids, self.draw + 1)
 
     @property
-    def work(self) -> FrontEndWork:
+    def work(self) -> FrontEndTiming:
         """What the front end did so far."""
-        return FrontEndWork(self._seconds, self._resumed, np.array(self._cost[1:]))
+        return FrontEndTiming(self._seconds, self._resumed, np.array(self._cost[1:]))
 
     def _watch(self, at: Any) -> None:
         for o in self.back.observers:

@@ -10,20 +10,22 @@ from tqdm.auto import tqdm
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run import config as cfg
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.source import load_log_source
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError
-from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 
 
 def _front_end(log: SensorLog, frontend: str, options: Mapping[str, Any] | None) -> Any:
-    settings: cfg.RunConfig = build(cfg.RunConfig, merge(recommended(log, frontend), {"frontend": options or {}}))
+    settings: cfg.RunConfig = build_config(
+        cfg.RunConfig, merge_options(recommended_options(log, frontend), {"frontend": options or {}})
+    )
     return make_front_end(frontend, settings.frontend)
 
 
@@ -114,5 +116,5 @@ def first_particles(
     if not isinstance(made, RbpfEkf):
         raise ConfigError(f"front end {frontend!r} makes no local maps of particles; wanted rbpf-ekf")
     with one_blas_thread():
-        found = made.with_particles(Feed(log), seed=SeedTree(seed).child("frontend"))
+        found = made.with_particles(RecordSource(log), seed=SeedTree(seed).child("frontend"))
         return next(x for x in found if x is not None)

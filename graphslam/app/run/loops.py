@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from graphslam.app.folders.lock import locked
-from graphslam.app.run.files import loops_of_run, undone_of_run
-from graphslam.app.run.pipeline import again
+from graphslam.app.folders.lock import lock_folder
+from graphslam.app.run.files import loops_of_run, removed_loops_of_run
+from graphslam.app.run.pipeline import rerun_without_loops
 from graphslam.core.errors import DataError
 from graphslam.loops.candidates import FRONT_END
-from graphslam.loops.ledger import Decision, LoopLedger
-from graphslam.loops.ties import ties_entries
+from graphslam.loops.ledger import LoopDecision, LoopLedger
+from graphslam.loops.overlap_constraints import overlap_entries
 
 
 def undo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLedger:
@@ -27,7 +27,7 @@ def undo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLe
         Number in the ledger.
     """
 
-    def without(before: LoopLedger, undone: list[Decision]) -> list[Decision]:
+    def without(before: LoopLedger, undone: list[LoopDecision]) -> list[LoopDecision]:
         d = before.of(loop)
         if d.verdict != "accepted":
             raise DataError(
@@ -44,23 +44,23 @@ def redo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLe
     Parameters and errors are those of :func:`undo_loop`.
     """
 
-    def without(before: LoopLedger, undone: list[Decision]) -> list[Decision]:
+    def without(before: LoopLedger, undone: list[LoopDecision]) -> list[LoopDecision]:
         d = before.of(loop)
         if d.verdict != "undone":
             raise DataError(f"loop {loop} was not undone", where=str(folder), got=d.verdict, wanted="an undone loop")
         entry = (d.submap_i, d.submap_j)
         gone = [x for x in undone if x.loop != loop]
-        return [x for x in gone if entry not in ties_entries(x.gates)] if d.source == FRONT_END else gone
+        return [x for x in gone if entry not in overlap_entries(x.gates)] if d.source == FRONT_END else gone
 
     return _again(folder, without, progress)
 
 
 def _again(
-    folder: str | Path, without: Callable[[LoopLedger, list[Decision]], list[Decision]], progress: bool
+    folder: str | Path, without: Callable[[LoopLedger, list[LoopDecision]], list[LoopDecision]], progress: bool
 ) -> LoopLedger:
     """Make a run again without the loops that are chosen from its ledger and from those that are undone."""
     without(loops_of_run(folder), [])  # a folder that is no run is not locked, nor made
-    with locked(folder):  # from the look at the ledger on
-        undone = without(loops_of_run(folder), undone_of_run(folder))
-        again(folder, sorted(undone, key=lambda x: x.loop), progress=progress)
+    with lock_folder(folder):  # from the look at the ledger on
+        undone = without(loops_of_run(folder), removed_loops_of_run(folder))
+        rerun_without_loops(folder, sorted(undone, key=lambda x: x.loop), progress=progress)
     return loops_of_run(folder)

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.app.folders.output_files import OutputFiles
-from graphslam.core.heap import give_back
-from graphslam.maps.coarse import drawable
+from graphslam.core.heap import trim_heap
+from graphslam.maps.coarse import drawable_map
 from graphslam.maps.export import save_maps, save_points
 from graphslam.maps.run_map import RunMap
 
@@ -46,15 +46,15 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
     """
     from graphslam.plots.evidence import plot_heights, plot_section
     from graphslam.plots.fused_map import plot_cut, plot_storey
-    from graphslam.plots.save import save as saved
+    from graphslam.plots.save import save_figure as saved
 
     def save(ax: Any, file: Path) -> Path:
         out = saved(ax, file)
         gc.collect()  # what a picture holds refers to itself, and is as large as the picture
-        give_back()
+        trim_heap()
         return out
 
-    grid = drawable(run_map.fused.grid)
+    grid = drawable_map(run_map.fused.grid)
     if grid.dim == 2:
         ax = plot_section(grid, title=f"{name}: fused map")
         if truth is not None:

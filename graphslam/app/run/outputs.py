@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from graphslam.app.folders.generations import Generation, consistent, new_generation
+from graphslam.app.folders.generations import FolderTransaction, new_generation, read_consistently
 from graphslam.app.folders.output_files import json_lines
-from graphslam.app.report.report import report_beside
+from graphslam.app.report.report import add_report
 from graphslam.app.run.figures import save_figures
 from graphslam.app.run.files import (
     ASSOCIATION_FORMAT,
@@ -36,7 +36,7 @@ from graphslam.app.run.files import (
 )
 from graphslam.app.run.maps import draw_run_map, write_run_map
 from graphslam.app.run.run import Run
-from graphslam.app.run.taken import write_taken
+from graphslam.app.run.run_inputs import write_inputs
 from graphslam.core.atomic import write_npz
 from graphslam.core.digest import Digest
 from graphslam.core.errors import FormatError, RunFolderError
@@ -44,8 +44,8 @@ from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import FigureTable, is_time
-from graphslam.evaluate.without_truth import ClassConsistency
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evaluate.residual_consistency import ClassConsistency
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.network import to_network
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
@@ -119,11 +119,11 @@ def write_outputs(folder: Path, run: Run) -> Run:
         if before is not None and _same_file(before / "map.npz", new.path / "map.npz"):
             for pattern in _MADE_OF_MAP:
                 new.adopt(only=pattern)
-        report_beside(new)  # made from the files, so they come first
+        add_report(new)  # made from the files, so they come first
     return run
 
 
-def _write_files(new: Generation, run: Run) -> None:
+def _write_files(new: FolderTransaction, run: Run) -> None:
     m, root = run.map, new.path
     mark = {"generation": run.report["generation"]}
     write_tum(root / "trajectory.tum", m.trajectory)
@@ -154,7 +154,7 @@ def _write_files(new: Generation, run: Run) -> None:
         write_npz(root / "fixes.npz", {"format": FIXES_FORMAT, **arrays, **mark})
     if run.taken is not None:
         try:
-            write_taken(root, run.taken, mark["generation"])
+            write_inputs(root, run.taken, mark["generation"])
         except FormatError as error:
             logger.warning(
                 "no loop closure of this run can be undone: the inputs of its graph are not stored (%s)", error
@@ -162,7 +162,7 @@ def _write_files(new: Generation, run: Run) -> None:
     new.write_lines("events.jsonl", [{"event": GENERATION_EVENT, **mark}, *run.events])
     if run.ledger is not None:
         new.write_text("ledger.csv", run.ledger.to_csv(index=False))
-    new.write_json("metrics.json", figure_rows(run))
+    new.write_json("metrics.json", metric_rows(run))
     new.write_json("timings.json", timing_rows(run))
     save_figures(run, new.figures)
     if run.fused is not None:
@@ -171,7 +171,7 @@ def _write_files(new: Generation, run: Run) -> None:
     new.write_json("run.json", {k: v for k, v in run.report.items() if k not in OF_THE_CLOCK})
 
 
-def _write_two_maps(new: Generation, run: Run) -> None:
+def _write_two_maps(new: FolderTransaction, run: Run) -> None:
     """The path of either map, and its ledger: what was in dispute is accepted in one of them."""
     assert run.two_maps is not None
     current = ledger_of_events(run.events).current()
@@ -182,7 +182,7 @@ def _write_two_maps(new: Generation, run: Run) -> None:
         new.write_text(f"{name}.csv", LoopLedger(inside).table().to_csv(index=False))
 
 
-def figure_rows(run: Run) -> list[dict[str, Any]]:
+def metric_rows(run: Run) -> list[dict[str, Any]]:
     """Rows of ``metrics.json``: what the run found."""
     return [r for r in run.metrics.to_dict("records") if not is_time(r["key"])]
 
@@ -199,7 +199,7 @@ def generation_id(run: Run) -> str:
     d.add_all(_map_arrays(run.map))
     d.add_all(_association_arrays(run.submaps))
     d.add("events", json_lines(run.events).encode())
-    d.add("metrics", json_lines(figure_rows(run)).encode())
+    d.add("metrics", json_lines(metric_rows(run)).encode())
     return d.text()
 
 
@@ -252,7 +252,7 @@ def _association_arrays(submaps: Any) -> dict[str, Any]:
 
 def identified_submaps(path: str | Path) -> list[Submap]:
     """Submaps of a store or of a run folder; a run's carry the identities of its back end."""
-    return consistent(path, lambda root: _identified(Path(path), root))
+    return read_consistently(path, lambda root: _identified(Path(path), root))
 
 
 def _identified(home: Path, root: Path) -> list[Submap]:
@@ -266,7 +266,7 @@ def _identified(home: Path, root: Path) -> list[Submap]:
     ]
 
 
-def open_run(path: str | Path) -> Run:
+def read_run_folder(path: str | Path) -> Run:
     """Read a finished run folder, all of it of one state.
 
     Examples
@@ -274,7 +274,7 @@ def open_run(path: str | Path) -> Run:
     >>> run = gs.open_run("runs/vp")
     >>> run.plot()
     """
-    return consistent(path, lambda root: _open(Path(path), root))
+    return read_consistently(path, lambda root: _open(Path(path), root))
 
 
 def _open(home: Path, root: Path) -> Run:
@@ -320,13 +320,13 @@ def refined_submaps_of(run: Run) -> list[Submap]:
         return run.refined.submaps
     if run.folder is None:
         return []
-    return consistent(run.folder, lambda root: _refined_of(run, root / REFINED))
+    return read_consistently(run.folder, lambda root: _refined_of(run, root / REFINED))
 
 
 def _refined_of(run: Run, store: Path) -> list[Submap]:
     if not store.is_dir():
         return []
-    submaps, where = read_submaps(store, load_grid=load_shelved), str(store)
+    submaps, where = read_submaps(store, load_grid=load_spilled), str(store)
     have, wanted = [s.key for s in submaps], [s.key for s in run.submaps]
     if have != wanted:
         raise FormatError("refined submaps do not belong to this run", where=where, got=have[:9], wanted=wanted[:9])
@@ -369,13 +369,13 @@ def _two_maps(root: Path, dim: int) -> tuple[Trajectory, Trajectory] | None:
     return None if first is None or second is None else (first, second)
 
 
-def graph_facts(graph: PoseGraph, classes: Mapping[str, ClassConsistency]) -> dict[str, Any]:
+def graph_metrics(graph: PoseGraph, classes: Mapping[str, ClassConsistency]) -> dict[str, Any]:
     """JSON-serialisable figures of a graph at its optimum.
 
     Parameters
     ----------
     classes : mapping of str to ClassConsistency
-        Of this graph (:func:`graphslam.evaluate.without_truth.class_consistency`).
+        Of this graph (:func:`graphslam.evaluate.residual_consistency.class_consistency`).
     """
     return {
         "dim": graph.dim,

@@ -12,48 +12,51 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.folders.generations import consistent
-from graphslam.app.folders.lock import locked
+from graphslam.app.folders.generations import read_consistently
+from graphslam.app.folders.lock import lock_folder
 from graphslam.app.machine import one_blas_thread, versions
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
 from graphslam.app.run.calibration import (
-    lasting_facts,
-    lasting_findings,
-    named_causes,
-    own_noise,
-    prepared,
-    suited,
+    apply_calibration,
+    bias_findings,
+    bias_table,
+    configure_for_calibration,
+    explain_disagreement,
+    uses_preset_noise,
     without_noise,
 )
 from graphslam.app.run.choice import choose_front_end, reading_line
-from graphslam.app.run.files import read_options, undone_of_run
+from graphslam.app.run.files import read_options, removed_loops_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
-from graphslam.app.run.front_ends import check_name, make_front_end, name_of, preset_of, recommended
-from graphslam.app.run.front_to_back import FrontEndWork, FrontToBack, ProgressBar
+from graphslam.app.run.front_ends import check_name, make_front_end, name_of, preset_of, recommended_options
+from graphslam.app.run.front_to_back import FrontEndTiming, ProgressBar, SubmapPipeline
 from graphslam.app.run.maps import sensor_reach
-from graphslam.app.run.outputs import graph_facts, write_outputs
+from graphslam.app.run.outputs import graph_metrics, write_outputs
+from graphslam.app.run.residual_consistency import check_residual_consistency
 from graphslam.app.run.run import Run
+from graphslam.app.run.run_inputs import RunInputs, collect_inputs, read_inputs
 from graphslam.app.run.source import load_log_source
 from graphslam.app.run.stream_use import stream_use
-from graphslam.app.run.summary import summary
-from graphslam.app.run.taken import Taken, read_taken, take
-from graphslam.app.run.verdict import Figures, observed, verdict
-from graphslam.app.run.without_truth import check_without_truth
+from graphslam.app.run.summary import summarise_run
+from graphslam.app.run.verdict import RunMetrics, findings_from_run, run_findings
 from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.backend.refining import refine_run, refined_ledger
-from graphslam.backend.streams import FixPart, ImuPart, beacons_of, compasses_of, split, used_fixes
-from graphslam.core.config import as_dict, build, dump_toml, merge
+from graphslam.backend.streams import GpsSource, ImuSource, beacons_of, compasses_of, split_fixes, used_fixes
+from graphslam.core.config import build_config, dump_toml, merge_options, options_dict
 from graphslam.core.errors import GraphSlamError, MissingDataError, UnknownNameError
-from graphslam.core.feed import Feed
 from graphslam.core.findings import verdict_json
-from graphslam.core.heap import give_back
+from graphslam.core.heap import trim_heap
 from graphslam.core.json_file import check_json
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import level
+from graphslam.core.poses import remove_roll_pitch
 from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.evaluate.bias_test import bias_test_findings
+from graphslam.evaluate.covariance_assessment import pooled_nonlinearity, tests_as_json
+from graphslam.evaluate.dead_reckoning_baseline import dead_reckoned_path
 from graphslam.evaluate.landmark_checks import sighting_findings
 from graphslam.evaluate.metrics import (
     Metrics,
@@ -70,25 +73,22 @@ from graphslam.evaluate.metrics import (
     truth_metrics_in_space,
     truth_path,
 )
-from graphslam.evaluate.reckoning import dead_reckoning
 from graphslam.evaluate.refined import (
     heading_error,
+    level_truth,
     refined_truth_metrics,
     refinement_facts,
     refinement_metrics,
-    upright_truth,
 )
-from graphslam.evaluate.stream_checks import Noticed, check_streams
-from graphslam.evaluate.systematic import systematic_findings
+from graphslam.evaluate.stream_checks import StreamFinding, check_streams
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.evaluate.trust import pooled_nonlinearity, rows_as_json
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from graphslam.maps.contradictions import Contradictions
-from graphslam.maps.global_map import GlobalMap, make_map
+from graphslam.maps.global_map import GlobalMap, make_global_map
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import RunMap, has_maps, make_run_map
 from graphslam.refine.scans import Scans
@@ -109,7 +109,7 @@ def run(
     config: Mapping[str, Any] | None = None,
     resume: bool = False,
     progress: bool = True,
-    undo: Sequence[int | Decision] | None = None,
+    undo: Sequence[int | LoopDecision] | None = None,
     observers: Sequence[Observer] = (),
     reader: str | None = None,
     reader_options: Mapping[str, Any] | None = None,
@@ -135,7 +135,7 @@ def run(
         Go on after the last finished submap of ``out``, to the same result.
     progress : bool
         Show a progress bar on stderr.
-    undo : sequence of int or Decision, optional
+    undo : sequence of int or LoopDecision, optional
         Loops that are taken out again at the end, by their numbers in the ledger of loops, or as an earlier ledger has
         them. By default those that were undone before where the run is resumed, none otherwise.
     observers : sequence of Observer
@@ -192,7 +192,7 @@ def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[s
     if frontend is None:
         choice = choose_front_end(log)
         frontend, why = choice.frontend, choice.why
-    options = recommended(log, frontend, preset)
+    options = recommended_options(log, frontend, preset)
     if read:
         taken = preset or preset_of(log, frontend)[0] or "none"
         logger.warning("front end: %s (%s); preset: %s", frontend, why, taken)
@@ -212,36 +212,36 @@ def _run(
     config: Mapping[str, Any],
     resume: bool,
     progress: bool,
-    undo: Sequence[int | Decision] | None,
+    undo: Sequence[int | LoopDecision] | None,
     observers: Sequence[Observer],
 ) -> Run:
     begin = time.perf_counter() - loading
     seconds = {"load": loading}
-    options = merge(suggested if own and own_noise(config) else without_noise(suggested), config)
-    settings: cfg.RunConfig = build(cfg.RunConfig, options)
+    options = merge_options(suggested if own and uses_preset_noise(config) else without_noise(suggested), config)
+    settings: cfg.RunConfig = build_config(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
     noticed = check_streams(log)
     recorded, clock = log, time.perf_counter()
-    log, applied, said, found = prepared(log, front, settings.calibrate, config, own=own, seed=seed)
-    front = suited(front, log, applied.given, found, config)
+    log, applied, said, found = apply_calibration(log, front, settings.calibrate, config, own=own, seed=seed)
+    front = configure_for_calibration(front, log, applied.given, found, config)
     settings = replace(settings, calibrate=applied)
     seconds["calibrate"] = time.perf_counter() - clock
-    noticed = [*noticed, *(Noticed("", f) for f in said)]
+    noticed = [*noticed, *(StreamFinding("", f) for f in said)]
     effective = effective_config(log.name, name_of(frontend), solver, seed, front.config, settings)
-    back = back_end(Feed(log), settings, solver, [ProgressBar(log, progress), *observers])
+    back = back_end(RecordSource(log), settings, solver, [ProgressBar(log, progress), *observers])
 
-    def finish(folder: RunFolder | None, undone: Sequence[int | Decision]) -> Run:
+    def finish(folder: RunFolder | None, undone: Sequence[int | LoopDecision]) -> Run:
         tree = SeedTree(seed)
-        work = FrontToBack(Feed(log), front, back, tree, folder, with_grids(settings))
+        work = SubmapPipeline(RecordSource(log), front, back, tree, folder, with_grids(settings))
         work.step()
-        return finished(log, work, settings, effective, seconds, begin, undone, noticed, progress=progress)
+        return solve_and_evaluate(log, work, settings, effective, seconds, begin, undone, noticed, progress=progress)
 
     if out is None:
         return finish(None, undo or ())
     effective = with_digest(effective, recorded)
     with RunFolder.start(out, effective, resume=resume) as folder:
         if undo is None:  # what was taken out of a run stays out when it is gone on with
-            undo = undone_of_run(folder.path) if resume else ()
+            undo = removed_loops_of_run(folder.path) if resume else ()
         return write_outputs(folder.path, finish(folder, undo))
 
 
@@ -251,15 +251,15 @@ def with_digest(effective: dict[str, Any], log: SensorLog) -> dict[str, Any]:
     return tomllib.loads(dump_toml(effective))
 
 
-def finished(
+def solve_and_evaluate(
     log: SensorLog,
-    work: FrontToBack,
+    work: SubmapPipeline,
     settings: cfg.RunConfig,
     effective: dict[str, Any],
     seconds: dict[str, float],
     begin: float,
-    undo: Sequence[int | Decision],
-    noticed: Sequence[Noticed],
+    undo: Sequence[int | LoopDecision],
+    noticed: Sequence[StreamFinding],
     *,
     progress: bool,
 ) -> Run:
@@ -275,11 +275,11 @@ def finished(
     steps = front.steps(log) if settings.refine.use else None
     scans = None if steps is None else Scans.of(steps)
     del steps
-    at_rest(work)
-    taken = take(log, work.drops.counts, reference_identities(log, front), noticed, scans)
-    attempts = _Attempts([] if work.settled is None else work.settled.attempts)
+    release_memory(work)
+    taken = collect_inputs(log, work.drops.counts, reference_identities(log, front), noticed, scans)
+    attempts = _MapCandidates([] if work.settled is None else work.settled.attempts)
 
-    def solve() -> _Attempt:
+    def solve() -> _MapCandidate:
         made = work.submaps, work.back, seconds, begin, work.work, effective, undo
         _solved(taken, settings, *made, work.draw, attempts)
         assert attempts.best is not None
@@ -289,75 +289,77 @@ def finished(
     while best.denied and front.draws and work.settled is None and not undo and work.draw + 1 < settings.backend.draws:
         logger.warning("overlapping submaps still contradict each other: making submaps again with another seed")
         bars = [ProgressBar(log, progress)]
-        work = work.drawn_anew(back_end(Feed(log), settings, effective["run"]["solver"], bars))
+        work = work.with_next_seed(back_end(RecordSource(log), settings, effective["run"]["solver"], bars))
         work.step()
-        at_rest(work)
+        release_memory(work)
         best = solve()
     if work.folder is not None and work.settled is None and work.draw:
         work.folder.settle(best.draw, attempts.of_others(best.draw))
     return replace(attempts.result(), log=log)
 
 
-def at_rest(work: FrontToBack) -> None:
+def release_memory(work: SubmapPipeline) -> None:
     """Let go of what making the submaps took."""
     work.front.forget()
-    give_back()
+    trim_heap()
 
 
-def again(folder: str | Path, undo: Sequence[Decision], *, progress: bool = True) -> Run:
+def rerun_without_loops(folder: str | Path, undo: Sequence[LoopDecision], *, progress: bool = True) -> Run:
     """Make a finished run again from what its folder holds, without these loops, and write its files anew.
 
     No log is read, and no submap made.
 
     Parameters
     ----------
-    undo : sequence of Decision
+    undo : sequence of LoopDecision
         Loops that are taken out.
     progress : bool
         Show a progress bar on stderr.
     """
     root = Path(folder)
     begin = time.perf_counter()
-    with one_blas_thread(), locked(root):
-        taken, _ = consistent(root, read_taken)
+    with one_blas_thread(), lock_folder(root):
+        taken, _ = read_consistently(root, read_inputs)
         effective, settings, back, submaps = _stored(root, taken, progress=progress)
         seconds = {"load": time.perf_counter() - begin}
         for s in submaps:
             back.add(s)
-        work = FrontEndWork(0.0, len(submaps), np.zeros(0))
+        work = FrontEndTiming(0.0, len(submaps), np.zeros(0))
         settled = RunFolder(root).settled()
         draw, earlier = (0, []) if settled is None else (settled.draw, settled.attempts)
-        attempts = _Attempts(earlier)
+        attempts = _MapCandidates(earlier)
         _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo, draw, attempts)
         return write_outputs(root, attempts.result())
 
 
-def solve_again(folder: str | Path) -> tuple[PoseGraph, Solution]:
+def resolve_from_folder(folder: str | Path) -> tuple[PoseGraph, Solution]:
     """Graph and solution of a finished run, from what its folder holds, without the loops that were undone."""
     root = Path(folder)
     with one_blas_thread():
-        taken, _ = consistent(root, read_taken)
+        taken, _ = read_consistently(root, read_inputs)
         _, _, back, submaps = _stored(root, taken, progress=False)
         for s in submaps:
             back.add(s)
-        solution = back.finish(undone_of_run(root))
+        solution = back.finish(removed_loops_of_run(root))
     return back.graph, solution
 
 
-def _stored(root: Path, taken: Taken, *, progress: bool) -> tuple[dict[str, Any], cfg.RunConfig, BackEnd, list[Submap]]:
+def _stored(
+    root: Path, taken: RunInputs, *, progress: bool
+) -> tuple[dict[str, Any], cfg.RunConfig, BackEnd, list[Submap]]:
     """Options and submaps of a run folder, and a back end that is to have them."""
     effective = read_options(root)
     wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
     said = check_json(effective, wanted, str(root / CONFIG))["run"]
-    settings: cfg.RunConfig = build(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
-    back = back_end(Feed(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
-    return effective, settings, back, read_submaps(root, load_grid=load_shelved if with_grids(settings) else None)
+    settings: cfg.RunConfig = build_config(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
+    back = back_end(RecordSource(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
+    return effective, settings, back, read_submaps(root, load_grid=load_spilled if with_grids(settings) else None)
 
 
-def back_end(feed: Feed, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
+def back_end(feed: RecordSource, settings: cfg.RunConfig, solver: str, observers: Sequence[Observer]) -> BackEnd:
     """A back end that has its IMUs, and the fixes that are to be used."""
-    fixes = FixPart(feed, settings.gps)
-    back = BackEnd(settings.backend, solver, imu=ImuPart(feed, settings.imu), observers=observers, fixes=fixes)
+    fixes = GpsSource(feed, settings.gps)
+    back = BackEnd(settings.backend, solver, imu=ImuSource(feed, settings.imu), observers=observers, fixes=fixes)
     if not feed.ended:  # compasses and beacons are given whole
         return back
     for name, compass in compasses_of(feed.log, settings.compass).items():
@@ -373,7 +375,7 @@ def with_grids(settings: cfg.RunConfig) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Attempt:
+class _MapCandidate:
     """One graph that was solved for a run.
 
     Parameters
@@ -396,9 +398,9 @@ class _Attempt:
     @property
     def denied(self) -> bool:
         """Do passes of its map deny each other?"""
-        return self.passes is not None and self.passes.denies
+        return self.passes is not None and self.passes.is_contradictory
 
-    def beats(self, other: _Attempt) -> bool:
+    def beats(self, other: _MapCandidate) -> bool:
         """Do its passes deny each other less?"""
         known = self.passes is not None and other.passes is not None
         return known and self.passes.agrees_better(other.passes)  # type: ignore[union-attr, arg-type]
@@ -409,7 +411,7 @@ class _Attempt:
         return {"draw": self.draw, "loops": self.loops, **facts}
 
 
-class _Attempts:
+class _MapCandidates:
     """Graphs that were solved for a run, of which the best is kept; maps of the others take no memory.
 
     Parameters
@@ -420,9 +422,9 @@ class _Attempts:
 
     def __init__(self, earlier: Sequence[Mapping[str, Any]] = ()) -> None:
         self.rows = [dict(r) for r in earlier]
-        self.best: _Attempt | None = None
+        self.best: _MapCandidate | None = None
 
-    def add(self, attempt: _Attempt) -> None:
+    def add(self, attempt: _MapCandidate) -> None:
         """One more."""
         self.rows.append(attempt.row())
         if self.best is None or attempt.beats(self.best):
@@ -441,24 +443,24 @@ class _Attempts:
         rows = sorted(self.rows, key=lambda r: (r["draw"], r["loops"]))
         rows = [{**r, "kept": (r["draw"], r["loops"]) == (best.draw, best.loops)} for r in rows]
         report = {**best.run.report, "map_attempts": rows}
-        figures = Figures(report, dict(zip(best.run.metrics["key"], best.run.metrics["value"])), best.run.events)
-        lines = verdict(figures)
-        report["verdict"] = verdict_json(summary(figures, lines), lines)
+        figures = RunMetrics(report, dict(zip(best.run.metrics["key"], best.run.metrics["value"])), best.run.events)
+        lines = run_findings(figures)
+        report["verdict"] = verdict_json(summarise_run(figures, lines), lines)
         return replace(best.run, report=report)
 
 
 def _solved(
-    taken: Taken,
+    taken: RunInputs,
     settings: cfg.RunConfig,
     submaps: list[Submap],
     back: BackEnd,
     seconds: dict[str, float],
     begin: float,
-    work: FrontEndWork,
+    work: FrontEndTiming,
     effective: dict[str, Any],
-    undo: Sequence[int | Decision],
+    undo: Sequence[int | LoopDecision],
     draw: int,
-    attempts: _Attempts,
+    attempts: _MapCandidates,
 ) -> None:
     """Try the graph of a back end that has all submaps; where its passes deny each other a second one with loops.
 
@@ -466,12 +468,12 @@ def _solved(
     one saw to be free. So the front end's matches alone are tried first, then loops that the back end looks for.
     """
 
-    def made(back: BackEnd) -> _Attempt:
+    def made(back: BackEnd) -> _MapCandidate:
         solution = back.finish(undo)
         spent = seconds | {"frontend": work.seconds} | {f"backend_{k}": v for k, v in back.seconds.items()}
         spent |= {"backend": sum(back.seconds.values()), "total": time.perf_counter() - begin}
-        run = _judge(taken, settings, submaps, back, solution, spent, work, effective)
-        return _Attempt(run, draw, back.config.looks)
+        run = _evaluate_run(taken, settings, submaps, back, solution, spent, work, effective)
+        return _MapCandidate(run, draw, back.config.looks)
 
     first = made(back)
     attempts.add(first)
@@ -479,7 +481,7 @@ def _solved(
         return
     looking = replace(settings, backend=replace(settings.backend, loops=True))
     logger.warning("overlapping submaps contradict each other: searching loop closures between submaps")
-    other = back_end(Feed(taken.log), looking, effective["run"]["solver"], ())
+    other = back_end(RecordSource(taken.log), looking, effective["run"]["solver"], ())
     for s in submaps:
         other.add(s)
     attempts.add(made(other))
@@ -498,42 +500,42 @@ def effective_config(
     run_part = {"source": source, "frontend": frontend, "solver": solver, "seed": seed}
     return {
         "run": run_part,
-        "frontend": as_dict(front_config),
-        "backend": as_dict(settings.backend),
-        "gps": as_dict(settings.gps),
-        "imu": as_dict(settings.imu),
-        "compass": as_dict(settings.compass),
-        "beacons": as_dict(settings.beacons),
-        "refine": as_dict(settings.refine),
-        "map": as_dict(settings.map),
-        "calibrate": as_dict(settings.calibrate),
+        "frontend": options_dict(front_config),
+        "backend": options_dict(settings.backend),
+        "gps": options_dict(settings.gps),
+        "imu": options_dict(settings.imu),
+        "compass": options_dict(settings.compass),
+        "beacons": options_dict(settings.beacons),
+        "refine": options_dict(settings.refine),
+        "map": options_dict(settings.map),
+        "calibrate": options_dict(settings.calibrate),
     }
 
 
-def _judge(
-    taken: Taken,
+def _evaluate_run(
+    taken: RunInputs,
     settings: cfg.RunConfig,
     submaps: list[Submap],
     back: BackEnd,
     solution: Solution,
     seconds: dict[str, float],
-    work: FrontEndWork,
+    work: FrontEndTiming,
     effective: dict[str, Any],
 ) -> Run:
     """Metrics, residuals, and the value that the user gets."""
     log, drops = taken.log, DropCounter()
     gps = gps_stream(log)
     hits = back.landmark_hits(submaps)
-    global_map = make_map(solution, submaps, hits, settings.backend.confirmed_hits)
+    global_map = make_global_map(solution, submaps, hits, settings.backend.confirmed_hits)
     out = Metrics()
     front_end_metrics(out, submaps)
     solution_metrics(out, solution, len(global_map.landmarks))
     imu_metrics(out, back.graph, drops)
     clock, graph_path = time.perf_counter(), global_map.trajectory
-    fixes = None if gps is None or solution.T_gps_world is None else (split(gps, settings.gps)[0], settings.gps)
+    fixes = None if gps is None or solution.T_gps_world is None else (split_fixes(gps, settings.gps)[0], settings.gps)
     refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=fixes, graph=back.graph)
     seconds_refine = time.perf_counter() - clock
-    give_back()
+    trim_heap()
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     ledger = back.graph.ledger
     if refined is not None:
@@ -561,7 +563,7 @@ def _judge(
     time_metrics(out, seconds, log.duration, scans, work.per_scan)
     out.add("path_length", global_map.trajectory.length(), "m")
     residuals = {}
-    reckoned = dead_reckoning(log, global_map.trajectory)
+    reckoned = dead_reckoned_path(log, global_map.trajectory)
     if gps is not None:
         withheld = ~used_fixes(gps, settings.gps)
         residuals = gps_metrics(out, global_map.trajectory, gps, withheld, global_map.T_gps_world)
@@ -571,14 +573,14 @@ def _judge(
     base = true_first_base(log, submaps[0])
     true_path = truth_path(log, global_map.trajectory.times, submaps[0])
     identified = [s.with_ids(back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in submaps]
-    checks = check_without_truth(
+    checks = check_residual_consistency(
         out, back.graph, identified, global_map.trajectory, global_map.base_poses, gps, settings
     )
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
         if refined is not None:
-            truth, true_path = upright_truth(truth, true_path, np.array(base))
-            base = level(np.array(base)).tolist() if back.graph.dim == 3 else base
+            truth, true_path = level_truth(truth, true_path, np.array(base))
+            base = remove_roll_pitch(np.array(base)).tolist() if back.graph.dim == 3 else base
             refined_truth_metrics(out, global_map, refined.refinement, submaps, truth, path=true_path)
             if true_path is not None and len(true_path) >= 3:
                 out.add("path_rmse_aligned_graph", ate(graph_path, true_path).statistics.rmse, "m")
@@ -611,15 +613,15 @@ def _judge(
         "covariance_scale": settings.backend.covariance_scale,
         "objective": solution.objective,
         "converged": solution.converged,
-        "graph": graph_facts(back.graph, checks.classes),
-        "evidence": rows_as_json(checks.evidence(submaps, refined=refined is not None)),
+        "graph": graph_metrics(back.graph, checks.classes),
+        "evidence": tests_as_json(checks.evidence(submaps, refined=refined is not None)),
         "nonlinearity": pooled_nonlinearity([s.report for s in submaps]) if refined is None else 0.0,
     }
     if truth is not None:
         report["nees_chart"] = "group" if refined is not None or back.graph.dim == 3 else solution.chart
     if checks.gps is not None:
         report["gps_innovations"] = checks.gps.facts()
-    lasting = lasting_facts(back.graph)
+    lasting = bias_table(back.graph)
     if lasting:
         report["lasting"] = lasting
     if refined is not None:
@@ -632,19 +634,24 @@ def _judge(
         report["map_coarser"] = fused.said()
     if fused is not None and len(fused.passes.pairs):
         report["map_passes"] = fused.passes.facts()
-    used = frozenset().union(*(s.uses | s.aids for s in submaps))
+    used = frozenset().union(*(s.uses | s.assisting_streams for s in submaps))
     streams = stream_use(log, back.graph, settings, {**log.dropped, **drops.counts}, used)
     report["streams"] = [s.as_row() for s in streams]
     metrics = out.table()
-    figures = Figures(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
+    figures = RunMetrics(report, dict(zip(metrics["key"], metrics["value"])), back.graph.events)
     reports = [s.report for s in submaps]
     join = figures.metrics.get("join_chi2_per_dof"), figures.metrics.get("join_dof", 0.0)
     corrected = "noise" in effective.get("frontend", {})
-    causes = named_causes(log, settings.calibrate, *join, ranges_corrected=corrected)
-    causes = [*causes, *lasting_findings(lasting)]
-    seen = [*causes, *sighting_findings(log, reports, {**log.dropped, **drops.counts}), *systematic_findings(reports)]
-    lines = [*observed(streams, taken.noticed, submaps, back.graph.events), *seen, *refining, *verdict(figures)]
-    report["verdict"] = verdict_json(summary(figures, lines), lines)
+    causes = explain_disagreement(log, settings.calibrate, *join, ranges_corrected=corrected)
+    causes = [*causes, *bias_findings(lasting)]
+    seen = [*causes, *sighting_findings(log, reports, {**log.dropped, **drops.counts}), *bias_test_findings(reports)]
+    lines = [
+        *findings_from_run(streams, taken.noticed, submaps, back.graph.events),
+        *seen,
+        *refining,
+        *run_findings(figures),
+    ]
+    report["verdict"] = verdict_json(summarise_run(figures, lines), lines)
     return Run(
         name=log.name,
         submaps=identified,
@@ -654,7 +661,7 @@ def _judge(
         events=list(back.graph.events),
         ledger=ledger.table(),
         gps=residuals,
-        fixes=None if gps is None or settings.gps.use == "none" else split(gps, settings.gps)[0],
+        fixes=None if gps is None or settings.gps.use == "none" else split_fixes(gps, settings.gps)[0],
         taken=taken,
         truth=truth,
         truth_path=true_path,

@@ -5,20 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from graphslam.app.folders.generations import new_generation, outputs
-from graphslam.app.folders.lock import locked
-from graphslam.app.hypotheses import Clearest, clearest_of_choices, clearest_of_topologies, write_clearest
-from graphslam.app.report.report import report_beside
+from graphslam.app.folders.generations import current_outputs, new_generation
+from graphslam.app.folders.lock import lock_folder
+from graphslam.app.hypotheses import (
+    MinimumEntropyMap,
+    minimum_entropy_loops,
+    minimum_entropy_topology,
+    write_minimum_entropy,
+)
+from graphslam.app.report.report import add_report
 from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
-from graphslam.app.run.outputs import open_run, refined_submaps_of
+from graphslam.app.run.outputs import read_run_folder, refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.app.run.surface import COLOURS, RunSurface, draw_surface, surface_of_run, write_surface
 from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain_file, terrain_of_run, write_terrain
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
 from graphslam.core.log import SensorLog
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.io.submap_store import read_submaps
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
@@ -32,14 +37,14 @@ class RemadeMap:
 
     Parameters
     ----------
-    clearest : Clearest or None
+    clearest : MinimumEntropyMap or None
         Choices of matches and loops, where they were asked for.
     files, figures : list of Path
         Written.
     """
 
     map: RunMap
-    clearest: Clearest | None
+    clearest: MinimumEntropyMap | None
     files: list[Path]
     figures: list[Path]
 
@@ -73,13 +78,13 @@ def remake_map(
     if minimum_entropy and hypotheses:
         raise ConfigError("minimum_entropy and hypotheses exclude each other; give one of them")
     home = Path(folder)
-    if not (outputs(home) / "run.json").is_file():
-        open_run(home)  # says what is wrong
-    with locked(home):
+    if not (current_outputs(home) / "run.json").is_file():
+        read_run_folder(home)  # says what is wrong
+    with lock_folder(home):
         run, made = map_of_folder(home, low=low, high=high)
-        found = clearest_of_choices(run, made, progress=progress) if minimum_entropy else None
+        found = minimum_entropy_loops(run, made, progress=progress) if minimum_entropy else None
         if hypotheses:
-            found = clearest_of_topologies(run, hypotheses, log=log, progress=progress)
+            found = minimum_entropy_topology(run, hypotheses, log=log, progress=progress)
         with new_generation(home) as new:
             files = write_run_map(new, made, run.report.get("generation"))
             if grid:
@@ -88,10 +93,10 @@ def remake_map(
             figures = draw_run_map(made, run.map.trajectory, new.figures, name=run.name, truth=run.truth_path)
             old = ["map.ply", "map.bt", "cloud.ply", "map*.pgm", "map*.yaml", "map.grid.npz", "figures/fused*.png"]
             if found is not None:
-                files += write_clearest(new.path, found, bands=made.bands)
+                files += write_minimum_entropy(new.path, found, bands=made.bands)
                 old += ["clearest*", "alternatives/*"]
             new.adopt(drop=old)
-            report_beside(new)  # the page of the run shows the pictures and the choices
+            add_report(new)  # the page of the run shows the pictures and the choices
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return RemadeMap(made, found, files, figures)
 
@@ -118,16 +123,16 @@ def remake_terrain(
     RunTerrain, files, figures
     """
     home = Path(folder)
-    if not (outputs(home) / "run.json").is_file():
-        open_run(home)  # says what is wrong
-    with locked(home):
-        run = open_run(home)
+    if not (current_outputs(home) / "run.json").is_file():
+        read_run_folder(home)  # says what is wrong
+    with lock_folder(home):
+        run = read_run_folder(home)
         made = terrain_of_run(run, log=log, vehicle=vehicle, sensor_height=sensor_height, progress=progress)
         with new_generation(home) as new:
             files = write_terrain(new, made, generation=run.report.get("generation"))
             figures = draw_terrain(made, new.figures, name=run.name)
             new.adopt(drop=["terrain*", "figures/terrain*.png"])
-            report_beside(new)
+            add_report(new)
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return made, files, figures
 
@@ -158,17 +163,17 @@ def remake_surface(
     home = Path(folder)
     if colour not in COLOURS:
         raise UnknownNameError("colour of a surface", colour, COLOURS)
-    if not (outputs(home) / "run.json").is_file():
-        open_run(home)  # says what is wrong
-    with locked(home):
-        run = open_run(home)
-        terrain = read_terrain_file(outputs(home)) if colour == "terrain" else None
+    if not (current_outputs(home) / "run.json").is_file():
+        read_run_folder(home)  # says what is wrong
+    with lock_folder(home):
+        run = read_run_folder(home)
+        terrain = read_terrain_file(current_outputs(home)) if colour == "terrain" else None
         made = surface_of_run(run, log=log, config=config, progress=progress)
         with new_generation(home) as new:
             files = write_surface(new, made, colour=colour, terrain=terrain, generation=run.report.get("generation"))
             figures = draw_surface(made, new.figures, name=run.name)
             new.adopt(drop=["surface*", "figures/surface*.png"])
-            report_beside(new)
+            add_report(new)
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return made, files, figures
 
@@ -181,10 +186,10 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     low, high : float, optional
         Heights of the floor plans above the path [m]; default the run's.
     """
-    run = open_run(path)
+    run = read_run_folder(path)
     root = Path(path)
     refined = refined_submaps_of(run)
-    submaps = refined or read_submaps(root, load_grid=load_shelved)
+    submaps = refined or read_submaps(root, load_grid=load_spilled)
     if not has_maps(submaps):
         raise MissingDataError(
             f"{root}: the run has no evidence grids or clouds, so there is no dense map",
@@ -193,7 +198,7 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
         )
     values = read_options(root)
     heights = {k: v for k, v in (("low", low), ("high", high)) if v is not None}
-    config: MapConfig = build(MapConfig, merge(values.get("map", {}), heights), "map")
+    config: MapConfig = build_config(MapConfig, merge_options(values.get("map", {}), heights), "map")
     frames = map_of_frames(run.map) if refined else run.map
     made = make_run_map(submaps, frames, reach=sensor_reach(values), config=config)
     if refined and {"map_entropy_open_chain", "map_known_volume_open_chain"} <= set(run.metrics["key"]):

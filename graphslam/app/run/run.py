@@ -15,7 +15,7 @@ from graphslam.core.findings import Finding, findings_of_json, headline_of_json
 from graphslam.core.geometry import se2_transform
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
-from graphslam.core.markup import element, frame, join
+from graphslam.core.markup import html_element, html_frame, join_parts
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -23,9 +23,9 @@ from graphslam.evaluate.gps import GpsResiduals
 from graphslam.maps.global_map import GlobalMap
 
 if TYPE_CHECKING:
-    from graphslam.app.run.taken import Taken
-    from graphslam.app.run.without_truth import WithoutTruth
-    from graphslam.backend.refining import Refined
+    from graphslam.app.run.residual_consistency import ResidualConsistency
+    from graphslam.app.run.run_inputs import RunInputs
+    from graphslam.backend.refining import RefinedRun
     from graphslam.graph.pose_graph import PoseGraph
     from graphslam.maps.run_map import RunMap
     from graphslam.solve.solution import Solution
@@ -35,7 +35,7 @@ _MAX_STRETCH = 2.5
 """A dead-reckoned path this many times larger than the map is not drawn: the map would be a dot."""
 
 
-class Later:
+class DeferredPart:
     """A part of a run that is made when it is first asked for.
 
     Parameters
@@ -49,7 +49,7 @@ class Later:
 
 
 class _Part:
-    """A field of a run that may be a :class:`Later`; None by default."""
+    """A field of a run that may be a :class:`DeferredPart`; None by default."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -58,7 +58,7 @@ class _Part:
         if run is None:
             return None  # the default of the field
         part = run.__dict__[self.name]
-        if isinstance(part, Later):
+        if isinstance(part, DeferredPart):
             part = run.__dict__[self.name] = part.make()
         return part
 
@@ -89,7 +89,7 @@ class Run:
         What of GPS became factors.
     folder : Path or None
     log : SensorLog or None
-    taken : Taken or None
+    taken : RunInputs or None
         Subset of the log used for the graph and the metrics; None for a run read back from disk.
     truth : MapTruth or None
         Ends of the submaps and landmarks.
@@ -98,14 +98,14 @@ class Run:
     solution, graph : Solution, PoseGraph or None
         The solver's own view. Of a run that :func:`graphslam.open_run` read they are solved again, once, when they are
         first asked for; None where its folder does not hold what that needs.
-    checks : WithoutTruth or None
+    checks : ResidualConsistency or None
         Consistency checks without ground truth; None for a run read back from disk, whose metrics hold the figures.
     fused : RunMap or None
         Fused evidence grid of submaps that have grids. Of a run that :func:`graphslam.open_run` read it is made again,
         once, when it is first asked for.
     graph_path : Trajectory or None
         Of a refined run the path of the graph, where the refinement began; from disk without covariances.
-    refined : Refined or None
+    refined : RefinedRun or None
         The path refined by its scans; None for a run read back from disk, whose ``map`` has the refined path.
     two_maps : tuple of two Trajectory, or None
         Where two groups of loops cannot both be right and nothing told which is: the path of the graph with either,
@@ -131,21 +131,21 @@ class Run:
     fixes: Gps | None = None
     folder: Path | None = None
     log: SensorLog | None = None
-    taken: Taken | None = None
+    taken: RunInputs | None = None
     truth: MapTruth | None = None
     truth_path: Trajectory | None = None
     dead_reckoning: Trajectory | None = None
     solution: Solution | None = _Part()  # type: ignore[assignment]
     graph: PoseGraph | None = _Part()  # type: ignore[assignment]
-    checks: WithoutTruth | None = None
+    checks: ResidualConsistency | None = None
     fused: RunMap | None = _Part()  # type: ignore[assignment]
     graph_path: Trajectory | None = None
-    refined: Refined | None = None
+    refined: RefinedRun | None = None
     two_maps: tuple[Trajectory, Trajectory] | None = None
 
     def holds(self, part: str) -> bool:
         """Is ``solution``, ``graph`` or ``fused`` there, made already?"""
-        return self.__dict__[part] is not None and not isinstance(self.__dict__[part], Later)
+        return self.__dict__[part] is not None and not isinstance(self.__dict__[part], DeferredPart)
 
     def metric(self, key: str) -> float:
         """Value of one metric.
@@ -240,7 +240,9 @@ class Run:
     def _repr_html_(self) -> str:
         where = f" in {self.folder.name}" if self.folder else ""
         said = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
-        return join([element("b", f"Run of {self.name}"), said, frame(self.metrics[["key", "value", "unit"]])])
+        return join_parts(
+            [html_element("b", f"Run of {self.name}"), said, html_frame(self.metrics[["key", "value", "unit"]])]
+        )
 
 
 def metric_value(metrics: pd.DataFrame, key: str) -> float:

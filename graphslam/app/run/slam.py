@@ -13,15 +13,15 @@ from typing import Any
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run import config as cfg
-from graphslam.app.run.calibration import looks_at
+from graphslam.app.run.calibration import can_calibrate
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.front_ends import make_front_end, named_preset
-from graphslam.app.run.front_to_back import FrontToBack
+from graphslam.app.run.front_to_back import SubmapPipeline
 from graphslam.app.run.outputs import write_outputs
-from graphslam.app.run.pipeline import back_end, effective_config, finished, run, with_digest, with_grids
+from graphslam.app.run.pipeline import back_end, effective_config, run, solve_and_evaluate, with_digest, with_grids
 from graphslam.app.run.run import Run
 from graphslam.backend.back_end import Observer
-from graphslam.core.config import build, merge
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -31,7 +31,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.stream_checks import check_streams
 from graphslam.io.growing_log import GrowingLog
 from graphslam.io.log_kinds import kind_name
-from graphslam.maps.global_map import GlobalMap, make_map
+from graphslam.maps.global_map import GlobalMap, make_global_map
 from graphslam.solve.batch import state_of
 from graphslam.solve.solution import make_solution
 from graphslam_frontends.base import FrontEnd
@@ -103,8 +103,8 @@ class Slam:
         observers: Sequence[Observer] = (),
         records: str | Path | None = None,
     ) -> None:
-        options = merge(named_preset(frontend, preset), config or {})
-        settings: cfg.RunConfig = build(cfg.RunConfig, options)
+        options = merge_options(named_preset(frontend, preset), config or {})
+        settings: cfg.RunConfig = build_config(cfg.RunConfig, options)
         front = make_front_end(frontend, settings.frontend)
         self.waits_for = _waits_for(front, settings)
         """What has to wait for the end of the log; empty where submaps are made while records come."""
@@ -118,10 +118,10 @@ class Slam:
         with self._closing_on_error():
             folder = records or self._stack.enter_context(tempfile.TemporaryDirectory(prefix="graphslam-records-"))
             self._feed = GrowingLog(name, folder)
-            self._work: FrontToBack | None = None
+            self._work: SubmapPipeline | None = None
             if self.waits_for:
                 return
-            own = replace(settings.calibrate, use="none") if looks_at(front) else settings.calibrate
+            own = replace(settings.calibrate, use="none") if can_calibrate(front) else settings.calibrate
             self._settings = replace(settings, calibrate=own)
             self._effective = effective_config(name, frontend, solver, seed, front.config, self._settings)
             self._folder: RunFolder | None = None
@@ -130,7 +130,7 @@ class Slam:
             self._stack.enter_context(one_blas_thread())
             back = back_end(self._feed, self._settings, solver, observers)
             tree = SeedTree(seed)
-            self._work = FrontToBack(self._feed, front, back, tree, self._folder, with_grids(self._settings))
+            self._work = SubmapPipeline(self._feed, front, back, tree, self._folder, with_grids(self._settings))
 
     def add(self, records: Stream, stream: str | None = None) -> None:
         """Take one record or more of a sensor, and go on as far as they allow.
@@ -186,7 +186,7 @@ class Slam:
         here = make_solution(
             self._asked["solver"], back.graph, state_of(back.graph), iterations=0, gap=None, seconds=0.0
         )
-        return make_map(here, submaps, back.landmark_hits(submaps), self._settings.backend.confirmed_hits)
+        return make_global_map(here, submaps, back.landmark_hits(submaps), self._settings.backend.confirmed_hits)
 
     @property
     def path(self) -> Trajectory:
@@ -230,7 +230,7 @@ class Slam:
     def _whole(self) -> Run:
         return run(self._feed.log, progress=False, **{**self._asked, "preset": self._asked["preset"] or "none"})
 
-    def _finished(self, work: FrontToBack) -> Run:
+    def _finished(self, work: SubmapPipeline) -> Run:
         log, seconds = self._feed.log, {"load": 0.0, "calibrate": 0.0}
         begin = time.perf_counter() - self._seconds  # time in which records were waited for is nobody's
         noticed = check_streams(log)
@@ -239,7 +239,7 @@ class Slam:
             effective = with_digest(effective, log)
             self._folder.describe(effective)
         work.step()
-        result = finished(log, work, self._settings, effective, seconds, begin, (), noticed, progress=False)
+        result = solve_and_evaluate(log, work, self._settings, effective, seconds, begin, (), noticed, progress=False)
         return result if self._folder is None else write_outputs(self._folder.path, result)
 
     def _closing_on_error(self) -> ExitStack:

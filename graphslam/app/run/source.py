@@ -8,7 +8,7 @@ from typing import Any
 
 from graphslam.core.errors import DataError, GraphSlamError, MissingDataError
 from graphslam.core.log import SensorLog
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.io.log_digest import log_digest
 
 
@@ -16,7 +16,7 @@ def load_log_source(source: str | Path | SensorLog, *, reader: str | None = None
     """A log from a card name, a file or folder on disk, or itself; ``options`` are for the reader."""
     if isinstance(source, SensorLog):
         return source
-    log = load(source, reader=reader, **options)
+    log = load_recording(source, reader=reader, **options)
     if not isinstance(log, SensorLog):
         verb = "solve" if isinstance(log, Path) else "join" if isinstance(log, list) else ""
         kind = {"solve": "a pose network", "join": "submaps"}.get(verb, type(log).__name__)

@@ -7,16 +7,16 @@ from fnmatch import fnmatchcase
 
 from graphslam.app.run.verdict import (
     TWO_MAPS_DO,
-    Figures,
-    Judged,
-    judged_chi2,
-    judged_nees,
-    judged_trust,
-    number,
+    ChiSquareTest,
+    RunMetrics,
+    chi_square_test,
+    covariance_assessment,
+    is_finite_number,
+    nees_tests,
     of_the_start,
 )
 from graphslam.core.errors import DataError
-from graphslam.core.findings import LEVELS, Finding, Level, worst
+from graphslam.core.findings import LEVELS, Finding, Level, worst_level
 from graphslam.loops.ledger import ledger_of_events
 
 TRUST: dict[Level, str] = {
@@ -147,14 +147,14 @@ NOTHING_KNOWN = "measure one distance in the field: there is no ground truth and
 NOTHING = "nothing; the result can be used"
 
 
-def summary(figures: Figures, findings: Sequence[Finding]) -> Finding:
+def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
     """First line of the verdict of a run or of a merge."""
     known = _error(figures)
-    nees = judged_nees(figures)
-    chi2, worst_nees = judged_chi2(figures), max(nees, key=lambda j: LEVELS.index(j.level), default=None)
+    nees = nees_tests(figures)
+    chi2, worst_nees = chi_square_test(figures), max(nees, key=lambda j: LEVELS.index(j.level), default=None)
     open_chain = "" if chi2 else "no redundant measurements, so consistency is not testable"
     facts = [_made(figures), known or "true error unknown", open_chain]
-    trusted = judged_trust(figures)
+    trusted = covariance_assessment(figures)
     word = "" if trusted is None else trusted.word
     held = [] if chi2 is None or of_the_start(figures, chi2) else [chi2]
     return headline(findings, facts, [*held, *([worst_nees] if worst_nees else [])], known=bool(known), word=word)
@@ -163,7 +163,7 @@ def summary(figures: Figures, findings: Sequence[Finding]) -> Finding:
 def headline(
     findings: Iterable[Finding],
     facts: Sequence[str] = (),
-    judged: Sequence[Judged] = (),
+    judged: Sequence[ChiSquareTest] = (),
     *,
     known: bool = True,
     word: str = "",
@@ -174,18 +174,19 @@ def headline(
     ----------
     facts : sequence of str
         The result, in a few words each.
-    judged : sequence of Judged
+    judged : sequence of ChiSquareTest
         Ratios of the findings with the codes ``chi2`` and ``nees``.
     known : bool
         Is there a reference to compare the result with?
     word : str
-        Verdict on the covariances without ground truth (:func:`graphslam.evaluate.trust.trust`).
+        Verdict on the covariances without ground truth
+        (:func:`graphslam.evaluate.covariance_assessment.assess_covariances`).
     """
     found = list(findings)
-    level = worst(found) or "good"
+    level = worst_level(found) or "good"
     points = sum(f.level == level for f in found) if level in MARKED else 0
     marked = f" ({points} {'point' if points == 1 else 'points'} marked “{level}”)" if points else ""
-    held = [consistency(j, found) for j in judged]
+    held = [consistency_line(j, found) for j in judged]
     by_truth = any(j.code == "nees" for j in judged)  # then tests without ground truth matter less
     if word and not (by_truth and word != "over-confident"):
         held.append(WITHOUT_TRUTH[word])
@@ -195,7 +196,7 @@ def headline(
     return Finding(level, "headline", f"{TRUST[level]}{marked}{': ' + said if said else ''}. To do: {do}.")
 
 
-def consistency(j: Judged, findings: Sequence[Finding]) -> str:
+def consistency_line(j: ChiSquareTest, findings: Sequence[Finding]) -> str:
     """Are the covariances consistent, and by which ratio?"""
     ratio = f"{j.name} {j.ratio:.3g}"
     if j.code == "chi2" and any(f.code == "consistency-test" for f in findings):
@@ -205,7 +206,7 @@ def consistency(j: Judged, findings: Sequence[Finding]) -> str:
 
 def _advice(findings: Sequence[Finding], over: set[str], known: bool, word: str) -> str:
     """The most important next step."""
-    level = worst(findings)
+    level = worst_level(findings)
     if level not in MARKED:
         return NOTHING if known else NOTHING_KNOWN
     _, first = min(((_rank(f.code, over), f) for f in findings if f.level == level), key=lambda r: r[0])
@@ -224,11 +225,11 @@ def _rank(code: str, over: set[str]) -> int:
     return next((k for k, pattern in enumerate(ADVICE) if fnmatchcase(code, pattern)), len(ADVICE))
 
 
-def _made(figures: Figures) -> str:
+def _made(figures: RunMetrics) -> str:
     """``305 m in 7 submaps, 4 loop closures``."""
     m = figures.metrics
     way = m.get("path_length")
-    length = in_metres(float(way)) if way is not None and number(way) else ""
+    length = length_text(float(way)) if way is not None and is_finite_number(way) else ""
     if figures.sessions:
         out = [f"{len(figures.sessions)} sessions"]
     else:
@@ -245,7 +246,7 @@ def _made(figures: Figures) -> str:
     return ", ".join(out)
 
 
-def _error(figures: Figures) -> str:
+def _error(figures: RunMetrics) -> str:
     """``path error 4.1 cm (RMSE against ground truth)``; empty without a reference."""
     m = figures.metrics
     for key, what in (
@@ -255,12 +256,12 @@ def _error(figures: Figures) -> str:
         ("gps_withheld_rmse", "{} RMSE against withheld GPS fixes"),
         ("gps_rmse", "{} RMSE against GPS fixes"),
     ):
-        if number(m.get(key)):
-            return what.format(in_metres(float(m[key])))
+        if is_finite_number(m.get(key)):
+            return what.format(length_text(float(m[key])))
     return ""
 
 
-def in_metres(x: float) -> str:
+def length_text(x: float) -> str:
     """A length in words: ``4.01 km``, ``305 m``, ``1.26 m``, ``4.1 cm``, ``6.3 mm``."""
     for least, unit, each, digits in ((1e3, "km", 1e3, 3), (1.0, "m", 1.0, 3), (0.01, "cm", 0.01, 2)):
         if x >= least:

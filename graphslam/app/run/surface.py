@@ -23,7 +23,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.surface.layer import PieceId, SurfaceLayer
-from graphslam.maps.surface.mesh import Mesh, owners, position_sigma, save_mesh, zero_set
+from graphslam.maps.surface.mesh import Mesh, position_sigma, save_mesh, vertex_owners, zero_set
 from graphslam.maps.surface.piece import Scan, SurfaceConfig
 from graphslam.maps.terrain.lines import lines_of_scans
 from graphslam.maps.terrain.pyramid import ClassGrid
@@ -192,7 +192,7 @@ def read_surface(
     if not len(mesh.triangles):
         raise DataError("the scans show no surface", where=streams, wanted="dense points")
     seconds = time.process_time() - begin
-    nodes = np.array([*layer.pieces, -1])[owners(mesh, layer)]
+    nodes = np.array([*layer.pieces, -1])[vertex_owners(mesh, layer)]
     session = np.where(nodes >= 0, np.searchsorted(first, nodes, side="right") - 1, -1)
     return RunSurface(
         layer, mesh, nodes, session, position_sigma(mesh, layer, covariances), scans, streams, read_s, seconds
@@ -230,16 +230,16 @@ def write_surface(
 
 def draw_surface(made: RunSurface, figures: Path, *, name: str) -> list[Path]:
     """Pictures from aslant: by height, by session where there are several, and by σ of its place where it is known."""
-    from graphslam.plots.save import save
+    from graphslam.plots.save import save_figure
     from graphslam.plots.surface import plot_surface
 
     v, t = made.mesh.vertices, made.mesh.triangles
     ax = plot_surface(v, t, v[:, 2], label="height [m]", title=f"{name}: surface")
-    out = [save(ax, figures / "surface.png")]
+    out = [save_figure(ax, figures / "surface.png")]
     if np.any(made.session > 0):
         ax = plot_surface(v, t, (made.session + 1).astype(np.float64), label="session", title=f"{name}: by session")
-        out.append(save(ax, figures / "surface_sessions.png"))
+        out.append(save_figure(ax, figures / "surface_sessions.png"))
     if np.any(np.isfinite(made.sigma)):
         ax = plot_surface(v, t, 1e3 * made.sigma, label="σ of the position [mm]", title=f"{name}: σ of the surface")
-        out.append(save(ax, figures / "surface_sigma.png"))
+        out.append(save_figure(ax, figures / "surface_sigma.png"))
     return out

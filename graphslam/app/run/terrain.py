@@ -26,15 +26,15 @@ from graphslam.core.npz import floats, ints
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.evidence.shelved import load_shelved
+from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.io.submap_store import read_submaps
-from graphslam.maps.moving import MovedThings, moving_points
+from graphslam.maps.moving import MovedObjects, moving_points
 from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
 from graphslam.maps.terrain.plan import cost_map, save_cost_map
 from graphslam.maps.terrain.pyramid import ClassGrid, TerrainClass, TerrainMap
-from graphslam.maps.terrain.tables import Tables, read_tables
+from graphslam.maps.terrain.tables import TerrainWeights, read_tables
 from graphslam.maps.terrain.vehicle import LineSensor, Vehicle
 
 FORMAT = "graphslam.terrain/1"
@@ -112,7 +112,7 @@ def terrain_of_run(
     stream: str | None = None,
     vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
-    tables: Tables | None = None,
+    tables: TerrainWeights | None = None,
     progress: bool = True,
 ) -> RunTerrain:
     """Read the log of a run once more, along its solved path.
@@ -128,7 +128,7 @@ def terrain_of_run(
     sensor_height : float, optional
         Of the scanner above the ground [m]; default found from the ground in its scans. A line laser needs it: its base
         is taken to drive on the ground.
-    tables : Tables, optional
+    tables : TerrainWeights, optional
         Default those of the package.
     """
     name, scans = scans_of_run(run, log, stream, what="terrain")
@@ -169,7 +169,7 @@ def read_terrain(
     stream: str = "scans",
     vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
-    tables: Tables | None = None,
+    tables: TerrainWeights | None = None,
     progress: bool = True,
 ) -> RunTerrain:
     """Terrain of scans along a path, a piece for each node.
@@ -211,7 +211,7 @@ def read_terrain(
     nodes = np.unique(owner)
     turns = None
     if isinstance(scans, PointClouds):
-        places = {k: MovedThings(np.asarray(se3.se3_transform(turn, p))) for k, p in (moved or {}).items()}
+        places = {k: MovedObjects(np.asarray(se3.se3_transform(turn, p))) for k, p in (moved or {}).items()}
         # the scan at a node is in the submap that ends there
         ends = np.searchsorted(node_times, scans.times[at], side="left") - 1
         gone = [places.get(k) for k in np.maximum(ends, 0).tolist()]
@@ -268,7 +268,7 @@ def _moved(run: Run) -> dict[int, Array]:
     """Points of things that moved, in the world, by node of a run whose submaps have grids and clouds."""
     if run.folder is None or not any(s.cloud is not None for s in run.submaps):
         return {}
-    submaps = read_submaps(run.folder, load_grid=load_shelved)
+    submaps = read_submaps(run.folder, load_grid=load_spilled)
     bases = np.asarray(run.map.node_poses)[: len(submaps)]
     return {
         k: np.asarray(se3.se3_transform(bases[k], s.cloud.points[mask]))
@@ -290,7 +290,7 @@ class _Turns:
         Of the scanner above the ground, about [m].
     look : bool
         Find it in the scans themselves.
-    gone : list of k MovedThings or None
+    gone : list of k MovedObjects or None
         What moved while each scan was made, in the level frame.
     """
 
@@ -301,7 +301,7 @@ class _Turns:
         level: Trajectory,
         height: float,
         look: bool,
-        gone: Sequence[MovedThings | None],
+        gone: Sequence[MovedObjects | None],
     ) -> None:
         self.scans, self.level, self.height, self.look, self.gone = scans, level, height, look, gone
         self.coming = deque(at.tolist())
@@ -388,10 +388,10 @@ def write_terrain(folder: OutputFiles, made: RunTerrain, *, generation: str | No
 
 def draw_terrain(made: RunTerrain, figures: Path, *, name: str) -> list[Path]:
     """Pictures of the classes, and in green, red and white."""
-    from graphslam.plots.save import save
+    from graphslam.plots.save import save_figure
     from graphslam.plots.terrain import plot_terrain
 
     path = made.path[:, :2]
-    out = [save(plot_terrain(made.map, path=path, title=f"{name}: terrain"), figures / "terrain.png")]
+    out = [save_figure(plot_terrain(made.map, path=path, title=f"{name}: terrain"), figures / "terrain.png")]
     ax = plot_terrain(made.map, plain=True, title=f"{name}: free, hazard, unknown")
-    return [*out, save(ax, figures / "terrain_plain.png")]
+    return [*out, save_figure(ax, figures / "terrain_plain.png")]

@@ -2,8 +2,8 @@
 
 "Reported" means: a line here, of the form ``subject: value [bounds] — meaning`` and, where something is to be done,
 one imperative sentence. The command line prints the lines, ``--json`` and ``run.json`` hold them, the report
-shows them. What follows from the stored figures is worked out anew wherever it is shown (:func:`stated`); what only the
-run itself saw (:func:`observed`) is read from ``run.json``.
+shows them. What follows from the stored figures is worked out anew wherever it is shown
+(:func:`findings_from_metrics`); what only the run itself saw (:func:`findings_from_run`) is read from ``run.json``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,17 @@ from typing import Any
 from graphslam.app.run.stream_use import StreamUse
 from graphslam.core.findings import Finding, Level, findings_of_json
 from graphslam.core.submap import Submap
+from graphslam.evaluate.covariance_assessment import (
+    LEVEL,
+    MAX_NONLINEARITY,
+    ConsistencyTest,
+    CovarianceAssessment,
+    assess_covariances,
+    tests_of_json,
+)
 from graphslam.evaluate.intervals import by_chance, two_sided_width
-from graphslam.evaluate.stream_checks import Noticed
-from graphslam.evaluate.trust import BENT, LEVEL, Evidence, Trust, rows_of_json, trust
-from graphslam.evaluate.without_truth import LASTING, two_sided
+from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
+from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.maps.contradictions import LOOK
 
 TWO_MAPS_DO = "check which of the two is right there, or add GPS there and run again"
@@ -58,7 +65,7 @@ MOSTLY = 0.95
 
 
 @dataclass(frozen=True)
-class Figures:
+class RunMetrics:
     """What the figures of a finished run are read from, in memory or from its folder.
 
     Parameters
@@ -81,15 +88,17 @@ class Figures:
         return found if isinstance(found, Mapping) else {}
 
 
-def verdict(figures: Figures) -> list[Finding]:
+def run_findings(figures: RunMetrics) -> list[Finding]:
     """All lines of a finished run.
 
     Lines that the run saw itself are those of ``report["verdict"]`` that do not follow from the figures.
     """
-    return stated(figures) + [f for f in findings_of_json(figures.report.get("verdict")) if f.code not in _STATED]
+    return findings_from_metrics(figures) + [
+        f for f in findings_of_json(figures.report.get("verdict")) if f.code not in _STATED
+    ]
 
 
-def stated(figures: Figures) -> list[Finding]:
+def findings_from_metrics(figures: RunMetrics) -> list[Finding]:
     """Lines that follow from the stored figures."""
     return [
         _state(figures),
@@ -124,9 +133,9 @@ _STATED = frozenset(
 )
 
 
-def observed(
+def findings_from_run(
     streams: Sequence[StreamUse],
-    noticed: Sequence[Noticed] = (),
+    noticed: Sequence[StreamFinding] = (),
     submaps: Sequence[Submap] = (),
     events: Sequence[Mapping[str, Any]] = (),
 ) -> list[Finding]:
@@ -134,7 +143,7 @@ def observed(
 
     Parameters
     ----------
-    noticed : sequence of Noticed
+    noticed : sequence of StreamFinding
         Of the raw streams; what is bad in one that was not used is only worth a look.
     submaps : sequence of Submap
         Their reports may hold ``findings``: rows of :meth:`Finding.as_row`, of the run as a whole or of the submap.
@@ -218,7 +227,7 @@ def _fix_errors(e: Mapping[str, Any]) -> Finding:
     return Finding("look", "gps-correlated" if e.get("bias_sigma") else "gps-errors", text.strip())
 
 
-def class_rows(figures: Figures) -> list[dict[str, Any]]:
+def class_rows(figures: RunMetrics) -> list[dict[str, Any]]:
     """χ² of each class of factors with its bounds: from the report, or as far as metrics of older runs hold it."""
     found = figures.part("graph").get("classes")
     if isinstance(found, list):
@@ -232,20 +241,22 @@ def class_rows(figures: Figures) -> list[dict[str, Any]]:
         dof = m.get(f"{stem}_dof", math.nan)
         row = {"class": stem.removeprefix("honesty_"), "dof": dof, "chi2": ratio * dof, "chi2_per_dof": ratio}
         if dof > 0:
-            row["low"], row["high"], row["verdict"] = two_sided(ratio, dof, CONFIDENCE)
+            row["low"], row["high"], row["verdict"] = two_sided_bounds(ratio, dof, CONFIDENCE)
         out.append(row | {"mean_weight": m.get(f"{stem}_mean_weight")})
     return out
 
 
-def whole_chi2(figures: Figures) -> tuple[float, float] | None:
+def whole_chi2(figures: RunMetrics) -> tuple[float, float] | None:
     """χ² and degrees of freedom of all classes that have any; None where that is not known."""
-    rows = [r for r in class_rows(figures) if number(r.get("dof")) and number(r.get("chi2_per_dof"))]
+    rows = [
+        r for r in class_rows(figures) if is_finite_number(r.get("dof")) and is_finite_number(r.get("chi2_per_dof"))
+    ]
     dof = sum(float(r["dof"]) for r in rows)
-    return (sum(float(r["chi2"]) for r in rows if number(r.get("chi2"))), dof) if dof > 0 else None
+    return (sum(float(r["chi2"]) for r in rows if is_finite_number(r.get("chi2"))), dof) if dof > 0 else None
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class ChiSquareTest:
     """A ratio that is 1 where covariances are consistent, and its bounds.
 
     Parameters
@@ -266,57 +277,57 @@ class Judged:
     @property
     def said(self) -> str:
         """``consistent``, ``over-confident`` or ``pessimistic``."""
-        return two_sided(self.ratio, self.dof, CONFIDENCE)[2]
+        return two_sided_bounds(self.ratio, self.dof, CONFIDENCE)[2]
 
     @property
     def level(self) -> Level:
         """One consistent run in forty is outside on either side; bad is less likely than one in a thousand."""
         if self.said == "consistent":
             return "good"
-        return "bad" if self.ratio > two_sided(self.ratio, self.dof, CERTAIN)[1] else "look"
+        return "bad" if self.ratio > two_sided_bounds(self.ratio, self.dof, CERTAIN)[1] else "look"
 
     @property
     def text(self) -> str:
         """``1.02 per degree of freedom [0.94, 1.06; 4321 dof] — residuals match the noise model``."""
-        low, high, said = two_sided(self.ratio, self.dof, CONFIDENCE)
+        low, high, said = two_sided_bounds(self.ratio, self.dof, CONFIDENCE)
         meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[said]
         return f"{self.ratio:.3g} per degree of freedom [{low:.3g}, {high:.3g}; {self.dof:.4g} dof] — {meaning}"
 
 
-def judged_chi2(figures: Figures) -> Judged | None:
+def chi_square_test(figures: RunMetrics) -> ChiSquareTest | None:
     """χ² of the whole graph; None where nothing is redundant that could contradict, or that is not known."""
     found = whole_chi2(figures)
     if found is None or found[0] < EXACT * found[1]:
         return None
-    return Judged("chi2", "χ²/dof", found[0] / found[1], found[1])
+    return ChiSquareTest("chi2", "χ²/dof", found[0] / found[1], found[1])
 
 
-def of_the_start(figures: Figures, chi2: Judged) -> bool:
+def of_the_start(figures: RunMetrics, chi2: ChiSquareTest) -> bool:
     """Does it say of the start of a refined path only that its noise was stated too large?"""
     return bool(figures.part("refine")) and chi2.said == "pessimistic"
 
 
-def judged_nees(figures: Figures) -> list[Judged]:
+def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
     """NEES against the truth, where it is known, in each gauge in which it was taken."""
     m = dict(figures.metrics)
     gauges = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after alignment")]
     bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]
-    if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and number(m.get(k))]:
+    if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and is_finite_number(m.get(k))]:
         m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
         gauges += [(k, f"base of {k.removesuffix('_base_nees')} in the common frame") for k in bases]
     return [
-        Judged("nees", "NEES/dof", m[f"{key}_per_dof"], m[f"{key}_dof"], gauge)
+        ChiSquareTest("nees", "NEES/dof", m[f"{key}_per_dof"], m[f"{key}_dof"], gauge)
         for key, gauge in gauges
-        if number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0
+        if is_finite_number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0
     ]
 
 
-def number(value: Any) -> bool:
+def is_finite_number(value: Any) -> bool:
     """Is it a finite number?"""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _state(figures: Figures) -> Finding:
+def _state(figures: RunMetrics) -> Finding:
     m = figures.metrics
     converged = figures.report.get("converged", m.get("converged"))
     if converged is None:
@@ -336,8 +347,8 @@ def _state(figures: Figures) -> Finding:
     return Finding("good" if small else "look", "state", f"solution: {value} — converged; {text}.")
 
 
-def _chi2(figures: Figures) -> Finding:
-    if j := judged_chi2(figures):
+def _chi2(figures: RunMetrics) -> Finding:
+    if j := chi_square_test(figures):
         if of_the_start(figures, j):
             text = f"chi-square of the initial graph: {j.text}. The refined path does not depend on it."
             return Finding("", "chi2", text)
@@ -349,26 +360,26 @@ def _chi2(figures: Figures) -> Finding:
     return Finding("", "chi2", text)
 
 
-def _said(row: Evidence) -> str:
+def _said(row: ConsistencyTest) -> str:
     """One test with its value."""
     if row.lasting and row.dof == 1.0:
         return f"{row.name} ({row.value:.1f} σ)"
     return f"{row.name} ({row.value:.3g} at {row.dof:.3g} degrees of freedom)"
 
 
-def judged_trust(figures: Figures) -> Trust | None:
+def covariance_assessment(figures: RunMetrics) -> CovarianceAssessment | None:
     """Are the covariances consistent, by the tests that need no ground truth? None in folders without their results."""
     if figures.report.get("evidence") is None:
         return None
-    rows = rows_of_json(figures.report.get("evidence"))
+    rows = tests_of_json(figures.report.get("evidence"))
     fixes = any(r.of == "fixes" for r in rows) or any(c.get("class") == "gps" for c in class_rows(figures))
     bend: Any = figures.report.get("nonlinearity")
-    return trust(rows, fixes=fixes, nonlinearity=float(bend) if number(bend) else 0.0)
+    return assess_covariances(rows, fixes=fixes, nonlinearity=float(bend) if is_finite_number(bend) else 0.0)
 
 
-def _trust(figures: Figures) -> list[Finding]:
+def _trust(figures: RunMetrics) -> list[Finding]:
     """Are the covariances consistent? The line names the tests; none of them uses ground truth."""
-    found = judged_trust(figures)
+    found = covariance_assessment(figures)
     if found is None:
         return []
     said = "; ".join(_said(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
@@ -387,7 +398,7 @@ def _trust(figures: Figures) -> list[Finding]:
         if found.bent:
             causes.append(
                 "bearing noise is much larger than range noise, so submap posteriors are not Gaussian "
-                f"(nonlinearity {figures.report['nonlinearity']:.2g} [< {BENT:g}])"
+                f"(nonlinearity {figures.report['nonlinearity']:.2g} [< {MAX_NONLINEARITY:g}])"
             )
         text = f"covariances: {'not tested' if found.missing else 'undecided'} — {'; '.join(causes)}.{held}"
         if figures.part("refine"):
@@ -402,20 +413,20 @@ def _trust(figures: Figures) -> list[Finding]:
     return [Finding("good", "trust", text)]
 
 
-def _nees(figures: Figures) -> list[Finding]:
-    said = [(j, f"NEES ({j.about}): {j.text}. One run is one sample.") for j in judged_nees(figures)]
+def _nees(figures: RunMetrics) -> list[Finding]:
+    said = [(j, f"NEES ({j.about}): {j.text}. One run is one sample.") for j in nees_tests(figures)]
     none = "NEES: not tested — no ground truth for this result."
     return [Finding(j.level, "nees", text) for j, text in said] or [Finding("", "nees", none)]
 
 
-def _tests(figures: Figures) -> list[Finding]:
+def _tests(figures: RunMetrics) -> list[Finding]:
     """Failed tests without ground truth; those that a run passes are in the metrics."""
     out: list[Finding] = []
 
     def judge(what: str, value: Any, dof: Any, cause: str) -> None:
-        if not (number(value) and number(dof) and dof > 0):
+        if not (is_finite_number(value) and is_finite_number(dof) and dof > 0):
             return
-        high = two_sided(float(value), float(dof), CERTAIN)[1]
+        high = two_sided_bounds(float(value), float(dof), CERTAIN)[1]
         if value > high:
             bounds = f"[≤ {high:.3g} in 999 of 1000 consistent runs]"
             out.append(Finding("bad", "consistency-test", f"{what}: {value:.3g} {bounds} — {cause}"))
@@ -423,7 +434,11 @@ def _tests(figures: Figures) -> list[Finding]:
     for row in class_rows(figures):
         cause = "these measurements contradict the others, or their assumed noise is too small."
         last = row.get("correlation_time")
-        dof = float(row["dof"]) / (float(last or 1.0) if number(last) else 1.0) if number(row.get("dof")) else None
+        dof = (
+            float(row["dof"]) / (float(last or 1.0) if is_finite_number(last) else 1.0)
+            if is_finite_number(row.get("dof"))
+            else None
+        )
         judge(f"χ²/dof of factors “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
         # a refined path holds fixes; the other factors of the graph were its start
         if row.get("verdict") == LASTING and (row.get("class") == "gps" or not figures.part("refine")):
@@ -465,7 +480,7 @@ def _lasting(row: Mapping[str, Any]) -> Finding:
     return Finding("look", "correlated", f"{text}. Add these errors to the noise model.")
 
 
-def _certificate(figures: Figures) -> Finding:
+def _certificate(figures: RunMetrics) -> Finding:
     found = figures.report.get("certificate")
     if found is None:
         text = "global optimum: not tested — no certificate was requested."
@@ -474,13 +489,13 @@ def _certificate(figures: Figures) -> Finding:
     return Finding("good" if text.startswith("certified") else "look", "certificate", f"global optimum: {text}")
 
 
-def _flagged(figures: Figures) -> list[Finding]:
+def _flagged(figures: RunMetrics) -> list[Finding]:
     """Submaps that the front end flags; consistent ones are flagged now and then, by chance."""
     counts = figures.part("flagged_submaps")
     flagged, n = counts.get("any", 0), figures.metrics.get("submaps", 0.0)
-    if not (number(flagged) and flagged):
+    if not (is_finite_number(flagged) and flagged):
         return []
-    why = ", ".join(f"{v:g} for {k}" for k, v in counts.items() if k != "any" and number(v))
+    why = ", ".join(f"{v:g} for {k}" for k, v in counts.items() if k != "any" and is_finite_number(v))
     text = f"submaps flagged by the front end: {flagged:g} of {n:g} ({why})"
     usual = by_chance(int(n), FLAGGED, CERTAIN)
     if flagged <= usual:
@@ -552,7 +567,7 @@ def _listed(loops: Sequence[int]) -> str:
     return f"loop{'s' * (len(loops) != 1)} {shown}" if loops else "none of these loops"
 
 
-def _left_out(figures: Figures) -> list[Finding]:
+def _left_out(figures: RunMetrics) -> list[Finding]:
     out: list[Finding] = []
     if figures.report.get("map_left_out"):
         out.append(Finding("look", "map-left-out", f"fused map: not made — {figures.report['map_left_out']}"))

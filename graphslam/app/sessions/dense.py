@@ -8,39 +8,39 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.folders.generations import consistent
+from graphslam.app.folders.generations import read_consistently
 from graphslam.app.run.files import read_options, read_report
 from graphslam.app.run.outputs import refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.backend.config import BackEndConfig, GpsOptions
-from graphslam.backend.sessions import DenseSession, InnerTie, ties_of_graph, ties_of_network
-from graphslam.core.config import build
+from graphslam.backend.sessions import DenseSession, IntraSessionLoop, loops_of_graph, loops_of_network
+from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
 from graphslam.core.network import PoseNetwork
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evidence.shelved import load_shelved
-from graphslam.evidence.views import has_view
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.evidence.spilled_grid import load_spilled
+from graphslam.evidence.views import has_dense_view
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
-from graphslam.loops.session_ties import SessionMap
+from graphslam.loops.inter_session_loops import SessionMap
 
 SPACING = 3.0
 """Of the nodes of a run that has none inside its submaps [m]: places to be tied are needed."""
 
 
-def is_dense(run: Run) -> bool:
+def run_is_dense(run: Run) -> bool:
     """Whether the submaps of a run are without landmarks."""
     return bool(run.submaps) and all(s.landmarks is None for s in run.submaps)
 
 
-def with_maps(run: Run) -> list[Submap]:
+def submaps_with_maps(run: Run) -> list[Submap]:
     """The submaps of a run with their dense maps, along its refined path where it has one."""
     submaps = refined_submaps_of(run) or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
-        submaps = read_submaps(run.folder, load_grid=load_shelved)
-    without = [s.key for s in submaps if not has_view(s)]
+        submaps = read_submaps(run.folder, load_grid=load_spilled)
+    without = [s.key for s in submaps if not has_dense_view(s)]
     if without:
         raise DataError(f"submaps {without} have no map", where=run.name, wanted="evidence grids or clouds")
     return submaps
@@ -60,7 +60,7 @@ def _options(run: Run, part: str, kind: Any) -> Any:
         values = read_options(file.parent).get(part)
     if values is None:
         raise DataError(f"a run does not say its {part} options", where=run.name, wanted="a finished run")
-    return build(kind, {k: v for k, v in values.items() if v is not None}, part)
+    return build_config(kind, {k: v for k, v in values.items() if v is not None}, part)
 
 
 def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.inf) -> DenseSession:
@@ -73,7 +73,7 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
     begin = run.submaps[0].interval[0]
     shift = 0.0 if begin > after else float(np.ceil(after - begin) + 1000.0)
     keys = {s.key: first_key + k for k, s in enumerate(run.submaps)}
-    found = with_maps(run)
+    found = submaps_with_maps(run)
     refined = all(s.report.get("refined") is True for s in found)
     submaps = [_in_common(s, keys, name, shift) for s in found]
     inner = [] if refined else _inner(run, config)
@@ -94,19 +94,19 @@ def _in_common(s: Submap, keys: dict[int, int], name: str, shift: float) -> Subm
     return replace(s.of_session(name), key=keys[s.key], interval=(a + shift, b + shift), trajectory=moved, matches=())
 
 
-def _inner(run: Run, config: BackEndConfig) -> list[InnerTie]:
+def _inner(run: Run, config: BackEndConfig) -> list[IntraSessionLoop]:
     """Factors of a run's graph beside the chain: of the graph itself, or of its file."""
     if _options(run, "backend", BackEndConfig).node_spacing != config.node_spacing:
         raise DataError(
             "a run whose submaps have no inner nodes cannot be tied", where=run.name, wanted="backend.node_spacing > 0"
         )
     if run.holds("graph") and run.graph is not None:
-        return ties_of_graph(run.graph)
-    net = None if run.folder is None else consistent(run.folder, lambda root: _graph_of(run, root))
+        return loops_of_graph(run.graph)
+    net = None if run.folder is None else read_consistently(run.folder, lambda root: _graph_of(run, root))
     if net is None:
         raise DataError("a run does not say how its submaps hang together", where=run.name, wanted="its graph.g2o")
-    kernel = NO_KERNEL if config.match_robust == "none" else Robust(config.match_robust, config.match_width)
-    return ties_of_network(net, kernel)
+    kernel = NO_KERNEL if config.match_robust == "none" else RobustKernel(config.match_robust, config.match_width)
+    return loops_of_network(net, kernel)
 
 
 def _graph_of(run: Run, root: Path) -> PoseNetwork | None:

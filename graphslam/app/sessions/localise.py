@@ -10,35 +10,35 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.app.folders.generations import outputs
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import RENAMED, make_front_end
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import load_log_source
-from graphslam.app.sessions.dense import back_end_config, is_dense, session_of, with_maps
-from graphslam.backend.sessions import DenseSession, attach, put
+from graphslam.app.sessions.dense import back_end_config, run_is_dense, session_of, submaps_with_maps
+from graphslam.backend.sessions import DenseSession, add_session, connect_session
 from graphslam.core.errors import DataError, MissingDataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
+from graphslam.loops.inter_session_loops import InterSessionConfig, InterSessionLoops, SessionMap, TwoSessions
 from graphslam.loops.measure import Loop
-from graphslam.loops.session_ties import SessionMap, TieConfig, Ties, TwoSessions
 from graphslam.solve.registry import make_solver
 
 
 @dataclass(frozen=True, slots=True)
-class Localisation:
+class LocalisationResult:
     """Where something lies in a saved map, or why that is not known.
 
     Parameters
     ----------
     why : str
         Why nothing is known; empty if it was found.
-    ties : Ties
+    ties : InterSessionLoops
         Every place that was tried, and what came of it.
     used : list of Loop
         Ties that the pose rests on.
@@ -50,7 +50,7 @@ class Localisation:
     """
 
     why: str
-    ties: Ties
+    ties: InterSessionLoops
     used: list[Loop]
     T_map_base: Array | None = None
     covariance: Array | None = None
@@ -78,10 +78,10 @@ def localise(
     run: Run | str | Path,
     source: Submap | Sequence[Submap] | SensorLog,
     *,
-    config: TieConfig | None = None,
+    config: InterSessionConfig | None = None,
     solver: str = "batch",
     progress: bool = False,
-) -> Localisation:
+) -> LocalisationResult:
     """Find a submap, a chain of them, or a stretch of a log in the map of a finished run.
 
     Nothing is assumed of where it may lie. Places of the map that look like places of it are registered; the pose is
@@ -93,14 +93,14 @@ def localise(
         Of dense submaps.
     source : Submap, sequence of Submap, or SensorLog
         A log goes through the front end of the run, with its options: slice it to the stretch that is to be found.
-    config : TieConfig, optional
+    config : InterSessionConfig, optional
     solver : str
     progress : bool
         Show progress bars on stderr.
 
     Returns
     -------
-    Localisation
+    LocalisationResult
         ``T_map_base`` ``(3,)`` or ``(7,)`` in the frame of the run's map, its covariance (right tangent), and ``why``
         nothing was found.
 
@@ -117,15 +117,15 @@ def localise(
     >>> found.T_map_base is None or found.T_map_base.shape == (7,)  # found.why says what was missing
     True
     """
-    opened = run if isinstance(run, Run) else open_run(run)
-    if not is_dense(opened):
+    opened = run if isinstance(run, Run) else read_run_folder(run)
+    if not run_is_dense(opened):
         raise DataError("only maps of dense submaps are localised in", where=opened.name, wanted="dense submaps")
     with one_blas_thread():
         if isinstance(source, SensorLog):
-            submaps = window_submaps(opened, source)
+            submaps = submaps_of_stretch(opened, source)
         else:
             submaps = [source] if isinstance(source, Submap) else list(source)
-        return _localise(opened, submaps, config or TieConfig(), solver, progress)
+        return _localise(opened, submaps, config or InterSessionConfig(), solver, progress)
 
 
 def source_of(
@@ -148,15 +148,15 @@ def source_of(
         Of a log [s].
     """
     path = Path(source)
-    if (outputs(path) / "run.json").is_file():
-        run = open_run(path)
+    if (current_outputs(path) / "run.json").is_file():
+        run = read_run_folder(path)
         known = [s.key for s in run.submaps]
         rows = [known.index(k) for k in keys if k in known]
         if len(rows) != len(keys) or any(b != a + 1 for a, b in pairwise(rows)):
             raise DataError(
                 "submaps do not follow one another in this run", where=str(path), got=list(keys), wanted=known
             )
-        submaps = with_maps(run)
+        submaps = submaps_with_maps(run)
         return submaps if not rows else [submaps[k] for k in rows]
     log = load_log_source(source, reader=reader, **(reader_options or {}))
     a, b = log.interval
@@ -166,7 +166,7 @@ def source_of(
     return part
 
 
-def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
+def submaps_of_stretch(run: Run, log: SensorLog) -> list[Submap]:
     """Submaps that the front end of a run makes of a log, with the options of the run."""
     folder = None if run.folder is None else Path(run.folder) / "config.toml"
     if folder is None or not folder.is_file():
@@ -181,25 +181,27 @@ def window_submaps(run: Run, log: SensorLog) -> list[Submap]:
     return submaps
 
 
-def _localise(run: Run, submaps: list[Submap], config: TieConfig, solver_name: str, progress: bool) -> Localisation:
+def _localise(
+    run: Run, submaps: list[Submap], config: InterSessionConfig, solver_name: str, progress: bool
+) -> LocalisationResult:
     known = session_of(run, "map")
     new = _query(run, known, submaps)
     two = TwoSessions(known.map, new.map)
     ties = two.find(config, progress=progress)
     if ties.why:
-        return Localisation(ties.why, ties, [])
+        return LocalisationResult(ties.why, ties, [])
     graph = PoseGraph(known.submaps[0].dim)
     solver = make_solver(solver_name, graph)
-    put(graph, known)
+    add_session(graph, known)
     solver.solve_to_optimum()
     try:
-        at = attach(graph, solver, known, 0, new, config=config, found=(two, ties), progress=progress)
+        at = connect_session(graph, solver, known, 0, new, config=config, found=(two, ties), progress=progress)
     except SolverError as error:
-        return Localisation(str(error), ties, [])
+        return LocalisationResult(str(error), ties, [])
     end = graph.submaps[-1].exit_node
     P = graph.covariance()
     poses = graph.values.poses
-    return Localisation(
+    return LocalisationResult(
         "", ties, at.used, poses[at.first_node].copy(), P.marginal(f"x{at.first_node}"),
         poses[end].copy(), P.marginal(f"x{end}"),
     )  # fmt: skip

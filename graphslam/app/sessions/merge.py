@@ -14,14 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.run import Run
-from graphslam.app.sessions.dense import is_dense
-from graphslam.app.sessions.merge_align import By, align_runs, of_session
+from graphslam.app.sessions.dense import run_is_dense
+from graphslam.app.sessions.merge_align import By, align_runs, submap_of_session
 from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
 from graphslam.app.sessions.merge_metrics import merge_metrics
 from graphslam.app.sessions.merged_map import MergedMap, Session
-from graphslam.association.identity import doubtful_identities
+from graphslam.association.identity import find_association_outliers
 from graphslam.association.merging import mahalanobis_merges
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
@@ -101,7 +101,7 @@ def merge(
     >>> merged.metrics["key"].size > 0
     True
     """
-    opened = [r if isinstance(r, Run) else open_run(r) for r in runs]
+    opened = [r if isinstance(r, Run) else read_run_folder(r) for r in runs]
     if len(opened) < 2:
         raise ConfigError(f"{len(opened)} runs to merge; wanted at least two")
     if surface is not None and (out is None or colour not in SESSION_COLOURS):
@@ -124,7 +124,7 @@ def merge(
 
 def _merged(opened: list[Run], by: By, solver: str, gate: float, tolerance: float) -> MergedMap | MergedSubmaps:
     with one_blas_thread():
-        if all(is_dense(r) for r in opened):
+        if all(run_is_dense(r) for r in opened):
             return merge_dense(opened, _names(opened), by=cast(Any, by), solver=solver)
         if by not in ("auto", "identity", "constellation"):
             raise ConfigError(f"by = {by!r}; known: auto, identity, constellation")
@@ -161,7 +161,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
         scale = float(runs[r].report.get("covariance_scale", 1.0))
         submaps = list(runs[r].submaps)
         for s in submaps if scale == 1.0 else scale_covariances(submaps, scale):
-            graph.add_submap(of_session(s, next_key, names[r], renamed[r]))
+            graph.add_submap(submap_of_session(s, next_key, names[r], renamed[r]))
             keys[r] = (*keys.get(r, ()), next_key)
             next_key += 1
     solver = make_solver(solver_name, graph)
@@ -174,7 +174,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
             fused += len(pairs)
             solver.solve_to_optimum()
     split = 0
-    while gate > 0 and split < 10 * next_key and (doubts := doubtful_identities(graph, gate)):
+    while gate > 0 and split < 10 * next_key and (doubts := find_association_outliers(graph, gate)):
         graph.split_landmark(doubts[0].factor_id, doubts[0].entry)
         solver.solve_to_optimum()
         split += 1

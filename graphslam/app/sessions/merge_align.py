@@ -114,7 +114,7 @@ def align_runs(
     return order, alignments, renamed
 
 
-def of_session(submap: Submap, key: int, session: str, renamed: dict[int, int]) -> Submap:
+def submap_of_session(submap: Submap, key: int, session: str, renamed: dict[int, int]) -> Submap:
     """The submap with its key and landmark ids in the common graph; its streams are those of its own robot."""
     s = replace(submap.of_session(session), key=key)
     if s.landmarks is None:

@@ -13,7 +13,14 @@ import pandas as pd
 
 from graphslam.app.run.run import Run, metric_value
 from graphslam.app.sessions.dense import session_of
-from graphslam.backend.sessions import SESSION, Attached, DenseSession, attach, attach_by_gps, put
+from graphslam.backend.sessions import (
+    SESSION,
+    ConnectedSession,
+    DenseSession,
+    add_session,
+    connect_by_gps,
+    connect_session,
+)
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.plan_view import plan_path
@@ -22,7 +29,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import Metrics, base_metrics
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.loops.session_ties import TieConfig
+from graphslam.loops.inter_session_loops import InterSessionConfig
 from graphslam.plots.paths import plot_paths
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
@@ -39,7 +46,7 @@ class PlacedSession:
     ----------
     session : DenseSession
         Its submaps with the keys and the clock of the common graph.
-    attached : Attached or None
+    attached : ConnectedSession or None
         How it hangs on another session; None for the one whose first base is fixed.
     trajectory : Trajectory
         Its path in the common frame, on its own clock, with covariances.
@@ -51,7 +58,7 @@ class PlacedSession:
     run: Run
     session: DenseSession
     first_node: int
-    attached: Attached | None
+    attached: ConnectedSession | None
     trajectory: Trajectory
     T_world_base: Array
     covariance: Array
@@ -95,7 +102,7 @@ def merge_dense(
     *,
     by: By = "auto",
     solver: str = "batch",
-    config: TieConfig | None = None,
+    config: InterSessionConfig | None = None,
     progress: bool = False,
 ) -> MergedSubmaps:
     """Merge runs of dense submaps into one graph, and solve it as one problem.
@@ -111,7 +118,7 @@ def merge_dense(
         Of the sessions, each once.
     by : {"auto", "places", "gps"}
         ``auto``: GPS where both have it, and then places that it brings together; else places.
-    config : TieConfig, optional
+    config : InterSessionConfig, optional
         When ties by places are believed.
     progress : bool
         Show progress bars on stderr.
@@ -130,10 +137,10 @@ def merge_dense(
         raise DataError("runs in the plane and in space cannot be merged", got=sorted(dims))
     graph = PoseGraph(dims.pop())
     solve = make_solver(solver, graph)
-    put(graph, sessions[0], use_gps=by != "places")
+    add_session(graph, sessions[0], use_gps=by != "places")
     solve.solve_to_optimum()
     first: dict[int, int] = {0: 0}
-    how: dict[int, Attached] = {}
+    how: dict[int, ConnectedSession] = {}
     waiting = list(range(1, len(sessions)))
     while waiting:
         errors: dict[int, list[str]] = {}
@@ -170,17 +177,23 @@ def _tie(
     known_node: int,
     new: DenseSession,
     by: By,
-    config: TieConfig | None,
+    config: InterSessionConfig | None,
     progress: bool,
-) -> Attached:
+) -> ConnectedSession:
     both = all(s.fixes is not None and s.T_gps_base is not None for s in (known, new))
     if by == "gps" or (by == "auto" and both):
-        return attach_by_gps(graph, solver, known, known_node, new, places=by == "auto", progress=progress)
-    return attach(graph, solver, known, known_node, new, config=config, use_gps=by == "auto", progress=progress)
+        return connect_by_gps(graph, solver, known, known_node, new, places=by == "auto", progress=progress)
+    return connect_session(
+        graph, solver, known, known_node, new, config=config, use_gps=by == "auto", progress=progress
+    )
 
 
 def _placed(
-    runs: Sequence[Run], sessions: list[DenseSession], first: dict[int, int], how: dict[int, Attached], s: Solution
+    runs: Sequence[Run],
+    sessions: list[DenseSession],
+    first: dict[int, int],
+    how: dict[int, ConnectedSession],
+    s: Solution,
 ) -> list[PlacedSession]:
     P, out = s.node_covariances(), []
     for k, (run, session) in enumerate(zip(runs, sessions)):

@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array, se2_transform
 from graphslam.evaluate.gauge import aligned_nees, gauge_directions
 from graphslam.evaluate.map_error import landmark_error, match_ids
 from graphslam.evaluate.metrics import Metrics, add_nees, rms
-from graphslam.evaluate.trajectory_error import associate
+from graphslam.evaluate.trajectory_error import match_stamps
 from graphslam.solve.solution import Solution
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def _score(
             frames = landmark_error(truth.landmark_ids, truth.landmarks, true_ids, true_points, gauge="rigid")
         except DataError:
             continue
-        a, b = associate(path.times, s.map.trajectory.times)
+        a, b = match_stamps(path.times, s.map.trajectory.times)
         if len(a) == 0:
             continue
         where = se2_transform(fit.T_truth_estimate, s.map.trajectory.positions[b])

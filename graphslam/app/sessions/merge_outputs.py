@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from graphslam.app.folders.generations import Generation, is_empty, new_generation, outputs
-from graphslam.app.folders.lock import locked, make_folder
-from graphslam.app.report.report import report_beside
+from graphslam.app.folders.generations import FolderTransaction, current_outputs, is_empty, new_generation
+from graphslam.app.folders.lock import lock_folder, make_folder
+from graphslam.app.report.report import add_report
 from graphslam.app.run.files import MERGED_DENSE_FORMAT, MERGED_FORMAT
-from graphslam.app.run.outputs import graph_facts, landmarks_csv
+from graphslam.app.run.outputs import graph_metrics, landmarks_csv
 from graphslam.app.run.surface import RunSurface, draw_surface, write_surface
 from graphslam.app.sessions.merge_dense import MergedSubmaps
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.atomic import write_npz
 from graphslam.core.errors import RunFolderError
-from graphslam.evaluate.without_truth import class_consistency
+from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.io.tum import write_tum
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 
 MOST_STATES = 6000
 """Of a graph with more free scalars χ² is not told by class: that takes dense matrices where kernels are at work."""
@@ -45,11 +45,11 @@ def merged_folder(path: str | Path, *, anew: bool = False) -> Iterator[Path]:
     folder = make_folder(path)
 
     def check() -> None:
-        if not (anew and (outputs(folder) / "merge.json").is_file()) and not is_empty(folder):
+        if not (anew and (current_outputs(folder) / "merge.json").is_file()) and not is_empty(folder):
             raise RunFolderError(f"{folder}: not empty; choose another --out")
 
     check()  # before a lock is put into somebody's folder
-    with locked(folder):
+    with lock_folder(folder):
         check()
         yield folder
 
@@ -73,7 +73,7 @@ def write_merged(
         _finish(new, merged)
 
 
-def _write_landmarks(folder: Generation, merged: MergedMap) -> None:
+def _write_landmarks(folder: FolderTransaction, merged: MergedMap) -> None:
     path = folder.path
     for s in merged.sessions:
         write_tum(path / f"trajectory_{s.name}.tum", s.map.trajectory)
@@ -94,7 +94,7 @@ def _write_landmarks(folder: Generation, merged: MergedMap) -> None:
     )
 
 
-def _write_dense(folder: Generation, merged: MergedSubmaps) -> None:
+def _write_dense(folder: FolderTransaction, merged: MergedSubmaps) -> None:
     path = folder.path
     for s in merged.sessions:
         write_tum(path / f"trajectory_{s.name}.tum", s.trajectory)
@@ -115,15 +115,15 @@ def _write_dense(folder: Generation, merged: MergedSubmaps) -> None:
     )
 
 
-def _finish(folder: Generation, merged: MergedMap | MergedSubmaps) -> None:
+def _finish(folder: FolderTransaction, merged: MergedMap | MergedSubmaps) -> None:
     """What both kinds of merged maps have."""
     folder.write_lines("events.jsonl", merged.graph.events)
     folder.write_json("metrics.json", merged.metrics.to_dict("records"))
-    save(merged.plot(), folder.figures / "map.png")
+    save_figure(merged.plot(), folder.figures / "map.png")
     folder.write_text("ledger.csv", merged.graph.ledger.table().to_csv(index=False))
     classes = class_consistency(merged.graph) if merged.solution.states <= MOST_STATES else {}
     report = dict(merged.report)
     seconds = float(report.pop("seconds"))
     folder.write_json("timings.json", [{"key": "seconds_merge", "value": seconds, "unit": "s", "direction": "lower"}])
-    folder.write_json("merge.json", {**report, "graph": graph_facts(merged.graph, classes)})
-    report_beside(folder)
+    folder.write_json("merge.json", {**report, "graph": graph_metrics(merged.graph, classes)})
+    add_report(folder)

@@ -10,7 +10,7 @@ import pandas as pd
 
 from graphslam.app.run.run import Run, metric_value
 from graphslam.core.geometry import Array
-from graphslam.core.markup import element, frame, join
+from graphslam.core.markup import html_element, html_frame, join_parts
 from graphslam.evaluate.gauge import gauge_directions, inner_covariance
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.places import Ints
@@ -89,4 +89,4 @@ class MergedMap:
         return f"MergedMap({len(self.sessions)} sessions, {len(self.landmarks)} landmarks, {shared} of them shared)"
 
     def _repr_html_(self) -> str:
-        return join([element("b", repr(self)), frame(self.metrics[["key", "value", "unit"]])])
+        return join_parts([html_element("b", repr(self)), html_frame(self.metrics[["key", "value", "unit"]])])

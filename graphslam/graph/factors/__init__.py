@@ -10,14 +10,14 @@ from graphslam.graph.factors.compass import CompassBatch, DeclinationBatch, Devi
 from graphslam.graph.factors.gps import BiasPriorBatch, GpsBatch
 from graphslam.graph.factors.imu.batch import ForceBatch, GyroBatch, ImuBatch, ImuBiasBatch
 from graphslam.graph.factors.landmark_submap import PathBatch, SubmapBatch
-from graphslam.graph.factors.lasting import LastingBatch
 from graphslam.graph.factors.odometer import OdometerBatch, OdometerPriorBatch
 from graphslam.graph.factors.pseudorange import ClockBatch, PseudorangeBatch, SatelliteBiasBatch
 from graphslam.graph.factors.range import BeaconRangeBatch, RangeBatch
+from graphslam.graph.factors.sensor_biases import SensorBiasBatch
 from graphslam.graph.factors.sighting import SightingBatch
 
 for _batch in (
-    *(SubmapBatch, PathBatch, LastingBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
+    *(SubmapBatch, PathBatch, SensorBiasBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
     *(ImuBatch, GyroBatch, ImuBiasBatch, ForceBatch),
     *(CompassBatch, DeclinationBatch, DeviationPriorBatch),
     *(RangeBatch, BeaconRangeBatch, SightingBatch),

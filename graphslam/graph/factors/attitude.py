@@ -22,7 +22,7 @@ import numpy as np
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.se3 import quat_rotate, quat_to_matrix, skew, so3_exp, so3_left_jacobian
 from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import gtsam_key
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -46,7 +46,7 @@ def without_tilt(covariance: Array) -> Array:
     return out
 
 
-def across(direction: ArrayLike) -> Array:
+def tangent_basis(direction: ArrayLike) -> Array:
     """Two orthonormal columns ``(..., 3, 2)`` across unit vectors ``(..., 3)``; for :data:`DOWN` the axes x and y."""
     d = np.asarray(direction, dtype=np.float64)
     axis = np.where(np.abs(d[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
@@ -73,7 +73,7 @@ def attitude_terms(poses: Array, tilt: Array, direction: Array) -> tuple[Array, 
     E, J_r = up_turn(tilt)
     conjugate = poses[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
     h = quat_rotate(conjugate, -E[:, 2])
-    Bt = np.swapaxes(across(direction), 1, 2)
+    Bt = np.swapaxes(tangent_basis(direction), 1, 2)
     J = np.zeros((len(poses), 2, 8))
     J[:, :, :3] = Bt @ skew(h)  # R Exp(δ): h → Exp(-δ) h = h + h × δ
     # u(τ + δ) = Exp(ω) Exp(J_r δ) e_z = u - Exp(ω) [e_z]× J_r δ, and h = -Rᵀ u
@@ -83,7 +83,7 @@ def attitude_terms(poses: Array, tilt: Array, direction: Array) -> tuple[Array, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeRecord:
-    """Where gravity points, seen from a node; see :mod:`graphslam.graph.attitude` for the residual.
+    """Where gravity points, seen from a node; see :mod:`graphslam.graph.factors.attitude` for the residual.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class AttitudeRecord:
     node: int
     direction: Array
     whitener: Array
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "attitude"
 
     @property
@@ -138,14 +138,14 @@ class AttitudeBatch(UniformBatch):
     def gtsam(cls, record: AttitudeRecord, origin: Array) -> gtsam.NonlinearFactor:
         """``W Bᵀ (-Rᵀ u(τ))`` in small matrices: the terms of the batch would cost ten times as much on one row."""
         names = record.variables()
-        pose, tilt = constant_or_read(names[0], origin), gtsam_key("tilt")
+        pose, tilt = node_rotation_position(names[0], origin), gtsam_key("tilt")
         free = [n for n in names if n != "x0"]
-        WB = record.whitener @ across(record.direction).T
+        WB = record.whitener @ tangent_basis(record.direction).T
         down = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # [e_z]×
 
         def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
             R, _ = pose(values)
-            E, J_r = turn_of(*values.atVector(tilt))
+            E, J_r = level_turn(*values.atVector(tilt))
             h = -(R.T @ E[:, 2])
             if H is not None:
                 if names[0] != "x0":
@@ -158,7 +158,7 @@ class AttitudeBatch(UniformBatch):
         return safe_factor(unit_noise(record), free, [6, 2][-len(free) :], 2, terms)
 
 
-def constant_or_read(name: str, origin: Array) -> Callable[[gtsam.Values], tuple[Array, Array]]:
+def node_rotation_position(name: str, origin: Array) -> Callable[[gtsam.Values], tuple[Array, Array]]:
     """Rotation matrix and position of a node; the fixed first base is a constant."""
     if name == "x0":
         constant = quat_to_matrix(origin[3:]), origin[:3]
@@ -177,7 +177,7 @@ def skew_of(v: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def turn_of(x: float, y: float) -> tuple[Array, Array]:
+def level_turn(x: float, y: float) -> tuple[Array, Array]:
     """``Exp([x, y, 0])`` and the first two columns of its right Jacobian ``I - a Ω + b Ω²`` (Rodrigues)."""
     t2 = x * x + y * y
     t = math.sqrt(t2)

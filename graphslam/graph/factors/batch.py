@@ -23,13 +23,13 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.se3 import matrix_to_quat, quat_normalize, quat_to_matrix
-from graphslam.graph.noise import NO_KERNEL, Robust, robust_terms
-from graphslam.graph.variables import KINDS, Layout, Values, gtsam_key, split_name
+from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms
+from graphslam.graph.variables import KINDS, Values, VariableLayout, gtsam_key, split_name
 
 Index = npt.NDArray[np.int64]
 
 
-class Record(Protocol):
+class FactorRecord(Protocol):
     """The facts of one factor: plain arrays, enough to make it again.
 
     Solvers never keep the only copy of anything: GTSAM's incremental solver is lost after a failed update, so whatever
@@ -60,7 +60,7 @@ class Record(Protocol):
         ...
 
 
-def offsets(lengths: Sequence[int] | Index) -> Index:
+def block_offsets(lengths: Sequence[int] | Index) -> Index:
     """``[0, l_0, l_0 + l_1, …]``."""
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
 
@@ -109,7 +109,7 @@ class FactorBatch(ABC):
     first: Index
     width: Index
 
-    def __init__(self, records: Sequence[Any], layout: Layout) -> None:
+    def __init__(self, records: Sequence[Any], layout: VariableLayout) -> None:
         self.records = records
         self.layout = layout
         kernels = [getattr(r, "robust", NO_KERNEL) for r in records]
@@ -176,7 +176,7 @@ class UniformBatch(FactorBatch):
 
     slots: ClassVar[tuple[str, ...]]
 
-    def __init__(self, records: Sequence[Any], layout: Layout) -> None:
+    def __init__(self, records: Sequence[Any], layout: VariableLayout) -> None:
         super().__init__(records, layout)
         keys = np.array([[-1 if k is None else k for k in self.keys(r)] for r in records], dtype=np.int64)
         rows = keys.reshape(-1, len(self.slots))
@@ -187,7 +187,9 @@ class UniformBatch(FactorBatch):
         self._fill(layout, rows, np.array([self.whitener(r) for r in records]).reshape(len(records), d, d))
 
     @classmethod
-    def _bare(cls, rows: Index, whiteners: Array, layout: Layout, group: str, record: Callable[[int], Any]) -> Self:
+    def _bare(
+        cls, rows: Index, whiteners: Array, layout: VariableLayout, group: str, record: Callable[[int], Any]
+    ) -> Self:
         """A batch from arrays, to which the kind adds its measurements; ``record`` makes a record for messages."""
         out = cls.__new__(cls)
         out.records, out.layout, out.group = LazyRecords(len(rows), record), layout, group
@@ -196,7 +198,7 @@ class UniformBatch(FactorBatch):
         out.__dict__["rows"] = np.full(len(rows), whiteners.shape[-1], dtype=np.int64)
         return out
 
-    def _fill(self, layout: Layout, rows: Index, whiteners: Array) -> None:
+    def _fill(self, layout: VariableLayout, rows: Index, whiteners: Array) -> None:
         """Columns and noise of factors whose variables stand in ``rows`` ``(k, slots)``."""
         self.dim, self._rows, self.whiteners = layout.dim, rows, whiteners
         widths = [KINDS[word].dof(layout.dim) for word in self.slots]
@@ -357,8 +359,8 @@ def read_value(values: gtsam.Values, name: str, key: int, dim: int) -> Array:
     return np.array(values.atVector(key))
 
 
-def with_kernel(base: Any, robust: Robust) -> Any:
-    """GTSAM noise model with the same kernel as :class:`~graphslam.graph.noise.Robust`."""
+def with_kernel(base: Any, robust: RobustKernel) -> Any:
+    """GTSAM noise model with the same kernel as :class:`~graphslam.graph.noise.RobustKernel`."""
     if robust.kind == "none":
         return base
     estimator = getattr(gtsam.noiseModel.mEstimator, robust.kind.capitalize())
@@ -402,7 +404,7 @@ def custom_factor(batch: type[UniformBatch], record: Any, origin: Array) -> gtsa
     one = _alone(batch, record, dim)
     names = [None if k is None else (w if KINDS[w].single else f"{w}{k}") for w, k in slots]
     widths = [KINDS[w].dof(dim) for w, _ in slots]
-    first = offsets(widths)
+    first = block_offsets(widths)
     free = [s for s, n in enumerate(names) if n is not None and n != "x0"]
     reads = [(s, names[s], gtsam_key(str(names[s]))) for s in free]
     blocks = [np.zeros((1, KINDS[w].size(dim))) for w in batch.slots]
@@ -426,4 +428,4 @@ def custom_factor(batch: type[UniformBatch], record: Any, origin: Array) -> gtsa
 
 def _alone(batch: type[UniformBatch], record: Any, dim: int) -> UniformBatch:
     """A batch of one factor whose columns nobody asks for."""
-    return batch([record], Layout(dim, tuple(0 for _ in KINDS), np.zeros(0, dtype=np.int64)))
+    return batch([record], VariableLayout(dim, tuple(0 for _ in KINDS), np.zeros(0, dtype=np.int64)))

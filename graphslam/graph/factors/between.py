@@ -22,7 +22,7 @@ from graphslam.graph.factors.batch import (
     shared_noise,
     with_kernel,
 )
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import gtsam_key
 
 
@@ -52,7 +52,7 @@ class BetweenRecord:
     j: int
     T_ij: Array
     whitener: Array
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "between"
 
     @property

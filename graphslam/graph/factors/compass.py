@@ -23,7 +23,7 @@ import numpy as np
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.graph.factors.batch import UniformBatch
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableKind, register_variable
 
 register_variable(
@@ -61,7 +61,7 @@ class CompassRecord:
     sigma: float
     compass: int = 0
     deviation: int | None = None
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "compass"
 
     @property

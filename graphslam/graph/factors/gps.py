@@ -29,11 +29,11 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array, rotation2
-from graphslam.core.poses import upright
+from graphslam.core.poses import level_poses
 from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, se3_transform, skew, so3_exp
-from graphslam.graph.factors.attitude import constant_or_read, skew_of, turn_of, up_turn
+from graphslam.graph.factors.attitude import level_turn, node_rotation_position, skew_of, up_turn
 from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
-from graphslam.graph.noise import NO_KERNEL, Robust, whitener
+from graphslam.graph.noise import NO_KERNEL, RobustKernel, whitener
 from graphslam.graph.variables import Values, gtsam_key
 
 Index = npt.NDArray[np.int64]
@@ -73,7 +73,7 @@ class GpsRecord:
     arm: Array
     z: Array
     whitener: Array
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     bias: int | None = None
     group: str = "gps"
     tilt: bool = False
@@ -248,7 +248,7 @@ def antenna_terms(
 
 def level_datum_pose(datum: Array, tilt: Array | None = None) -> Array:
     """``T_gps_world`` ``(7,)`` of a datum ``[x, y, z, heading]`` and of the tilt of the first base."""
-    pose = upright(datum[:3], datum[3])
+    pose = level_poses(datum[:3], datum[3])
     if tilt is not None:
         pose[3:] = quat_normalize(quat_multiply(pose[3:], so3_exp(-np.append(tilt, 0.0))))
     return pose
@@ -392,7 +392,7 @@ def _in_the_plane(names: list[str], record: GpsRecord, origin: Array) -> Terms:
 
 def _in_space(names: list[str], record: GpsRecord, origin: Array) -> Terms:
     """``W (arm - x⁻¹ Exp(τ) R_z(ψ)ᵀ (z - bias - t))`` in small matrices and scalars."""
-    pose = constant_or_read(names[0], origin)
+    pose = node_rotation_position(names[0], origin)
     datum = gtsam_key("datum")
     bias = None if record.bias is None else gtsam_key(f"bias{record.bias}")
     tilt = gtsam_key("tilt") if record.tilt else None
@@ -409,7 +409,7 @@ def _in_space(names: list[str], record: GpsRecord, origin: Array) -> Terms:
         w = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
         RtE = R.T
         if tilt is not None:
-            E, J_r = turn_of(*values.atVector(tilt))
+            E, J_r = level_turn(*values.atVector(tilt))
             RtE = RtE @ E
         q = RtE @ w - R.T @ t
         if H is not None:

@@ -18,10 +18,10 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.charts import arc_terms
+from graphslam.core.charts import inverse_left_jacobian_terms
 from graphslam.core.geometry import Array
-from graphslam.graph.factors.batch import FactorBatch, Index, offsets, safe_factor
-from graphslam.graph.variables import Layout, Values, gtsam_key
+from graphslam.graph.factors.batch import FactorBatch, Index, block_offsets, safe_factor
+from graphslam.graph.variables import Values, VariableLayout, gtsam_key
 
 _TWO_PI = 2.0 * math.pi
 CONSTANT = ("wheels", "sensor", "mount")
@@ -50,7 +50,7 @@ class SubmapRecord:
     chart : str
         In which the residual is taken (:mod:`graphslam.core.charts`).
     robot : int
-        Row of its constant errors (:mod:`graphslam.core.lasting`); -1: it has none.
+        Row of its constant errors (:mod:`graphslam.core.sensor_biases`); -1: it has none.
     """
 
     factor_id: int
@@ -154,7 +154,7 @@ class SubmapBatch(FactorBatch):
 
     record: ClassVar[type] = SubmapRecord
 
-    def __init__(self, records: Sequence[SubmapRecord | PathRecord], layout: Layout) -> None:
+    def __init__(self, records: Sequence[SubmapRecord | PathRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
         row, marks, robots = layout.row_of, layout.count("l"), layout.count("wheels")
         self._start = np.array([r.start for r in records], dtype=np.int64)
@@ -165,12 +165,12 @@ class SubmapBatch(FactorBatch):
             x if r.robot < 0 else [*x, *(self._constant + k * robots + r.robot for k in range(len(CONSTANT)))]
             for x, r in zip(rows, records)
         ]
-        self._entry_offset = offsets([len(x) for x in rows])
+        self._entry_offset = block_offsets([len(x) for x in rows])
         self._entry_row = np.array([i for some in rows for i in some], dtype=np.int64)
         self._z = np.concatenate([np.zeros(0), *(r.z for r in records)])
-        self._z_offset = offsets([len(r.z) for r in records])
+        self._z_offset = block_offsets([len(r.z) for r in records])
         self._info = np.concatenate([np.zeros(0), *(r.information for r in records)])
-        self._info_offset = offsets([len(r.z) ** 2 for r in records])
+        self._info_offset = block_offsets([len(r.z) ** 2 for r in records])
         self._bent = np.array([r.chart == "group" for r in records], dtype=bool)
         entries = np.diff(self._entry_offset)
         self.arity = 2 + entries
@@ -194,15 +194,15 @@ class SubmapBatch(FactorBatch):
     def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
         """See :meth:`FactorBatch.blocks`."""
         from graphslam.graph.normal_kernels import (
-            SubmapArrays,
             SubmapBlocks,
+            SubmapFactorArrays,
             submap_blocks,
         )  # numba takes a third of a second to load
 
         chi2 = np.zeros(len(self))
         if len(self) == 0:
             return chi2
-        submaps = SubmapArrays(
+        submaps = SubmapFactorArrays(
             self._start, self._entry_offset, self._entry_row, self._z, self._z_offset, self._info, self._info_offset,
             self._bent, self._constant,
         )  # fmt: skip
@@ -293,7 +293,7 @@ def _terms(
         r[2] = math.pi - (math.pi - r[2]) % _TWO_PI
         Vi, bent = None, None
         if group:
-            a, b, slope = (float(v) for v in arc_terms(r[2]))
+            a, b, slope = (float(v) for v in inverse_left_jacobian_terms(r[2]))
             e = np.concatenate([r[:2], r[3:]]).reshape(-1, 2)
             Vi = np.array([[a, b], [-b, a]])
             bent = _rows(e @ np.array([[slope, -0.5], [0.5, slope]]))

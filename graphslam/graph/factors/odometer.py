@@ -17,7 +17,7 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
 from graphslam.graph.factors.batch import UniformBatch
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableKind, register_variable
 
 register_variable(
@@ -49,7 +49,7 @@ class OdometerRecord:
     twist: Array
     seconds: float
     whitener: Array
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "odometer"
 
     @property

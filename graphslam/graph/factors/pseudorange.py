@@ -22,7 +22,7 @@ from graphslam.core.geometry import Array
 from graphslam.graph.factors.batch import UniformBatch
 from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.range import TOUCHING
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableKind, register_variable
 
 register_variable(
@@ -73,7 +73,7 @@ class PseudorangeRecord:
     bias: int | None = None
     system: int | None = None
     tilt: bool = False
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "pseudorange"
 
     @property

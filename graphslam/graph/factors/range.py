@@ -16,7 +16,7 @@ from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import SE2, SE3
 from graphslam.core.se3 import quat_to_matrix, skew
 from graphslam.graph.factors.batch import UniformBatch
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableKind, register_variable
 
 register_variable(
@@ -49,7 +49,7 @@ class RangeRecord:
     arm_j: Array
     distance: float
     sigma: float
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "range"
 
     @property
@@ -86,7 +86,7 @@ class BeaconRangeRecord:
     arm: Array
     distance: float
     sigma: float
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "beacon"
 
     @property

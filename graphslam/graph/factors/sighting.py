@@ -13,8 +13,8 @@ import numpy as np
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, rotation2, wrap_angle
 from graphslam.graph.factors.batch import Index, UniformBatch, custom_factor, shared_noise, with_kernel
-from graphslam.graph.noise import NO_KERNEL, Robust
-from graphslam.graph.variables import Layout, gtsam_key
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
+from graphslam.graph.variables import VariableLayout, gtsam_key
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class SightingRecord:
     z: Array
     polar: bool
     whitener: Array
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "sighting"
 
     @property
@@ -60,13 +60,13 @@ class SightingBatch(UniformBatch):
     record = SightingRecord
     slots = ("x", "l")
 
-    def __init__(self, records: Sequence[SightingRecord], layout: Layout) -> None:
+    def __init__(self, records: Sequence[SightingRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
         self._z = np.array([r.z for r in records]).reshape(-1, 2)
         self._polar = np.array([r.polar for r in records], dtype=bool)
 
     @classmethod
-    def of_arrays(cls, seen: Index, z: Array, polar: bool, whiteners: Array, layout: Layout) -> SightingBatch:
+    def of_arrays(cls, seen: Index, z: Array, polar: bool, whiteners: Array, layout: VariableLayout) -> SightingBatch:
         """A batch without an object for each factor.
 
         Parameters

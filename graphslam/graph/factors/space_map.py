@@ -10,20 +10,20 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import matrix_to_quat, quat_to_matrix
 from graphslam.graph.factors.batch import safe_factor
-from graphslam.linear.space_maps import ORIGIN, Placed
+from graphslam.linear.space_maps import ORIGIN, PlacedMap
 
 
-def pose_of(pose: gtsam.Pose3) -> Array:
+def pose_of_gtsam(pose: gtsam.Pose3) -> Array:
     """``(7,)``."""
     return np.concatenate([pose.translation(), matrix_to_quat(pose.rotation().matrix())])
 
 
-def gtsam_pose(pose: Array) -> gtsam.Pose3:
+def gtsam_pose3(pose: Array) -> gtsam.Pose3:
     """A pose ``(7,)``."""
     return gtsam.Pose3(gtsam.Rot3(quat_to_matrix(pose[3:])), pose[:3])
 
 
-def space_factor(one: Placed) -> gtsam.CustomFactor:
+def space_factor(one: PlacedMap) -> gtsam.CustomFactor:
     """A factor on the poses ``x{k}`` and points ``l{j}`` of a placed map, whitened, with its analytic Jacobian.
 
     Pose ``k`` of the problem is the variable ``x{k + 1}``, as in the graphs of submaps: ``x0`` is the fixed first base.
@@ -42,7 +42,7 @@ def space_factor(one: Placed) -> gtsam.CustomFactor:
     p, rows = len(own), len(W)
 
     def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
-        poses = np.array([pose_of(values.atPose3(k)) for k in keys[:p]]).reshape(-1, 7)
+        poses = np.array([pose_of_gtsam(values.atPose3(k)) for k in keys[:p]]).reshape(-1, 7)
         points = np.array([values.atPoint3(k) for k in keys[p:]]).reshape(-1, 3)
         if H is None:
             return np.asarray(W @ small.residual(poses, points))

@@ -30,7 +30,7 @@ MOST = 65535
 
 
 @kernel()
-def weigh(d, along):
+def point_weight(d, along):
     """Weight 0 … `FULL` of a point for a voxel ``d`` before its plane and ``along`` from it in the plane [voxels]."""
     if along >= WIDE or d > FRONT or d <= -BEHIND:
         return 0
@@ -71,7 +71,7 @@ def add_planes(points, normals, first, table, sums):
                     ux, uy, uz = x + 0.5 - px, y + 0.5 - py, z + 0.5 - pz
                     d = nx * ux + ny * uy + nz * uz
                     along = math.sqrt(max(ux * ux + uy * uy + uz * uz - d * d, 0.0))
-                    w = weigh(d, along)
+                    w = point_weight(d, along)
                     here = x == ix and y == iy and z == iz
                     if w == 0 and not here:
                         continue
@@ -104,7 +104,7 @@ def add_rays(points, origins, first, table, sums):
                 continue
             last = row * 512 + v
             d = length - ((x + 0.5 - ox) * dx + (y + 0.5 - oy) * dy + (z + 0.5 - oz) * dz)
-            w = weigh(d, 0.0)
+            w = point_weight(d, 0.0)
             if w:
                 sums[row, v, NUM] += math.floor(w * d * UNIT / FULL + 0.5)
                 sums[row, v, WEIGHT] += w
@@ -114,7 +114,7 @@ def add_rays(points, origins, first, table, sums):
 
 
 @kernel()
-def carve(points, origins, short, first, table, sums):
+def count_passing_beams(points, origins, short, first, table, sums):
     """Count the beams that pass through each voxel of the bricks; they end ``short`` voxels before their points."""
     shape = table.shape
     for k in range(points.shape[0]):
@@ -150,7 +150,7 @@ def carve(points, origins, short, first, table, sums):
 
 
 @kernel()
-def settle(sums, distance, normal, counts):
+def field_distances(sums, distance, normal, counts):
     """Distances ``(n, 512)`` float32, their gradients ``(n, 512, 3)`` int8 (in 1/127), and weight, beams and points
     ``counts (n, 512, 3)`` uint16 of sums; 0 where nothing is.
 
@@ -276,7 +276,7 @@ def fill_block(b, near, phi, known, block, there):
 
 
 @kernel()
-def beside(block, there, z, y, x, step):
+def neighbour_values(block, there, z, y, x, step):
     """Values on both sides along an axis, ``step`` its offset; one that is not known goes on in a straight line."""
     c = block[z, y, x]
     dz, dy, dx = step
@@ -291,7 +291,7 @@ def beside(block, there, z, y, x, step):
 
 
 @kernel()
-def mixed(block, there, z, y, x, first, second):
+def mixed_difference(block, there, z, y, x, first, second):
     """Mixed second difference along two axes; 0 where one of its four corners is not known."""
     total = 0.0
     for s in (-1, 1):
@@ -308,22 +308,22 @@ def mixed(block, there, z, y, x, first, second):
 @kernel()
 def curvature(block, there, z, y, x):
     """``κ |∇φ|`` of the level set through a voxel, at most 1 in size."""
-    xa, xb = beside(block, there, z, y, x, (0, 0, 1))
-    ya, yb = beside(block, there, z, y, x, (0, 1, 0))
-    za, zb = beside(block, there, z, y, x, (1, 0, 0))
+    xa, xb = neighbour_values(block, there, z, y, x, (0, 0, 1))
+    ya, yb = neighbour_values(block, there, z, y, x, (0, 1, 0))
+    za, zb = neighbour_values(block, there, z, y, x, (1, 0, 0))
     c = block[z, y, x]
     gx, gy, gz = 0.5 * (xb - xa), 0.5 * (yb - ya), 0.5 * (zb - za)
     hxx, hyy, hzz = xa + xb - 2.0 * c, ya + yb - 2.0 * c, za + zb - 2.0 * c
-    hxy = mixed(block, there, z, y, x, (0, 0, 1), (0, 1, 0))
-    hxz = mixed(block, there, z, y, x, (0, 0, 1), (1, 0, 0))
-    hyz = mixed(block, there, z, y, x, (0, 1, 0), (1, 0, 0))
+    hxy = mixed_difference(block, there, z, y, x, (0, 0, 1), (0, 1, 0))
+    hxz = mixed_difference(block, there, z, y, x, (0, 0, 1), (1, 0, 0))
+    hyz = mixed_difference(block, there, z, y, x, (0, 1, 0), (1, 0, 0))
     total = hxx * (gy * gy + gz * gz) + hyy * (gx * gx + gz * gz) + hzz * (gx * gx + gy * gy)
     total -= 2.0 * (gx * gy * hxy + gx * gz * hxz + gy * gz * hyz)
     return min(max(total / (gx * gx + gy * gy + gz * gz + 1e-6), -1.0), 1.0)
 
 
 @kernel()
-def evolve(near, phi, other, target, known, rows, figures):
+def evolve_level_set(near, phi, other, target, known, rows, figures):
     """One step of ``φ ← φ + dt [w (f − φ) + λ κ |∇φ|]`` from ``phi`` into ``other``; ``figures``: dt and λ."""
     dt, smooth = figures
     block, there = np.zeros((10, 10, 10)), np.zeros((10, 10, 10), np.uint8)
@@ -363,7 +363,7 @@ def redistance(near, phi, other, start, known, rows, dt):
             sign = 1.0 if c0 > 0.0 else -1.0
             crossed, slope = False, 0.0
             for s in range(3):
-                a, d = beside(origin, same, z, y, x, steps[s])
+                a, d = neighbour_values(origin, same, z, y, x, steps[s])
                 crossed = crossed or a * c0 <= 0.0 or d * c0 <= 0.0
                 one = max(abs(0.5 * (d - a)), abs(d - c0), abs(c0 - a))
                 slope += one * one

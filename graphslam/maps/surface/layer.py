@@ -18,7 +18,14 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError, GridError
 from graphslam.core.geometry import Array
 from graphslam.evidence.layout import BRICK_VOXELS
-from graphslam.maps.surface.field_kernels import FULL, evolve, make_target, pose_piece, reach_bricks, redistance
+from graphslam.maps.surface.field_kernels import (
+    FULL,
+    evolve_level_set,
+    make_target,
+    pose_piece,
+    reach_bricks,
+    redistance,
+)
 from graphslam.maps.surface.piece import Scan, SurfaceConfig, SurfacePiece, piece_of_scans
 
 PieceId: TypeAlias = Hashable
@@ -117,7 +124,7 @@ class SurfaceLayer:
         phi[rows_in] = self._target[rows_in, :, 0]
         other = phi.copy()
         for _ in range(c.steps):
-            evolve(near, phi, other, self._target, self._known, rows_in, (c.dt, c.smoothing))
+            evolve_level_set(near, phi, other, self._target, self._known, rows_in, (c.dt, c.smoothing))
             phi, other = other, phi
         start = phi.copy()
         for _ in range(c.redistance_steps):

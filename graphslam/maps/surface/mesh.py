@@ -178,7 +178,7 @@ def _triangles(
 # --- what a mesh hangs on ----------------------------------------------------------------------------------------
 
 
-def owners(mesh: Mesh, layer: SurfaceLayer) -> npt.NDArray[np.int64]:
+def vertex_owners(mesh: Mesh, layer: SurfaceLayer) -> npt.NDArray[np.int64]:
     """Number of the piece, in the layer's order, that says most of each vertex ``(v,)``; −1 where none speaks."""
     best, out = np.zeros(len(mesh.vertices)), np.full(len(mesh.vertices), -1, np.int64)
     for k, (name, piece) in enumerate(layer.pieces.items()):
@@ -209,7 +209,7 @@ def position_sigma(mesh: Mesh, layer: SurfaceLayer, covariances: Mapping[PieceId
     ``J = R [−[q]×, I]``, ``σ² = trace(J Σ Jᵀ)``. NaN where no piece speaks or no covariance is given.
     """
     out = np.full(len(mesh.vertices), np.nan)
-    own = owners(mesh, layer)
+    own = vertex_owners(mesh, layer)
     for k, name in enumerate(layer.pieces):
         if name not in covariances:
             continue

@@ -14,7 +14,14 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GridError
 from graphslam.core.geometry import Array
 from graphslam.evidence.layout import BRICK_VOXELS
-from graphslam.maps.surface.field_kernels import COLUMNS, add_planes, add_rays, carve, mark_bricks, settle
+from graphslam.maps.surface.field_kernels import (
+    COLUMNS,
+    add_planes,
+    add_rays,
+    count_passing_beams,
+    field_distances,
+    mark_bricks,
+)
 
 Ints = npt.NDArray[np.int64]
 Scan: TypeAlias = tuple[Array, Array]
@@ -90,7 +97,7 @@ class SurfacePiece:
     normal : (n, 512, 3) int8
     counts : (n, 512, 3) uint16
         Distances, their gradients, and weight, beams that passed and points of every voxel; see
-        :func:`~graphslam.maps.surface.field_kernels.settle`.
+        :func:`~graphslam.maps.surface.field_kernels.field_distances`.
     """
 
     coordinates: Ints
@@ -198,7 +205,7 @@ def piece_of_planes(
     else:
         add_planes(p[flat], np.ascontiguousarray(normals[flat]), first, table, sums)
     if config.carving and len(where):
-        carve(p, beams, 2.5, first, table, sums)
+        count_passing_beams(p, beams, 2.5, first, table, sums)
     return _settled(where[:, ::-1] + first, sums)
 
 
@@ -206,5 +213,5 @@ def _settled(coordinates: Ints, sums: npt.NDArray[np.int32]) -> SurfacePiece:
     n = len(coordinates)
     distance, normal = np.zeros((n, BRICK_VOXELS), np.float32), np.zeros((n, BRICK_VOXELS, 3), np.int8)
     counts = np.zeros((n, BRICK_VOXELS, 3), np.uint16)
-    settle(sums, distance, normal, counts)
+    field_distances(sums, distance, normal, counts)
     return SurfacePiece(coordinates, distance, normal, counts)

@@ -22,9 +22,9 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError, GridError
 from graphslam.core.geometry import Array
 from graphslam.maps.terrain.line_kernels import OVERHANG, SUPPORT, add_rows, bound_rows
-from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe
+from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe_terrain
 from graphslam.maps.terrain.pyramid import Box, Pyramid, TerrainMap
-from graphslam.maps.terrain.tables import Tables
+from graphslam.maps.terrain.tables import TerrainWeights
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
 
 PieceId: TypeAlias = Hashable
@@ -57,7 +57,7 @@ class TerrainPiece:
         return len(self.cells)
 
 
-def piece_of(rows: Rows, tables: Tables, pose: Array) -> TerrainPiece:
+def piece_of(rows: Rows, tables: TerrainWeights, pose: Array) -> TerrainPiece:
     """Sum up statements ``(k, 6)`` that were made in the level frame of a node."""
     bands = tables.bands
     first, last = np.full((bands, 2), 1 << 40), np.full((bands, 2), -(1 << 40))
@@ -84,7 +84,9 @@ class TerrainLayer:
         Widths of the cells of the bands [m].
     """
 
-    def __init__(self, tables: Tables, vehicle: Vehicle, sensor: LineSensor, cells: tuple[float, ...] = CELLS) -> None:
+    def __init__(
+        self, tables: TerrainWeights, vehicle: Vehicle, sensor: LineSensor, cells: tuple[float, ...] = CELLS
+    ) -> None:
         self.tables, self.vehicle, self.sensor, self.cells = tables, vehicle, sensor, cells
         self.pieces: dict[PieceId, TerrainPiece] = {}
         self.poses: dict[PieceId, Array] = {}
@@ -99,7 +101,7 @@ class TerrainLayer:
         edges = self.sensor.band_edges(self.cells)
         parts: list[Rows] = [np.zeros((0, 6), np.int32)]
         for of in lines:
-            parts += list(observe(_in_frame(of, pose), edges, np.array(self.cells), self.vehicle, config))
+            parts += list(observe_terrain(_in_frame(of, pose), edges, np.array(self.cells), self.vehicle, config))
         piece = piece_of(np.concatenate(parts), self.tables, pose)
         self.pieces[name], self.poses[name] = piece, piece.pose
         self._made = None

@@ -20,7 +20,7 @@ STEP, SUPPORT, OVERHANG, ABOVE, GROUND, ROUGH = 0, 1, 2, 3, 4, 5
 above its reach [1], height of the ground [mm], roughness of the ground [mm]."""
 
 
-class Lattice(NamedTuple):
+class BandCells(NamedTuple):
     """Cells of the bands."""
 
     edges: Array
@@ -31,7 +31,7 @@ class Lattice(NamedTuple):
     """Nothing is said of what is nearer to the sensor than this [m]."""
 
 
-class Figures(NamedTuple):
+class DetectorSettings(NamedTuple):
     """Settings of the detectors [m, or m per m]; see `lines.DetectorConfig`."""
 
     smooth: float

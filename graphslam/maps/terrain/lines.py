@@ -19,7 +19,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
-from graphslam.maps.terrain.line_kernels import Figures, Lattice, observe_lines, sort_into_columns
+from graphslam.maps.terrain.line_kernels import BandCells, DetectorSettings, observe_lines, sort_into_columns
 from graphslam.maps.terrain.vehicle import Vehicle
 
 Rows = npt.NDArray[np.int32]
@@ -183,7 +183,7 @@ def lines_of_turns(clouds: PointClouds, path: Trajectory, height: float, **optio
         yield lines_of_clouds(points, T[:3], float(T[2]) - height, **options)
 
 
-def observe(
+def observe_terrain(
     lines: ScanLines, edges: Array, cells: Array, vehicle: Vehicle, config: DetectorConfig | None = None
 ) -> Iterator[Rows]:
     """Statements of lines, some lines at a time; see :mod:`graphslam.maps.terrain.line_kernels`.
@@ -202,12 +202,12 @@ def observe(
         Line, band, ix, iy, channel, value.
     """
     c = config or DetectorConfig()
-    figures = Figures(
+    figures = DetectorSettings(
         *(c.smooth, c.window, math.tan(vehicle.max_slope), c.residual, c.residual_rate, c.memory, c.support_reach),
         *(math.tan(min(vehicle.max_slope + math.radians(5.0), 1.2)), vehicle.clearance, vehicle.height, c.above_limit),
         *(vehicle.climbable_step, vehicle.width),
     )
-    lattice = Lattice(np.ascontiguousarray(edges, np.float64), np.ascontiguousarray(cells, np.float64), c.nearest)
+    lattice = BandCells(np.ascontiguousarray(edges, np.float64), np.ascontiguousarray(cells, np.float64), c.nearest)
     per_line = 8 * lines.points.shape[1] + 4 * int(lattice.edges[-1] / lattice.cells[0])
     for k in range(0, len(lines), _LINES_AT_ONCE):
         part = slice(k, k + _LINES_AT_ONCE)

@@ -98,7 +98,7 @@ def cost_map(found: TerrainMap, vehicle: Vehicle, config: CostConfig | None = No
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlannedWay:
+class PlannedPath:
     """A way ``(k, 2)`` [m] from cell to cell, what it costs, and how long it is [m]."""
 
     points: Array
@@ -106,7 +106,7 @@ class PlannedWay:
     length: float
 
 
-def plan_way(costs: CostMap, start: Array, goal: Array) -> PlannedWay | None:
+def plan_vehicle_path(costs: CostMap, start: Array, goal: Array) -> PlannedPath | None:
     """The cheapest way from a place to another one, or to one of several; None where there is none.
 
     Moves go to the eight neighbours; the cost of a move is its length times the mean cost of both cells.
@@ -142,7 +142,7 @@ def plan_way(costs: CostMap, start: Array, goal: Array) -> PlannedWay | None:
     if a != costs.index(start):
         points = np.vstack([start, points])
     length = float(np.sum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    return PlannedWay(points, float(totals[b]) * costs.cell, length)
+    return PlannedPath(points, float(totals[b]) * costs.cell, length)
 
 
 def _way_out(costs: CostMap, a: tuple[int, int]) -> tuple[int, int] | None:

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, GridError
 from graphslam.core.geometry import Array
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, add_rows
-from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe
-from graphslam.maps.terrain.tables import SCALE, Tables, calibrated, hazard_factors
+from graphslam.maps.terrain.lines import DetectorConfig, Rows, ScanLines, observe_terrain
+from graphslam.maps.terrain.tables import SCALE, TerrainWeights, calibrate_probability, hazard_factors
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
 
 Box = tuple[float, float, float, float]
@@ -136,7 +136,7 @@ class Pyramid:
     """
 
     def __init__(
-        self, box: Box, tables: Tables, vehicle: Vehicle, sensor: LineSensor, cells: tuple[float, ...] = CELLS
+        self, box: Box, tables: TerrainWeights, vehicle: Vehicle, sensor: LineSensor, cells: tuple[float, ...] = CELLS
     ) -> None:
         if len(cells) != tables.bands:
             raise ConfigError(f"terrain: {len(cells)} widths of cells, tables of {tables.bands} bands")
@@ -178,7 +178,7 @@ class Pyramid:
     def insert(self, lines: ScanLines, config: DetectorConfig | None = None) -> int:
         """Read lines; number of statements."""
         count = 0
-        for rows in observe(lines, self.edges, self.cells, self.vehicle, config):
+        for rows in observe_terrain(lines, self.edges, self.cells, self.vehicle, config):
             self.add(rows)
             count += len(rows)
         self.lines += len(lines)
@@ -276,7 +276,7 @@ class Pyramid:
         any_known = known.any(axis=0)
         speaks = np.where(band >= 0, band, np.where(support_band >= 0, support_band, self.bands - 1))
         u, v = np.array([self.weights_of(b)[-2:] for b in range(self.bands)]).T
-        probability = np.where(any_known, calibrated(1.0 - free.prod(axis=0), u[speaks], v[speaks]), np.nan)
+        probability = np.where(any_known, calibrate_probability(1.0 - free.prod(axis=0), u[speaks], v[speaks]), np.nan)
         classes = np.full((ny, nx), TerrainClass.UNKNOWN, np.int8)
         classes[any_known] = TerrainClass.FREE
         classes[any_known & above] = TerrainClass.ABOVE_REACH
@@ -316,7 +316,9 @@ def _difference(a: Array, k: int, axis: int) -> Array:
     return out
 
 
-def pyramid_of(lines: Iterable[ScanLines], box: Box, tables: Tables, vehicle: Vehicle, sensor: LineSensor) -> Pyramid:
+def pyramid_of(
+    lines: Iterable[ScanLines], box: Box, tables: TerrainWeights, vehicle: Vehicle, sensor: LineSensor
+) -> Pyramid:
     """A pyramid of some lines."""
     p = Pyramid(box, tables, vehicle, sensor)
     for part in lines:

@@ -29,7 +29,7 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tables:
+class TerrainWeights:
     """Learnt weights.
 
     Parameters
@@ -95,7 +95,7 @@ class Tables:
         )
 
 
-def read_tables(path: str | Path = DEFAULT) -> Tables:
+def read_tables(path: str | Path = DEFAULT) -> TerrainWeights:
     """Tables of a file; default those of the package, learnt for the panning line laser of the simulated streets.
 
     Raises
@@ -112,7 +112,7 @@ def read_tables(path: str | Path = DEFAULT) -> Tables:
     try:
         ratios = np.array([found["step"], found["support"]], dtype=np.int32)
         weights, single = np.array(found["weights"]), np.array(found["single"])
-        return Tables(ratios, weights, single, float(found["threshold"]), found["provenance"])
+        return TerrainWeights(ratios, weights, single, float(found["threshold"]), found["provenance"])
     except (ValueError, OverflowError, ConfigError) as error:
         raise FormatError(f"terrain tables that do not fit ({error})", where=str(path)) from None
 
@@ -124,7 +124,7 @@ def fixed_tables(bands: int, hit: float, miss: float, *, step: int = 6, depth: i
     return np.repeat(np.round(SCALE * np.array(rows))[:, None], bands, axis=1).astype(np.int32)
 
 
-def dampened(count: Array) -> Array:
+def effective_count(count: Array) -> Array:
     """What ``count`` statements are worth, 5 at most: lines in one cell are not independent."""
     return count / (1.0 + count / 5.0)
 
@@ -149,7 +149,7 @@ def hazard_factors(ratios: Array, counts: Array, weights: Array) -> Array:
     out = np.ones(counts.shape)
     for k, (prior, shift, slope) in enumerate(((p, a0, a1), (q, b0, b1))):
         n = counts[k].astype(np.float64)
-        x = prior + dampened(n) * (shift + slope * ratios[k] / np.maximum(n, 1.0))
+        x = prior + effective_count(n) * (shift + slope * ratios[k] / np.maximum(n, 1.0))
         out[k] = np.where(n > 0, 0.5 * (1.0 - np.tanh(0.5 * x)), 1.0)
     out[2] = np.exp(-c * counts[2])
     return out
@@ -160,7 +160,7 @@ def noisy_or(ratios: Array, counts: Array, weights: Array) -> Array:
     return np.asarray(1.0 - hazard_factors(ratios, counts, weights).prod(axis=0))
 
 
-def calibrated(p: Array, u: Array | float, v: Array | float) -> Array:
+def calibrate_probability(p: Array, u: Array | float, v: Array | float) -> Array:
     """Probability whose log-odds are ``u + v · log-odds(p)``: as often a hazard as it says (Platt's scaling).
 
     Parameters

@@ -12,9 +12,9 @@ import gtsam
 import numpy as np
 
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.flat import FlatGraph
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import RELATIVE
 from graphslam.solve.network.factors import to_graph
@@ -36,7 +36,7 @@ class BatchProblem:
         Which edges and observations enter; all of them if not given.
     """
 
-    def __init__(self, network: PoseNetwork, used: np.ndarray | None = None, flat: FlatGraph | None = None) -> None:
+    def __init__(self, network: PoseNetwork, used: np.ndarray | None = None, flat: FactorArrays | None = None) -> None:
         self.network = network
         self.flat = problem_of_network(network, ordered=False) if flat is None else flat
         self.graph = to_graph(network, used, self.flat)
@@ -49,7 +49,7 @@ class BatchProblem:
 
     def unpack(self, values: gtsam.Values) -> Values:
         """GTSAM's values as ours."""
-        return from_gtsam(values, values_of(self.network, self.network.poses))
+        return from_gtsam(values, network_values(self.network, self.network.poses))
 
     def objective(self, values: gtsam.Values) -> float:
         """``Σ rᵀ Ω r`` (GTSAM's error is half of it)."""

@@ -30,10 +30,10 @@ import scipy.sparse.linalg as spla
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import values_of
-from graphslam.solve.descent import SAME, polish
+from graphslam.graph.network import network_values
+from graphslam.solve.descent import SAME, descend_to_minimum
 from graphslam.solve.network.multistart import make_problem
-from graphslam.solve.sparse import factor
+from graphslam.solve.sparse import factorise_sparse
 
 Verdict = Literal["certified", "not certified", "not known"]
 # S is taken for positive semi-definite if S + TOLERANCE · (median diagonal of Q) has no negative pivot.
@@ -113,7 +113,7 @@ def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue:
     if negative:
         return Certificate("not certified", f"{negative} negative directions", lowest, value)
     problem = make_problem(network)
-    back = polish(problem, problem.pack(values_of(network, _poses_of(X, network)))).objective
+    back = descend_to_minimum(problem, problem.pack(network_values(network, _poses_of(X, network)))).objective
     if abs(back - objective) <= SAME * abs(objective) + 1e-12 * network.residuals:
         return Certificate("certified", "", lowest, value, back)
     word = "lower" if back < objective else "higher"
@@ -205,7 +205,7 @@ def _descend(network: PoseNetwork, A: sp.csr_matrix, poses: Array) -> tuple[Arra
         H = sp.csc_matrix(D.T @ (sp.block_diag([S] * p, format="csr") @ D))
         while True:
             try:
-                step = factor(sp.csc_matrix(H + damping * eye)).solve(-gradient)
+                step = factorise_sparse(sp.csc_matrix(H + damping * eye)).solve(-gradient)
             except RuntimeError:
                 step = np.full(len(gradient), np.nan)
             fall = -float(gradient @ step)
@@ -275,7 +275,7 @@ def _negative_pivots(S: sp.csc_matrix) -> int:
     definite either.
     """
     try:
-        lu = factor(S)
+        lu = factorise_sparse(S)
     except RuntimeError:
         return 1
     swapped = int((lu.perm_r != lu.perm_c).sum())

@@ -20,7 +20,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from graphslam.association.consistent_set import Chain, LoopArrays, chain_chi2, pair_chi2
+from graphslam.association.consistent_set import LoopArrays, OdometryChain, chain_chi2, pair_chi2
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
@@ -48,7 +48,7 @@ DISAGREEMENT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Consensus:
+class LoopConsensus:
     """What the loops of a network say about each other.
 
     Parameters
@@ -87,7 +87,7 @@ def odometry_edges(network: PoseNetwork) -> Mask:
     return step
 
 
-def chain_of(network: PoseNetwork, odometry: Mask) -> Chain:
+def odometry_chain(network: PoseNetwork, odometry: Mask) -> OdometryChain:
     """The odometry of a network as a chain, cut where an increment is missing or its information singular."""
     n, d = len(network), network.tangent_dim
     rows = np.flatnonzero(odometry)
@@ -106,33 +106,33 @@ def chain_of(network: PoseNetwork, odometry: Mask) -> Chain:
     )
     k = at[sound]
     increments[k], covariances[k], known[k] = turned.measured, turned.covariance, True
-    return Chain.of(increments, covariances, known)
+    return OdometryChain.of(increments, covariances, known)
 
 
 def _identities(network: PoseNetwork, n: int) -> Array:
     return np.tile(group_of(network.poses).identity, (n, 1))
 
 
-def _blank(network: PoseNetwork) -> Chain:
+def _blank(network: PoseNetwork) -> OdometryChain:
     n, d = len(network), network.tangent_dim
-    return Chain(_identities(network, n), np.zeros((n, d, d)), np.zeros(n, dtype=np.int64))
+    return OdometryChain(_identities(network, n), np.zeros((n, d, d)), np.zeros(n, dtype=np.int64))
 
 
-def loop_consensus(network: PoseNetwork) -> Consensus:
+def loop_consensus(network: PoseNetwork) -> LoopConsensus:
     """Votes of neighbouring loops for each other, the noise scale, and the loops that are likely right.
 
     Landmark observations take no part.
     """
     m, d = len(network.edges), network.tangent_dim
     odometry = odometry_edges(network)
-    nothing = Consensus(
+    nothing = LoopConsensus(
         odometry, bool(odometry.any()), np.zeros(m, np.bool_), np.zeros(m, np.bool_), np.zeros(m, np.int64), 1.0
     )
     w = np.linalg.eigvalsh(network.information)
     rows = np.flatnonzero(~odometry & (w[:, 0] > 1e-12 * w[:, -1]))
     if not nothing.ordered or len(rows) < 2:
         return nothing
-    chain = chain_of(network, odometry)
+    chain = odometry_chain(network, odometry)
     loops = LoopArrays.of(
         chain, network.edges[rows], network.measurements[rows], np.linalg.inv(network.information[rows])
     )
@@ -168,10 +168,10 @@ def loop_consensus(network: PoseNetwork) -> Consensus:
     keep &= _agreeing_clusters(chain, loops, np.where(keep, label, -1), limit)
     likely, core, all_votes = np.zeros(m, np.bool_), np.zeros(m, np.bool_), np.zeros(m, np.int64)
     likely[rows[keep]], core[rows[_largest(label, keep)]], all_votes[rows] = True, True, votes
-    return Consensus(odometry, True, likely, core, all_votes, max(scale, np.finfo(float).tiny))
+    return LoopConsensus(odometry, True, likely, core, all_votes, max(scale, np.finfo(float).tiny))
 
 
-def _informative(chain: Chain, loops: LoopArrays) -> Mask:
+def _informative(chain: OdometryChain, loops: LoopArrays) -> Mask:
     """Loops whose ends the chain does not tie far better than they do: those agree with anything near them."""
     a, b = loops.ends.T
     g = group_of(chain.poses)
@@ -198,7 +198,7 @@ def _own_first(other: Ints) -> Ints:
     return out
 
 
-def _agreeing_clusters(chain: Chain, loops: LoopArrays, label: Ints, limit: float) -> Mask:
+def _agreeing_clusters(chain: OdometryChain, loops: LoopArrays, label: Ints, limit: float) -> Mask:
     """Loops of clusters that are left when the most contradicted cluster has been taken out again and again.
 
     A cluster is contradicted by the loops of every cluster that disagrees with it; the one for which they are most,

@@ -12,15 +12,15 @@ import numpy as np
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.diagnose import null_variables, unreached
+from graphslam.graph.diagnose import null_variables, unconnected_variables
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import UniformBatch
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.variables import Values, split_name
 
 
-def check_determined(network: PoseNetwork, flat: FlatGraph) -> None:
+def check_determined(network: PoseNetwork, flat: FactorArrays) -> None:
     """Raise if some vertex or landmark is not connected to an anchor by measurements."""
-    lost, islands = unreached(flat)
+    lost, islands = unconnected_variables(flat)
     if lost:
         names = _in_words(network, lost)
         raise IndeterminateError(
@@ -31,7 +31,7 @@ def check_determined(network: PoseNetwork, flat: FlatGraph) -> None:
         )
 
 
-def check_full_rank(network: PoseNetwork, flat: FlatGraph, values: Values) -> None:
+def check_full_rank(network: PoseNetwork, flat: FactorArrays, values: Values) -> None:
     """Raise if measurements with rank-deficient information leave a direction free.
 
     Costs nothing where every information matrix has full rank.

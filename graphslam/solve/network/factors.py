@@ -12,15 +12,15 @@ import numpy.typing as npt
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import gtsam_poses
 from graphslam.graph.factors.between import BetweenBatch
 from graphslam.graph.factors.sighting import SightingBatch
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.network import problem_of_network
 from graphslam.graph.variables import gtsam_key
 
 
-def measured_factors(flat: FlatGraph) -> list[list[gtsam.NonlinearFactor]]:
+def measured_factors(flat: FactorArrays) -> list[list[gtsam.NonlinearFactor]]:
     """Native factors of the edges, and of the observations."""
     found = [cast("BetweenBatch | SightingBatch", f).natives for f in flat.batches]
     return [found[0], found[1] if len(found) > 1 else []]
@@ -48,7 +48,7 @@ def anchor_factors(network: PoseNetwork) -> list[gtsam.NonlinearFactor]:
 
 
 def to_graph(
-    network: PoseNetwork, used: npt.NDArray[np.bool_] | None = None, flat: FlatGraph | None = None
+    network: PoseNetwork, used: npt.NDArray[np.bool_] | None = None, flat: FactorArrays | None = None
 ) -> gtsam.NonlinearFactorGraph:
     """Anchors, then edges, then observations; of these two only where ``used`` (m + k,) says so, if given."""
     graph = gtsam.NonlinearFactorGraph()
@@ -61,7 +61,7 @@ def to_graph(
     return graph
 
 
-def indeterminate(network: PoseNetwork, error: Exception) -> IndeterminateError:
+def translate_indeterminate(network: PoseNetwork, error: Exception) -> IndeterminateError:
     """Turn GTSAM's message about a key into one about the file's vertices."""
     found = re.search(r"Symbol: (x|l)(\d+)", str(error))
     names: tuple[str, ...] = ()

@@ -25,8 +25,8 @@ from graphslam.graph.network import problem_of_network
 from graphslam.graph.variables import gtsam_key
 from graphslam.solve.network.factors import (
     anchor_factors,
-    indeterminate,
     measured_factors,
+    translate_indeterminate,
 )
 from graphslam.solve.network.start import cartesian_observations, neighbours
 
@@ -139,7 +139,7 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
             try:
                 isam.update(graph, values)
             except RuntimeError as error:
-                raise indeterminate(network, error) from None
+                raise translate_indeterminate(network, error) from None
             graph, values, fresh = gtsam.NonlinearFactorGraph(), gtsam.Values(), set()
     return isam.calculateEstimate()
 

@@ -12,10 +12,10 @@ import numpy as np
 from graphslam.core.errors import IndeterminateError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.flat import FlatGraph
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import SAME, Optimum, Problem, polish
+from graphslam.solve.descent import SAME, LeastSquaresProblem, Optimum, descend_to_minimum
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start, wound_cycles
 from graphslam.solve.sparse import MANY, SparseProblem
 
@@ -79,7 +79,7 @@ def _incremental(network: PoseNetwork) -> Start:
     from graphslam.graph.gtsam_values import from_gtsam
     from graphslam.solve.network.incremental import run_isam2
 
-    found = from_gtsam(run_isam2(network), values_of(network, network.poses))
+    found = from_gtsam(run_isam2(network), network_values(network, network.poses))
     return found.poses, found.landmarks
 
 
@@ -107,29 +107,29 @@ def default_starts(network: PoseNetwork) -> tuple[str, ...]:
 
 def canonical_start(network: PoseNetwork) -> Values:
     """What the file says: its values where it has them all, else its odometry chain."""
-    return values_of(network, *(_file(network) or _odometry(network)))
+    return network_values(network, *(_file(network) or _odometry(network)))
 
 
-def flat_of(network: PoseNetwork) -> FlatGraph:
+def network_arrays(network: PoseNetwork) -> FactorArrays:
     """The problem of a network, in an order of elimination unless it is dissected later or GTSAM orders it."""
     return problem_of_network(
         network, ordered=network.dim == 2 and (len(network) <= MANY or len(network.landmark_ids) > 0)
     )
 
 
-def make_problem(network: PoseNetwork, flat: FlatGraph | None = None) -> Problem:
+def make_problem(network: PoseNetwork, flat: FactorArrays | None = None) -> LeastSquaresProblem:
     """Plain numpy in 2-D and for many poses, where it beats GTSAM's factors; these for the rest of 3-D."""
     if network.dim == 2 or len(network) > MANY:
-        return SparseProblem(flat or flat_of(network))
+        return SparseProblem(flat or network_arrays(network))
     return native_problem(network, flat)
 
 
-def native(network: PoseNetwork) -> bool:
+def has_native_factors(network: PoseNetwork) -> bool:
     """Whether GTSAM has native factors for every measurement (it has none for Cartesian landmark observations)."""
     return len(network.observations) == 0 or network.observation_kind == "bearing-range"
 
 
-def native_problem(network: PoseNetwork, flat: FlatGraph | None = None) -> BatchProblem:
+def native_problem(network: PoseNetwork, flat: FactorArrays | None = None) -> BatchProblem:
     """The network as a GTSAM graph."""
     from graphslam.solve.network.batch import BatchProblem  # gtsam, which most files do not need
 
@@ -137,7 +137,7 @@ def native_problem(network: PoseNetwork, flat: FlatGraph | None = None) -> Batch
 
 
 @dataclass(frozen=True, slots=True)
-class Starts:
+class StartsResult:
     """Best of the starts that were tried.
 
     Parameters
@@ -149,7 +149,7 @@ class Starts:
         nothing did, or if starts were named.
     """
 
-    problem: Problem
+    problem: LeastSquaresProblem
     best: Optimum
     start: str
     reports: tuple[StartReport, ...]
@@ -161,7 +161,7 @@ class Starts:
         return sum(r.iterations for r in self.reports)
 
 
-def doubt(network: PoseNetwork, problem: Problem, end: Optimum) -> str:
+def suspicion_of_answer(network: PoseNetwork, problem: LeastSquaresProblem, end: Optimum) -> str:
     """Why an answer may not be the best one, in words; empty if nothing speaks against it.
 
     * The descent did not end at a stationary point.
@@ -190,23 +190,23 @@ def best_of_starts(
     names: Sequence[str] | None = None,
     *,
     given: dict[str, Values] | None = None,
-    flat: FlatGraph | None = None,
-    problem: Problem | None = None,
-    certified: Callable[[PoseNetwork, Problem, Optimum], bool] | None = None,
+    flat: FactorArrays | None = None,
+    problem: LeastSquaresProblem | None = None,
+    certified: Callable[[PoseNetwork, LeastSquaresProblem, Optimum], bool] | None = None,
     progress: bool = False,
-) -> Starts:
+) -> StartsResult:
     """Descend from a start, from all that can compete if there is doubt of the answer, and keep the lowest objective.
 
     Parameters
     ----------
     names : sequence of str, optional
         Keys of :data:`STARTS`, all of which are tried. If not given: the first (of ``given``, then of
-        :func:`default_starts`), and the others if there is :func:`doubt` that no certificate settles.
+        :func:`default_starts`), and the others if there is :func:`suspicion_of_answer` that no certificate settles.
     given : dict of str to Values, optional
         Further starts, tried first.
-    flat : FlatGraph, optional
+    flat : FactorArrays, optional
         The network as a problem, where it was made already.
-    problem : Problem, optional
+    problem : LeastSquaresProblem, optional
         How it is solved; :func:`make_problem` if not given.
     certified : callable, optional
         Whether an answer is proved to be the best, which settles a doubt for less than other starts cost.
@@ -235,30 +235,35 @@ def best_of_starts(
             continue
         if name not in given and made is None:
             continue
-        start = given[name] if made is None else values_of(network, *made)
+        start = given[name] if made is None else network_values(network, *made)
         initial = problem.flat.objective(start)
         twin = next((r for r in reports if abs(r.objective_initial - initial) <= TWIN * abs(initial)), None)
         if twin is not None:
             reports.append(StartReport(name, initial, twin.objective, 0, f"same as {twin.name}"))
             continue
         known = np.inf if best is None else best.objective
-        end = polish(problem, problem.pack(start), best_known=known, foretell=True)
-        if own and end.status in ("stalled", "out of iterations") and native(network) and not _is_native(problem):
+        end = descend_to_minimum(problem, problem.pack(start), best_known=known, foretell=True)
+        if (
+            own
+            and end.status in ("stalled", "out of iterations")
+            and has_native_factors(network)
+            and not _is_native(problem)
+        ):
             # GTSAM has more ways down: a trust region, and QR
             problem = native_problem(network, problem.flat)
             best = best and replace(best, values=problem.pack(best.values))
-            end = polish(problem, problem.pack(end.values), best_known=known, foretell=True)
+            end = descend_to_minimum(problem, problem.pack(end.values), best_known=known, foretell=True)
         reports.append(StartReport(name, initial, end.objective, end.iterations, end.status))
         log.info("%s: %s %.8g -> %.8g (%s)", network.source, name, initial, end.objective, end.status)
         if best is None or _better(end, best):
             best, winner = end, name
         if names is None and len(reports) == 1:
-            why = doubt(network, problem, end)
+            why = suspicion_of_answer(network, problem, end)
             if not why or (certified is not None and end.status == "converged" and certified(network, problem, end)):
                 break
     if best is None:
         raise failure or IndeterminateError(f"{network.source}: no start could be made")
-    return Starts(problem, best, winner, tuple(reports), why)
+    return StartsResult(problem, best, winner, tuple(reports), why)
 
 
 def _shown(names: list[str]) -> Iterable[str]:
@@ -267,7 +272,7 @@ def _shown(names: list[str]) -> Iterable[str]:
     return tqdm(names, desc="starts", unit="start", leave=False)
 
 
-def _is_native(problem: Problem) -> bool:
+def _is_native(problem: LeastSquaresProblem) -> bool:
     return not isinstance(problem, SparseProblem)
 
 

@@ -5,7 +5,8 @@ file misstates its variance. Graduated non-convexity finds a good local minimum 
 everything, its usual start, is no such place when a third of the loops are wrong. So it begins from the loops that
 their neighbours bear out (:mod:`~graphslam.solve.network.consensus`), with the schedule as late as the residuals there
 allow. Plain trimming from every start is the competitor. What it ends with is settled by evidence, loop by loop and
-group by group (:mod:`~graphslam.solve.network.settle`), with the file's own limit, and the lowest truncated cost wins.
+group by group (:mod:`~graphslam.solve.network.leave_one_out`), with the file's own limit, and the lowest truncated cost
+wins.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ from tqdm import tqdm
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.flat import FlatGraph
-from graphslam.graph.network import values_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.network import network_values
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import polish
+from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.gnc import truncation_weights
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import REPEATED, loop_consensus, odometry_edges
 from graphslam.solve.network.diagnose import check_determined
-from graphslam.solve.network.settle import FEW, Robust, settle
+from graphslam.solve.network.leave_one_out import FEW, RobustResult, leave_one_out_test
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start
 
 log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ CAUCHY, KERNEL_ROUNDS, KERNEL_STEPS = 2.385, 15, 2
 START_STEPS = 40
 
 
-def truncated_cost(flat: FlatGraph, values: Values, limit: Array) -> float:
+def truncated_cost(flat: FactorArrays, values: Values, limit: Array) -> float:
     """``Σ min(rᵀ Ω r, limit)`` over all factors."""
     return float(np.minimum(flat.squared(values), limit).sum())
 
@@ -73,7 +74,7 @@ def truncated_least_squares(
     trust_odometry: bool = True,
     noise_scale: float | None = None,
     progress: bool = False,
-) -> Robust:
+) -> RobustResult:
     """Minimise ``Σ min(rᵀ Ω r, s² χ²_d(p))``.
 
     Parameters
@@ -130,7 +131,7 @@ def truncated_least_squares(
             starts["cauchy"] = (_under_kernel(problem, begun, trusted), used)
     limit = _limits(network, probability, scale if noise_scale is not None else min(1.0, MARGIN * scale), trusted)
     starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
-    found: list[tuple[str, Robust]] = []
+    found: list[tuple[str, RobustResult]] = []
     for name in tqdm(list(starts), desc="robust starts", unit="start", disable=not progress, leave=False):
         if name not in starts:
             continue
@@ -140,7 +141,7 @@ def truncated_least_squares(
         if not (name == "consensus" and confirmed):
             weights, annealed = _anneal(problem, values, limit, believed)
             trimmed = min(trimmed, _trim(problem, annealed, weights > 0.5, limit), key=lambda t: t.truncated)
-        best = settle(
+        best = leave_one_out_test(
             problem,
             trimmed.end.values,
             trimmed.inliers,
@@ -175,7 +176,7 @@ def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam
         else:
             poses = odometry_start(part)
             arrays = poses, landmarks_from(part, poses)
-        return polish(inner, inner.pack(values_of(part, *arrays)), max_iterations=START_STEPS).values
+        return descend_to_minimum(inner, inner.pack(network_values(part, *arrays)), max_iterations=START_STEPS).values
     except (IndeterminateError, RuntimeError) as error:
         log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
         return None
@@ -192,7 +193,7 @@ def _under_kernel(problem: BatchProblem, values: gtsam.Values, trusted: Mask) ->
             information=weights[:m, None, None] * network.information,
             observation_information=weights[m:, None, None] * network.observation_information,
         )
-        values = polish(BatchProblem(weighted), values, max_iterations=KERNEL_STEPS).values
+        values = descend_to_minimum(BatchProblem(weighted), values, max_iterations=KERNEL_STEPS).values
     return values
 
 
@@ -241,7 +242,7 @@ def _anneal(problem: BatchProblem, values: gtsam.Values, limit: Array, believed:
             information=weights[:m, None, None] * network.information,
             observation_information=weights[m:, None, None] * network.observation_information,
         )
-        values = polish(BatchProblem(weighted, weights > 0.0), values, max_iterations=STEPS).values
+        values = descend_to_minimum(BatchProblem(weighted, weights > 0.0), values, max_iterations=STEPS).values
         now = ratio(values)
         if not ((weights > 0.0) & (weights < 1.0)).any():
             break
@@ -251,17 +252,17 @@ def _anneal(problem: BatchProblem, values: gtsam.Values, limit: Array, believed:
 
 def _trim(
     problem: BatchProblem, values: gtsam.Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
-) -> Robust:
+) -> RobustResult:
     """Alternate least squares of the inliers and the choice of inliers until the choice stays.
 
     Neither step raises the truncated cost, so it ends.
     """
     for _ in range(ROUNDS):
         inner = BatchProblem(problem.network, inliers, problem.flat)
-        end = polish(inner, values, max_iterations=steps)
+        end = descend_to_minimum(inner, values, max_iterations=steps)
         costs = problem.flat.squared(problem.unpack(end.values))
         fresh = costs <= limit
         if (fresh == inliers).all():
             break
         inliers, values = fresh, end.values
-    return Robust(inliers, inner, end, limit, float(np.where(inliers, costs, limit).sum()))
+    return RobustResult(inliers, inner, end, limit, float(np.where(inliers, costs, limit).sum()))

@@ -14,27 +14,27 @@ from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
-from graphslam.graph.flat import FlatGraph
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import SAME, Optimum, Problem, limits_of, polish
+from graphslam.solve.descent import SAME, LeastSquaresProblem, Optimum, descend_to_minimum, limits_of
 from graphslam.solve.network.diagnose import check_determined, check_full_rank
 from graphslam.solve.network.multistart import (
     StartReport,
-    Starts,
+    StartsResult,
     best_of_starts,
     canonical_start,
     default_starts,
-    flat_of,
-    native,
+    has_native_factors,
     native_problem,
+    network_arrays,
 )
 from graphslam.solve.sparse import PcgProblem
 
 if TYPE_CHECKING:
     from graphslam.solve.network.batch import BatchProblem
     from graphslam.solve.network.certificate import Certificate
-    from graphslam.solve.network.settle import Robust
+    from graphslam.solve.network.leave_one_out import RobustResult
 
 # A threshold at 0.99 leaves out one right loop in a hundred, which alone costs the rest more than 1 % (measured).
 INLIER_PROBABILITY = 0.9999
@@ -108,7 +108,7 @@ class NetworkSolution:
     @property
     def objective_g2o(self) -> float:
         """``Σ rᵀ Ω r`` with g2o's residual (x, y, θ or t, vec q) at the same answer."""
-        return g2o_objective(self.network, values_of(self.network, self.poses, self.landmarks))
+        return g2o_objective(self.network, network_values(self.network, self.poses, self.landmarks))
 
     @property
     def objective_g2o_initial(self) -> float:
@@ -146,18 +146,18 @@ class _Answer:
     values: Any
     end: Values
     iterations: int
-    optimum: Starts
+    optimum: StartsResult
     start: str
     details: dict[str, Any]
     # what the solver minimised, where that is not the whole objective
-    minimised: Problem | None = None
+    minimised: LeastSquaresProblem | None = None
     minimum: float | None = None
     inliers: npt.NDArray[np.bool_] | None = None
 
 
 class _Task(NamedTuple):
     network: PoseNetwork
-    flat: FlatGraph
+    flat: FactorArrays
     starts: Sequence[str] | None
     options: dict[str, Any]
     progress: bool
@@ -184,7 +184,7 @@ def solve_network(
     starts : sequence of str or "all", optional
         Starts to try (:data:`graphslam.solve.network.multistart.STARTS`); "all" that are worth trying for this
         network. If not given one, and the others if there is doubt of its answer
-        (:func:`graphslam.solve.network.multistart.doubt`).
+        (:func:`graphslam.solve.network.multistart.suspicion_of_answer`).
     certificate : bool
         Also say whether the answer is the global optimum of what was minimised (for gnc: of the inliers), in
         ``NetworkSolution.certificate``.
@@ -204,7 +204,7 @@ def solve_network(
     if starts is not None:
         starts = default_starts(network) if starts == "all" else [starts] if isinstance(starts, str) else list(starts)
     begin = time.perf_counter()
-    flat = flat_of(network)
+    flat = network_arrays(network)
     check_determined(network, flat)
     initial = canonical_start(network)
     check_full_rank(network, flat, initial)
@@ -248,7 +248,7 @@ def solve_network(
     )
 
 
-def _certified(network: PoseNetwork, problem: Problem, end: Optimum) -> bool:
+def _certified(network: PoseNetwork, problem: LeastSquaresProblem, end: Optimum) -> bool:
     from graphslam.solve.network.certificate import certify
 
     poses = problem.unpack(end.values).poses
@@ -374,20 +374,22 @@ def _gnc(task: _Task) -> _Answer:
     )
 
 
-def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: Robust) -> Starts:
+def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: RobustResult) -> StartsResult:
     """What least squares of everything makes of the robust answer, in a few steps: the gap is measured against it."""
     initial = problem.objective(robust.end.values)
     if np.mean(~robust.inliers) > FEW:
         # random loops fill the factorisation: a step of everything costs many times the whole robust solve
         unknown = Optimum(robust.end.values, initial, float("nan"), float("inf"), 0, "rejected")
-        return Starts(problem, unknown, "inliers", (StartReport("inliers", initial, float("nan"), 0, "not tried"),))
-    best = polish(problem, robust.end.values, max_iterations=BATCH_STEPS)
+        return StartsResult(
+            problem, unknown, "inliers", (StartReport("inliers", initial, float("nan"), 0, "not tried"),)
+        )
+    best = descend_to_minimum(problem, robust.end.values, max_iterations=BATCH_STEPS)
     report = StartReport("inliers", initial, best.objective, best.iterations, best.status)
-    return Starts(problem, best, "inliers", (report,))
+    return StartsResult(problem, best, "inliers", (report,))
 
 
-def _native(network: PoseNetwork, flat: FlatGraph, solver: str) -> BatchProblem:
-    if not native(network):
+def _native(network: PoseNetwork, flat: FactorArrays, solver: str) -> BatchProblem:
+    if not has_native_factors(network):
         raise SolverError(
             f"{network.source}: solver {solver} needs GTSAM's native factors, which do not cover Cartesian landmark "
             "observations; use lm or pcg"

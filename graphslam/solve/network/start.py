@@ -20,7 +20,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
-from graphslam.solve.sparse import MANY, BlockElimination, factor
+from graphslam.solve.sparse import MANY, BlockElimination, factorise_sparse
 
 Index = npt.NDArray[np.intp]
 
@@ -40,7 +40,7 @@ def neighbours(network: PoseNetwork) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 @dataclass(frozen=True, slots=True)
-class Tree:
+class SpanningTree:
     """A spanning tree of the edges, rooted at the anchors.
 
     Parameters
@@ -68,7 +68,7 @@ class Tree:
         return total
 
 
-def spanning_tree(network: PoseNetwork, *, chain: bool = False) -> Tree:
+def spanning_tree(network: PoseNetwork, *, chain: bool = False) -> SpanningTree:
     """Breadth first: fewest edges between a vertex and an anchor, so the least accumulated error.
 
     With ``chain`` edges between neighbours in id order have precedence: dead reckoning.
@@ -98,10 +98,10 @@ def spanning_tree(network: PoseNetwork, *, chain: bool = False) -> Tree:
     key = np.minimum(parent, vertex) * n + np.maximum(parent, vertex)
     used = np.full(n, -1)
     used[~rooted] = edge[np.searchsorted(pair, key[~rooted])]
-    return Tree(parent, used, np.where(used >= 0, j[used] == vertex, True))
+    return SpanningTree(parent, used, np.where(used >= 0, j[used] == vertex, True))
 
 
-def tree_poses(network: PoseNetwork, tree: Tree) -> Array:
+def tree_poses(network: PoseNetwork, tree: SpanningTree) -> Array:
     """Poses by chaining the measurements of a tree from the anchors."""
     g = group_of(network.poses)
     step = np.tile(g.identity, (len(network), 1))
@@ -182,7 +182,7 @@ def _least_squares(A: sp.csc_matrix, b: Array, width: int) -> Array:
     rhs = np.asarray(A.conj().T @ b)
     whole = np.iscomplexobj(rhs)
     if H.shape[0] // (1 if whole else width) <= MANY:
-        return np.asarray(factor(H).solve(rhs))
+        return np.asarray(factorise_sparse(H).solve(rhs))
     lu = BlockElimination(H, width).factor(H)
     if whole:
         x = lu.solve(np.stack([rhs.real, rhs.imag], axis=1).ravel()).reshape(-1, 2)

@@ -34,7 +34,7 @@ import numpy as np
 import pandas as pd
 
 from graphslam.core.errors import UnknownNameError
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_studies.association_trial import LOCAL, SINGLE, TrialConfig, run_trial
 from graphslam_studies.evaluate.tables import consistency_of
 from graphslam_studies.montecarlo.trials import Measurement
@@ -116,7 +116,7 @@ class AssociationAmbiguity:
             if not some.empty:
                 rank = some["algorithm"].map({name: k for k, name in enumerate((*LOCAL, *SINGLE))})
                 some = some.iloc[np.argsort(rank.to_numpy(), kind="stable")]
-                made.append(save(plot_runs(some, label=label), folder / f"{quantity}.png"))
+                made.append(save_figure(plot_runs(some, label=label), folder / f"{quantity}.png"))
         return made
 
 

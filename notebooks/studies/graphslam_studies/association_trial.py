@@ -25,10 +25,10 @@ from graphslam.core.submap import Submap
 from graphslam.evaluate.association import AssociationErrors, association_errors, majority_identity, pair_agreement
 from graphslam.evaluate.consistency import nees, vector_pose_error
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinResult
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential
-from graphslam.join.polish import polish
 from graphslam_studies.montecarlo.trials import Measurement
 
 Ints = npt.NDArray[np.int64]
@@ -137,8 +137,8 @@ class Trial:
 
     def join(self, submaps: list[Submap], *, known: bool = False) -> JoinResult:
         """Joined in sequence by joint compatibility (or by the ids they bear), and polished."""
-        rule = None if known else Association(rule="joint", sensor_range=float(self.observations.max_range))
-        return polish(submaps, join_sequential(submaps, association=rule))
+        rule = None if known else MapAssociationConfig(rule="joint", sensor_range=float(self.observations.max_range))
+        return optimise_from_join(submaps, join_sequential(submaps, association=rule))
 
     # ---------------------------------------------------------------- figures
 

@@ -23,8 +23,8 @@ from graphslam.core.records import Odometry, VelocityControls
 from graphslam.core.se3 import se3_inverse, se3_transform
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
-from graphslam_frontends.odometry.recorded import chain
-from graphslam_studies.evaluate.relations import covered, random_pairs, relation_error
+from graphslam_frontends.odometry.recorded import chain_odometry
+from graphslam_studies.evaluate.relations import covered_part, random_pairs, relation_error
 from graphslam_studies.montecarlo.trials import Measurement
 
 UNKNOWN = "unknown"
@@ -86,7 +86,7 @@ def _worse(odometry: Odometry, added: Added, rng: np.random.Generator) -> Odomet
         xi[:, g.heading] += turn
         increments = g.exp(xi)
     else:
-        attitude = chain(odometry).poses
+        attitude = chain_odometry(odometry).poses
         attitude[:, :3] = 0.0
         level = se3_transform(se3_inverse(attitude), np.broadcast_to([0.0, 0.0, 1.0], (len(xi), 3)))
         extra = np.zeros_like(xi)
@@ -180,7 +180,7 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str
     result = run(log, frontend=frontend, solver="batch", config=options, seed=seed, progress=False)
     said = {f.code for f in findings_of_json(result.report["verdict"])}
     path = result.map.trajectory
-    input_path = chain(next(s for s in log.streams.values() if isinstance(s, Odometry)))
+    input_path = chain_odometry(next(s for s in log.streams.values() if isinstance(s, Odometry)))
     of_run, of_input = (path_errors(p, log["reference"]) for p in (path, input_path))
     for key, value in of_run.items():
         yield Measurement(name, key, value)
@@ -194,7 +194,7 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str
 
 def path_errors(path: Trajectory, reference: Any) -> dict[str, float]:
     """Relations of pairs drawn at random [m, deg], and ATE after an alignment [m]."""
-    part = covered(Trajectory(reference.times, reference.poses), path)
+    part = covered_part(Trajectory(reference.times, reference.poses), path)
     pairs = random_pairs(len(part), PAIRS, np.random.default_rng(0))
     row = relation_error(path, part, pairs).as_row()
     at = Trajectory(part.times, path.interpolate(part.times))

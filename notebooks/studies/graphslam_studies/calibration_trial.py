@@ -16,7 +16,7 @@ from graphslam.app.run.pipeline import run
 from graphslam.app.run.source import load_log_source
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import Calibration
-from graphslam.core.config import as_dict
+from graphslam.core.config import options_dict
 from graphslam.core.log import SensorLog
 from graphslam_studies.calibration_robot import DrawnRobot, draw_robot, drive
 from graphslam_studies.calibration_scanned import UNKNOWN, Added, faulty, scanned
@@ -76,7 +76,7 @@ def _drawn(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
     yield Measurement("calibrated", "cpu_seconds", process_time() - begin, timing=True)
     yield from _recovered(robot, log, found)
     ways = {"stated": {"use": "none"}, "calibrated": found.config()}
-    ways["oracle"] = {"use": "none", "given": as_dict(true_figures(robot))}
+    ways["oracle"] = {"use": "none", "given": options_dict(true_figures(robot))}
     for name, calibrate in ways.items():
         yield from _mapped(name, log, {**OPTIONS, "calibrate": calibrate}, seed)
 

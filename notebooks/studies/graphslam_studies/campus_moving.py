@@ -3,7 +3,7 @@
 ``gone``: share of the voxels in which only things that move were met, that are not occupied in the map. ``lost``:
 share of those occupied in a map drawn without these things that are not occupied in the map drawn with them. Both maps
 are drawn along the path that the run found. ``evidence``: the beams added up. ``outvoted``: besides, without voxels
-that more moments saw through than were stopped by (:func:`graphslam.maps.moving.outvoted`).
+that more moments saw through than were stopped by (:func:`graphslam.maps.moving.seen_through_voxels`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.se3 import se3_transform
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.moving import outvoted
+from graphslam.maps.moving import seen_through_voxels
 from graphslam.sim.campus import simulate_campus
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
@@ -59,7 +59,7 @@ def moving_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
     met: Array = (np.unique(np.floor(hits / size).astype(np.int64), axis=0) + 0.5) * np.float64(size)
     met = met[~standing.occupied_at(met)]
     known = np.asarray(standing.occupied_cloud())
-    centres, moved = outvoted(whole, make.moments(log))
+    centres, moved = seen_through_voxels(whole, make.moments(log))
     taken = {tuple(k) for k in np.floor(centres[moved] / size).astype(np.int64).tolist()}
 
     def left(points: Array) -> Array:

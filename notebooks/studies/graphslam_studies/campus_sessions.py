@@ -17,7 +17,7 @@ from scipy import stats
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.pipeline import run as run_log
 from graphslam.app.sessions.merge_dense import MergedSubmaps, merge_dense
-from graphslam.core.config import as_dict
+from graphslam.core.config import options_dict
 from graphslam.core.errors import DataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
@@ -41,8 +41,8 @@ def session_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measuremen
     """Simulate three sessions, run each, and merge them."""
     begin = process_time()
     logs = [simulate_campus(replace(config.campus, session=k, far=k == 2), seed) for k in range(3)]
-    options: dict[str, Any] = {"frontend": as_dict(config.front_end), "backend": as_dict(config.back_end)}
-    options |= {"gps": as_dict(config.gps), "refine": {"use": False}}
+    options: dict[str, Any] = {"frontend": options_dict(config.front_end), "backend": options_dict(config.back_end)}
+    options |= {"gps": options_dict(config.gps), "refine": {"use": False}}
     runs = [
         run_log(log, frontend="scan-window", solver="batch", seed=seed, config=options, progress=False) for log in logs
     ]

@@ -18,10 +18,10 @@ import numpy as np
 from graphslam.app.machine import one_blas_thread
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig, GpsOptions
-from graphslam.backend.streams import split
+from graphslam.backend.streams import split_fixes
 from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import SE3, level
+from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
@@ -104,7 +104,7 @@ def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
 def with_fixes(end: BackEnd, gps: Gps, how: GpsOptions) -> tuple[Solution, Array]:
     """The graph as it is, with these fixes and no others; and its frame in that of the fixes."""
     without_fixes(end)
-    end.add_gps(split(gps, how)[0], how)
+    end.add_gps(split_fixes(gps, how)[0], how)
     end.graph.finish_gps()
     end.solver.solve_to_optimum()
     values, origin = end.graph.values, end.graph.gps_origin
@@ -145,7 +145,7 @@ class Judge:
         assert log.truth is not None
         self.meta: Mapping[str, Any] = log.meta
         self.truth = log.truth.trajectory
-        base = level(self.truth.interpolate(np.array([begin]))[0])
+        base = remove_roll_pitch(self.truth.interpolate(np.array([begin]))[0])
         base[2] -= lift
         self.base = base
         self.T_world_base = SE3.compose(np.asarray(log.meta["T_world_frame"], dtype=np.float64), base)

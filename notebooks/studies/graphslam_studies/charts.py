@@ -42,9 +42,9 @@ from graphslam.core.records import LandmarkObservations, Odometry, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.join.association import Association
+from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinResult
-from graphslam.join.polish import polish
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.registry import JOINERS, methods_for
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam.sim.point_field import PRESETS, PointFieldConfig, simulate_point_field
@@ -193,13 +193,13 @@ def _trial(c: ChartConfig, seed: SeedTree) -> Iterator[Measurement]:
         joined: JoinResult = JOINERS[name](submaps)
         yield from _judged(name, joined, submaps, truth, optimum.objective)
         if name == "eif-tree":
-            yield from _judged(f"{name}+polish", polish(submaps, joined), submaps, truth, optimum.objective)
+            yield from _judged(f"{name}+polish", optimise_from_join(submaps, joined), submaps, truth, optimum.objective)
     options |= {"association": "likelihood", "particles": PARTICLES}
     try:
         submaps = list(make_front_end("rbpf-ekf", options).submaps(log, seed=seed.child("unknown")))
-        rule = Association(rule="joint", sensor_range=c.max_range)
+        rule = MapAssociationConfig(rule="joint", sensor_range=c.max_range)
         joined = JOINERS["eif-tree"](submaps, association=rule)
-        best = polish(submaps, joined)
+        best = optimise_from_join(submaps, joined)
     except GraphSlamError:
         yield Measurement("unknown-eif-tree", "failed", 1.0)
         return

@@ -31,7 +31,7 @@ from pathlib import Path
 import pandas as pd
 
 from graphslam.core.errors import UnknownNameError
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_studies.combined_report import report
 from graphslam_studies.combined_trial import TrialConfig, run_trial
 from graphslam_studies.montecarlo.trials import Measurement
@@ -77,7 +77,7 @@ class CombinedSlam:
             t = table[table["world"] == world]
             there = set(t.loc[t["quantity"] == "error_x", "algorithm"])
             axes = plot_growth_panels(t, algorithms=[a for a in _GROWTH if a in there])
-            made.append(save(axes[0], folder / f"fig7-growth-{world}.png"))
+            made.append(save_figure(axes[0], folder / f"fig7-growth-{world}.png"))
         return made
 
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
-from graphslam.core.config import merge
+from graphslam.core.config import merge_options
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import se2_compose
 from graphslam.core.log import DropCounter
@@ -25,12 +25,12 @@ from graphslam.core.submap import Submap
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.online import RelinearisationPolicy, join_online
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.polish import polish
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam_frontends.landmarks.ekf_slam import ekf_snapshots
-from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.prepare import prepare_log
 from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
 from graphslam_frontends.landmarks.snapshot import Snapshot
 from graphslam_studies.baselines.full_batch import full_batch
@@ -115,7 +115,9 @@ class _Trial:
     def _options(self, front_end: str, options: dict[str, Any]) -> dict[str, Any]:
         """The preset's options with those of the study on top: noise as the log states it, equal cuts."""
         own = {"association": "known", "stopping": {"scans": self.config.scans}}
-        merged: dict[str, Any] = merge(recommended(self.log, front_end), {"frontend": merge(own, options)})
+        merged: dict[str, Any] = merge_options(
+            recommended_options(self.log, front_end), {"frontend": merge_options(own, options)}
+        )
         return dict(merged["frontend"])
 
     def _submaps(self, front_end: str, options: dict[str, Any]) -> list[Submap]:
@@ -175,7 +177,7 @@ class _Trial:
         if {"ekf", classical} <= set(done):
             difference = np.abs(done["ekf"].vector - done[classical].vector)
             yield Measurement(f"{family}-ekf", "difference_to_eif", float(difference.max()))
-        polished = polish(submaps, done["eif-tree"])
+        polished = optimise_from_join(submaps, done["eif-tree"])
         name = f"{family}-eif+polish"
         yield from self.judge.estimate(name, polished)
         yield from timed(name, {"polish": polished.times["polish"]})
@@ -188,7 +190,7 @@ class _Trial:
         yield Measurement("default-batch", "objective_optimum", best.objective)
         yield Measurement("default-batch", "objective_dof", float(_degrees_of_freedom(submaps, best)))
         for kind, join in (("sequence", join_sequential), ("ekf", join_ekf)):
-            polished = polish(submaps, join(submaps))
+            polished = optimise_from_join(submaps, join(submaps))
             yield Measurement(f"default-{kind}+polish", "objective_optimum", _optimum(polished))
             yield Measurement(f"default-{kind}+polish", "polish_iterations", float(polished.iterations))
         isam = solve_submaps_isam2(submaps)
@@ -211,7 +213,7 @@ class _Trial:
     def _full_batch(self, submaps: list[Submap], best: SubmapEstimate) -> Iterator[Measurement]:
         """All scan poses at once, from the submaps' optimum."""
         front_end = make_front_end("rbpf-ekf", self._options("rbpf-ekf", {}))
-        data = prepare(self.log, front_end.config, DropCounter())
+        data = prepare_log(self.log, front_end.config, DropCounter())
         start = np.concatenate(
             [
                 se2_compose(base, s.trajectory.poses[-n:])

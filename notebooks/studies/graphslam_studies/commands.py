@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from graphslam.app.cli.run import JSON
-from graphslam.app.cli.terminal import emit, table
+from graphslam.app.cli.terminal import print_result, text_table
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.plugins import plugins
 
@@ -46,7 +46,7 @@ def study(
         reports = {}
     failures = result.failures.to_dict("records")
     rows = [{"world": w, "runs": n} for w, n in result.runs.items()]
-    text = [table(rows)] + [f"\n{title}\n{table(found)}" for title, found in reports.items()]
+    text = [text_table(rows)] + [f"\n{title}\n{text_table(found)}" for title, found in reports.items()]
     value = {
         "out": str(out),
         "name": result.identity["name"],
@@ -57,7 +57,7 @@ def study(
         "reports": reports,
         "figures": sorted(str(p) for p in (out / "figures").glob("*.png")),
     }
-    emit(value, "\n".join([*text, f"\nwritten to {out}: report.md, table.csv, timings.csv"]), as_json=as_json)
+    print_result(value, "\n".join([*text, f"\nwritten to {out}: report.md, table.csv, timings.csv"]), as_json=as_json)
     if failures:
         first = failures[0]
         raise GraphSlamError(
@@ -81,4 +81,4 @@ def terrain_tables(
         {"threshold": t, "false": a, "false on flat ground": b}
         for t, (a, b) in value["false_alarms_while_learning"].items()
     ]
-    emit(value, f"{table(rows)}\nthreshold {tables.threshold}; written to {out}", as_json=as_json)
+    print_result(value, f"{text_table(rows)}\nthreshold {tables.threshold}; written to {out}", as_json=as_json)

@@ -23,14 +23,14 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.refined import heading_error
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import Refinement, refine
+from graphslam.refine.refine import Refinement, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
 from graphslam.solve.batch import BatchSolver
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.segslam.result import SegSlamResult
-from graphslam_frontends.segslam.submaps import base_of
+from graphslam_frontends.segslam.submaps import segment_base
 from graphslam_studies.evaluate import segslam_judge as judge
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.segmap_trial import GraphTrial, GraphTrialConfig
@@ -103,7 +103,7 @@ class RefinementTrial(GraphTrial):
         yield from self.graph_figures("loops", result, built)
         yield Measurement("loops", "failed", 0.0)
         start = built.solution.trajectory().interpolate(self.steps.times)
-        base = base_of(result.segmap, self.truth[0])
+        base = segment_base(result.segmap, self.truth[0])
         scans = Scans.of(self.steps)
         yield from self.refined("refined", scans, start, base, entropy="entropy" in self.config.figures)
         for count in self.study.wrong:
@@ -121,7 +121,7 @@ class RefinementTrial(GraphTrial):
             np.clip(scans.times, self.steps.times[0], self.steps.times[-1])
         )
         wall, cpu = perf_counter(), process_time()
-        found = refine(scans, start, self.study.refine)
+        found = refine_by_scans(scans, start, self.study.refine)
         yield Measurement(kind, "seconds_refine", perf_counter() - wall, timing=True)
         yield Measurement(kind, "cpu_share", (process_time() - cpu) / float(scans.times[-1]), timing=True)
         before = judge.path_errors(Trajectory(scans.times, start), true)

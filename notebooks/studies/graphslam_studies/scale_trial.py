@@ -14,10 +14,10 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.se3 import matrix_to_quat, quat_to_matrix
 from graphslam.skeleton.collapse import Collapse, number_by_first_sighting
 from graphslam.skeleton.landmark_kernels import Poses
-from graphslam.skeleton.preconditioner import Levels
+from graphslam.skeleton.preconditioner import PreconditionerLevels
 from graphslam.skeleton.problem import SkeletonProblem
-from graphslam.skeleton.relax import RelaxConfig, Relaxed, relax_skeleton
-from graphslam.skeleton.schur import Layout, Network, Workers
+from graphslam.skeleton.relax import RelaxationResult, RelaxConfig, relax_skeleton
+from graphslam.skeleton.schur import Network, Workers, WorkRanges
 from graphslam.solve.network.solve import solve_network
 from graphslam_studies.baselines.links import relative_links
 from graphslam_studies.montecarlo.trials import Measurement
@@ -51,13 +51,13 @@ class ScaleTrialConfig:
 
 TIGHT = RelaxConfig(gain=1e-6, move=1e-5, soft=0)
 METHODS: dict[str, RelaxConfig] = {
-    "direct": replace(TIGHT, method="levels", levels=Levels(0, 1)),
+    "direct": replace(TIGHT, method="levels", levels=PreconditionerLevels(0, 1)),
     "gn": TIGHT,
-    "gn, block Jacobi": replace(TIGHT, levels=Levels(), inner=2000),
+    "gn, block Jacobi": replace(TIGHT, levels=PreconditionerLevels(), inner=2000),
     "cg, two levels": replace(TIGHT, method="cg", iterations=300),
     "cg, two levels kept": replace(TIGHT, method="cg", iterations=300, rebuild=0),
-    "cg, block Jacobi": replace(TIGHT, method="cg", iterations=300, rebuild=50, levels=Levels()),
-    "cg, none": replace(TIGHT, method="cg", iterations=300, rebuild=0, levels=Levels(-1, 0)),
+    "cg, block Jacobi": replace(TIGHT, method="cg", iterations=300, rebuild=50, levels=PreconditionerLevels()),
+    "cg, none": replace(TIGHT, method="cg", iterations=300, rebuild=0, levels=PreconditionerLevels(-1, 0)),
     "blocks": replace(TIGHT, method="blocks"),
     "keyframes alone": replace(TIGHT, method="levels"),
 }
@@ -79,7 +79,7 @@ def rms(a: Poses, b: Poses) -> float:
     return float(np.sqrt(np.mean(np.sum((a.position - b.position) ** 2, axis=1))))
 
 
-def _said(name: str, found: Relaxed, best: Relaxed, truth: Poses, first: float) -> Rows:
+def _said(name: str, found: RelaxationResult, best: RelaxationResult, truth: Poses, first: float) -> Rows:
     yield Measurement(name, "gap", found.objective - best.objective)
     yield Measurement(name, "chi2", found.chi2)
     yield Measurement(name, "iterations", found.iterations)
@@ -95,7 +95,7 @@ def _methods(config: ScaleTrialConfig, seed: int) -> Rows:
     world = draw_laps(config.world, seed)
     problem = world.problem()
     start = problem.dead_reckoning()
-    first = float(np.linalg.norm(Network(Layout(problem, Workers(1)), start).gradient))
+    first = float(np.linalg.norm(Network(WorkRanges(problem, Workers(1)), start).gradient))
     best = relax_skeleton(problem, TIGHT)
     for name, how in METHODS.items():
         yield from _said(name, relax_skeleton(problem, how, start), best, world.truth, first)
@@ -201,7 +201,9 @@ def _stability(config: ScaleTrialConfig, seed: int) -> Rows:
         problem = replace(world.problem(), up=None, gps_pose=np.empty(0, np.int64), gps_position=nothing)
         start = problem.dead_reckoning()
         best = relax_skeleton(problem, replace(TIGHT, split=False), world.truth)
-        once = RelaxConfig(method="levels", levels=Levels(0, 1), iterations=1, soft=0, split=False, halve=False)
+        once = RelaxConfig(
+            method="levels", levels=PreconditionerLevels(0, 1), iterations=1, soft=0, split=False, halve=False
+        )
         ways: dict[str, Poses] = {
             "dead reckoning": start,
             "relinearised": relax_skeleton(problem, replace(TIGHT, split=False, start="odometry")).poses,
@@ -209,7 +211,7 @@ def _stability(config: ScaleTrialConfig, seed: int) -> Rows:
             "information form, linearised once": relax_skeleton(problem, once, start).poses,
             "links fixed once": linked(problem, start),
         }
-        layout = Layout(problem, Workers(1))
+        layout = WorkRanges(problem, Workers(1))
         for way, poses in ways.items():
             name = f"{way}; {1e3 * turn:g} mrad"
             network = Network(layout, poses)

@@ -21,7 +21,7 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees, nees, pose_error, vector_pose_error
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam.join.joined_map import MapView, landmark_scalars
+from graphslam.join.joined_map import JoinedMapView, landmark_scalars
 from graphslam.join.submap_solver import SubmapEstimate
 from graphslam_frontends.landmarks.snapshot import Snapshot
 from graphslam_studies.montecarlo.trials import Measurement
@@ -188,7 +188,7 @@ class Watch:
         self._seconds = 0.0
         self._left = perf_counter()
 
-    def __call__(self, k: int, view: MapView) -> None:
+    def __call__(self, k: int, view: JoinedMapView) -> None:
         """Score the map right after submap k."""
         self._seconds += perf_counter() - self._left
         self.rows.append(Measurement(self.algorithm, "seconds_cumulative", self._seconds, k, timing=True))

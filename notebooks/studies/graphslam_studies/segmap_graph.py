@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_studies import segslam_report as tables
 from graphslam_studies.montecarlo.worlds_study import draw_runs
 from graphslam_studies.segmap_trial import GraphStudy, GraphTrialConfig

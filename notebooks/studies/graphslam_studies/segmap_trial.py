@@ -26,11 +26,17 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop
-from graphslam.maps.entropy import Clarity
+from graphslam.maps.entropy import MapEntropy
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.solution import Solution
 from graphslam_frontends.segslam.result import SegSlamResult
-from graphslam_frontends.segslam.submaps import base_of, drift_by_path, sampled_chain, settle, settled_chain
+from graphslam_frontends.segslam.submaps import (
+    common_ancestor_chain,
+    drift_by_path,
+    sampled_chain,
+    segment_base,
+    submaps_of_segments,
+)
 from graphslam_studies.evaluate import segslam_judge as judge
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy
@@ -121,8 +127,8 @@ class GraphTrial(GridTrial):
     def submaps(self, result: SegSlamResult) -> list[Submap]:
         """The settled chain of the likeliest particle, with maps."""
         segmap = result.segmap
-        chain = settled_chain(segmap, int(result.closed[result.best]))
-        return settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift, result.steps))
+        chain = common_ancestor_chain(segmap, int(result.closed[result.best]))
+        return submaps_of_segments(segmap, chain, drift_by_path(segmap, chain, self.config.drift, result.steps))
 
     def build(self, submaps: Sequence[Submap], kind: str) -> BuiltGraph:
         """The graph of settled segments, one of :data:`GRAPHS`."""
@@ -154,14 +160,17 @@ class GraphTrial(GridTrial):
                 chains.add(tuple(chain.tolist()))
                 found.append(
                     self.build(
-                        settle(segmap, chain, drift_by_path(segmap, chain, self.config.drift, result.steps)), "loops"
+                        submaps_of_segments(
+                            segmap, chain, drift_by_path(segmap, chain, self.config.drift, result.steps)
+                        ),
+                        "loops",
                     )
                 )
         seconds = sum(b.seconds for b in found)
         best = min(found, key=lambda b: self.clarity(b).entropy)
         return replace(best, seconds=seconds)
 
-    def clarity(self, built: BuiltGraph) -> Clarity:
+    def clarity(self, built: BuiltGraph) -> MapEntropy:
         """Of all scans along the path of a graph."""
         at = built.solution.trajectory().interpolate(self.steps.times)
         model = self.config.filter.beam_model()
@@ -216,7 +225,7 @@ class GraphTrial(GridTrial):
         node_times = np.unique(np.concatenate([np.asarray(s.times) for s in built.graph.submaps]))[1:]
         rows = np.clip(np.searchsorted(path.times, node_times), 0, len(path.times) - 1)
         g, truth = group_of(path.poses), self._truth_at(path.times[rows])
-        base = base_of(result.segmap, self.truth[0])
+        base = segment_base(result.segmap, self.truth[0])
         true = g.between(np.broadcast_to(base, truth.shape), truth)
         e = g.log(g.between(path.poses[rows], true))
         assert path.covariances is not None

@@ -29,7 +29,7 @@ import numpy as np
 import pandas as pd
 
 from graphslam.core.errors import UnknownNameError
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam.plots.segments import plot_segments
 from graphslam_studies import segslam_report as tables
 from graphslam_studies.montecarlo.worlds_study import draw_runs
@@ -110,11 +110,11 @@ class SegSlamGarage(GridStudy):
                     None, curves, label="error at the end [m]", title=world, reference=reference,
                     limit=(tables.GOOD, f"closed below {tables.GOOD:g} m"),
                 )  # fmt: skip
-                made.append(save(ax, folder / f"{world}-error.png"))
+                made.append(save_figure(ax, folder / f"{world}-error.png"))
             seconds = dict(time_curves(table, timings, world))
             if seconds:
                 ax = plot_by_particles(None, seconds, label="run time [s]", title=world)
-                made.append(save(ax, folder / f"{world}-seconds.png"))
+                made.append(save_figure(ax, folder / f"{world}-seconds.png"))
             made += path_figure(table, world, folder)
         return made + draw_runs(table, {"final_error": "error at the end [m]"}, folder)
 
@@ -170,7 +170,7 @@ def path_figure(table: pd.DataFrame, world: str, folder: Path) -> list[Path]:
     ]
     truth = p[["path_true_x", "path_true_y"]].to_numpy(dtype=np.float64)
     ax = plot_segments(None, pieces, truth=truth, title=f"{world}, {of['algorithm'].iloc[0]}, run {run}")
-    return [save(ax, folder / f"{world}-path.png")]
+    return [save_figure(ax, folder / f"{world}-path.png")]
 
 
 STUDY = SegSlamGarage(

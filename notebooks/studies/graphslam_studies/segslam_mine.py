@@ -20,8 +20,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from graphslam.plots.save import save
-from graphslam_frontends.segslam.config import SegSlamConfig, WinnowConfig
+from graphslam.plots.save import save_figure
+from graphslam_frontends.segslam.config import SegmentCandidateConfig, SegSlamConfig
 from graphslam_studies import segslam_report as tables
 from graphslam_studies.plots.association import plot_runs
 from graphslam_studies.segslam_garage import path_figure
@@ -30,7 +30,7 @@ from graphslam_studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridS
 _FIGURES: tuple[Figure, ...] = ("matches", "exits", "loops", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "segslam-20")
 # Galleries do not lie above each other, so that heights may drift: at 6 mrad of gravity 2.4 m on the first loop.
-SEGSLAM = SegSlamConfig(winnowing=WinnowConfig(height_per_metre=7e-3))
+SEGSLAM = SegSlamConfig(winnowing=SegmentCandidateConfig(height_per_metre=7e-3))
 _MINE = GridTrialConfig(world="mine", algorithms=_ALGORITHMS, figures=_FIGURES, segslam=SEGSLAM)
 WORLDS = {"mine": _MINE, "mine-drawn": replace(_MINE, layout="drawn")}
 QUICK_WORLDS = {
@@ -58,7 +58,7 @@ class SegSlamMine(GridStudy):
         if not visits.empty:
             worst = visits.groupby(["world", "run", "algorithm"], sort=False)["value"].max().reset_index()
             ax = plot_runs(worst, label="greatest error at a second visit [m]")
-            made.append(save(ax, folder / "visit_error.png"))
+            made.append(save_figure(ax, folder / "visit_error.png"))
         for world in dict.fromkeys(table["world"].astype(str)):
             made += path_figure(table, world, folder)
         return made

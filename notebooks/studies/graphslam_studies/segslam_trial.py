@@ -24,12 +24,12 @@ from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.refined import heading_error
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from graphslam.sim.world import DRAWN, World
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
 from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.make_steps import make_steps
@@ -39,8 +39,8 @@ from graphslam_frontends.segslam.config import (
     CandidateSearch,
     ChoiceConfig,
     SegmentationConfig,
+    SegmentCandidateConfig,
     SegSlamConfig,
-    WinnowConfig,
 )
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
@@ -115,7 +115,7 @@ class GridTrialConfig:
         layout = self.layout
         if layout == "drawn":
             layout = f"{DRAWN}{1 + int(SeedTree(seed).child('layout').generator().integers(10**9))}"
-        made = court(seed=seed) if self.world == "court" else mesh_world(self.world, layout=layout, seed=seed)
+        made = ring_hall(seed=seed) if self.world == "court" else mesh_world(self.world, layout=layout, seed=seed)
         return replace(made, speed=self.speed * made.speed)
 
 
@@ -358,7 +358,7 @@ QUICK = GridTrialConfig(
     segslam_filter=GridFilterConfig(weight_beams=120, walk_scale=0.5),
     segslam=SegSlamConfig(
         segmentation=SegmentationConfig(window=2.0, min_seconds=6.0, min_length=5.0, max_length=14.0, excluded=3.0),
-        winnowing=WinnowConfig(gap=15.0),
+        winnowing=SegmentCandidateConfig(gap=15.0),
         search=CandidateSearch(source_radius=8.0),
         choice=ChoiceConfig(every=2.0),
     ),

@@ -36,9 +36,9 @@ from graphslam.core.errors import GraphSlamError
 from graphslam.core.gnss import TangentPlane
 from graphslam.core.log import SensorLog
 from graphslam.graph.factors.attitude import DOWN
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies import segslam_report as tables
 from graphslam_studies.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
@@ -112,7 +112,7 @@ def settings_of(grid: Mapping[str, tuple[float, ...]]) -> list[dict[str, float]]
 def config_of(settings: Settings) -> PseudorangeConfig:
     """How pseudoranges enter the graph by some settings."""
     rest = {k: v for k, v in settings.items() if k != CAUCHY}
-    robust = Robust("cauchy", settings[CAUCHY]) if CAUCHY in settings else Robust()
+    robust = RobustKernel("cauchy", settings[CAUCHY]) if CAUCHY in settings else RobustKernel()
     return PseudorangeConfig(**rest, robust=robust)
 
 
@@ -188,7 +188,7 @@ def run_smartloc_trial(config: SmartLocTrialConfig, seed: int) -> list[Measureme
 
 
 def _figures(config: SmartLocTrialConfig, seed: int) -> Iterator[Measurement]:
-    log = load("smartloc-gnss") if config.street is None else simulate_satellites(seed, config.street)
+    log = load_recording("smartloc-gnss") if config.street is None else simulate_satellites(seed, config.street)
     halves = windows(log, 2)
     test, training = halves[config.scored], windows(halves[1 - config.scored], config.windows)
     for name, grid in config.grids.items():

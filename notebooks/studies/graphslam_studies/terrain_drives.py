@@ -38,7 +38,7 @@ from scipy.ndimage import binary_closing, distance_transform_edt
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.maps.terrain.lines import ScanLines, lines_of_scans
-from graphslam.maps.terrain.plan import CostConfig, CostMap, PlannedWay, cost_map, plan_way
+from graphslam.maps.terrain.plan import CostConfig, CostMap, PlannedPath, cost_map, plan_vehicle_path
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass, TerrainMap
 from graphslam.maps.terrain.tables import read_tables
 from graphslam.maps.terrain.vehicle import CELLS, Vehicle
@@ -106,7 +106,7 @@ class Course:
     """Along x [m]."""
     hazards: dict[str, Array]
     """Distance to the nearest hazard of each kind, on cells of 0.05 m [m]."""
-    best: PlannedWay | None
+    best: PlannedPath | None
     """Way over a map of the truth."""
     costs: CostMap
     """Of the truth."""
@@ -232,10 +232,10 @@ class Navigator:
         return min(self.sensor_bound, self.vehicle.safe_speed(seen))
 
 
-def _plan(costs: CostMap, place: Array, goal: float) -> PlannedWay | None:
+def _plan(costs: CostMap, place: Array, goal: float) -> PlannedPath | None:
     """Way to the line x = ``goal``."""
     y = costs.origin[1] + costs.cell * (np.arange(len(costs.cost)) + 0.5)
-    return plan_way(costs, place, np.column_stack([np.full(len(y), goal), y]))
+    return plan_vehicle_path(costs, place, np.column_stack([np.full(len(y), goal), y]))
 
 
 def _smooth(points: Array, costs: CostMap) -> Array:

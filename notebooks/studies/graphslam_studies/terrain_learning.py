@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT
 from graphslam.maps.terrain.lines import Rows, lines_of_scans
 from graphslam.maps.terrain.pyramid import Pyramid
-from graphslam.maps.terrain.tables import BINS, SCALE, WEIGHTS, Tables, fixed_tables
+from graphslam.maps.terrain.tables import BINS, SCALE, WEIGHTS, TerrainWeights, fixed_tables
 from graphslam.maps.terrain.vehicle import CELLS
 from graphslam_studies.maps.learning import count_values, fit_calibration, fit_weights, ratios_of
 from graphslam_studies.sim.street import OBSTACLE, RAMP_LENGTH, TARGETS, Street, draw_street, drive_street
@@ -79,7 +79,7 @@ def learn_tables(
     targets: Sequence[str] = tuple(TARGETS),
     config: TerrainTrialConfig | None = None,
     progress: bool = True,
-) -> Tables:
+) -> TerrainWeights:
     """Tables of a sensor and a vehicle.
 
     Parameters
@@ -94,7 +94,7 @@ def learn_tables(
     c = config or TerrainTrialConfig()
     if not seeds or not targets:
         raise ConfigError("tables are learnt on at least one drive: name seeds and targets")
-    blank = Tables(fixed_tables(4, 0.0, 0.0), np.zeros((4, WEIGHTS)), np.zeros(WEIGHTS), 0.5, {})
+    blank = TerrainWeights(fixed_tables(4, 0.0, 0.0), np.zeros((4, WEIGHTS)), np.zeros(WEIGHTS), 0.5, {})
     shape = Pyramid(BOX, blank, c.vehicle, c.sensor)
     wide = Pyramid(BOX, blank, c.vehicle, c.sensor, SINGLE)
     histograms = np.zeros((2, 3, shape.bands, BINS), np.int64)
@@ -114,16 +114,16 @@ def learn_tables(
         flat = [coarser(truth, round(SINGLE[0] / CELLS[0]))]
         kept_wide.append(Drive(target, _until(wide_rows, ends), places, flat, _on_ramp(street, wide)))
     ratios = ratios_of(histograms)
-    learnt = Tables(ratios, np.zeros((4, WEIGHTS)), np.zeros(WEIGHTS), 0.5, {})
+    learnt = TerrainWeights(ratios, np.zeros((4, WEIGHTS)), np.zeros(WEIGHTS), 0.5, {})
     cells, wide_cells = labelled_cells(kept, learnt, c), labelled_cells(kept_wide, learnt, c, SINGLE)
     weights = np.array([fit_weights(of.ratios, of.counts, of.hazard, of.slope) for of in cells])
     of = wide_cells[0]
     single = fit_weights(of.ratios, of.counts, of.hazard, of.slope)
-    learnt = Tables(ratios, weights, single, 0.5, {})
+    learnt = TerrainWeights(ratios, weights, single, 0.5, {})
     cells, wide_cells = labelled_cells(kept, learnt, c), labelled_cells(kept_wide, learnt, c, SINGLE)
     for row, of in zip([*weights, single], [*cells, wide_cells[0]]):
         row[-2:] = fit_calibration(of.probability, of.hazard)
-    learnt = Tables(ratios, weights, single, 0.5, {})
+    learnt = TerrainWeights(ratios, weights, single, 0.5, {})
     rates = false_alarms(kept, learnt, c)
     good = [t for t in CANDIDATES if rates[t][0] <= MOST_FALSE and rates[t][1] <= MOST_FALSE_FLAT]
     threshold = good[0] if good else CANDIDATES[-1]
@@ -141,12 +141,12 @@ def learn_tables(
         },
         "false_alarms_while_learning": {str(t): [round(a, 5) for a in rates[t]] for t in CANDIDATES},
     }
-    return Tables(ratios, weights, single, threshold, provenance)
+    return TerrainWeights(ratios, weights, single, threshold, provenance)
 
 
 def write_learnt_tables(
     path: str | Path, *, drives: int = 10, first_seed: int = FIRST_SEED, progress: bool = True
-) -> Tables:
+) -> TerrainWeights:
     """Learn the tables of the simulated robot and write them."""
     if drives < 1:
         raise ConfigError(f"{drives} drives for each target; wanted at least 1")
@@ -187,7 +187,7 @@ def _until(rows: Rows, ends: list[int]) -> list[Rows]:
 
 
 def _pyramids(
-    kept: list[Drive], tables: Tables, c: TerrainTrialConfig, cells: tuple[float, ...] = CELLS
+    kept: list[Drive], tables: TerrainWeights, c: TerrainTrialConfig, cells: tuple[float, ...] = CELLS
 ) -> Iterator[tuple[Pyramid, Drive, float]]:
     for drive in kept:
         pyramid = Pyramid(BOX, tables, c.vehicle, c.sensor, cells)
@@ -197,7 +197,7 @@ def _pyramids(
 
 
 def labelled_cells(
-    kept: list[Drive], tables: Tables, c: TerrainTrialConfig, cells: tuple[float, ...] = CELLS
+    kept: list[Drive], tables: TerrainWeights, c: TerrainTrialConfig, cells: tuple[float, ...] = CELLS
 ) -> list[LabelledCells]:
     """Of every band: cells for which it speaks of steps, ahead of the sensor and within 11 m, at all distances asked.
 
@@ -224,7 +224,7 @@ def labelled_cells(
     return [LabelledCells(*(np.concatenate(part, axis=-1) for part in zip(*of))) for of in parts if of]
 
 
-def false_alarms(kept: list[Drive], tables: Tables, c: TerrainTrialConfig) -> dict[float, tuple[float, float]]:
+def false_alarms(kept: list[Drive], tables: TerrainWeights, c: TerrainTrialConfig) -> dict[float, tuple[float, float]]:
     """Share of free cells within 7 m that are called a hazard, by threshold: all, and those of streets without a target
     that are farther than 0.5 m from any hazard."""
     counts = {t: np.zeros(4) for t in CANDIDATES}

@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.maps.terrain.line_kernels import OVERHANG
-from graphslam.maps.terrain.lines import Rows, ScanLines, lines_of_scans, observe
+from graphslam.maps.terrain.lines import Rows, ScanLines, lines_of_scans, observe_terrain
 from graphslam.maps.terrain.pyramid import Box, Pyramid, TerrainMap
 from graphslam.maps.terrain.tables import read_tables
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
@@ -128,7 +128,7 @@ def _finer(a: Mask, k: int) -> Mask:
 
 def statements(lines: ScanLines, pyramid: Pyramid) -> Rows:
     """All statements of lines in the cells of a pyramid."""
-    parts = list(observe(lines, pyramid.edges, pyramid.cells, pyramid.vehicle))
+    parts = list(observe_terrain(lines, pyramid.edges, pyramid.cells, pyramid.vehicle))
     return np.concatenate(parts) if parts else np.zeros((0, 6), np.int32)
 
 

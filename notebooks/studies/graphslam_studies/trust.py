@@ -3,7 +3,7 @@
 Worlds are drawn (:mod:`graphslam_studies.trust_worlds`): route, features, robot, noise, receiver; every other
 world is clean, the others have one or two things wrong that nobody tells the run. ``graphslam.run`` maps each as a user
 would, with the noise as it is stated (no calibration), identities known, and says its word
-(:mod:`graphslam.evaluate.trust`).
+(:mod:`graphslam.evaluate.covariance_assessment`).
 
 The score has nothing in common with what it judges: it is made here of the simulator's poses and the covariances that
 the graph claims. With fixes poses are scored in the frame of the fixes, else in that of the first base.

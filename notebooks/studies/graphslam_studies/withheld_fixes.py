@@ -43,9 +43,9 @@ from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam.solve.batch import BatchSolver
-from graphslam_studies.graph.inertial_start import inertial_start, turned_on
+from graphslam_studies.graph.inertial_start import inertial_start, integrate_attitude
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
 
@@ -164,7 +164,7 @@ def run_withheld_trial(config: WithheldConfig, seed: int) -> list[Measurement]:
 
 
 def _figures(config: WithheldConfig) -> Iterator[Measurement]:
-    log = load(config.source)
+    log = load_recording(config.source)
     fixes: Gps = log[str(log.of_type(Gps))]
     unit = log.of_type(Imu)
     low, high = config.span
@@ -175,7 +175,7 @@ def _figures(config: WithheldConfig) -> Iterator[Measurement]:
         used = used_of(fixes.times, config.every)
         told = fixes.take(used)
         attitude, bias = inertial_start(imu, told.times, told.positions)
-        attitudes = turned_on(attitude, imu, fixes.times, bias)
+        attitudes = integrate_attitude(attitude, imu, fixes.times, bias)
         values = scores(graph_of_fixes(imu, fixes, used, attitudes), fixes, used)
     else:
         fixes = fixes.take((fixes.times >= low) & (fixes.times <= high))

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 import graphslam as gs
-from graphslam.app.cli import app, one_line
+from graphslam.app.cli import app, error_line
 from graphslam.app.run.run import Run
 from graphslam.core.errors import ConfigError, MissingDataError, SolverError, UnknownNameError
 from graphslam.core.log import SensorLog
@@ -75,7 +75,7 @@ def test_shells_complete_verbs() -> None:
 )
 def test_ctrl_c_says_how_to_go_on(typed: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["graphslam", *typed.split()])
-    assert one_line(KeyboardInterrupt()).endswith(said)
+    assert error_line(KeyboardInterrupt()).endswith(said)
 
 
 def test_ctrl_c_in_a_run_is_one_line_that_says_how_to_go_on(tmp_path: Path) -> None:
@@ -140,10 +140,10 @@ def test_a_front_end_is_given_by_name_as_a_class_or_as_an_object(log: SensorLog,
 
 def run_config(run: Run) -> RbpfEkfConfig:
     from graphslam.app.run.files import read_options
-    from graphslam.core.config import build
+    from graphslam.core.config import build_config
 
     assert run.folder is not None
-    made: RbpfEkfConfig = build(RbpfEkfConfig, read_options(run.folder)["frontend"])
+    made: RbpfEkfConfig = build_config(RbpfEkfConfig, read_options(run.folder)["frontend"])
     return made
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from graphslam.app.folders import generations
-from graphslam.app.folders.generations import check_same, consistent, is_empty, new_generation, outputs
-from graphslam.app.folders.lock import LOCK, locked
+from graphslam.app.folders.generations import check_same, current_outputs, is_empty, new_generation, read_consistently
+from graphslam.app.folders.lock import LOCK, lock_folder
 from graphslam.core.atomic import part_path
 from graphslam.core.errors import FormatError, RunFolderError
 from graphslam_studies.montecarlo.study import study
@@ -39,7 +39,7 @@ def test_plain_paths_show_one_state(tmp_path: Path) -> None:
         (new.figures / "map.png").write_text("one")
         assert plain(tmp_path) == {}
     assert plain(tmp_path) == {"run.json": "1", "figures/map.png": "one"}
-    assert outputs(tmp_path) == tmp_path / "generations" / "000001"
+    assert current_outputs(tmp_path) == tmp_path / "generations" / "000001"
     seen = []
 
     def read(root: Path) -> str:  # another state is committed while this one is read
@@ -50,7 +50,7 @@ def test_plain_paths_show_one_state(tmp_path: Path) -> None:
         seen.append(root.name)
         return (root / "figures" / "map.png").read_text() if len(seen) == 1 else (root / "run.json").read_text()
 
-    assert consistent(tmp_path, read) == "2"
+    assert read_consistently(tmp_path, read) == "2"
     assert seen == ["000001", "000002"]
     assert plain(tmp_path) == {"run.json": "2", "report.html": "page"}
     assert not (tmp_path / "figures" / "map.png").is_symlink()  # nor a link that leads nowhere
@@ -79,7 +79,7 @@ def test_copies_and_folders_of_older_versions_become_generations(followed: bool,
     folder = Path(shutil.copytree(old, tmp_path / "new", symlinks=not followed))
     (folder / "figures" / "own.svg").write_text("mine")
     (folder / "figures" / "progress.png").write_text("on the way")
-    assert outputs(folder) == (folder if followed else folder / "generations" / "000001")
+    assert current_outputs(folder) == (folder if followed else folder / "generations" / "000001")
     assert plain(folder) == {"run.json": "1", "figures/map.png": "one"}
     with new_generation(folder) as new:
         assert new.before is not None
@@ -121,21 +121,24 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(RunFolderError, match=rf"process {other.pid} on \S+ is writing into it"), locked(tmp_path):
+        with (
+            pytest.raises(RunFolderError, match=rf"process {other.pid} on \S+ is writing into it"),
+            lock_folder(tmp_path),
+        ):
             pass
         with pytest.raises(RunFolderError, match=str(other.pid)), new_generation(tmp_path):
             pass
         other.kill()
         other.wait()
     assert str(other.pid) in (tmp_path / LOCK).read_text()  # the dead one's name blocks nobody
-    with locked(tmp_path), locked(tmp_path):
+    with lock_folder(tmp_path), lock_folder(tmp_path):
         assert str(os.getpid()) in (tmp_path / LOCK).read_text()
     commit(tmp_path)
 
 
 def test_the_second_process_gets_one_line(tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text("")
-    with locked(tmp_path):
+    with lock_folder(tmp_path):
         done = graphslam("report", tmp_path)
     assert done.returncode == 1
     assert re.fullmatch(rf"graphslam: .*process {os.getpid()} on \S+ is writing into it.*\n", done.stderr)
@@ -168,7 +171,7 @@ def test_what_a_kill_leaves_is_swept_and_nothing_else(tmp_path: Path) -> None:
 def test_a_folder_with_the_leavings_of_a_kill_is_empty(tmp_path: Path) -> None:
     (tmp_path / PART).write_text("half")
     assert is_empty(tmp_path)
-    with locked(tmp_path):
+    with lock_folder(tmp_path):
         (tmp_path / "generations" / "000001").mkdir(parents=True)
         (tmp_path / "run.json").symlink_to("current/run.json")
         assert is_empty(tmp_path)

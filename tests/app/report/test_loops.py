@@ -17,7 +17,7 @@ from graphslam.app.cli import app
 from graphslam.app.report.loops import COLUMNS
 from graphslam.app.report.report import PAGE, make_report
 from graphslam.app.run import pipeline
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from tests.app.run.test_pipeline_space import ring
 from tests.reference.page import Page
 
@@ -27,7 +27,7 @@ def run_ring(dim: int, out: Path) -> Path:
     log, front = ring(dim)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "make_front_end", lambda *_: front)
-        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
         config = {"gps": {"use": "every-second", "robust": "none"}}
         pipeline.run(log, frontend="ring", out=out, config=config, progress=False, solver="batch")
     return out
@@ -46,7 +46,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
 def decisions() -> list[dict[str, Any]]:
     """Loops of every verdict, one of them undone after it was in."""
     P = (0.01 * np.eye(6)).tolist()
-    first = Decision(
+    first = LoopDecision(
         loop=0, verdict="accepted", why="all gates", i=3, j=40, submap_i=0, submap_j=5, source="proximity", score=2.5,
         gain=3.0, gates={"fitness": 0.9, "fitness_known": 0.93, "margin": 0.2, "tilt": None}, chi2=4.25, weight=0.75,
         effect_predicted=4.5, effect=4.125, effect_earlier=1.5, factor_id=9, T_ij=[0.0, 0, 0, 0, 0, 0, 1], covariance=P,
@@ -56,9 +56,9 @@ def decisions() -> list[dict[str, Any]]:
         first.event(),
         second.event(),
         replace(second, verdict="undone", why="asked for", weight=0.0, factor_id=-1).event(),
-        Decision(loop=2, verdict="rejected", why="χ² 95.2 > 22.5", i=2, j=33, chi2=95.2).event(),
-        Decision(loop=3, verdict="switched-off", why="weight 0.001", i=7, j=31, weight=0.001, factor_id=12).event(),
-        Decision(loop=4, verdict="rejected", why="registration: nothing", i=8, j=34).event(),
+        LoopDecision(loop=2, verdict="rejected", why="χ² 95.2 > 22.5", i=2, j=33, chi2=95.2).event(),
+        LoopDecision(loop=3, verdict="switched-off", why="weight 0.001", i=7, j=31, weight=0.001, factor_id=12).event(),
+        LoopDecision(loop=4, verdict="rejected", why="registration: nothing", i=8, j=34).event(),
     ]
 
 
@@ -170,7 +170,7 @@ def test_nees_of_the_ends_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(report_figures, "Consistency", keep)
     log, front = ring(3)
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: front)
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     r = pipeline.run(log, frontend="ring", out=tmp_path / "run", progress=False, solver="batch")
     assert r.solution is not None
     assert r.truth is not None

@@ -9,7 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graphslam.core.markup import Markup, element, escape, figure_text, is_figure, join, pairs, table
+from graphslam.core.markup import (
+    Markup,
+    escape_text,
+    html_element,
+    html_table,
+    is_numeric,
+    join_parts,
+    pair_list,
+    value_text,
+)
 from tests.reference.page import Page
 
 HOSTILE = "<script>alert(1)</script>\"' onload=x &amp; </td></table>"
@@ -22,10 +31,10 @@ def page(body: Markup) -> Page:
 @given(st.text())
 def test_any_text_comes_back_as_it_was(text: str) -> None:
     fit = "".join("\ufffd" if _unfit(c) else c for c in text)
-    got = page(table([{"a": text}], ["a"])).tables[0].rows[1][0]
+    got = page(html_table([{"a": text}], ["a"])).tables[0].rows[1][0]
     # line ends are the parser's: HTML reads \r as \n
     assert got.replace("\r\n", "\n").replace("\r", "\n") == fit.replace("\r\n", "\n").replace("\r", "\n")
-    escape(text).encode("utf-8")
+    escape_text(text).encode("utf-8")
 
 
 def _unfit(c: str) -> bool:
@@ -35,11 +44,11 @@ def _unfit(c: str) -> bool:
 
 
 def test_hostile_text_is_text_everywhere() -> None:
-    body = join(
+    body = join_parts(
         [
-            element("p", HOSTILE, title=HOSTILE),
-            table([{HOSTILE: HOSTILE, "b": {HOSTILE: [HOSTILE]}}], [HOSTILE, "b"]),
-            pairs({HOSTILE: HOSTILE}),
+            html_element("p", HOSTILE, title=HOSTILE),
+            html_table([{HOSTILE: HOSTILE, "b": {HOSTILE: [HOSTILE]}}], [HOSTILE, "b"]),
+            pair_list({HOSTILE: HOSTILE}),
         ]
     )
     found = page(body)
@@ -47,7 +56,7 @@ def test_hostile_text_is_text_everywhere() -> None:
     assert found.attributes <= {"id", "title", "class", "scope"}
     assert found.sections["s"].count("alert(1)") == 7
     assert found.tables[0].rows[1][0] == HOSTILE
-    assert element("p", element("b", "x")) == "<p><b>x</b></p>"  # markup is not escaped twice
+    assert html_element("p", html_element("b", "x")) == "<p><b>x</b></p>"  # markup is not escaped twice
 
 
 @pytest.mark.parametrize(
@@ -69,8 +78,15 @@ def test_hostile_text_is_text_everywhere() -> None:
     ],
 )
 def test_values_as_cells_show_them(value: object, said: str) -> None:
-    assert figure_text(value) == said
+    assert value_text(value) == said
 
 
 def test_only_numbers_stand_to_the_right() -> None:
-    assert [is_figure(v) for v in (1, 1.0, np.float64(1.0), True, "1", None)] == [True, True, True, False, False, False]
+    assert [is_numeric(v) for v in (1, 1.0, np.float64(1.0), True, "1", None)] == [
+        True,
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]

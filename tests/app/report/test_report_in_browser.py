@@ -9,14 +9,16 @@ import pytest
 
 import graphslam as gs
 from graphslam.app.report.report import make_report
-from graphslam.loops.ledger import Decision
+from graphslam.loops.ledger import LoopDecision
 from tests.reference.browser import CHROMIUM, WHY_NOT, act
 from tests.reference.page import Page
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
 LOOPS = [
-    Decision(loop=0, verdict="accepted", why="", i=1, j=5, submap_i=1, submap_j=5, chi2=2.0, weight=1.0, factor_id=9),
-    Decision(loop=1, verdict="rejected", why="χ²", i=0, j=3, submap_i=0, submap_j=3, chi2=90.0),
+    LoopDecision(
+        loop=0, verdict="accepted", why="", i=1, j=5, submap_i=1, submap_j=5, chi2=2.0, weight=1.0, factor_id=9
+    ),
+    LoopDecision(loop=1, verdict="rejected", why="χ²", i=0, j=3, submap_i=0, submap_j=3, chi2=90.0),
 ]
 PIXELS = """
 const v = document.getElementById("view"), c = v.getContext("2d");

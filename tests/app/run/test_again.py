@@ -17,14 +17,14 @@ from graphslam.app.run import config as cfg
 from graphslam.app.run import pipeline
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.outputs import SAME_BYTES
-from graphslam.app.run.pipeline import again
+from graphslam.app.run.pipeline import rerun_without_loops
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import solve_choice
-from graphslam.backend.streams import ImuPart
-from graphslam.core.config import build
+from graphslam.backend.streams import ImuSource
+from graphslam.core.config import build_config
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
-from graphslam.core.feed import Feed
 from graphslam.core.log import SensorLog
+from graphslam.core.record_source import RecordSource
 from graphslam.io.log_digest import log_digest
 from graphslam.io.log_store import load_log, save_log
 from tests.app.run.test_imu_run import made, solved
@@ -59,7 +59,7 @@ def remade(folder: Path) -> None:
     before = snapshot(folder, SAME_BYTES)
     assert {"run.json", "taken.npz", "graph.g2o", "figures/map.png"} <= set(before)
     assert (folder / "timings.json").is_file()
-    again(folder, [], progress=False)
+    rerun_without_loops(folder, [], progress=False)
     after = snapshot(folder, SAME_BYTES)
     assert [n for n in {*before, *after} if before.get(n) != after.get(n)] == []
 
@@ -82,8 +82,8 @@ def test_with_imu_factors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.undo()
     assert run.graph.imu.used
     remade(tmp_path / "run")
-    settings = build(cfg.RunConfig, {"imu": {"use": "auto"}})
-    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuPart(Feed(short), settings.imu))
+    settings = build_config(cfg.RunConfig, {"imu": {"use": "auto"}})
+    back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuSource(RecordSource(short), settings.imu))
     back.finish()
     assert back.graph.objective().total == pytest.approx(run.metric("objective"), rel=1e-6)
 
@@ -97,7 +97,7 @@ def test_a_folder_without_what_the_graph_was_made_of_says_so(
     assert "no loop closure of this run can be undone" in caplog.text
     assert gs.open_run(tmp_path / "run").metric("converged") == 1.0
     with pytest.raises(MissingDataError, match="--resume"):
-        again(tmp_path / "run", [], progress=False)
+        rerun_without_loops(tmp_path / "run", [], progress=False)
 
 
 def test_files_of_two_states_are_told_apart(folder: Path, log: SensorLog, tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_a_run_that_failed_before_its_first_submap_does_not_block(
     log: SensorLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as m:
-        m.setattr(pipeline.FrontToBack, "step", lambda _: None)
+        m.setattr(pipeline.SubmapPipeline, "step", lambda _: None)
         with pytest.raises(MissingDataError, match="no submap"):
             gs.run(log, seed=1, out=tmp_path / "run", progress=False)
     assert (tmp_path / "run" / "config.toml").is_file()

@@ -12,13 +12,13 @@ from graphslam.app.run.choice import choose_front_end
 from graphslam.app.run.front_ends import preset_of
 from graphslam.core.errors import MissingDataError
 from graphslam.core.records import LandmarkObservations
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from tests.io import small_sources as small
 from tests.io.bag_worlds import Messages, write_mcap
 
 
 def chosen(path: Path, **options: object) -> tuple[str, str]:
-    log = load(path, **options)
+    log = load_recording(path, **options)
     name = choose_front_end(log).frontend
     return name, preset_of(log, name)[0]
 
@@ -32,7 +32,7 @@ def test_clouds_without_poses_are_followed_and_with_poses_these_are_used(tmp_pat
 def test_planar_laser_and_tables(tmp_path: Path) -> None:
     assert chosen(small.carmen(tmp_path / "robot.log")) == ("segslam", "planar-laser")
     assert chosen(small.tables(tmp_path / "csv")) == ("rbpf-ekf", "named-landmarks")
-    log = load(tmp_path / "csv")
+    log = load_recording(tmp_path / "csv")
     seen = log["landmarks"]
     some = replace(seen, ids=np.where(np.arange(len(seen.ids)) % 3 == 0, -1, seen.ids))
     assert preset_of(replace(log, streams={**log.streams, "landmarks": some}), "rbpf-ekf") == ("", True)
@@ -59,11 +59,11 @@ def test_wheels_in_space_and_a_lidar_of_unknown_place_are_not_what_clouds_are_pu
     assert chosen(bag("good", flat=False, placed=True))[0] == "segslam"
     assert chosen(bag("wheels", flat=True, placed=True))[0] == "lidar-odometry"
     lost = bag("lost", flat=False, placed=False)
-    assert load(lost).meta["unplaced"] == ["clouds"]
+    assert load_recording(lost).meta["unplaced"] == ["clouds"]
     assert chosen(lost)[0] == "lidar-odometry"
-    assert load(lost, mount=(0, 0, 0, 0, 0, 0)).meta["unplaced"] == []
+    assert load_recording(lost, mount=(0, 0, 0, 0, 0, 0)).meta["unplaced"] == []
 
 
 def test_a_log_that_no_front_end_maps_says_what_would_do(tmp_path: Path) -> None:
     with pytest.raises(MissingDataError, match="laser scans with odometry"):
-        choose_front_end(load(small.euroc(tmp_path / "e")))
+        choose_front_end(load_recording(small.euroc(tmp_path / "e")))

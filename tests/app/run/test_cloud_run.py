@@ -20,16 +20,16 @@ from graphslam.app.run.files import loops_of_run
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.run import Run
 from graphslam.backend.back_end import Observer
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.submap_store import read_submaps
-from graphslam.loops.ledger import Decision
-from graphslam.sim.court import court
+from graphslam.loops.ledger import LoopDecision
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.faults.kills import snapshot
 from tests.reference.cloud_front_end import CloudConfig, CloudFrontEnd
 
@@ -37,15 +37,15 @@ from tests.reference.cloud_front_end import CloudConfig, CloudFrontEnd
 @pytest.fixture(scope="module")
 def log() -> SensorLog:
     """Nearly one and a half times round a block: the way comes back to where it was."""
-    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
 
 
 @pytest.fixture(scope="module")
 def go(log: SensorLog) -> Any:
     """Runs the log with the front end of clouds through the public verb."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "recommended", lambda *_: {})
-        patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build(CloudConfig, o, "frontend")))
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
+        patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build_config(CloudConfig, o, "frontend")))
 
         def run(out: Path | None = None, *, every: int = 2, loops: bool = True, **how: Any) -> Run:
             front = {k: how.pop(k) for k in ("origins", "grid") if k in how}
@@ -93,7 +93,7 @@ class Listener(Observer):
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         self.told.append(submap.key)
 
-    def loop_decided(self, decision: Decision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
         if decision.verdict == "accepted":
             assert decision.factor_id in graph.records
             self.told.append((decision.submap_i, decision.submap_j))

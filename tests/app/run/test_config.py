@@ -9,20 +9,20 @@ import tomllib
 import pytest
 
 from graphslam.app.run import config as cfg
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.backend.config import GpsOptions, ImuOptions
-from graphslam.core.config import as_dict, build, dump_toml, merge, parse_setting, read_toml
+from graphslam.core.config import build_config, dump_toml, merge_options, options_dict, parse_setting, read_toml
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam_frontends.landmarks.config import RbpfEkfConfig
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 
 
 def test_nested_options_are_built_and_checked():
-    c = build(
+    c = build_config(
         RbpfEkfConfig, {"particles": 7, "motion": {"speed": 1}, "noise": {"range_sigma": 0.1, "bearing_sigma": 0.01}}
     )
     assert (c.particles, c.motion.speed, c.noise.range_sigma) == (7, 1.0, 0.1)
@@ -30,11 +30,11 @@ def test_nested_options_are_built_and_checked():
 
 
 def test_lists_of_any_length_and_of_a_given_one():
-    c = build(
+    c = build_config(
         SegSlamFrontEndConfig, {"segslam": {"registration": {"radii": [3, 1, 0.5]}}, "steps": {"scanners": ["a"]}}
     )
     assert (c.segslam.registration.radii, c.steps.scanners) == ((3.0, 1.0, 0.5), ("a",))
-    assert build(SegSlamFrontEndConfig, {"filter": {"clamp": [0.1, 0.9]}}).filter.clamp == (0.1, 0.9)
+    assert build_config(SegSlamFrontEndConfig, {"filter": {"clamp": [0.1, 0.9]}}).filter.clamp == (0.1, 0.9)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_lists_of_any_length_and_of_a_given_one():
 )
 def test_wrong_lists_are_refused(values, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        build(SegSlamFrontEndConfig, values)
+        build_config(SegSlamFrontEndConfig, values)
 
 
 @pytest.mark.parametrize(
@@ -94,18 +94,18 @@ def test_malformed_settings_are_refused(text):
 
 
 def test_merge_is_deep_and_the_later_wins():
-    assert merge({"a": {"b": 1, "c": 2}}, {"a": {"b": 5}, "d": 1}) == {"a": {"b": 5, "c": 2}, "d": 1}
+    assert merge_options({"a": {"b": 1, "c": 2}}, {"a": {"b": 5}, "d": 1}) == {"a": {"b": 5, "c": 2}, "d": 1}
 
 
 def test_effective_configuration_round_trips_through_toml():
     front = make_front_end("rbpf-ekf", {"trim": 16.0, "smoothing_noise": {"range_sigma": 0.1, "bearing_sigma": 0.01}})
-    text = dump_toml(as_dict(front.config))
+    text = dump_toml(options_dict(front.config))
     assert make_front_end("rbpf-ekf", tomllib.loads(text)).config == front.config
 
 
 def test_simulated_log_brings_its_own_noise():
     log = simulate("landmark-field", preset="quick", seed=0, sigma_speed=0.11)
-    options = recommended(log, "rbpf-ekf")
+    options = recommended_options(log, "rbpf-ekf")
     assert options["frontend"]["motion"]["speed"] == 0.11
     assert options["frontend"]["association"] == "known"
 
@@ -120,27 +120,27 @@ def test_every_option_of_gps_and_imu_can_be_set_and_comes_back_from_toml():
         "gps": gps | {"robust": "huber", "robust_width": 1.2},
         "imu": imu | {"robust": "cauchy", "robust_width": 1.7},
     }
-    run = build(cfg.RunConfig, values)
+    run = build_config(cfg.RunConfig, values)
     for part, kind in ((run.gps, GpsConfig), (run.imu, ImuConfig)):
         assert isinstance(part, kind)
         assert all(getattr(part, f.name) != f.default for f in dataclasses.fields(part))
-    written = dump_toml(as_dict(run))
+    written = dump_toml(options_dict(run))
     assert {k: tomllib.loads(written)[k] for k in values} == values
-    assert build(cfg.RunConfig, tomllib.loads(written)) == run
+    assert build_config(cfg.RunConfig, tomllib.loads(written)) == run
 
 
 def test_a_width_alone_leaves_the_kernel_as_it_was():
-    assert build(GpsOptions, parse_setting("robust_width=1.5")).robust == Robust("cauchy", 1.5)
-    assert build(ImuOptions, parse_setting("robust=huber")).robust == Robust("huber", 2.385)
+    assert build_config(GpsOptions, parse_setting("robust_width=1.5")).robust == RobustKernel("cauchy", 1.5)
+    assert build_config(ImuOptions, parse_setting("robust=huber")).robust == RobustKernel("huber", 2.385)
     with pytest.raises(ConfigError, match=r"gps.robust_width = 'wide'"):
-        build(GpsOptions, {"robust_width": "wide"}, "gps")
+        build_config(GpsOptions, {"robust_width": "wide"}, "gps")
     with pytest.raises(ConfigError, match="width must be positive"):
-        build(GpsOptions, {"robust_width": -1.0}, "gps")
+        build_config(GpsOptions, {"robust_width": -1.0}, "gps")
 
 
 def test_presets_are_valid():
     for name in ("victoria-park.rbpf-ekf", "landmark-field.rbpf-ekf"):
-        run = build(cfg.RunConfig, cfg.preset(name))
+        run = build_config(cfg.RunConfig, cfg.preset(name))
         make_front_end("rbpf-ekf", run.frontend)
     assert cfg.preset("never-heard-of") == {}
 

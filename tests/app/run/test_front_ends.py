@@ -41,9 +41,9 @@ class Entry:
 
 def test_a_front_end_without_motion_is_not_given_any(monkeypatch: pytest.MonkeyPatch) -> None:
     log = gs.simulate("landmark-field", preset="quick")
-    assert front_ends.recommended(log, "rbpf-ekf")["frontend"]["motion"]["speed"] == log.meta["noise"]["speed"]
+    assert front_ends.recommended_options(log, "rbpf-ekf")["frontend"]["motion"]["speed"] == log.meta["noise"]["speed"]
     monkeypatch.setattr(front_ends, "entry_points", lambda group: [Entry()])
-    values = front_ends.recommended(log, "plain")
+    values = front_ends.recommended_options(log, "plain")
     assert values == {}
     assert front_ends.make_front_end("plain", values.get("frontend", {})).config == Plain()
     with pytest.raises(UnknownNameError, match="plain"):

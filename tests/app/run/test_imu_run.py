@@ -13,15 +13,15 @@ import pytest
 from graphslam.app.run import pipeline
 from graphslam.app.run.config import RunConfig
 from graphslam.backend.back_end import Observer
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, MissingDataError
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.app.run.test_pipeline_space import Ring as HandedOver
 from tests.app.run.test_pipeline_space import ring as flat_ring
 from tests.reference.imu_ring import STEP, ring
@@ -44,7 +44,7 @@ def made(uses: frozenset[str] = frozenset({"laser"})) -> tuple[SensorLog, list[S
 
 def solved(log: SensorLog, submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, out: Any = None, **options: Any):
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: HandedOver(tuple(submaps)))
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     return pipeline.run(log, frontend="ring", out=out, progress=False, **options)
 
 
@@ -173,12 +173,12 @@ def test_in_the_plane_it_is_left_out(monkeypatch):
 def test_its_options_are_checked():
     for bad in ({"longest": 0.0}, {"axes": "shrug"}, {"robust": "tukey"}, {"acceleration": -1.0}, {"wings": 2}):
         with pytest.raises(ConfigError, match="imu"):
-            build(RunConfig, {"imu": bad})
+            build_config(RunConfig, {"imu": bad})
 
 
 def test_a_simulated_robot_is_as_it_is_mounted(tmp_path):
     """SegSLAM on a robot whose IMU it uses: looked at, and nothing is said against it; turned round, it is named."""
-    log = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    log = simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
     options = {"frontend": {"filter": {"particles": 1}}, "map": {"fuse": False}, "refine": {"use": False}}
     r = pipeline.run(log, frontend="segslam", seed=2, config=options, progress=False)
     assert [e["verdict"] for e in r.events if e["event"] == "imu-axes"] == ["as stated"]

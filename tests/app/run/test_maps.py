@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.hypotheses import clearest_of_choices, clearest_of_topologies
+from graphslam.app.hypotheses import minimum_entropy_loops, minimum_entropy_topology
 from graphslam.app.run import config as cfg
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.pipeline import run
@@ -20,18 +20,18 @@ from graphslam.app.run.run import Run
 from graphslam.app.worlds import simulate
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import choices_of_matches, solve_choice
-from graphslam.core.config import build, read_toml
+from graphslam.core.config import build_config, read_toml
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.core.poses import SE3, level
+from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.submap import Match
 from graphslam.evidence.formats import load_npz
 from graphslam.io.log_store import save_log
 from graphslam.io.tum import read_tum
-from graphslam.maps.fuse import fuse
+from graphslam.maps.fuse import fuse_pieces
 from graphslam.maps.run_map import floor_bands, make_run_map, nodes_by_submap
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.app.cli.test_cli import graphslam, refused
 from tests.reference.small_maps import same_map
 
@@ -39,7 +39,7 @@ from tests.reference.small_maps import same_map
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """SegSLAM of three particles in the small court, twice round a corner, by its preset."""
-    log = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    log = simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
     options = {"frontend": {"filter": {"particles": 3}}, "refine": {"use": False}}  # it is the map of the graph
     out = tmp_path_factory.mktemp("run") / "run"
     return run(log, frontend="segslam", seed=2, out=out, config=options, progress=False)
@@ -72,8 +72,8 @@ def test_pieces_stand_at_the_nodes_of_the_graph(finished: Run) -> None:
     for s in finished.graph.submaps:
         for k, node in enumerate(s.nodes[:-1]):
             if (s.key, k) in divided.pieces:
-                np.testing.assert_allclose(wanted[s.key, k], level(poses[node]), atol=1e-9)
-                np.testing.assert_allclose(divided.local[s.key, k], level(s.T_base_node[k]), atol=1e-9)
+                np.testing.assert_allclose(wanted[s.key, k], remove_roll_pitch(poses[node]), atol=1e-9)
+                np.testing.assert_allclose(divided.local[s.key, k], remove_roll_pitch(s.T_base_node[k]), atol=1e-9)
                 seen += 1
     assert seen == len(divided.pieces)
 
@@ -83,14 +83,14 @@ def test_without_a_loop_the_map_is_that_of_the_open_chain(finished: Run) -> None
     bare = [replace(s, matches=()) for s in finished.submaps]
     assert finished.folder is not None
     values = read_toml(finished.folder / "config.toml")
-    config = build(BackEndConfig, {**values["backend"], "level_sigma": 0.0})
-    from graphslam.maps.global_map import make_map
+    config = build_config(BackEndConfig, {**values["backend"], "level_sigma": 0.0})
+    from graphslam.maps.global_map import make_global_map
 
-    m = make_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
+    m = make_global_map(solve_choice(bare, frozenset(), config).finish(), bare, {}, 1)
     made = make_run_map(bare, m, reach=8.0)
     assert made.fused.entropy() == pytest.approx(made.open_entropy, rel=0.01)
     assert made.fused.known_volume() == pytest.approx(made.open_volume, rel=0.01)
-    scratch = fuse(made.divided.pieces, made.fused.poses, model=made.fused.grid.model)
+    scratch = fuse_pieces(made.divided.pieces, made.fused.poses, model=made.fused.grid.model)
     assert same_map(made.fused.grid, scratch.grid)
     shifted = make_run_map(bare, replace(m, node_poses=_shifted(m.node_poses)), reach=8.0)
     assert shifted.fused.entropy() != pytest.approx(made.fused.entropy(), rel=1e-6)
@@ -151,7 +151,7 @@ def test_every_choice_of_matches_is_solved_before_it_is_ranked(finished: Run) ->
     choices = choices_of_matches(submaps, 0.5)
     assert choices["as the run"] == choices_of_matches(again.submaps, 0.5)["as the run"]
     assert len(set(choices.values())) == len(choices)
-    found = clearest_of_choices(replace(again, submaps=submaps), made, progress=False)
+    found = minimum_entropy_loops(replace(again, submaps=submaps), made, progress=False)
     table = found.choice.rows()
     assert len(table) == len(choices)
     rows = {r["choice"]: r for r in table}
@@ -202,7 +202,7 @@ def test_topologies_of_the_particles_become_graphs(finished: Run, tmp_path: Path
     config = tmp_path / "foreign" / "config.toml"
     config.write_text(config.read_text().replace('frontend = "segslam"', 'frontend = "rbpf-grid"'))
     with pytest.raises(ConfigError, match="'rbpf-grid' tells one topology"):
-        clearest_of_topologies(foreign, 2, log=finished.log)
+        minimum_entropy_topology(foreign, 2, log=finished.log)
 
 
 def test_runs_without_grids_are_as_before_and_say_so(tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_what_does_not_belong_together_is_refused(finished: Run) -> None:
     with pytest.raises(MissingDataError, match=re.escape(f"{len(finished.submaps)} of {len(finished.submaps)}")):
         make_run_map([replace(s, grid=None) for s in finished.submaps], finished.map)
     with pytest.raises(ConfigError, match="low < high"):
-        build(cfg.RunConfig, {"map": {"low": 2.0}})
+        build_config(cfg.RunConfig, {"map": {"low": 2.0}})
 
 
 def test_floor_plans_of_storeys_and_reach() -> None:

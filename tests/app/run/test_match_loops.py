@@ -14,7 +14,7 @@ from graphslam.backend.config import BackEndConfig
 from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Match, Submap
-from graphslam.loops.ledger import Decision, ledger_of_events
+from graphslam.loops.ledger import LoopDecision, ledger_of_events
 from tests.app.run.test_loops import there_and_back
 
 C = np.diag([0.01, 0.01, 0.01, 0.05, 0.05, 0.03]) ** 2
@@ -75,10 +75,10 @@ def test_a_match_is_undone_with_its_ties(
     assert {d.why for d in undone} == {"asked for", f"by loop {match}, which was undone"}
 
     # and comes back with them
-    asked: list[Decision] = []
+    asked: list[LoopDecision] = []
     monkeypatch.setattr(app_loops, "loops_of_run", lambda folder: ledger_of_events(back.graph.events))
-    monkeypatch.setattr(app_loops, "undone_of_run", lambda folder: undone)
-    monkeypatch.setattr(app_loops, "again", lambda folder, gone, progress: asked.extend(gone))
+    monkeypatch.setattr(app_loops, "removed_loops_of_run", lambda folder: undone)
+    monkeypatch.setattr(app_loops, "rerun_without_loops", lambda folder, gone, progress: asked.extend(gone))
     app_loops.redo_loop(tmp_path, match)
     assert asked == []
     tie = next(d.loop for d in undone if d.source == "tie")

@@ -13,7 +13,7 @@ import graphslam as gs
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.run import Run
 from graphslam.core.log import SensorLog
-from graphslam.core.shelf import SHELF
+from graphslam.core.spill_cache import SPILL_CACHE
 from graphslam.evidence.pool import GridPool
 from graphslam.io.submap_store import SubmapStore
 from graphslam.loops import measure
@@ -44,7 +44,7 @@ def whole(log: SensorLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a run that has room for everything."""
     folder = tmp_path_factory.mktemp("memory") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SHELF, "room", 1 << 40)
+        patch.setattr(SPILL_CACHE, "room", 1 << 40)
         run = go(log, folder)
     assert len(run.submaps) >= 10
     assert run.fused is not None
@@ -54,7 +54,7 @@ def whole(log: SensorLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def narrow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hardly any room, for loops neither."""
-    monkeypatch.setattr(SHELF, "room", ROOM)
+    monkeypatch.setattr(SPILL_CACHE, "room", ROOM)
     monkeypatch.setattr(measure, "ROOM", 0)
 
 

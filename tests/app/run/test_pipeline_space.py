@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.run import pipeline
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import se2_between, se2_log
@@ -79,7 +79,7 @@ def ring(dim: int, seed: int = 4) -> tuple[SensorLog, Ring]:
 def solved(dim: int, monkeypatch: pytest.MonkeyPatch, out: Any = None, *, seed: int = 4, **options: Any) -> Any:
     log, front = ring(dim, seed)
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: front)
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     config = {"gps": {"use": "every-second", "robust": "none"}, **options.pop("config", {})}
     return pipeline.run(log, frontend="ring", out=out, config=config, progress=False, **options)
 
@@ -106,7 +106,7 @@ def test_folder_is_complete_and_comes_back(dim, tmp_path, monkeypatch):
     events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     assert [e["support"] for e in events if e["event"] == "match-not-used"] == [0.1]
     assert sum(e.get("group") == "match" for e in events if e["event"] == "between") == 3
-    back = open_run(tmp_path / "run")
+    back = read_run_folder(tmp_path / "run")
     np.testing.assert_array_equal(back.map.base_poses, r.map.base_poses)
     np.testing.assert_array_equal(back.map.trajectory.covariances, r.map.trajectory.covariances)
     assert back.truth_path.dim == dim
@@ -191,7 +191,7 @@ def test_a_flat_front_end_takes_the_level_part_of_fixes_in_space(monkeypatch):
     flat, front = ring(2)
     flat = SensorLog(name="ring", streams=log.streams, truth=flat.truth)
     monkeypatch.setattr(pipeline, "make_front_end", lambda *_: front)
-    monkeypatch.setattr(pipeline, "recommended", lambda *_: {})
+    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
     r = pipeline.run(flat, frontend="ring", config={"gps": {"use": "all"}}, progress=False)
     assert r.graph.dim == 2
     assert r.dead_reckoning.dim == 2

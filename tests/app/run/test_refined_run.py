@@ -14,11 +14,11 @@ import pytest
 
 import graphslam
 from graphslam.app.export import export
-from graphslam.app.hypotheses import clearest_of_choices, write_clearest
+from graphslam.app.hypotheses import minimum_entropy_loops, write_minimum_entropy
 from graphslam.app.report.report import make_report
 from graphslam.app.run import outputs, pipeline
-from graphslam.app.run.outputs import SAME_BYTES, open_run, refined_submaps_of
-from graphslam.app.run.pipeline import again, run
+from graphslam.app.run.outputs import SAME_BYTES, read_run_folder, refined_submaps_of
+from graphslam.app.run.pipeline import rerun_without_loops, run
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
 from graphslam.app.sessions.localise import localise
@@ -26,16 +26,16 @@ from graphslam.backend.back_end import BackEnd
 from graphslam.core import se3
 from graphslam.core.errors import FormatError, GraphSlamError
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import SE3, level
+from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.records import Gps
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.io.tum import read_tum
 from graphslam.maps import run_map
 from graphslam.maps.contradictions import Contradictions
 from graphslam.maps.refined import base_frames, refined_map
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.faults.kills import snapshot
 from tests.reference.small_maps import same_map
 
@@ -44,7 +44,7 @@ OPTIONS: dict[str, Any] = {"frontend": {"filter": {"particles": 1}}}
 
 def drive(seed: int) -> SensorLog:
     """Twice round a corner of one court, by a robot of its own."""
-    return simulate_crawler(court(seed=9), seed, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), seed, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def made(log: SensorLog, out: Path, *, seed: int = 2, resume: bool = False, **options: Any) -> Run:
@@ -99,7 +99,7 @@ def test_the_path_is_refined_and_the_folder_has_both(finished: Run) -> None:
     assert finished.folder is not None
     for name in ("refined/index.json", "scans.npz", "trajectory_graph.tum", "figures/refined.png"):
         assert (finished.folder / name).is_file(), name
-    again_read = open_run(finished.folder)
+    again_read = read_run_folder(finished.folder)
     assert again_read.graph_path is not None
     assert finished.refined is not None
     np.testing.assert_allclose(again_read.graph_path.poses, finished.refined.graph_path.poses, atol=1e-6)
@@ -156,7 +156,7 @@ def test_the_ledger_says_what_the_refined_path_spends(finished: Run) -> None:
 
 def test_bases_of_the_refined_submaps_stand_level_in_the_frame_of_the_truth(finished: Run) -> None:
     base = np.array(finished.report["T_world_base"])
-    np.testing.assert_allclose(level(base), base, atol=1e-12)
+    np.testing.assert_allclose(remove_roll_pitch(base), base, atol=1e-12)
     submaps = refined_submaps_of(finished)
     frames = base_frames(finished.map)
     for s, a, b in zip(submaps, frames, frames[1:]):
@@ -186,7 +186,7 @@ def test_interrupted_and_made_again_it_is_the_same_to_the_last_byte(
     wanted = snapshot(tmp_path / "whole", SAME_BYTES)
     assert {"refined/index.json", "refined/000000.grid.npz", "trajectory_graph.tum", "scans.npz"} <= set(wanted)
     assert differing(wanted, snapshot(tmp_path / "stopped", SAME_BYTES)) == []
-    again(tmp_path / "whole", [], progress=False)
+    rerun_without_loops(tmp_path / "whole", [], progress=False)
     assert differing(wanted, snapshot(tmp_path / "whole", SAME_BYTES)) == []
 
 
@@ -211,11 +211,11 @@ def test_switched_off_it_leaves_nothing_of_a_refined_state(copy: Path) -> None:
     text = config.read_text()
     at = text.index("[refine]")
     config.write_text(text[:at] + text[at:].replace("use = true", "use = false", 1))
-    again(copy, [], progress=False)
-    assert refined_submaps_of(open_run(copy)) == []
+    rerun_without_loops(copy, [], progress=False)
+    assert refined_submaps_of(read_run_folder(copy)) == []
     for name in ("refined/index.json", "trajectory_graph.tum", "figures/refined.png"):
         assert not (copy / name).is_symlink(), name
-    assert open_run(copy).graph_path is None
+    assert read_run_folder(copy).graph_path is None
 
 
 def test_residuals_of_the_start_do_not_judge_the_refined_path(finished: Run) -> None:
@@ -242,7 +242,7 @@ def test_passes_that_deny_each_other_are_given_loops(
     options.write_text(options.read_text().replace("loops = true", 'loops = "auto"'))
     # each graph has a map before its refinement and one after it
     said = iter([told(40), told(40), told(denied), told(denied)])
-    monkeypatch.setattr(run_map, "contradictions", lambda *_: next(said))
+    monkeypatch.setattr(run_map, "find_contradictions", lambda *_: next(said))
     looked: list[bool] = []
     finish = BackEnd.finish
 
@@ -251,7 +251,7 @@ def test_passes_that_deny_each_other_are_given_loops(
         return finish(self, *undo)
 
     monkeypatch.setattr(BackEnd, "finish", watched)
-    r = again(copy, [], progress=False)
+    r = rerun_without_loops(copy, [], progress=False)
     assert looked == [False, True]
     assert next(said, None) is None
     attempts = r.report["map_attempts"]
@@ -260,7 +260,7 @@ def test_passes_that_deny_each_other_are_given_loops(
     assert r.metric("map_denied") == (denied / 100 if kept == "loops" else 0.4)
     line = next(f for f in r.verdict if f.code == "passes-attempts")
     assert line.level == ("" if kept == "loops" else "look")
-    assert open_run(copy).verdict == r.verdict
+    assert read_run_folder(copy).verdict == r.verdict
 
 
 def test_the_map_is_made_again_of_the_refined_submaps(finished: Run, copy: Path) -> None:
@@ -268,7 +268,7 @@ def test_the_map_is_made_again_of_the_refined_submaps(finished: Run, copy: Path)
     assert finished.fused is not None
     assert same_map(remade.fused.grid, finished.fused.fused.grid)
     assert remade.open_entropy == finished.metric("map_entropy_open_chain")
-    found = clearest_of_choices(read, remade, progress=False)
+    found = minimum_entropy_loops(read, remade, progress=False)
     rows = found.choice.rows()
     assert len(rows) > 1
     own = [r for r in rows if r["choice"] == "as the run"]
@@ -276,7 +276,7 @@ def test_the_map_is_made_again_of_the_refined_submaps(finished: Run, copy: Path)
     assert found.refined is not None  # the chosen one is refined, whichever it is
     assert found.refined_map is not None
     assert found.refined_map.fused.entropy() < rows[0]["entropy"]
-    write_clearest(copy, found)
+    write_minimum_entropy(copy, found)
     kept = json.loads((copy / "clearest.json").read_text())
     assert kept["refined_entropy"] == found.refined_map.fused.entropy()
     np.testing.assert_allclose(
@@ -287,7 +287,7 @@ def test_the_map_is_made_again_of_the_refined_submaps(finished: Run, copy: Path)
 def test_a_store_that_is_damaged_or_of_another_state_is_refused(copy: Path) -> None:
     """Of plain files, as they are copied by hand."""
     plain = Path(shutil.copytree(copy, copy.with_name("plain")))
-    assert len(refined_submaps_of(open_run(plain))) > 2
+    assert len(refined_submaps_of(read_run_folder(plain))) > 2
     store = plain / "refined"
     keep = (store / "000001.npz").read_bytes()
     for foreign in ((plain / "submaps" / "000001.npz").read_bytes(), keep[: len(keep) // 2], b""):
@@ -360,7 +360,7 @@ def test_particles_are_drawn_anew_where_passes_still_deny_each_other(
 
     def say(*values: int) -> None:
         shares[:] = values
-        monkeypatch.setattr(run_map, "contradictions", lambda *_: told(shares.pop(0)))
+        monkeypatch.setattr(run_map, "find_contradictions", lambda *_: told(shares.pop(0)))
 
     say(40, 40, second, *([60] if second else []))
     r = made(log, folder, **options)

@@ -21,9 +21,9 @@ from graphslam.core.log import SensorLog
 from graphslam.core.plan_view import plan_path
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.records import Odometry
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from graphslam_frontends.lidar_odometry.front_end import FIRST
 from graphslam_studies.sim.lidar import LidarConfig, drawn_imu, simulate_lidar
 from tests.frontends.landmarks.test_preparing import in_portions
@@ -78,7 +78,7 @@ def wheeled() -> SensorLog:
 
 
 def beams() -> SensorLog:
-    whole = simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
+    whole = simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.02, max_range=8.0))
     begin, _ = whole.interval
     return whole.slice(begin, begin + 15.0)
 

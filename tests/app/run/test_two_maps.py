@@ -12,18 +12,18 @@ import pandas as pd
 import pytest
 
 from graphslam.app.report.folder import read_folder
-from graphslam.app.report.scene import scene
-from graphslam.app.run.outputs import SAME_BYTES, TWO_MAPS, open_run
+from graphslam.app.report.scene import report_scene
+from graphslam.app.run.outputs import SAME_BYTES, TWO_MAPS, read_run_folder
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import group_of
 from graphslam.loops import loops as decisions
-from graphslam.loops.disputes import AMBIGUOUS
+from graphslam.loops.conflicting_groups import AMBIGUOUS
 from graphslam.loops.measure import Loop, LoopMeasurer
-from graphslam.sim.court import court
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.faults.kills import snapshot
 
 OPTIONS: dict[str, Any] = {
@@ -37,7 +37,7 @@ OPTIONS: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def log() -> SensorLog:
     """Twice round a corner: SegSLAM enters its first map again."""
-    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def shifted(loops: Sequence[Loop]) -> list[Loop]:
@@ -58,7 +58,7 @@ def disputed(log: SensorLog, folder: Path) -> Run:
     with pytest.MonkeyPatch.context() as patch:
         measure = LoopMeasurer.measure
         patch.setattr(LoopMeasurer, "measure", lambda self, c, **k: shifted(measure(self, c, **k)))
-        patch.setattr(decisions, "weigh", lambda *_: ("ambiguous", f"{AMBIGUOUS}, two groups: by the test"))
+        patch.setattr(decisions, "choose_group", lambda *_: ("ambiguous", f"{AMBIGUOUS}, two groups: by the test"))
         return run(log, frontend="segslam", seed=2, out=folder, config=OPTIONS, progress=False)
 
 
@@ -75,7 +75,7 @@ def test_both_maps_are_in_the_folder_with_their_loops(finished: Run) -> None:
     assert first
     assert second
     assert not set(first) & set(second)
-    opened = open_run(folder)
+    opened = read_run_folder(folder)
     assert opened.two_maps is not None
     assert finished.two_maps is not None
     for name, path, stored, own, other in zip(
@@ -98,7 +98,7 @@ def test_the_verdict_says_so_in_one_line_and_the_report_shows_both(finished: Run
     assert "To do: check which of the two is right" in line.text
     assert finished.headline.level == "bad"
     assert finished.folder is not None
-    drawn = scene(read_folder(finished.folder, finished.folder))
+    drawn = report_scene(read_folder(finished.folder, finished.folder))
     assert drawn is not None
     layers = {x["name"]: x for x in drawn["layers"]}
     a, b = layers["two maps, the first"], layers["two maps, the second"]

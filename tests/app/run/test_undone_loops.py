@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphslam.app.compare import compare
-from graphslam.app.run.files import loops_of_run, undone_of_run
+from graphslam.app.compare import compare_methods
+from graphslam.app.run.files import loops_of_run, removed_loops_of_run
 from graphslam.app.run.loops import redo_loop, undo_loop
-from graphslam.app.run.outputs import SAME_BYTES, open_run
+from graphslam.app.run.outputs import SAME_BYTES, read_run_folder
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
-from graphslam.join.registry import join
-from graphslam.sim.court import court
+from graphslam.join.registry import join_by_method
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
+from graphslam.sim.ring_hall import ring_hall
 from tests.app.cli.test_cli import graphslam
 from tests.faults.kills import snapshot
 
@@ -36,7 +36,7 @@ OPTIONS: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def log() -> SensorLog:
     """Twice round a corner: SegSLAM enters its first map again."""
-    return simulate_crawler(court(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
+    return simulate_crawler(ring_hall(seed=9), 9, CrawlerConfig(drift=0.08, max_range=8.0))
 
 
 def go_on(log: SensorLog, folder: Path, *, resume: bool = True) -> Run:
@@ -50,7 +50,7 @@ def check_that_joiners_find_the_graph(whole: Run, folder: Path) -> None:
         "folder": submap_source(folder),
         "store": submap_source(folder / "submaps"),
     }
-    tables = {name: compare(s.material, truth=s.truth, memory=False) for name, s in sources.items()}
+    tables = {name: compare_methods(s.material, truth=s.truth, memory=False) for name, s in sources.items()}
     wanted = whole.graph.objective().total
     for table in tables.values():
         np.testing.assert_allclose(table["objective_polished"], wanted, rtol=1e-6)
@@ -59,7 +59,7 @@ def check_that_joiners_find_the_graph(whole: Run, folder: Path) -> None:
     problem = sources["folder"].problem
     assert problem.levelled
     assert problem.dof == whole.graph.objective().dof
-    found = join(problem, "eif-tree", polish=True)
+    found = join_by_method(problem, "eif-tree", polish=True)
     np.testing.assert_allclose(found.poses, whole.map.node_poses, atol=1e-5)
     P = np.stack([found.pose_covariance(int(k)) for k in problem.bases[1:]])
     np.testing.assert_allclose(P, whole.map.node_covariances[problem.bases[1:]], atol=1e-4 * np.abs(P).max())
@@ -69,7 +69,7 @@ def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp
     folder = tmp_path / "run"
     whole = go_on(log, folder, resume=False)
     (loop,) = [d for d in loops_of_run(folder).current() if d.verdict == "accepted"]
-    assert undone_of_run(folder) == []
+    assert removed_loops_of_run(folder) == []
     check_that_joiners_find_the_graph(whole, folder)
     with pytest.raises(DataError, match="was not undone"):
         redo_loop(folder, loop.loop, progress=False)
@@ -77,11 +77,11 @@ def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp
     before = snapshot(folder, SAME_BYTES)
     undo_loop(folder, loop.loop, progress=False)
     assert snapshot(folder, SAME_BYTES)["run.json"] != before["run.json"]
-    without = open_run(folder).map.node_poses
+    without = read_run_folder(folder).map.node_poses
     assert np.abs(without - whole.map.node_poses).max() > 1e-3
     for _ in range(2):  # and again when what was resumed is resumed
         resumed = go_on(log, folder)
-        (undone,) = undone_of_run(folder)
+        (undone,) = removed_loops_of_run(folder)
         assert (undone.submap_i, undone.submap_j, undone.i, undone.j) == (
             loop.submap_i, loop.submap_j, loop.i, loop.j,
         )  # fmt: skip
@@ -92,12 +92,12 @@ def test_an_undone_loop_stays_undone_when_the_run_is_resumed(log: SensorLog, tmp
     redo_loop(folder, undone.loop, progress=False)
     after = snapshot(folder, SAME_BYTES)
     assert [n for n in {*before, *after} if before.get(n) != after.get(n)] == []
-    assert undone_of_run(folder) == []
-    np.testing.assert_allclose(open_run(folder).map.node_poses, whole.map.node_poses, atol=1e-9)
+    assert removed_loops_of_run(folder) == []
+    np.testing.assert_allclose(read_run_folder(folder).map.node_poses, whole.map.node_poses, atol=1e-9)
 
 
 def test_a_run_that_was_never_finished_has_undone_nothing(tmp_path: Path) -> None:
-    assert undone_of_run(tmp_path) == []
+    assert removed_loops_of_run(tmp_path) == []
 
 
 def test_the_command_takes_one_of_both(tmp_path: Path) -> None:

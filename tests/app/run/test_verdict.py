@@ -24,12 +24,12 @@ from graphslam.app.run.summary import (
     PESSIMISTIC,
     SMALL_RESIDUALS,
     TRUST,
-    in_metres,
-    summary,
+    length_text,
+    summarise_run,
 )
-from graphslam.app.run.verdict import Figures, observed, stated
-from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst
-from graphslam.evaluate.trust import by_size, rows_as_json
+from graphslam.app.run.verdict import RunMetrics, findings_from_metrics, findings_from_run
+from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst_level
+from graphslam.evaluate.covariance_assessment import chi_square_ratio_test, tests_as_json
 from tests.reference.page import Page
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -98,7 +98,7 @@ def test_every_finding_that_may_be_bad_says_what_to_do() -> None:
 
 def figures(
     converged: bool | None, chi2: float | None, nees: float | None, loops: float | None, own: float | None = None
-) -> Figures:
+) -> RunMetrics:
     m = {"submaps": 7.0, "path_length": 305.2, "gap": 0.0}
     if chi2 is not None:
         m |= {"honesty_submap_chi2_per_dof": chi2, "honesty_submap_dof": 300.0}
@@ -108,8 +108,8 @@ def figures(
         m |= {"loops_value": loops, "loops_dof": 400.0}
     report: dict[str, Any] = {} if converged is None else {"converged": converged}
     if own is not None:
-        report["evidence"] = rows_as_json(by_size("χ²", "map", own, 300.0 if own else 2.0))
-    return Figures(report, m)
+        report["evidence"] = tests_as_json(chi_square_ratio_test("χ²", "map", own, 300.0 if own else 2.0))
+    return RunMetrics(report, m)
 
 
 RATIOS = (None, 0.3, 1.0, 1.19, 6.3)
@@ -126,9 +126,9 @@ def test_the_first_line_is_never_greener_than_the_lines_below_it() -> None:
     for converged, chi2, nees, loops, own in every:
         figs = figures(converged, chi2, nees, loops, own)
         for more in extra:
-            lines = [*stated(figs), *more]
-            first = summary(figs, lines)
-            level = worst(lines) or "good"
+            lines = [*findings_from_metrics(figs), *more]
+            first = summarise_run(figs, lines)
+            level = worst_level(lines) or "good"
             assert first.level == level
             assert first.text.startswith(TRUST[level])
             assert not [t for other, t in TRUST.items() if other != level and t in first.text]
@@ -161,20 +161,20 @@ def test_the_first_line_is_never_greener_than_the_lines_below_it() -> None:
 
 def test_the_first_line_says_what_was_made_and_what_to_do() -> None:
     figs = figures(True, 1.0, 6.3, None)
-    assert summary(figs, stated(figs)).text == (
+    assert summarise_run(figs, findings_from_metrics(figs)).text == (
         "Do not rely on this yet (1 point marked “bad”): 305 m in 7 submaps, no loop closures; path error 4.1 cm "
         "(RMSE, ground truth); residuals match the noise model (χ²/dof 1); covariances over-confident: true errors "
         "are larger (NEES/dof 6.3). To do: repeat with other seeds (--seed 1, 2, …) before you use its covariances."
     )
     own = Finding("bad", "calibration", "Ranges are long. To do: check the unit of the ranges.")
-    (cause,) = (summary(figs, [*stated(figs), own]).text,)
+    (cause,) = (summarise_run(figs, [*findings_from_metrics(figs), own]).text,)
     assert cause.endswith("To do: check the unit of the ranges.")
     honest = figures(True, 1.0, 1.0, None)
-    assert summary(honest, stated(honest)).text.endswith(f"To do: {NOTHING}.")
+    assert summarise_run(honest, findings_from_metrics(honest)).text.endswith(f"To do: {NOTHING}.")
     unknown = figures(True, 1.0, None, None)
-    assert "true error unknown" in summary(unknown, stated(unknown)).text
-    assert summary(unknown, stated(unknown)).text.endswith(f"To do: {NOTHING_KNOWN}.")
-    assert [in_metres(x) for x in (4012.0, 305.2, 1.263, 0.0412, 0.0063)] == [
+    assert "true error unknown" in summarise_run(unknown, findings_from_metrics(unknown)).text
+    assert summarise_run(unknown, findings_from_metrics(unknown)).text.endswith(f"To do: {NOTHING_KNOWN}.")
+    assert [length_text(x) for x in (4012.0, 305.2, 1.263, 0.0412, 0.0063)] == [
         *("4.01 km", "305 m", "1.26 m", "4.1 cm", "6.3 mm")
     ]
 
@@ -184,7 +184,7 @@ def test_loops_that_disagree_are_read_by_the_verdict() -> None:
     solved = {"converged": True}
     dof = 400.0
     for value, expected in ((1.05, []), (1.76, ["bad"])):
-        lines = stated(Figures(solved, {"loops_value": value, "loops_dof": dof, "gap": 0.0}))
+        lines = findings_from_metrics(RunMetrics(solved, {"loops_value": value, "loops_dof": dof, "gap": 0.0}))
         assert [f.level for f in lines if "disagreement of loop closures" in f.text] == expected
 
 
@@ -194,13 +194,13 @@ def test_what_is_said_of_many_submaps_is_said_twice_and_counted() -> None:
         rows += [Finding("", "note", text).as_row() for text in ("one", "two", "three")] if key == 0 else []
         return SimpleNamespace(key=key, report={"findings": rows})
 
-    found = observed([], submaps=[submap(k) for k in range(20)])  # type: ignore[misc]
+    found = findings_from_run([], submaps=[submap(k) for k in range(20)])  # type: ignore[misc]
     assert [f.text for f in found if f.code == "note"] == ["one", "two", "three"]
     unheld = [f.text for f in found if f.code == "scans-unheld"]
     assert len(unheld) == 3
     assert unheld[0] == "Submap 0: nothing holds it."
     assert "18 more submaps (2, 3, 4" in unheld[2]
-    assert not [f for f in observed([], submaps=[submap(0), submap(1)]) if "more submaps" in f.text]
+    assert not [f for f in findings_from_run([], submaps=[submap(0), submap(1)]) if "more submaps" in f.text]
 
 
 def test_what_is_no_finding_of_ours_is_left_out() -> None:
@@ -244,7 +244,7 @@ def test_two_maps_that_explain_a_log_are_said() -> None:
     }
 
     def said(report: dict[str, Any]) -> list[Finding]:
-        return [f for f in stated(Figures(report, {}, [])) if f.code == "two-maps"]
+        return [f for f in findings_from_metrics(RunMetrics(report, {}, [])) if f.code == "two-maps"]
 
     (line,) = said({"two_maps": facts})
     assert line.level == "bad"

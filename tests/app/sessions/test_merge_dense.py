@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 
 import graphslam
 from graphslam.app.cli import app
-from graphslam.app.folders.generations import outputs
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.run import pipeline
-from graphslam.app.run.outputs import open_run
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.surface import scanned_path
 from graphslam.app.sessions.dense import session_of
 from graphslam.app.sessions.localise import localise
 from graphslam.app.sessions.merge_surface import surface_of_sessions
-from graphslam.backend.sessions import attach, put
+from graphslam.backend.sessions import add_session, connect_session
 from graphslam.core import se3
 from graphslam.core.atomic import read_npz
 from graphslam.core.errors import ConfigError, DataError, RunFolderError, SolverError
@@ -34,7 +34,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.loops.session_ties import TieConfig, TwoSessions
+from graphslam.loops.inter_session_loops import InterSessionConfig, TwoSessions
 from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
 from graphslam_frontends.base import FrontEnd
@@ -101,7 +101,7 @@ def scanned_from(logs: list[tuple[Any, SensorLog]]) -> Any:
 def solved(d: HallDrive, name: str, out: Path, *, gps: str = "none", seed: int = 0) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "make_front_end", lambda *_: Ready(tuple(d.submaps)))
-        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
         config = {"gps": {"use": gps, "robust": "none"}}
         return pipeline.run(log_of(d, name, seed), frontend="ready", out=out, config=config, progress=False)
 
@@ -175,10 +175,10 @@ def test_drives_of_clouds_become_one_map(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("graphslam.app.sessions.merge_surface.scanned_path", scanned_from(list(zip(runs, logs))))
         graphslam.merge(runs, out=tmp_path / "both", surface=SurfaceConfig(voxel=0.3))
-    facts = json.loads((outputs(tmp_path / "both") / "surface.json").read_text())
+    facts = json.loads((current_outputs(tmp_path / "both") / "surface.json").read_text())
     assert facts["sessions"] == 2
     assert facts["colour"] == "session"
-    assert (outputs(tmp_path / "both") / "figures" / "surface_sessions.png").is_file()
+    assert (current_outputs(tmp_path / "both") / "figures" / "surface_sessions.png").is_file()
     with pytest.raises(ConfigError, match="taste"):
         graphslam.merge(runs, out=tmp_path / "third", surface=SurfaceConfig(), colour="taste")
 
@@ -263,19 +263,19 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
     """Ties that agree, all of them 9 m off: what is brought near each other by them does not match."""
     known, new = (session_of(r, name, first_key=10 * k, after=1e4 * k) for k, (r, name) in enumerate(zip(runs, "ab")))
     two = TwoSessions(known.map, new.map)
-    found = two.find(TieConfig())
+    found = two.find(InterSessionConfig())
     shift = np.array([-9.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])  # the first drive goes straight on
     wrong = replace(found, loops=tuple(replace(x, T_ij=se3.se3_compose(shift, x.T_ij)) for x in found.loops))
     for ties, named in ((wrong, r"b: \d+ ties to a agree .* looks alike"), (found, "")):
         graph = PoseGraph(3)
         solver = make_solver("batch", graph)
-        put(graph, known)
+        add_session(graph, known)
         solver.solve_to_optimum()
         if named:
             with pytest.raises(SolverError, match=named):
-                attach(graph, solver, known, 0, new, found=(two, ties), config=TieConfig(heard=1))
+                connect_session(graph, solver, known, 0, new, found=(two, ties), config=InterSessionConfig(heard=1))
         else:
-            assert len(attach(graph, solver, known, 0, new, found=(two, ties)).used) >= 2
+            assert len(connect_session(graph, solver, known, 0, new, found=(two, ties)).used) >= 2
 
 
 def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:
@@ -303,14 +303,14 @@ def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path)
 def test_a_run_goes_on_in_a_saved_map(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "make_front_end", lambda *_: Ready(tuple(drives[1].submaps)))
-        patch.setattr(pipeline, "recommended", lambda *_: {})
+        patch.setattr(pipeline, "recommended_options", lambda *_: {})
         patch.setattr(pipeline, "load_log_source", lambda *_, **__: log_of(drives[1], "again", 1))
         patch.setattr(pipeline, "check_name", lambda *_: None)
         arguments = ["run", "again", "--frontend", "ready", "--continue", str(runs[0].folder), "--json"]
         out = tmp_path / "again"
         done = CliRunner().invoke(app, [*arguments, "--out", str(out)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    assert open_run(out).name == "again"
+    assert read_run_folder(out).name == "again"
     a = read_npz(out / "continued" / "merged.npz", fmt="graphslam.merged-submaps/1")
     assert a["sessions"].tolist() == ["there", "again"]
     assert json.loads(done.stdout)["continued"]["sessions"][1]["hangs_on"] == "there"

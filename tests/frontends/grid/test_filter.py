@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import GeometryError
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
-from graphslam.evidence.memory import memory
+from graphslam.evidence.memory import measure_memory
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
 from graphslam_frontends.grid.rbpf_grid import run_rbpf
@@ -59,12 +59,12 @@ def test_one_particle_takes_roll_and_pitch_from_gravity() -> None:
     steps = ring(1, 3, length=8.0, beams=40)
     assert steps.tilt is not None
     path = run_rbpf(steps, replace(CONFIG, particles=1), SeedTree(0)).ancestry.path(0)
-    from graphslam_frontends.grid.motion import tilts
+    from graphslam_frontends.grid.motion import roll_pitch_of
 
-    assert tilts(path) == pytest.approx(steps.tilt, abs=1e-12)
+    assert roll_pitch_of(path) == pytest.approx(steps.tilt, abs=1e-12)
     # the frame of the map stands level: the robot drove on one level, and stays there
     assert np.abs(path[:, 2] - path[0, 2]).max() < 0.1
-    assert level(path[0]) == pytest.approx([0, 0, CONFIG.lift * CONFIG.voxel_size, 0, 0, 0, 1])
+    assert remove_roll_pitch(path[0]) == pytest.approx([0, 0, CONFIG.lift * CONFIG.voxel_size, 0, 0, 0, 1])
 
 
 def test_particles_without_noise_are_one_and_cost_one_map() -> None:
@@ -74,7 +74,7 @@ def test_particles_without_noise_are_one_and_cost_one_map() -> None:
     result = run_rbpf(steps, quiet, SeedTree(0))
     alone = run_rbpf(steps, replace(quiet, particles=1), SeedTree(0))
     assert result.poses == pytest.approx(np.tile(dead_reckoned(steps)[-1], (8, 1)), abs=1e-12)
-    together, one = memory(result.particles.grids), memory(alone.particles.grids[0])
+    together, one = measure_memory(result.particles.grids), measure_memory(alone.particles.grids[0])
     assert together.bricks == one.bricks
     assert result.tally.rays == alone.tally.rays
 
@@ -107,8 +107,8 @@ def test_children_of_one_particle_share_their_map_and_are_updated_once() -> None
             assert np.array_equal(grid.brick_values(), values)
             first = int(np.flatnonzero(ancestors == ancestors[i])[0])
             assert grid.same_as(p.grids[first])
-        total = memory(p.grids).bricks
-        assert total < 0.7 * sum(memory(g).bricks for g in p.grids)
+        total = measure_memory(p.grids).bricks
+        assert total < 0.7 * sum(measure_memory(g).bricks for g in p.grids)
         return
     pytest.fail("never resampled")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError
-from graphslam.core.poses import SE2, SE3, Group, level
-from graphslam_frontends.grid.filter_drift import FilterDrift, Passed, between_knots
+from graphslam.core.poses import SE2, SE3, Group, remove_roll_pitch
+from graphslam_frontends.grid.filter_error_model import ErrorPassThrough, FilterDrift, interpolate_covariances
 
 MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, position_scale=0.01, few=5.0, alone_walk=0.03)
 
@@ -72,7 +72,7 @@ def test_how_many_particles_and_how_far() -> None:
 def test_frames_at_the_end_are_level_where_submaps_are() -> None:
     """On a ramp the error of the heading turns about the vertical, not about the body's own axis."""
     path = _bend(SE3, pitch=-0.3)
-    flat = np.array(level(path))
+    flat = np.array(remove_roll_pitch(path))
     leaning = MODEL.covariance(path, 20)
     np.testing.assert_allclose(leaning, MODEL.covariance(np.vstack([path[:-1], flat[-1:]]), 20), atol=1e-12)
     assert np.abs(MODEL.covariance(path, 20, gravity=False) - leaning).max() > 1e-4
@@ -112,7 +112,11 @@ def _reckoned(d: int, seed: int = 3) -> np.ndarray:
 @pytest.mark.parametrize(("dim", "tilt"), [(3, None), (6, None), (6, 0.01)])
 def test_errors_of_which_a_share_is_passed_on_have_that_covariance(dim: int, tilt: float | None) -> None:
     """Drawn: of every error of dead reckoning its share reaches the end, and the floor pulls by tilt² a metre."""
-    passed, O, rng = Passed(heading=0.5, position=0.8, height_tilt=200.0), _reckoned(dim), np.random.default_rng(0)
+    passed, O, rng = (
+        ErrorPassThrough(heading=0.5, position=0.8, height_tilt=200.0),
+        _reckoned(dim),
+        np.random.default_rng(0),
+    )
     share = {3: [0.8, 0.8, 0.5], 6: [0.5, 0.5, 0.5, 0.8, 0.8, 0.8]}[dim]
     if tilt is not None:  # roll, pitch and heights are gravity's
         share = [0.0, 0.0, 0.5, 0.8, 0.8, 0.0]
@@ -126,7 +130,7 @@ def test_errors_of_which_a_share_is_passed_on_have_that_covariance(dim: int, til
 
 def test_a_single_particle_passes_everything_on_and_more_never_less_than_nothing() -> None:
     path, O = _bend(SE3), 0.01 * _reckoned(6)
-    assert np.array_equal(Passed().covariance(O, 40.0, 1, tilt=0.01), O)
+    assert np.array_equal(ErrorPassThrough().covariance(O, 40.0, 1, tilt=0.01), O)
     quiet = FilterDrift(few=0.0)
     # of one the heading walks as dead reckoning says, not as the robot that the model was fitted to
     assert quiet.covariance(path, 1, reckoned=O) - O == pytest.approx(quiet.covariance(path, 40))
@@ -139,7 +143,7 @@ def test_a_single_particle_passes_everything_on_and_more_never_less_than_nothing
 def test_impossible_shares_are_refused() -> None:
     for bad in ({"heading": -0.1}, {"position": 1.1}, {"height_tilt": np.nan}):
         with pytest.raises(ConfigError, match="passed on"):
-            Passed(**bad)
+            ErrorPassThrough(**bad)
 
 
 @pytest.mark.parametrize("group", [SE2, SE3])
@@ -149,7 +153,7 @@ def test_between_knots_covariances_are_those_of_a_slow_twin(group: Group) -> Non
     along = np.linspace(0.0, 40.0, n)
     knots = np.array([0, 20, 45, n - 1])
     C = np.array([k * _reckoned(d, 5) + np.eye(d) for k in range(4)])
-    got = between_knots(knots, C, poses, along)
+    got = interpolate_covariances(knots, C, poses, along)
     assert got[knots] == pytest.approx(C)
     for at in (7, 33, 58):
         j = int(np.searchsorted(knots, at)) - 1

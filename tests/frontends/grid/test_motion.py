@@ -9,7 +9,14 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.poses import group_of, heading_of
 from graphslam.core.se3 import quat_multiply, se3_exp
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.motion import motion_covariance, move, square_root, tilted, tilts, walk_tilt_errors
+from graphslam_frontends.grid.motion import (
+    motion_covariance,
+    move_poses,
+    roll_pitch_of,
+    square_root,
+    walk_tilt_errors,
+    with_roll_pitch,
+)
 
 QUIET = {"motion_scale": 0.0, "position_walk": 0.0, "height_walk": 0.0, "heading_walk": 0.0, "heading_turn": 0.0,
          "tilt_walk": 0.0}  # fmt: skip
@@ -74,7 +81,7 @@ def test_sampled_motion_has_the_covariance_it_was_sampled_from(planar: bool, rng
     start = np.array([1.0, 2.0, 0.5]) if planar else se3_exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     step = np.array([0.3, 0.1, 0.2]) if planar else se3_exp(np.array([0.02, 0.01, 0.1, 0.3, 0.1, 0.02]))
     n = 20_000
-    moved = move(np.tile(start, (n, 1)), step, rng.normal(size=(n, d)) @ square_root(cov).T)
+    moved = move_poses(np.tile(start, (n, 1)), step, rng.normal(size=(n, d)) @ square_root(cov).T)
     group = group_of(start)
     e = group.log(group.between(np.broadcast_to(group.compose(start, step), moved.shape), moved))
     nees = np.einsum("na,ab,nb->n", e, np.linalg.inv(cov), e)
@@ -92,13 +99,13 @@ def test_the_square_root_of_a_covariance_with_a_direction_without_noise() -> Non
 def test_gravity_replaces_roll_and_pitch_and_nothing_else(rng: np.random.Generator) -> None:
     poses = se3_exp(rng.normal(size=(50, 6)) * np.array([0.4, 0.4, 2.0, 5.0, 5.0, 5.0]))
     new = rng.normal(size=(50, 2)) * 0.3
-    level = tilted(poses, new)
-    assert np.allclose(tilts(level), new, atol=1e-12)
+    level = with_roll_pitch(poses, new)
+    assert np.allclose(roll_pitch_of(level), new, atol=1e-12)
     assert np.allclose(np.exp(1j * heading_of(level)), np.exp(1j * heading_of(poses)), atol=1e-12)
     assert np.array_equal(level[:, :3], poses[:, :3])
     assert np.allclose(np.linalg.norm(level[:, 3:], axis=1), 1.0, atol=1e-12)
     # what gravity says already changes nothing
-    again = tilted(poses, tilts(poses))
+    again = with_roll_pitch(poses, roll_pitch_of(poses))
     assert np.allclose(np.abs(np.sum(again[:, 3:] * poses[:, 3:], axis=1)), 1.0, atol=1e-12)
 
 

@@ -12,16 +12,16 @@ from graphslam.app.run.front_ends import make_front_end
 from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.core.poses import group_of, level
+from graphslam.core.poses import group_of, remove_roll_pitch
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.memory import memory
+from graphslam.evidence.memory import measure_memory
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.filter_drift import Passed
+from graphslam_frontends.grid.filter_error_model import ErrorPassThrough
 from graphslam_frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
-from graphslam_frontends.odometry.scan_use import reckoned_covariance
+from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance
 from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring, true_end
 
@@ -74,8 +74,8 @@ def test_result_holds_what_happened(run: tuple[Steps, RbpfResult]) -> None:
     assert np.array_equal(result.ancestry.paths()[-1], result.poses)
     assert result.seconds > 0.0
     assert set(result.tally.seconds) == {"predict", "weigh", "record", "resample", "update"}
-    assert result.used_bytes == memory(result.particles.grids).total
-    assert result.used_bytes < 0.6 * sum(memory(g).total for g in result.particles.grids)
+    assert result.used_bytes == measure_memory(result.particles.grids).total
+    assert result.used_bytes < 0.6 * sum(measure_memory(g).total for g in result.particles.grids)
     assert result.particles.weights[result.best] == result.particles.weights.max()
     json.dumps(result.report())
 
@@ -84,7 +84,7 @@ def test_the_map_is_of_the_place(run: tuple[Steps, RbpfResult]) -> None:
     steps, result = run
     group = group_of(result.final_pose)
     assert steps.truth is not None
-    start = level(steps.truth.poses[0])
+    start = remove_roll_pitch(steps.truth.poses[0])
     points = np.concatenate([group.transform(group.between(start, T), steps.scan(k)[0][steps.scan(k)[2]])
                              for k, T in enumerate(steps.truth.poses)])  # fmt: skip
     cloud = result.particles.grids[result.best].occupied_cloud()
@@ -125,10 +125,10 @@ def test_submap_is_the_best_particles_with_an_honest_exit(run: tuple[Steps, Rbpf
 def test_the_exit_takes_along_what_the_filter_passes_on_of_dead_reckoning(run: tuple[Steps, RbpfResult]) -> None:
     steps, result = run
     n = len(steps)
-    plain, passed = rbpf_submap(result, drift, steps=steps), Passed(heading=0.5, position=0.7)
+    plain, passed = rbpf_submap(result, drift, steps=steps), ErrorPassThrough(heading=0.5, position=0.7)
     submap = rbpf_submap(result, drift, steps=steps, passed=passed)
     tilt = None if steps.tilt is None else steps.tilt_sigma
-    reckoned = reckoned_covariance(steps, 0, n - 1, level_end=False)
+    reckoned = dead_reckoning_covariance(steps, 0, n - 1, level_end=False)
     wanted = passed.covariance(reckoned, float(steps.path_length[-1]), len(result.particles), tilt=tilt)
     assert np.trace(wanted) > 0
     assert submap.exit_covariance - plain.exit_covariance == pytest.approx(wanted, rel=1e-6, abs=1e-12)

@@ -12,7 +12,7 @@ from graphslam.core.random import SeedTree
 from graphslam.evidence.likelihood import log_weights
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
-from graphslam_frontends.grid.upright import NEIGHBOURS, SURE, upright_beams, vertical
+from graphslam_frontends.grid.upright import NEIGHBOURS, SURE, up_directions, upright_beams
 from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring
 
@@ -50,7 +50,7 @@ def test_floors_are_left_out_and_walls_are_not(steps: Steps) -> None:
     assert steps.truth is not None
     poses = steps.truth.interpolate(steps.times)
     step = np.repeat(np.arange(len(steps)), np.diff(steps.offsets))
-    up = np.array([vertical(steps.tilt)[k] for k in step])  # type: ignore[arg-type]
+    up = np.array([up_directions(steps.tilt)[k] for k in step])  # type: ignore[arg-type]
     heights = np.einsum("ki,ki->k", steps.points, up) + poses[step, 2]
     found = upright_beams(steps)
     lies = steps.returns & ((np.abs(heights + 0.07) < 0.1) | (np.abs(heights - 2.68) < 0.1))
@@ -67,10 +67,10 @@ def test_what_is_up_is_seen_from_a_tilted_body() -> None:
     poses = GridFilter(
         replace(ring(1, 3, length=1.0, beams=10), tilt_sigma=0.0), GridFilterConfig(particles=1), SeedTree(0)
     ).particles.poses
-    from graphslam_frontends.grid.motion import tilted
+    from graphslam_frontends.grid.motion import with_roll_pitch
 
-    for t, seen in zip(tilt, vertical(tilt)):
-        q = tilted(poses, t[None])[0, 3:]
+    for t, seen in zip(tilt, up_directions(tilt)):
+        q = with_roll_pitch(poses, t[None])[0, 3:]
         assert se3.quat_rotate(q, seen) == pytest.approx([0.0, 0.0, 1.0], abs=1e-12)
 
 

@@ -12,16 +12,16 @@ from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
 from graphslam_frontends.grid.particles import normalise_log_weights
-from graphslam_frontends.grid.weights import informed, inherit, spread
+from graphslam_frontends.grid.weights import evenly_spaced_indices, fill_with_mean_likelihood, maps_with_enough_scans
 from tests.frontends.grid_world import ring
 from tests.reference.grid_weighing import endpoint_gains
 
 
 def test_spread_takes_all_or_evenly_many() -> None:
-    assert spread(5, 0).tolist() == spread(5, 9).tolist() == [0, 1, 2, 3, 4]
-    assert spread(0, 10).tolist() == []
+    assert evenly_spaced_indices(5, 0).tolist() == evenly_spaced_indices(5, 9).tolist() == [0, 1, 2, 3, 4]
+    assert evenly_spaced_indices(0, 10).tolist() == []
     for n, most in ((305, 60), (100, 99), (7, 3)):
-        got = spread(n, most)
+        got = evenly_spaced_indices(n, most)
         assert len(np.unique(got)) == most
         assert got[0] == 0
         assert got[-1] < n
@@ -30,18 +30,18 @@ def test_spread_takes_all_or_evenly_many() -> None:
 
 def test_only_maps_that_know_enough_are_asked_or_else_the_oldest() -> None:
     ages = np.array([0, 3, 12, 20])
-    assert informed(ages, 12).tolist() == [False, False, True, True]
-    assert informed(ages, 0).tolist() == [False, True, True, True]
-    assert informed(np.array([0, 3, 5, 5]), 12).tolist() == [False, False, True, True]
-    assert informed(np.array([4, 4]), 12).tolist() == [True, True]
-    assert not informed(np.zeros(3, dtype=np.int64), 12).any()
+    assert maps_with_enough_scans(ages, 12).tolist() == [False, False, True, True]
+    assert maps_with_enough_scans(ages, 0).tolist() == [False, True, True, True]
+    assert maps_with_enough_scans(np.array([0, 3, 5, 5]), 12).tolist() == [False, False, True, True]
+    assert maps_with_enough_scans(np.array([4, 4]), 12).tolist() == [True, True]
+    assert not maps_with_enough_scans(np.zeros(3, dtype=np.int64), 12).any()
 
 
 def test_the_young_keep_their_share_of_the_weight(rng: np.random.Generator) -> None:
     log_weights = np.log(rng.dirichlet(np.ones(9)))
     gains = rng.normal(scale=5.0, size=9)
     told = np.array([True, False, True, True, False, True, True, True, False])
-    new = inherit(gains, log_weights, told)
+    new = fill_with_mean_likelihood(gains, log_weights, told)
     assert np.array_equal(new[told], gains[told])
     assert np.ptp(new[~told]) == 0.0
     before, after = np.exp(log_weights), normalise_log_weights(log_weights + new)
@@ -51,15 +51,15 @@ def test_the_young_keep_their_share_of_the_weight(rng: np.random.Generator) -> N
     assert after[told] / after[told].sum() == pytest.approx(
         normalise_log_weights(log_weights[told] + gains[told]), rel=1e-12
     )
-    assert np.array_equal(inherit(gains, log_weights, np.zeros(9, dtype=np.bool_)), np.zeros(9))
-    assert np.array_equal(inherit(gains, log_weights, np.ones(9, dtype=np.bool_)), gains)
-    far = inherit(gains - 1e6, log_weights, told)
+    assert np.array_equal(fill_with_mean_likelihood(gains, log_weights, np.zeros(9, dtype=np.bool_)), np.zeros(9))
+    assert np.array_equal(fill_with_mean_likelihood(gains, log_weights, np.ones(9, dtype=np.bool_)), gains)
+    far = fill_with_mean_likelihood(gains - 1e6, log_weights, told)
     assert np.all(np.isfinite(far))
 
 
 def test_a_likelihood_that_is_nothing_leaves_the_young_alone() -> None:
     gains = np.array([-np.inf, -2.0, 0.0])
-    new = inherit(gains, np.log(np.full(3, 1 / 3)), np.array([True, True, False]))
+    new = fill_with_mean_likelihood(gains, np.log(np.full(3, 1 / 3)), np.array([True, True, False]))
     assert new[2] == pytest.approx(-2.0 - np.log(2.0))
 
 

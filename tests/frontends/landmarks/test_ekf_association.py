@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from graphslam.core.errors import ConfigError
-from graphslam_frontends.landmarks.compatibility import gates_by_dof, pair
+from graphslam_frontends.landmarks.compatibility import gates_by_dof, pair_observations
 from tests.reference.ekf_slam import distance2, exhaustive_joint, measurement, nearest_neighbour
 
 SENSOR = np.array([0.4, 0.1, -0.05])
@@ -39,7 +39,7 @@ def test_nearest_neighbour_equals_the_obvious_loop(ranges_only):
     contested = 0
     for _ in range(60):
         x, P, obs = problem(rng, ranges_only=ranges_only)
-        got = pair(x, P, obs, SENSOR, gate=11.8, method="nearest")
+        got = pair_observations(x, P, obs, SENSOR, gate=11.8, method="nearest")
         np.testing.assert_array_equal(got.landmark, nearest_neighbour(x, P, obs, SENSOR, 11.8))
         gates = gates_by_dof(11.8, 2)
         for o in range(len(obs)):
@@ -58,7 +58,7 @@ def test_joint_compatibility_equals_the_exhaustive_search(ranges_only):
     differs, sizes = 0, []
     for _ in range(40):
         x, P, obs = problem(rng, landmarks=4, ranges_only=ranges_only)
-        got = pair(x, P, obs, SENSOR, gate=11.8, method="jcbb")
+        got = pair_observations(x, P, obs, SENSOR, gate=11.8, method="jcbb")
         match, d2 = exhaustive_joint(x, P, obs, SENSOR, 11.8)
         np.testing.assert_array_equal(got.landmark, match)
         assert got.distance2 == pytest.approx(d2, rel=1e-9, abs=1e-12)
@@ -81,8 +81,8 @@ def test_joint_compatibility_sees_the_common_error_that_nearest_neighbour_takes_
     P = np.block([[P, np.zeros((15, 4))], [np.zeros((4, 15)), 1e-4 * np.eye(4)]])
     seen = [1, 2, 3, 4, 6, 7]
     obs = np.array([[*measurement(truth, j, np.zeros(3))[0], 0.01, 1e-3] for j in seen])
-    nearest = pair(x, P, obs, np.zeros(3), gate=11.8, method="nearest").landmark
-    joint = pair(x, P, obs, np.zeros(3), gate=11.8, method="jcbb").landmark
+    nearest = pair_observations(x, P, obs, np.zeros(3), gate=11.8, method="nearest").landmark
+    joint = pair_observations(x, P, obs, np.zeros(3), gate=11.8, method="jcbb").landmark
     assert (nearest[:4] != seen[:4]).sum() >= 3
     np.testing.assert_array_equal(joint, seen)
 
@@ -90,10 +90,10 @@ def test_joint_compatibility_sees_the_common_error_that_nearest_neighbour_takes_
 def test_search_stops_at_its_bound_says_so_and_keeps_the_best_so_far():
     rng = np.random.default_rng(3)
     x, P, obs = problem(rng, landmarks=12, observations=10, spread=0.8)
-    whole = pair(x, P, obs, SENSOR, gate=11.8, method="jcbb", max_nodes=10**7)
+    whole = pair_observations(x, P, obs, SENSOR, gate=11.8, method="jcbb", max_nodes=10**7)
     assert not whole.capped
     assert whole.nodes > 60
-    cut = pair(x, P, obs, SENSOR, gate=11.8, method="jcbb", max_nodes=60)
+    cut = pair_observations(x, P, obs, SENSOR, gate=11.8, method="jcbb", max_nodes=60)
     assert cut.capped
     assert cut.nodes == 60
     used = cut.landmark[cut.landmark >= 0]
@@ -112,7 +112,7 @@ def test_bound_prunes():
     P = 1e-3 * np.eye(len(x))
     obs = np.array([[*measurement(x, j, SENSOR)[0], 0.01, 1e-4] for j in range(12)])
     obs[:, 0] += 0.05 * rng.standard_normal(12)
-    got = pair(x, P, obs, SENSOR, gate=11.8, method="jcbb")
+    got = pair_observations(x, P, obs, SENSOR, gate=11.8, method="jcbb")
     np.testing.assert_array_equal(got.landmark, np.arange(12))
     assert got.nodes == 12
 
@@ -120,14 +120,14 @@ def test_bound_prunes():
 @pytest.mark.parametrize("method", ["nearest", "jcbb"])
 def test_nothing_to_pair(method):
     x, P = np.zeros(3), np.eye(3)
-    got = pair(x, P, np.array([[3.0, 0.0, 0.01, 0.01]]), SENSOR, gate=11.8, method=method)
+    got = pair_observations(x, P, np.array([[3.0, 0.0, 0.01, 0.01]]), SENSOR, gate=11.8, method=method)
     np.testing.assert_array_equal(got.landmark, [-1])
     assert got.nearest[0] == np.inf
     x, P = np.array([0, 0, 0, 4.0, 1.0]), np.eye(5)
-    assert len(pair(x, P, np.zeros((0, 4)), SENSOR, gate=11.8, method=method).landmark) == 0
+    assert len(pair_observations(x, P, np.zeros((0, 4)), SENSOR, gate=11.8, method=method).landmark) == 0
     row = np.array([[*measurement(x, 0, SENSOR)[0], 0.01, 0.01]])
-    assert pair(x, P, row, SENSOR, gate=11.8, method=method).landmark[0] == 0
-    dead = pair(x, P, row, SENSOR, gate=11.8, method=method, alive=np.array([False]))
+    assert pair_observations(x, P, row, SENSOR, gate=11.8, method=method).landmark[0] == 0
+    dead = pair_observations(x, P, row, SENSOR, gate=11.8, method=method, alive=np.array([False]))
     assert dead.landmark[0] == -1
 
 

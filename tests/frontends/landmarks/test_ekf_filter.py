@@ -10,7 +10,7 @@ from graphslam.core.geometry import se2_compose
 from graphslam_frontends.landmarks import ekf_filter
 from graphslam_frontends.landmarks.ekf_config import EkfSlamConfig
 from graphslam_frontends.landmarks.ekf_filter import EkfMap
-from graphslam_frontends.landmarks.ekf_kernels import linearise
+from graphslam_frontends.landmarks.ekf_kernels import linearise_observation
 from tests.reference.ekf_slam import DenseEkf, DenseEkfByDistance, measurement
 
 SENSOR = np.array([0.6, -0.3, 0.1])
@@ -61,7 +61,7 @@ def test_jacobian_equals_finite_differences(row):
     H, nu, h = np.empty((2, 5)), np.empty(2), np.empty(12)
     for k in range(2):
         z = np.array([4.0, 0.3, 0.1, 0.1])
-        linearise(x, k, z, SENSOR, h, H, nu)
+        linearise_observation(x, k, z, SENSOR, h, H, nu)
         columns = [0, 1, 2, 3 + 2 * k, 4 + 2 * k]
         for i, c in enumerate(columns):
             e = np.zeros(7)

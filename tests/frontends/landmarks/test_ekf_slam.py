@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError, CovarianceError, GeometryError, MissingDataError
 from graphslam.core.geometry import tangent_to_vector_covariance
@@ -88,7 +88,7 @@ def test_where_ranges_are_sure_and_bearings_are_not_the_filter_believes_itself_t
 
 def test_front_ends_are_registered_with_presets_for_the_simulated_world(world):
     for name, kind in (("ekf", Ekf), ("ekf-slam", EkfSlam)):
-        made = make_front_end(name, recommended(world, name)["frontend"])
+        made = make_front_end(name, recommended_options(world, name)["frontend"])
         assert isinstance(made, kind)
         assert isinstance(made, FrontEnd)
         assert made.config.association == "known"
@@ -188,7 +188,7 @@ def clear_world():
 
 @pytest.mark.parametrize("association", ["nearest", "jcbb"])
 def test_unknown_association_finds_the_identities_over_a_loop_closure(clear_world, association):
-    options = recommended(clear_world, "ekf-slam")["frontend"]
+    options = recommended_options(clear_world, "ekf-slam")["frontend"]
     s = next(make_front_end("ekf-slam", {**options, "association": association}).submaps(clear_world, seed=SEED))
     rows = s.landmarks.sightings
     found = pair_agreement(rows[:, 1], clear_world["landmarks"].ids[rows[:, 0]])

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.pipeline import load_log_source
 from graphslam.app.verbs import run
 from graphslam.core.random import SeedTree
@@ -31,7 +31,7 @@ def test_joint_compatibility_and_nearest_neighbour_agree_on_separate_trees(data_
     log = log.slice(log.interval[0], log.interval[0] + 120.0)
     maps = []
     for association in ("nearest", "jcbb"):
-        options = {**recommended(log, "ekf-slam")["frontend"], "association": association}
+        options = {**recommended_options(log, "ekf-slam")["frontend"], "association": association}
         maps.append(next(make_front_end("ekf-slam", options).submaps(log, seed=SeedTree(0))))
     nearest, joint = maps
     assert len(nearest.landmarks) > 40

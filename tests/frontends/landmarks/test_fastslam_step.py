@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import chi2
 
 from graphslam.core.geometry import se2_compose, wrap_angle
-from graphslam_frontends.landmarks.config import DelayedStart, RbpfEkfConfig
+from graphslam_frontends.landmarks.config import DelayedInitialisation, RbpfEkfConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
-from graphslam_frontends.landmarks.measurement_kernels import observe
+from graphslam_frontends.landmarks.measurement_kernels import observe_landmark
 from tests.reference.fastslam import SlowParticle, measure, numeric_jacobians
 
 SENSOR = np.array([0.6, -0.3, 0.1])
@@ -59,7 +59,7 @@ def world(rng, scans=25, clutter=0.3):
 def test_step_equals_slow_twin(proposal, association, ranges_only, seed):
     rng = np.random.default_rng(seed)
     outlier = 6.0 if ranges_only else 0.0
-    never = DelayedStart(min_ranges=10**6)  # what waits for a landmark is no part of the step
+    never = DelayedInitialisation(min_ranges=10**6)  # what waits for a landmark is no part of the step
     config = RbpfEkfConfig(
         particles=5, proposal=proposal, association=association, ess_fraction=1e-9, outlier_gate=outlier, delayed=never
     )
@@ -117,7 +117,7 @@ def test_step_equals_slow_twin(proposal, association, ranges_only, seed):
 def test_observation_jacobians_equal_finite_differences(seed):
     rng = np.random.default_rng(seed)
     pose, landmark, out = rng.normal(size=3), 5 * rng.normal(size=2) + 3, np.empty(12)
-    observe(*pose, np.asarray(SENSOR), *landmark, out)
+    observe_landmark(*pose, np.asarray(SENSOR), *landmark, out)
     Hx, Hl = numeric_jacobians(pose, SENSOR, landmark)
     z = measure(pose, SENSOR, landmark)
     np.testing.assert_allclose([out[0], wrap_angle(out[1] - z[1])], [z[0], 0], atol=1e-12)

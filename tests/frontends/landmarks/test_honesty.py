@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import Gaussian
@@ -14,7 +14,7 @@ from graphslam.core.random import SeedTree
 from graphslam.evaluate.metrics import Metrics, flag_counts, front_end_metrics
 from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
-from graphslam_frontends.landmarks.honesty import flag, pool, variance_bounds
+from graphslam_frontends.landmarks.moment_consistency import consistency_flag, pool_gaussians, variance_bounds
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 from graphslam_frontends.odometry.motion import MotionNoise
 
@@ -29,7 +29,7 @@ def test_pool_is_unbiased_for_estimates_of_one_posterior():
         x = rng.multivariate_normal([1.0, 2.0, np.pi], C, (k, n))
         x[..., 2] = wrap_angle(x[..., 2])
         gs = [Gaussian(np.r_[s[:, :2].mean(0), np.pi + wrap_angle(s[:, 2] - np.pi).mean()], C, (2,)) for s in x]
-        g = pool([Gaussian(np.r_[a.mean[:2], wrap_angle(a.mean[2])], C, (2,)) for a in gs])
+        g = pool_gaussians([Gaussian(np.r_[a.mean[:2], wrap_angle(a.mean[2])], C, (2,)) for a in gs])
         assert abs(wrap_angle(g.mean[2] - np.pi)) < 0.5  # averaged on the circle
         totals.append(g.covariance)
     expected = C * (1 + (1 + 1 / k) / n)
@@ -94,7 +94,7 @@ def test_the_alarm_rings_for_moments_that_are_handed_over_and_not_for_the_rest(m
 )
 def test_degenerate_filters_and_wrong_noise_are_flagged(options, reason):
     log = simulate("landmark-field", seed=3, preset="quick")
-    merged = recommended(log, "rbpf-ekf")["frontend"] | options
+    merged = recommended_options(log, "rbpf-ekf")["frontend"] | options
     submaps = list(make_front_end("rbpf-ekf", merged).submaps(log, seed=SeedTree(1)))
     assert np.mean([reason in s.report["flag"] for s in submaps]) > 0.7
 
@@ -111,7 +111,7 @@ def test_honest_filters_are_flagged_in_one_submap_of_twenty_at_most():
             sigma_bearing=np.deg2rad(rng.uniform(1.0, 5.0)),
         )
         association = ("known", "likelihood")[seed % 2]
-        options = recommended(log, "rbpf-ekf")["frontend"] | {"association": association}
+        options = recommended_options(log, "rbpf-ekf")["frontend"] | {"association": association}
         flags += [bool(s.report["flag"]) for s in make_front_end("rbpf-ekf", options).submaps(log, seed=SeedTree(seed))]
     assert len(flags) > 35
     assert np.mean(flags) <= 0.05
@@ -162,7 +162,7 @@ def test_watching_changes_nothing_that_is_handed_over():
     ],
 )  # fmt: skip
 def test_flag_names_its_reasons(figures, particles, expected):
-    assert flag(figures, particles) == expected
+    assert consistency_flag(figures, particles) == expected
 
 
 def test_flagged_maps_are_counted(maps):

@@ -11,10 +11,10 @@ import graphslam as gs
 from graphslam.core.charts import map_difference
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log, wrap_angle
-from graphslam.core.lasting import LastingErrors
-from graphslam_frontends.landmarks.config import LastingConfig
-from graphslam_frontends.landmarks.lasting import lasting_errors
-from graphslam_frontends.landmarks.summarise import Smoothed, smooth
+from graphslam.core.sensor_biases import SensorBiases
+from graphslam_frontends.landmarks.config import SensorBiasConfig
+from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases
+from graphslam_frontends.landmarks.summarise import SmoothingResult, smooth_submap
 from tests.frontends.landmarks.test_smoothing import SENSOR, Q, drive
 from tests.reference.fastslam import measure
 
@@ -39,9 +39,9 @@ def measured_with(g, u, z, config):
     return se2_exp(xi), z, sensor
 
 
-def again(s: Smoothed, g, u, k, j, z, config) -> Smoothed:
+def again(s: SmoothingResult, g, u, k, j, z, config) -> SmoothingResult:
     u, z, sensor = measured_with(g, u, z, config)
-    return smooth(s.poses, s.landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, sensor)
+    return smooth_submap(s.poses, s.landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, sensor)
 
 
 def nearly_exact(seed):
@@ -56,9 +56,9 @@ def nearly_exact(seed):
 
 
 CONFIGS = {
-    "wheels and sensor": LastingConfig(),
-    "a vehicle that steers": LastingConfig(yaw_bias=0.0, turn_per_metre=0.02),
-    "ranges alone": LastingConfig(sensor_yaw=0.0, range_scale=0.05, mount=0.0),
+    "wheels and sensor": SensorBiasConfig(),
+    "a vehicle that steers": SensorBiasConfig(yaw_bias=0.0, turn_per_metre=0.02),
+    "ranges alone": SensorBiasConfig(sensor_yaw=0.0, range_scale=0.05, mount=0.0),
 }
 
 
@@ -68,8 +68,8 @@ def test_responses_are_those_of_smoothing_again(name):
     truth, landmarks, u, k, j, z = nearly_exact(1)
     if name == "ranges alone":
         z[:, 1], z[:, 3] = 0.0, np.inf
-    s = smooth(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
-    found = lasting_errors(config, s, SECONDS, None, base=False)
+    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
+    found = estimate_sensor_biases(config, s, SECONDS, None, base=False)
     step = np.full(6, 2e-4)
     # what the residuals say: the least cost for each g is a parabola, C - 2 score g + g' information g
     cost = lambda g: again(s, g, u, k, j, z, config).chi2  # noqa: E731
@@ -94,8 +94,8 @@ def test_responses_are_those_of_smoothing_again(name):
 
 def test_likelihood_is_the_score_and_the_information():
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(2))
-    s = smooth(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
-    found = lasting_errors(LastingConfig(), s, SECONDS, None, base=True)
+    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
+    found = estimate_sensor_biases(SensorBiasConfig(), s, SECONDS, None, base=True)
     R, d = found.likelihood()
     np.testing.assert_allclose(R.T @ R, found.information, rtol=1e-6, atol=1e-6 * found.information.max())
     np.testing.assert_allclose(R.T @ d, found.score, rtol=1e-6, atol=1e-6 * np.abs(found.score).max())
@@ -105,9 +105,9 @@ def test_likelihood_is_the_score_and_the_information():
 
 def test_two_names_for_one_error_are_refused():
     with pytest.raises(ConfigError, match="cannot be estimated together"):
-        LastingConfig(turn_per_metre=0.1)
+        SensorBiasConfig(turn_per_metre=0.1)
     with pytest.raises(ConfigError, match="σ ≥ 0"):
-        LastingConfig(range_offset=-1.0)
+        SensorBiasConfig(range_offset=-1.0)
 
 
 def erring(log, g):
@@ -169,27 +169,27 @@ def test_constant_errors_are_found_with_the_map_and_its_covariances_know_of_them
 
 def test_lasting_errors_refuse_what_does_not_fit():
     good = {
-        "names": LastingConfig().chosen()[0], "sigmas": np.ones(6),
+        "names": SensorBiasConfig().chosen()[0], "sigmas": np.ones(6),
         "response": np.zeros((5, 6)), "score": np.zeros(6), "information": np.eye(6), "path": np.zeros((3, 3, 6)),
         "points": np.zeros((0, 6)),
     }  # fmt: skip
-    LastingErrors(**good)
+    SensorBiases(**good)
     for name, bad in {
         "sigmas": np.zeros(6),
         "information": np.triu(np.ones((6, 6))),
         "score": np.full(6, np.nan),
     }.items():
         with pytest.raises(GraphSlamError):
-            LastingErrors(**{**good, name: bad})
+            SensorBiases(**{**good, name: bad})
 
 
 def test_a_pose_that_errs_moves_like_its_response():
     """The trajectory of a solution has the constant errors taken out of it."""
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(3))
-    s = smooth(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
-    found = lasting_errors(LastingConfig(), s, SECONDS, None, base=False)
+    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
+    found = estimate_sensor_biases(SensorBiasConfig(), s, SECONDS, None, base=False)
     g = np.array([0.01, 0.02, 0.05, 0.02, 0.05, -0.05])
-    other = again(s, g, u, k, j, z, LastingConfig())
+    other = again(s, g, u, k, j, z, SensorBiasConfig())
     moved = se2_compose(s.poses, se2_exp(found.path @ g))
     left = np.abs(se2_log(se2_between(moved, other.poses))).max()
     assert left < 0.1 * np.abs(se2_log(se2_between(s.poses, other.poses))).max()

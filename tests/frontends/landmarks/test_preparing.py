@@ -17,8 +17,8 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
 from graphslam.io.growing_log import GrowingLog
 from graphslam_frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig
-from graphslam_frontends.landmarks.prepare import Prepared, Preparing, prepare
-from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoning
+from graphslam_frontends.landmarks.prepare import LogPreparation, PreparedLog, prepare_log
+from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments
 
 
 def in_portions(log: SensorLog, seed: int, most: int = 7) -> Iterator[tuple[str, Any]]:
@@ -65,7 +65,7 @@ def velocities(cut: bool = True) -> SensorLog:
 def recorded() -> SensorLog:
     log = velocities(cut=False)
     stamps = log["wheels"].times[::3]
-    odometry, _ = dead_reckoning(log, stamps, MotionNoise(speed=0.02, yaw_rate=0.01))
+    odometry, _ = dead_reckoned_increments(log, stamps, MotionNoise(speed=0.02, yaw_rate=0.01))
     kept = (stamps < 20.0) | (stamps > 27.0)
     return SensorLog(name="odometry", streams={"odometry": odometry.take(kept), "seen": log["seen"]})
 
@@ -73,7 +73,7 @@ def recorded() -> SensorLog:
 def slow() -> SensorLog:
     """Odometry at 0.4 Hz: every pause is longer than one of a robot that has stopped, and none is a gap."""
     log = velocities(cut=False)
-    odometry, _ = dead_reckoning(log, log["wheels"].times[::25], MotionNoise(speed=0.02, yaw_rate=0.01))
+    odometry, _ = dead_reckoned_increments(log, log["wheels"].times[::25], MotionNoise(speed=0.02, yaw_rate=0.01))
     return SensorLog(name="slow", streams={"odometry": odometry, "seen": log["seen"]})
 
 
@@ -97,13 +97,13 @@ def test_portions_change_nothing(make: Any, known: bool) -> None:
     noise = RangeBearingNoise(range_sigma=0.1, bearing_sigma=0.02, range_scale=1.02) if known else None
     config = RbpfEkfConfig(association="known" if known else "likelihood", max_range=30.0, noise=noise)
     counts = DropCounter()
-    whole = prepare(log, config, counts)
+    whole = prepare_log(log, config, counts)
     assert len(whole.gaps) == {"drawn": 3, "odometry": 1}.get(log.name, 0)
     for seed, most in ((0, 1), (1, 40), (2, 400)):
         drops = DropCounter()
         with tempfile.TemporaryDirectory() as folder:
             growing = GrowingLog(log.name, folder)
-            made = Preparing(growing, config, drops)
+            made = LogPreparation(growing, config, drops)
             steps = 0
             for name, part in in_portions(log, seed, most):
                 growing.add(name, part)
@@ -123,7 +123,7 @@ def test_a_scan_is_there_when_it_is_known_to_be_the_last_or_not() -> None:
     log = steering()
     with tempfile.TemporaryDirectory() as folder:
         growing = GrowingLog(log.name, folder)
-        made = Preparing(growing, RbpfEkfConfig(), DropCounter())
+        made = LogPreparation(growing, RbpfEkfConfig(), DropCounter())
         waiting = made.reach(2)
         assert next(waiting, "there") is None
         growing.add("landmarks", log["landmarks"].take(slice(0, 3)))
@@ -150,11 +150,11 @@ def test_a_log_that_ends_without_a_scan_or_motion_is_refused() -> None:
             growing.add(name, log[name])
             growing.end()
             with pytest.raises(MissingDataError, match=wanted):
-                Preparing(growing, RbpfEkfConfig(), DropCounter()).advance()
+                LogPreparation(growing, RbpfEkfConfig(), DropCounter()).advance()
 
 
 def test_usual_noise_is_the_mean_of_what_was_seen_until_then() -> None:
-    data: Prepared = prepare(velocities(), RbpfEkfConfig(max_range=30.0), DropCounter())
+    data: PreparedLog = prepare_log(velocities(), RbpfEkfConfig(max_range=30.0), DropCounter())
     for scan in (0, 10, len(data) - 1):
         seen = data.rows[: data.observations.offsets[scan + 1], 2:]
         expected = np.sqrt(seen.mean(axis=0)) if len(seen) else np.ones(2)

@@ -16,9 +16,10 @@ from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.submap_consistency import submap_nees
-from graphslam_frontends.landmarks.config import DelayedStart, RbpfEkfConfig, RbpfSlamConfig, StoppingConfig
+from graphslam_frontends.landmarks.config import DelayedInitialisation, RbpfEkfConfig, RbpfSlamConfig, StoppingConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
-from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem, resolve_mirror_ambiguity
+from graphslam_frontends.landmarks.prepare import prepare_log
 from graphslam_frontends.landmarks.range_only import WaitingRanges
 from graphslam_frontends.landmarks.range_only_kernels import (
     FIT_CHI2,
@@ -30,11 +31,10 @@ from graphslam_frontends.landmarks.range_only_kernels import (
     FIT_XX,
     FIT_YY,
     circle_starts,
-    trilaterate,
+    trilaterate_kernel,
 )
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 from graphslam_frontends.landmarks.rbpf_slam import rbpf_snapshots
-from graphslam_frontends.landmarks.rivals import SubmapProblem, settle_rivals
 from graphslam_frontends.odometry.motion import MotionNoise
 from tests.reference import trilateration as slow
 
@@ -59,7 +59,7 @@ def measured(anchors, rng, sigma=SIGMA):
 def fitted(anchors, ranges, variances, limit=np.inf):
     starts = circle_starts(anchors, ranges, limit)
     fit, used, minima = np.empty(FIT_LENGTH), np.zeros(len(ranges), bool), np.empty((len(starts), 3))
-    found = trilaterate(anchors, ranges, variances, limit, starts, fit, used, minima)
+    found = trilaterate_kernel(anchors, ranges, variances, limit, starts, fit, used, minima)
     return found, fit, used, minima[:found]
 
 
@@ -125,7 +125,7 @@ def test_outliers_are_left_out_and_named():
 def wait(path, config=None, particles=3, rng=None):
     """Feed one beacon range by range; returns the buffer and what started after which range."""
     rng = rng or np.random.default_rng(0)
-    waiting = WaitingRanges(particles, config or DelayedStart(), np.inf)
+    waiting = WaitingRanges(particles, config or DelayedInitialisation(), np.inf)
     ranges, started = measured(path, rng), None
     for k, (p, r) in enumerate(zip(path, ranges)):
         waiting.add(np.array([4]), np.array([k]), np.array([r]), np.array([SIGMA**2]), np.tile(p, (particles, 1)))
@@ -146,10 +146,10 @@ def test_a_beacon_waits_until_it_is_sharp_and_alone():
     assert start is None
     assert len(waiting) == 40
     np.testing.assert_array_equal(waiting.slots, [4])
-    assert wait(bend(40), DelayedStart(spread=0.01))[1] > k
+    assert wait(bend(40), DelayedInitialisation(spread=0.01))[1] > k
     for bad in ({"min_ranges": 2}, {"spread": 0.0}, {"support": 1.5}):
         with pytest.raises(ConfigError):
-            DelayedStart(**bad)
+            DelayedInitialisation(**bad)
 
 
 def test_every_range_is_spent_once():
@@ -174,7 +174,9 @@ def test_every_range_is_spent_once():
 
 def test_paths_that_explain_the_ranges_gain_weight():
     """Two particles, one of which drifted: the ranges that make the landmark say so."""
-    config = RbpfEkfConfig(particles=2, association="known", ess_fraction=1e-6, delayed=DelayedStart(support=0.4))
+    config = RbpfEkfConfig(
+        particles=2, association="known", ess_fraction=1e-6, delayed=DelayedInitialisation(support=0.4)
+    )
     p = ParticleSet(config, np.zeros(3), (-np.pi, np.pi), 100.0, np.random.default_rng(0))
     anchors, rng = bend(40), np.random.default_rng(3)
     before, started = np.zeros(2), False
@@ -252,7 +254,7 @@ def drive(path):
         [measured(path, rng), np.zeros(len(path)), np.full(len(path), SIGMA**2), np.full(len(path), np.inf)]
     )
     k = np.arange(len(path))
-    problem = SubmapProblem(u, np.tile(Q, (len(u), 1, 1)), k, np.zeros(len(k), int), z, np.zeros(3), 0.0, 1)
+    problem = SmoothingProblem(u, np.tile(Q, (len(u), 1, 1)), k, np.zeros(len(k), int), z, np.zeros(3), 0.0, 1)
     return problem, poses
 
 
@@ -267,19 +269,19 @@ def test_a_landmark_in_the_wrong_mirror_is_put_right():
     problem, poses = drive(path)
     wrong = problem.smooth(poses, mirrored(BEACON, path[0], path[-1])[None])
     assert np.hypot(*(wrong.gaussian.mean[3:] - BEACON)) > 5
-    settled = settle_rivals(problem, wrong, DelayedStart())
+    settled = resolve_mirror_ambiguity(problem, wrong, DelayedInitialisation())
     assert (settled.swapped, settled.ambiguous) == (1, 0)
     assert settled.smoothed.chi2 < wrong.chi2 - 16
     right = problem.smooth(poses, BEACON[None])
     np.testing.assert_allclose(settled.smoothed.gaussian.mean, right.gaussian.mean, atol=1e-3)
-    again = settle_rivals(problem, right, DelayedStart())
+    again = resolve_mirror_ambiguity(problem, right, DelayedInitialisation())
     assert again.swapped == again.ambiguous == again.vague == 0
     assert again.smoothed is right
 
 
 def test_a_landmark_that_cannot_be_told_from_its_mirror_goes():
     problem, poses = drive(straight(30))
-    settled = settle_rivals(problem, problem.smooth(poses, BEACON[None]), DelayedStart())
+    settled = resolve_mirror_ambiguity(problem, problem.smooth(poses, BEACON[None]), DelayedInitialisation())
     assert settled.ambiguous == 1
     assert len(settled.smoothed.gaussian.mean) == 3
     assert not settled.smoothed.landmark_kept.any()
@@ -291,8 +293,8 @@ def test_a_landmark_that_the_free_path_leaves_vague_goes():
     first = problem.smooth(poses, BEACON[None])
     sigma = np.sqrt(np.linalg.eigvalsh(first.gaussian.covariance[3:, 3:])[-1])
     ratio = sigma / problem.observations[:, 0].mean()
-    assert settle_rivals(problem, first, DelayedStart(spread=1.05 * ratio)).vague == 0
-    assert settle_rivals(problem, first, DelayedStart(spread=0.2 * ratio)).vague == 1
+    assert resolve_mirror_ambiguity(problem, first, DelayedInitialisation(spread=1.05 * ratio)).vague == 0
+    assert resolve_mirror_ambiguity(problem, first, DelayedInitialisation(spread=0.2 * ratio)).vague == 1
 
 
 def test_single_map_filter_takes_ranges_too():
@@ -309,9 +311,9 @@ def test_single_map_filter_takes_ranges_too():
 def test_ranges_without_identities_are_refused():
     log = blind(simulate("landmark-field", seed=0, preset="quick"))
     with pytest.raises(MissingDataError, match="ranges alone"):
-        prepare(log, RbpfEkfConfig(association="likelihood"), DropCounter())
+        prepare_log(log, RbpfEkfConfig(association="likelihood"), DropCounter())
     noise = RbpfEkfConfig(association="known").noise
     assert noise is None
-    data = prepare(log, RbpfEkfConfig(association="known"), DropCounter())
+    data = prepare_log(log, RbpfEkfConfig(association="known"), DropCounter())
     assert np.isinf(data.rows[:, 3]).all()
     assert np.isinf(data.smoothing_variances[:, 1]).all()

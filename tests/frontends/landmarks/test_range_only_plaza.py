@@ -11,7 +11,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import align_se2, se2_transform
 from graphslam.core.log import DropCounter
 from graphslam_frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig
-from graphslam_frontends.landmarks.prepare import prepare
+from graphslam_frontends.landmarks.prepare import prepare_log
 from tests.benchmarks.bench_plaza import Evidence, Model, free_nees
 
 pytestmark = pytest.mark.data
@@ -77,7 +77,7 @@ def test_calibration_is_the_maximum_of_the_evidence(log):
 def test_range_calibration_is_taken_out_before_anything_else(log):
     noise = RangeBearingNoise(range_sigma=0.5, bearing_sigma=np.inf, range_scale=1.25, range_offset=6.0)
     drops = DropCounter()
-    data = prepare(log, RbpfEkfConfig(association="known", max_range=40.0, noise=noise), drops)
+    data = prepare_log(log, RbpfEkfConfig(association="known", max_range=40.0, noise=noise), drops)
     raw = log["landmarks"].ranges
     d = (raw - 6.0) / 1.25
     np.testing.assert_allclose(data.rows[:, 0], d[(d > 0) & (d <= 40.0)])

@@ -15,9 +15,9 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam_frontends.landmarks.config import RbpfSlamConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
-from graphslam_frontends.landmarks.lineage import WholeMapParticles
-from graphslam_frontends.landmarks.prepare import prepare
-from graphslam_frontends.landmarks.rbpf_slam import RbpfSlam, WholeMapFilter, rbpf_snapshots
+from graphslam_frontends.landmarks.lineage import SingleMapParticles
+from graphslam_frontends.landmarks.prepare import prepare_log
+from graphslam_frontends.landmarks.rbpf_slam import RbpfSlam, SingleMapFilter, rbpf_snapshots
 from graphslam_frontends.landmarks.summarise import REGULARISER
 from graphslam_frontends.odometry.motion import MotionNoise
 from tests.frontends.landmarks.test_fastslam_step import FOV, SENSOR, world
@@ -43,7 +43,7 @@ class Copying(ParticleSet):
 def test_shared_histories_equal_copied_ones(association, seed):
     config = RbpfSlamConfig(particles=6, association=association, ess_fraction=0.8)
     shared, copied = (
-        kind(config, SENSOR, FOV, 9.0, np.random.default_rng(seed)) for kind in (WholeMapParticles, Copying)
+        kind(config, SENSOR, FOV, 9.0, np.random.default_rng(seed)) for kind in (SingleMapParticles, Copying)
     )
     slots: dict[int, int] = {}
     for u, Q, obs, ids in world(np.random.default_rng(50 + seed), scans=120):
@@ -69,8 +69,8 @@ def test_shared_histories_equal_copied_ones(association, seed):
 @pytest.mark.parametrize("association", ["known", "likelihood"])
 def test_snapshot_is_the_moment_matched_set(log, association):
     config = RbpfSlamConfig(particles=12, association=association, min_hits=2)
-    data = prepare(log, config, DropCounter())
-    filter = WholeMapFilter(data, config, SeedTree(1).generator())
+    data = prepare_log(log, config, DropCounter())
+    filter = SingleMapFilter(data, config, SeedTree(1).generator())
     for _ in range(80):
         filter.advance()
     got, dropped, _ = filter.snapshot(joint=True)

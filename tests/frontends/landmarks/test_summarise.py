@@ -16,8 +16,8 @@ from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
-from graphslam_frontends.landmarks.stopping import Stopping
-from graphslam_frontends.landmarks.summarise import common_features, moment_matched, winning_association
+from graphslam_frontends.landmarks.stopping import StoppingRule
+from graphslam_frontends.landmarks.summarise import common_features, gaussian_of_particles, winning_association
 
 
 def particle_set(n=4, observations=6, **config):
@@ -62,7 +62,7 @@ def test_moment_matching_equals_the_moments_of_a_large_sample(inflate):
     p.assoc[:, :2] = [0, 1]
     p.mean[:, :2] = rng.normal(0, 1, (8, 2, 2)) * 0.2 + [[5, 1], [3, -4]]
     p.cov[:, 0], p.cov[:, 1] = [0.05, 0.01, 0.08], [0.02, -0.005, 0.03]
-    got, dropped = moment_matched(p, winning_association(p, 1), inflate=inflate)
+    got, dropped = gaussian_of_particles(p, winning_association(p, 1), inflate=inflate)
     assert dropped == 0
     n = 400_000
     pick = rng.choice(8, n, p=p.weights)
@@ -90,7 +90,7 @@ SIGMA = np.array([0.5, 0.5, 0.1])
 
 
 def stopping(**config):
-    return Stopping(StoppingConfig(min_scans=1, **config))
+    return StoppingRule(StoppingConfig(min_scans=1, **config))
 
 
 def test_each_criterion_names_itself():
@@ -106,7 +106,7 @@ def test_each_criterion_names_itself():
     assert stopping(min_ancestors=1).reason(p, 0.2, u, 1, SIGMA) == "diversity"
     assert stopping(max_distance=0.9).reason(p, 0.2, u, 1, SIGMA) == "distance"
     assert stopping(max_scans=5).reason(p, 0.2, u, 1, SIGMA) == "scans"
-    assert Stopping(StoppingConfig(min_scans=6, max_scans=5)).reason(p, 0.2, u, 1, SIGMA) is None
+    assert StoppingRule(StoppingConfig(min_scans=6, max_scans=5)).reason(p, 0.2, u, 1, SIGMA) is None
 
 
 def test_a_fixed_number_of_scans_overrules_every_other_criterion():
@@ -114,7 +114,7 @@ def test_a_fixed_number_of_scans_overrules_every_other_criterion():
     p.hits[0, :9] = 3
     p.resamplings, p.ancestor[:] = 9, 0
     everything = {"num_features": 1, "max_resamplings": 1, "min_ancestors": 3, "max_distance": 0.1, "max_scans": 1}
-    s = Stopping(StoppingConfig(min_scans=1, scans=4, **everything))
+    s = StoppingRule(StoppingConfig(min_scans=1, scans=4, **everything))
     reasons = []
     for p.scans in range(1, 5):
         reasons.append(s.reason(p, 100.0, np.ones(3), 0, SIGMA))

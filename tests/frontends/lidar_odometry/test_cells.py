@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from graphslam.core import se3
 from graphslam_frontends.lidar_odometry import cell_kernels as kernels
-from graphslam_frontends.lidar_odometry.cells import CellMap, LevelConfig, evenly, thin
+from graphslam_frontends.lidar_odometry.cells import CellMap, LevelConfig, evenly_spaced_rows, first_rows_by_cube
 from tests.reference.plain_cells import plain_cells, plain_cost, plain_fit
 
 SCALE = 2.0
@@ -185,7 +185,7 @@ def test_forgotten_cells_are_gone_and_the_others_as_they_were():
 
 def test_thinning_keeps_the_first_of_each_cube_within_ranges():
     points = np.random.default_rng(1).uniform(-3, 3, (5000, 3))
-    rows = thin(points, 0.5, (1.0, 2.5))
+    rows = first_rows_by_cube(points, 0.5, (1.0, 2.5))
     seen, wanted = set(), []
     for k, p in enumerate(points):
         cube = tuple(np.floor(p / 0.5).astype(int))
@@ -193,5 +193,5 @@ def test_thinning_keeps_the_first_of_each_cube_within_ranges():
             seen.add(cube)
             wanted.append(k)
     np.testing.assert_array_equal(rows, wanted)
-    np.testing.assert_array_equal(evenly(10, 20), np.arange(10))
-    assert len(evenly(1000, 30)) == 30
+    np.testing.assert_array_equal(evenly_spaced_rows(10, 20), np.arange(10))
+    assert len(evenly_spaced_rows(1000, 30)) == 30

@@ -15,8 +15,15 @@ from graphslam.core.random import SeedTree
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, odometry_of
-from graphslam_frontends.lidar_odometry.inertial import Readings, Way, fit, running, tilt_of, upright
+from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, start_odometry
+from graphslam_frontends.lidar_odometry.inertial import (
+    ImuReadings,
+    InertialMotion,
+    align_with_gravity,
+    cumulative_products,
+    fit_velocity_gravity,
+    gravity_along_path,
+)
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 NOISE = ImuNoise(
@@ -36,7 +43,7 @@ def carried(seed, *, most=9.0, **change):
 
 def follow(log, imu):
     clouds = log["clouds"]
-    odometry = odometry_of(clouds, LidarOdometryConfig(), imu)
+    odometry = start_odometry(clouds, LidarOdometryConfig(), imu)
     poses = []
     for k in range(len(clouds)):
         odometry.step(clouds.cloud(k), float(clouds.times[k]), clouds.ages(k))
@@ -81,14 +88,14 @@ def test_a_running_product_is_that_of_a_loop(rng):
     slow = [np.array([0.0, 0, 0, 1])]
     for q in turns:
         slow.append(se3.quat_multiply(slow[-1], q))
-    for fast, one in zip(running(turns), slow):
+    for fast, one in zip(cumulative_products(turns), slow):
         assert abs(fast @ one) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_a_way_is_that_of_preintegration(rng):
     imu, bias = shaken(rng), np.array([0.02, -0.01, 0.03])
     begin, ends = 0.1234, np.array([0.3, 0.777, 1.5])
-    way = Readings(imu).way(begin, ends, bias)
+    way = ImuReadings(imu).way(begin, ends, bias)
     twin = preintegrate(imu, np.full(3, begin), ends, np.concatenate([bias, np.zeros(3)]))
     np.testing.assert_allclose(se3.quat_to_matrix(way.q), twin.R, atol=1e-9)
     np.testing.assert_allclose(way.v, twin.v, atol=2e-5)
@@ -96,7 +103,7 @@ def test_a_way_is_that_of_preintegration(rng):
 
 
 def test_a_way_backwards_undoes_the_way_there(rng):
-    readings, v, g = Readings(shaken(rng)), np.array([1.0, -0.5, 0.2]), np.array([0.3, 0.1, -9.8])
+    readings, v, g = ImuReadings(shaken(rng)), np.array([1.0, -0.5, 0.2]), np.array([0.3, 0.1, -9.8])
     there = readings.way(0.4, np.array([0.9]), np.zeros(3))
     T = there.poses(v, g)[0]
     # velocity and gravity as the body has them at the other end
@@ -110,7 +117,7 @@ def test_readings_of_a_mounted_unit_are_those_of_the_base():
     """A base that turns about its own origin feels gravity alone; a unit beside it feels the turn."""
     nothing = dict.fromkeys(("gyro_bias", "gyro_walk", "accelerometer_bias", "accelerometer_walk"), 0.0)
     log = carried(2, most=3.0, bob=0.0, imu=ImuNoise(gyro=1e-9, accelerometer=1e-9, **nothing))
-    readings, truth = Readings(log["imu"]), log.truth.trajectory
+    readings, truth = ImuReadings(log["imu"]), log.truth.trajectory
     t0, at = 0.6, np.array([1.1, 1.7])
     T0, dt = truth.interpolate(np.array([t0]))[0], 0.005
     v = (truth.interpolate(np.array([t0 + dt]))[0, :3] - truth.interpolate(np.array([t0 - dt]))[0, :3]) / (2 * dt)
@@ -125,19 +132,19 @@ def test_readings_of_a_mounted_unit_are_those_of_the_base():
 
 def test_no_way_over_a_pause_or_beyond_the_readings(rng):
     imu = shaken(rng)
-    paused = Readings(imu.take(np.r_[0:100, 160:400]))
+    paused = ImuReadings(imu.take(np.r_[0:100, 160:400]))
     assert paused.way(0.1, np.array([0.4]), np.zeros(3)) is not None
     assert paused.way(0.1, np.array([0.9]), np.zeros(3)) is None
-    assert Readings(imu).way(0.1, np.array([2.5]), np.zeros(3)) is None
-    assert Readings(imu.take(slice(0, 1))).way(0.0, np.array([0.0]), np.zeros(3)) is None
+    assert ImuReadings(imu).way(0.1, np.array([2.5]), np.zeros(3)) is None
+    assert ImuReadings(imu.take(slice(0, 1))).way(0.0, np.array([0.0]), np.zeros(3)) is None
 
 
 def test_velocity_and_gravity_are_those_of_the_positions(rng):
     """Within their covariance, 200 times; it would not hold with one of four times or of a quarter of the size."""
     tau = -np.linspace(0.0, 3.0, 13)
-    readings = Readings(shaken(rng))
+    readings = ImuReadings(shaken(rng))
     variance = readings.doubt(tau, 1e-3)
-    way = Way(tau, np.tile([0.0, 0, 0, 1], (13, 1)), np.zeros((13, 3)), rng.normal(size=(13, 3)))
+    way = InertialMotion(tau, np.tile([0.0, 0, 0, 1], (13, 1)), np.zeros((13, 3)), rng.normal(size=(13, 3)))
     z = []
     for _ in range(200):
         v, g = rng.normal(size=3), rng.normal(0.0, 0.5, size=3) + [0, 0, -GRAVITY]
@@ -148,7 +155,7 @@ def test_velocity_and_gravity_are_those_of_the_positions(rng):
             + rng.normal(size=(13, 3)) * np.sqrt(variance)[:, None]
         )
         guess = g + rng.normal(0.0, 1.0, 3)
-        found_v, found_g, C = fit(way, p, variance, guess, 1.0)
+        found_v, found_g, C = fit_velocity_gravity(way, p, variance, guess, 1.0)
         e = np.stack([found_v - v, found_g - g])
         z.append(np.einsum("ic,ij,jc->", e, np.linalg.inv(C[1:, 1:]), e) / 6)
     assert 0.85 < np.mean(z) < 1.15
@@ -157,12 +164,12 @@ def test_velocity_and_gravity_are_those_of_the_positions(rng):
 def test_upright_keeps_place_and_heading_and_puts_up_on_z(rng):
     pose = np.concatenate([rng.normal(size=3), se3.so3_exp(rng.normal(size=3))])
     up = se3.quat_rotate(pose[3:], np.array([0.1, -0.3, 0.9]) / np.linalg.norm([0.1, -0.3, 0.9]))
-    stood = upright(pose, up)
+    stood = align_with_gravity(pose, up)
     np.testing.assert_allclose(se3.quat_rotate(stood[3:], np.array([0.0, 0, 1])), up, atol=1e-12)
     np.testing.assert_allclose(stood[:3], pose[:3])
     ahead = se3.quat_rotate(stood[3:] * [-1, -1, -1, 1], se3.quat_rotate(pose[3:], np.array([1.0, 0, 0])))
     assert abs(ahead[1]) < 1e-12  # the body looks along x of the frame that stands
-    assert upright(pose, None) is pose
+    assert align_with_gravity(pose, None) is pose
 
 
 # --- along scans -----------------------------------------------------------------------------------------------------
@@ -206,7 +213,7 @@ def test_bias_velocity_and_gravity_are_learned(paths):
         fine = np.arange(20, len(log["imu"].times) - 20)
         at = log["imu"].times[fine]
         w = se3.so3_log(se3.se3_between(truth.interpolate(at - 0.005), truth.interpolate(at + 0.005))[:, 3:]) / 0.01
-        off = np.mean(Readings(log["imu"]).rate[fine] - w, axis=0)
+        off = np.mean(ImuReadings(log["imu"]).rate[fine] - w, axis=0)
         assert np.linalg.norm(unit.bias - off) < 2.5e-3
 
 
@@ -237,7 +244,7 @@ def test_a_wrong_unit_is_a_line_of_the_report(logs):
     submaps = list(LidarFrontEnd().submaps(spoilt, seed=SeedTree(0)))
     said = [f["code"] for s in submaps for f in s.report.get("findings", ())]
     assert said.count("imu-left-aside") == len(submaps)
-    assert all(s.aids == frozenset() for s in submaps)
+    assert all(s.assisting_streams == frozenset() for s in submaps)
 
 
 def test_covariances_say_nothing_of_what_the_unit_tells(paths, plain):
@@ -258,17 +265,17 @@ def test_submaps_stand_upright_and_name_what_helped(logs, submaps):
     assert len(submaps) > 1
     for a in submaps:
         assert a.uses == {"clouds"}
-        assert a.aids == {"imu"}
+        assert a.assisting_streams == {"imu"}
         assert a.report["scans_aided"] > 0.9 * a.report["scans"]
         arrays = {name: np.asarray(value) for name, value in submap_arrays(a).items()}
-        assert submap_from_arrays(arrays, where="x").aids == {"imu"}
+        assert submap_from_arrays(arrays, where="x").assisting_streams == {"imu"}
     first = submaps[0]
     truth = log.truth.trajectory.interpolate(np.array([first.interval[0]]))[0]
     T_world_base = se3.se3_compose(truth, se3.se3_inverse(first.trajectory.poses[0]))
     assert np.arccos(se3.quat_rotate(T_world_base[3:], np.array([0.0, 0, 1]))[2]) < 0.015
-    assert abs(se3.roll_pitch(truth[None])[0]).max() > 0.03  # which the body does not
+    assert abs(se3.roll_pitch_jacobian(truth[None])[0]).max() > 0.03  # which the body does not
     plain = list(LidarFrontEnd(LidarFrontEndConfig(imu="none")).submaps(log, seed=SeedTree(0)))
-    assert plain[0].aids == frozenset()
+    assert plain[0].assisting_streams == frozenset()
     np.testing.assert_array_equal(plain[0].trajectory.poses[0], [0, 0, 0, 0, 0, 0, 1])
 
 
@@ -286,8 +293,8 @@ def test_gravity_along_the_path_is_as_sure_as_it_says(paths):
     z = []
     for log, poses, odometry in paths:
         times = log["clouds"].times
-        tilt = tilt_of(odometry.inertial, times, poses)
-        true, _ = se3.roll_pitch(log.truth.trajectory.interpolate(times))
+        tilt = gravity_along_path(odometry.inertial, times, poses)
+        true, _ = se3.roll_pitch_jacobian(log.truth.trajectory.interpolate(times))
         off = tilt.at(times, poses) - true
         z.append(np.mean((off / tilt.sigma) ** 2))
         assert np.abs(off).max() < 0.03

@@ -11,7 +11,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.sim.raycast import RayCaster
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
-from graphslam_frontends.scan_window.exits import relative_covariance
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
 from graphslam_studies.sim.lidar import LidarConfig, drawn_lidar, simulate_lidar
 
 

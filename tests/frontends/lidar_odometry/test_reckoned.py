@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.core import se3
 from graphslam.core.records import Odometry
-from graphslam_frontends.lidar_odometry.reckoned import NOISE, Reckoned
+from graphslam_frontends.lidar_odometry.wheel_prior import NOISE, WheelMotionPrior
 
 
 def wheels(scale: float = 1.0, n: int = 200, dim: int = 2) -> tuple[Odometry, np.ndarray]:
@@ -30,7 +30,7 @@ def wheels(scale: float = 1.0, n: int = 200, dim: int = 2) -> tuple[Odometry, np
 def test_motions_are_those_of_the_records(dim: int) -> None:
     """Also between records, and where they come one by one."""
     odometry, poses = wheels(dim=dim)
-    whole, parts = Reckoned(odometry), Reckoned(odometry.take(slice(0, 0)))
+    whole, parts = WheelMotionPrior(odometry), WheelMotionPrior(odometry.take(slice(0, 0)))
     for k in range(200):
         parts.more(odometry.take(slice(k, k + 1)), 0.05 * k - 9.5)
     for found in (whole, parts):
@@ -49,7 +49,7 @@ def test_motions_are_those_of_the_records(dim: int) -> None:
 def test_it_is_of_use_while_it_tells_the_motions_of_scans(scale: float, useful: bool, better: bool) -> None:
     """An error of the scale leaves it useful; a wrong sign does not."""
     odometry, poses = wheels(scale)
-    reckoned = Reckoned(odometry)
+    reckoned = WheelMotionPrior(odometry)
     assert reckoned.useful
     assert not reckoned.better
     for k in range(2, 40, 2):

@@ -7,7 +7,7 @@ import graphslam as gs
 from graphslam.core import se3
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
-from graphslam_frontends.odometry.recorded import chain
+from graphslam_frontends.odometry.recorded import chain_odometry
 
 SCANS = 90
 
@@ -18,7 +18,7 @@ def recorded(data_dir):
     clouds = log["clouds"]
     rows = [(k, float(clouds.times[k]), clouds.cloud(k)) for k in range(SCANS)]
     other = gs.load("lidar3d-hku-mb")["clouds"]
-    return rows, chain(log["odometry"]).poses, [other.cloud(k) for k in (200, 201)]
+    return rows, chain_odometry(log["odometry"]).poses, [other.cloud(k) for k in (200, 201)]
 
 
 def _followed(rows):

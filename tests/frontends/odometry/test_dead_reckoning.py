@@ -11,10 +11,20 @@ from scipy.stats import chi2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
 from graphslam.core.log import DropCounter
-from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise, dead_reckon, reckon
-from graphslam_frontends.odometry.drift import calibrate
+from graphslam_frontends.odometry.dead_reckoned_path import (
+    DeadReckonedPath,
+    euler,
+    euler_quat,
+    level_by_euler,
+    tangent_of_state,
+)
+from graphslam_frontends.odometry.dead_reckoning import (
+    DeadReckoningNoise,
+    imu_wheel_increments,
+    integrate_imu_and_wheels,
+)
+from graphslam_frontends.odometry.drift import calibrate_drift
 from graphslam_frontends.odometry.gaps import find_gaps
-from graphslam_frontends.odometry.reckoned import Reckoned, euler, euler_quat, level, tangent_of_state
 from tests.reference.imu_drive import NOISE, STILL, drive
 
 TIMES = np.linspace(0.0, 40.0, 101)
@@ -23,25 +33,25 @@ RUNS = 200
 
 def motion(poses: np.ndarray, i: int, j: int, is_level: bool) -> np.ndarray:
     a, b = poses[i], poses[j]
-    return se3.se3_between(level(a), level(b)) if is_level else se3.se3_between(a, b)
+    return se3.se3_between(level_by_euler(a), level_by_euler(b)) if is_level else se3.se3_between(a, b)
 
 
 @pytest.mark.parametrize("gives_attitude", [True, False])
 def test_without_noise_it_is_the_truth(gives_attitude: bool) -> None:
     d = drive(None, gives_attitude=gives_attitude, stated=STILL)
-    r = reckon(d.imu, d.wheels, TIMES, NOISE)
+    r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
     truth = d.truth.interpolate(TIMES)
     off = se3.se3_log(se3.se3_between(motion(r.poses, 0, 100, False), motion(truth, 0, 100, False)))
     # without an attitude of its own, gravity is seen through a filter while the base accelerates
     assert np.abs(off).max() < (1e-4 if gives_attitude else 5e-3)
     assert np.linalg.norm(motion(truth, 0, 100, False)[:3]) > 10.0
     assert np.abs(r.tilt - euler(truth)[:, :2]).max() < (1e-6 if gives_attitude else 1e-3)
-    np.testing.assert_array_equal(r.odometry.increments, dead_reckon(d.imu, d.wheels, TIMES, NOISE).increments)
+    np.testing.assert_array_equal(r.odometry.increments, imu_wheel_increments(d.imu, d.wheels, TIMES, NOISE).increments)
 
 
 def test_increments_chain_to_the_poses() -> None:
     d = drive(np.random.default_rng(1), seconds=40.0)
-    r = reckon(d.imu, d.wheels, TIMES, NOISE)
+    r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
     T = r.poses[0]
     np.testing.assert_allclose(r.poses[0][:3], 0.0)
     assert abs(euler(r.poses[0])[2]) < 1e-12
@@ -54,7 +64,7 @@ def nees(gives_attitude: bool, intervals: list[tuple[int, int]]) -> dict[tuple[i
     out: dict[tuple[int, int, bool], list[float]] = {}
     for seed in range(RUNS):
         d = drive(np.random.default_rng(seed), gives_attitude=gives_attitude)
-        r = reckon(d.imu, d.wheels, TIMES, NOISE)
+        r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
         truth = d.truth.interpolate(TIMES)
         for i, j in intervals:
             for is_level in (False, True):
@@ -87,7 +97,7 @@ def test_what_is_new_in_each_step_is_as_stated() -> None:
     squares = []
     for seed in range(40):
         d = drive(np.random.default_rng(1000 + seed), lasting=False)
-        o = reckon(d.imu, d.wheels, TIMES, NOISE).odometry
+        o = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE).odometry
         truth = d.truth.interpolate(TIMES)
         e = se3.se3_log(se3.se3_between(o.increments[1:], se3.se3_between(truth[:-1], truth[1:])))
         squares.append(np.mean(e**2 / np.diagonal(o.covariances[1:], axis1=1, axis2=2), axis=0))
@@ -98,7 +108,7 @@ def test_what_is_new_in_each_step_is_as_stated() -> None:
 def test_independent_increments_promise_too_much() -> None:
     """The reason for carrying errors that last: composing white increments is over-confident many times over."""
     d = drive(np.random.default_rng(5))
-    r = reckon(d.imu, d.wheels, TIMES, NOISE)
+    r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
     P = np.zeros((6, 6))
     for step, C in zip(r.odometry.increments[1:], r.odometry.covariances[1:]):
         back = se3.se3_adjoint(se3.se3_inverse(step))
@@ -110,26 +120,26 @@ def test_independent_increments_promise_too_much() -> None:
 def test_transition_equals_differences_of_the_whole_integration() -> None:
     """Errors put into the measurements move the end as the transition says: gyro's bias, wheels' scale, tilt."""
     d = drive(None, stated=STILL)
-    r = reckon(d.imu, d.wheels, TIMES, NOISE)
+    r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
     F = np.linalg.multi_dot(r.transitions[1:][::-1])
     eps = 1e-4
 
-    def state(q: Reckoned) -> np.ndarray:
+    def state(q: DeadReckonedPath) -> np.ndarray:
         return np.concatenate([[euler(q.poses[-1])[2]], q.poses[-1][:3]])
 
     to_imu = se3.quat_to_matrix(d.imu.T_base_imu[3:])
     for axis in range(3):  # true = measured + error, so the estimate without it is off by the opposite
         turned = replace(d.imu, angular_rate=d.imu.angular_rate + eps * to_imu[axis])
-        moved = (state(reckon(turned, d.wheels, TIMES, NOISE)) - state(r)) / eps
+        moved = (state(integrate_imu_and_wheels(turned, d.wheels, TIMES, NOISE)) - state(r)) / eps
         np.testing.assert_allclose(moved, F[:4, 4 + axis], atol=1e-8 + 2e-2 * np.abs(F[:4, 4 + axis]).max())
     faster = replace(d.wheels, speed=d.wheels.speed * (1 + eps))
-    moved = (state(reckon(d.imu, faster, TIMES, NOISE)) - state(r)) / eps
+    moved = (state(integrate_imu_and_wheels(d.imu, faster, TIMES, NOISE)) - state(r)) / eps
     np.testing.assert_allclose(moved, F[:4, 7], atol=2e-2 * np.abs(F[:4, 7]).max())
     flat = replace(d.imu, T_base_imu=np.array([0, 0, 0, 0, 0, 0, 1.0]), angular_rate=d.imu.angular_rate @ to_imu.T)
     tilt = euler(d.truth.poses)[:, :2]
-    base = reckon(replace(flat, attitude=tilt), d.wheels, TIMES, NOISE)
+    base = integrate_imu_and_wheels(replace(flat, attitude=tilt), d.wheels, TIMES, NOISE)
     for axis in range(2):
-        tilted = reckon(replace(flat, attitude=tilt + eps * np.eye(2)[axis]), d.wheels, TIMES, NOISE)
+        tilted = integrate_imu_and_wheels(replace(flat, attitude=tilt + eps * np.eye(2)[axis]), d.wheels, TIMES, NOISE)
         moved = (state(tilted) - state(base)) / eps
         np.testing.assert_allclose(moved, F[:4, 10 + axis], atol=2e-2 * np.abs(F[:4, 10 + axis]).max())
 
@@ -138,7 +148,7 @@ def test_tangent_of_state_equals_finite_differences(rng: np.random.Generator) ->
     a, b = (np.concatenate([rng.normal(size=3), euler_quat(*rng.normal(scale=0.4, size=3))]) for _ in range(2))
     eps = 1e-6
     for is_level in (False, True):
-        frames = [level(p) if is_level else p for p in (a, b)]
+        frames = [level_by_euler(p) if is_level else p for p in (a, b)]
         G = tangent_of_state(frames[0][None], frames[1][None], level_start=is_level, level_end=is_level)[0]
         for k in range(14):
             e = eps * np.eye(14)[k]
@@ -153,13 +163,13 @@ def test_tangent_of_state_equals_finite_differences(rng: np.random.Generator) ->
 
 def test_gaps_are_bridged_with_doubt_and_counted() -> None:
     d = drive(np.random.default_rng(2))
-    sharp = reckon(d.imu, d.wheels, TIMES, NOISE)
+    sharp = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
     for what, inside in (("imu", 2), ("wheels", 3)):
         stream = getattr(d, what)
         hole = stream.take((stream.times <= 20.01) | (stream.times >= 21.49))
         drops = DropCounter()
         streams = {"imu": d.imu, "wheels": d.wheels, what: hole}
-        r = reckon(streams["imu"], streams["wheels"], TIMES, NOISE, drops=drops)
+        r = integrate_imu_and_wheels(streams["imu"], streams["wheels"], TIMES, NOISE, drops=drops)
         assert drops.counts == {f"log/{what}: gap bridged": 1}
         # the whole gap's σ over 1.5 s: of the heading 0.3 rad/s, of the distance 0.5 m/s
         added = (r.covariance(49, 55) - sharp.covariance(49, 55))[inside, inside]
@@ -172,7 +182,7 @@ def test_gaps_are_bridged_with_doubt_and_counted() -> None:
         streams[what] = late
         option = r"at most 2 s \(frontend\.steps\.longest_record\)"
         with pytest.raises(DataError, match=rf"log/{what}: gap without records.*to 21\.5.*{option}"):
-            reckon(streams["imu"], streams["wheels"], TIMES, NOISE, longest=2.0)
+            integrate_imu_and_wheels(streams["imu"], streams["wheels"], TIMES, NOISE, longest=2.0)
 
 
 def test_a_jump_of_the_clock_is_a_gap() -> None:
@@ -184,7 +194,7 @@ def test_a_jump_of_the_clock_is_a_gap() -> None:
 
 def test_a_standing_base_stays_and_only_its_heading_drifts() -> None:
     d = drive(np.random.default_rng(3))
-    r = reckon(d.imu, replace(d.wheels, speed=0.0 * d.wheels.speed), TIMES, NOISE)
+    r = integrate_imu_and_wheels(d.imu, replace(d.wheels, speed=0.0 * d.wheels.speed), TIMES, NOISE)
     np.testing.assert_allclose(r.poses[:, :3], 0.0)
     C = r.covariance(0, 100)
     assert np.abs(np.diag(C)[3:] - NOISE.floor_position**2).max() < 1e-15
@@ -194,23 +204,23 @@ def test_a_standing_base_stays_and_only_its_heading_drifts() -> None:
 def test_refusals() -> None:
     d = drive(np.random.default_rng(4))
     with pytest.raises(DataError, match="times outside the records"):
-        reckon(d.imu, d.wheels, [0.0, 41.0])
+        integrate_imu_and_wheels(d.imu, d.wheels, [0.0, 41.0])
     with pytest.raises(DataError, match="times outside the records"):
-        reckon(d.imu, d.wheels.take(slice(10, None)), TIMES)
+        integrate_imu_and_wheels(d.imu, d.wheels.take(slice(10, None)), TIMES)
     with pytest.raises(MissingDataError, match="log/wheels"):
-        reckon(d.imu, d.wheels.take(slice(0, 0)), TIMES)
+        integrate_imu_and_wheels(d.imu, d.wheels.take(slice(0, 0)), TIMES)
     with pytest.raises(DataError, match="no time"):
-        reckon(d.imu, d.wheels, [])
+        integrate_imu_and_wheels(d.imu, d.wheels, [])
     with pytest.raises(DataError, match="does not increase"):
-        reckon(d.imu, d.wheels, [1.0, 1.0])
+        integrate_imu_and_wheels(d.imu, d.wheels, [1.0, 1.0])
     wall = replace(d.imu, T_base_imu=np.concatenate([np.zeros(3), se3.so3_exp([0, np.pi / 2, 0])]))
     with pytest.raises(GeometryError, match="wall"):
-        reckon(wall, d.wheels, TIMES)
+        integrate_imu_and_wheels(wall, d.wheels, TIMES)
     weightless = replace(d.imu, attitude=None, specific_force=0.0 * d.imu.specific_force)
     with pytest.raises(DataError, match="no gravity"):
-        reckon(weightless, d.wheels, TIMES)
+        integrate_imu_and_wheels(weightless, d.wheels, TIMES)
     with pytest.raises(DataError, match="no such interval"):
-        reckon(d.imu, d.wheels, TIMES).between(5, 101)
+        integrate_imu_and_wheels(d.imu, d.wheels, TIMES).between(5, 101)
     for bad in ({"filter_time": 0.0}, {"wheel": -1.0}, {"wheel_scale": np.nan}):
         with pytest.raises(ConfigError):
             DeadReckoningNoise(**bad)
@@ -218,7 +228,7 @@ def test_refusals() -> None:
 
 def test_one_time_is_a_path_without_motion() -> None:
     d = drive(np.random.default_rng(4))
-    r = reckon(d.imu, d.wheels, [3.0])
+    r = integrate_imu_and_wheels(d.imu, d.wheels, [3.0])
     np.testing.assert_array_equal(r.odometry.increments, [[0, 0, 0, 0, 0, 0, 1]])
     T, C = r.between(0, 0)
     np.testing.assert_allclose(T, [0, 0, 0, 0, 0, 0, 1], atol=1e-12)
@@ -228,9 +238,9 @@ def test_one_time_is_a_path_without_motion() -> None:
 def test_drift_model_of_the_motion_noise() -> None:
     """Calibrated on the noise alone, the model covers what the same noise does on average, at every length."""
     d = drive(np.random.default_rng(6))
-    r = reckon(d.imu, d.wheels, TIMES, NOISE)
+    r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
     length = np.cumsum(np.linalg.norm(r.odometry.increments[:, :3], axis=1))
-    model = calibrate(r, length, lengths=(3.0, 6.0, 12.0, 24.0), level=True)
+    model = calibrate_drift(r, length, lengths=(3.0, 6.0, 12.0, 24.0), level=True)
     assert model.dim == 3
     for metres in (5.0, 10.0, 20.0):
         stated = []

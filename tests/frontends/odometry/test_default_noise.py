@@ -16,7 +16,7 @@ from graphslam.sim.crawler import crawler_motion
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import yaw_bias_for
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.filter_drift import FilterDrift
+from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.motion import motion_covariance, walk_tilt_errors
 from graphslam_frontends.odometry.drift import DriftModel
 from tests.reference.garage_exits import Ends, read

@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.records import Odometry
-from graphslam_frontends.odometry.drift import DriftModel, calibrate, fit_drift
+from graphslam_frontends.odometry.drift import DriftModel, calibrate_drift, fit_drift
 from graphslam_frontends.odometry.recorded import RecordedErrors
 
 PURE = dict.fromkeys(
@@ -118,20 +118,20 @@ def straight_drive() -> tuple[RecordedErrors, np.ndarray]:
 
 def test_intervals_may_be_shorter_than_a_metre_and_those_of_no_length_are_left_out() -> None:
     errors, metres = straight_drive()
-    model = calibrate(errors, metres, lengths=(0.5, 1.0, 4.0), intervals=5)  # three lengths: none may be missing
+    model = calibrate_drift(errors, metres, lengths=(0.5, 1.0, 4.0), intervals=5)  # three lengths: none may be missing
     assert model.heading_walk == pytest.approx(0.0005 / np.sqrt(0.1), rel=0.05)
-    assert calibrate(errors, metres, lengths=(-1.0, 0.0, 0.5, 1.0, 4.0), intervals=5) == model
+    assert calibrate_drift(errors, metres, lengths=(-1.0, 0.0, 0.5, 1.0, 4.0), intervals=5) == model
     # lengths that differ by millimetres are different ones, those that differ by arithmetic are not
-    assert calibrate(errors, metres / 25, lengths=(0.006, 0.01, 0.014), intervals=5).dim == 2
+    assert calibrate_drift(errors, metres / 25, lengths=(0.006, 0.01, 0.014), intervals=5).dim == 2
     with pytest.raises(DataError, match="too short"):
-        calibrate(errors, metres, lengths=(0.55, 0.58, 1.05), intervals=50)
+        calibrate_drift(errors, metres, lengths=(0.55, 0.58, 1.05), intervals=50)
 
 
 def test_calibrated_on_planar_odometry() -> None:
     """Every parameter comes back."""
     errors, metres = straight_drive()
     step = metres[1]
-    model = calibrate(errors, metres)
+    model = calibrate_drift(errors, metres)
     assert model.heading_walk == pytest.approx(0.0005 / np.sqrt(step), rel=0.05)
     assert model.heading_scale == pytest.approx(0.001, rel=0.02)  # 1 m/s
     assert model.bend == pytest.approx(1.0, abs=0.02)
@@ -158,4 +158,4 @@ def test_refusals() -> None:
     np.testing.assert_allclose(found.covariance(2.0), DriftModel().covariance(2.0), rtol=0.05, atol=1e-7)
     two = Odometry(times=np.arange(2.0), increments=np.array([[0, 0, 0], [0.1, 0, 0]]), covariances=np.zeros((2, 3, 3)))
     with pytest.raises(DataError, match="too short"):
-        calibrate(RecordedErrors(odometry=two), np.array([0.0, 0.1]))
+        calibrate_drift(RecordedErrors(odometry=two), np.array([0.0, 0.1]))

@@ -7,15 +7,15 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from graphslam.app.run.front_ends import make_front_end, recommended
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_exp, wrap_angle
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Odometry, VelocityControls
-from graphslam_frontends.odometry.motion import HEADING_UNKNOWN, MotionNoise, dead_reckoning
-from graphslam_frontends.odometry.motion_gaps import MotionGap, bridged_reckoning
+from graphslam_frontends.odometry.motion import HEADING_UNKNOWN, MotionNoise, dead_reckoned_increments
+from graphslam_frontends.odometry.motion_gaps import MotionGap, dead_reckon_over_gaps
 from tests.faults import inject_landmarks as inject
 
 
@@ -38,7 +38,7 @@ def bridged(
     motion: VelocityControls | Odometry, times: np.ndarray, limit: float = 60.0, counts: DropCounter | None = None
 ) -> tuple[Odometry, list[MotionGap]]:
     counts = counts or DropCounter()
-    odometry, _, gaps = bridged_reckoning(log_of(motion), times, NOISE, hold=0.0, limit=limit, drops=counts)
+    odometry, _, gaps = dead_reckon_over_gaps(log_of(motion), times, NOISE, hold=0.0, limit=limit, drops=counts)
     return odometry, gaps
 
 
@@ -51,7 +51,7 @@ def test_the_end_of_a_gap_is_within_its_covariance(step: float) -> None:
         times = np.arange(30.0, 50.0 + 1e-9, step)
         cut = whole.take((whole.times <= 35.0) | (whole.times >= 45.0))
         out, gaps = bridged(cut, times)
-        true, _ = dead_reckoning(log_of(whole), times, MotionNoise())
+        true, _ = dead_reckoned_increments(log_of(whole), times, MotionNoise())
         assert len(gaps) == 1
         assert gaps[0].end - gaps[0].begin == pytest.approx(10.0)
         heading = [float(np.sum(o.increments[1:, 2])) for o in (out, true)]
@@ -74,7 +74,9 @@ def test_a_gap_is_counted_and_named() -> None:
     # what is no gap stays as it is
     same, none = bridged(whole, times)
     assert none == []
-    np.testing.assert_array_equal(same.covariances, dead_reckoning(log_of(whole), times, NOISE)[0].covariances)
+    np.testing.assert_array_equal(
+        same.covariances, dead_reckoned_increments(log_of(whole), times, NOISE)[0].covariances
+    )
 
 
 def test_a_record_of_odometry_over_a_gap_is_believed_only_if_it_tells_the_way() -> None:
@@ -98,7 +100,7 @@ def test_a_record_of_odometry_over_a_gap_is_believed_only_if_it_tells_the_way() 
 @pytest.mark.parametrize("frontend", ["rbpf-ekf", "ekf"])
 def test_a_map_is_split_where_nothing_was_seen(frontend: str) -> None:
     log = simulate("landmark-field", seed=2, preset="quick")
-    front = make_front_end(frontend, recommended(log, frontend)["frontend"])
+    front = make_front_end(frontend, recommended_options(log, frontend)["frontend"])
     submaps = list(front.submaps(inject.gap_of_all(10.0)(log), seed=SeedTree(1)))
     bridge = [s for s in submaps if s.report["gaps"]]
     assert len(bridge) == 1
@@ -117,4 +119,4 @@ def test_impossible_limits_are_refused() -> None:
     log = simulate("landmark-field", seed=2, preset="quick")
     for frontend in ("rbpf-ekf", "ekf", "ekf-slam"):
         with pytest.raises(ConfigError, match="longest_gap"):
-            make_front_end(frontend, recommended(log, frontend)["frontend"] | {"longest_gap": -1.0})
+            make_front_end(frontend, recommended_options(log, frontend)["frontend"] | {"longest_gap": -1.0})

@@ -17,7 +17,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import AckermannGeometry, Gps, Odometry, SteeringControls, VelocityControls
 from graphslam_frontends.odometry.motion import (
     MotionNoise,
-    dead_reckoning,
+    dead_reckoned_increments,
     recorded_odometry,
     steering_odometry,
     velocity_odometry,
@@ -155,14 +155,14 @@ def test_hold_reaches_beyond_the_ends_and_no_farther(rng):
     o = recorded(rng)
     log = SensorLog(name="l", streams={"odo": o})
     t = np.array([-0.2, 0.0, o.times[-1] + 0.2])
-    got, name = dead_reckoning(log, t, MotionNoise(), hold=0.2)
+    got, name = dead_reckoned_increments(log, t, MotionNoise(), hold=0.2)
     assert name == "odo"
     back = se2_exp(0.2 / o.times[1] * se2_log(o.increments[1]))
     np.testing.assert_allclose(got.increments[1], back, atol=1e-12)
     with pytest.raises(DataError, match="before the first motion record"):
-        dead_reckoning(log, t, MotionNoise(), hold=0.1)
+        dead_reckoned_increments(log, t, MotionNoise(), hold=0.1)
     with pytest.raises(DataError, match="outside the odometry"):
-        dead_reckoning(log, t[1:], MotionNoise(), hold=0.1)
+        dead_reckoned_increments(log, t[1:], MotionNoise(), hold=0.1)
 
 
 def test_the_log_decides_what_is_reckoned_from(rng):
@@ -170,20 +170,20 @@ def test_the_log_decides_what_is_reckoned_from(rng):
     steering = SteeringControls(times=T, speed=SPEED, steering=0.1 * RATE, geometry=car)
     streams = {"odo": recorded(rng), "vel": controls(), "car": steering}
     noise = MotionNoise()
-    got, name = dead_reckoning(SensorLog(name="l", streams=streams), STAMPS, noise)
+    got, name = dead_reckoned_increments(SensorLog(name="l", streams=streams), STAMPS, noise)
     assert name == "car"
     np.testing.assert_array_equal(got.increments, steering_odometry(steering, STAMPS, noise).increments)
     del streams["car"]
-    got, name = dead_reckoning(SensorLog(name="l", streams=streams), STAMPS - 0.3, noise, hold=0.3)
+    got, name = dead_reckoned_increments(SensorLog(name="l", streams=streams), STAMPS - 0.3, noise, hold=0.3)
     assert name == "vel"
     early = VelocityControls(times=np.concatenate([[-0.3], T[1:]]), speed=SPEED, yaw_rate=RATE)
     np.testing.assert_array_equal(got.covariances, velocity_odometry(early, STAMPS - 0.3, noise).covariances)
     none = Gps(times=[0.0], positions=[[0.0, 0.0]], sigma=[1.0], lever=[0.0, 0.0])
     with pytest.raises(MissingDataError, match="no motion to dead-reckon"):
-        dead_reckoning(SensorLog(name="l", streams={"gps": none}), STAMPS, noise)
+        dead_reckoned_increments(SensorLog(name="l", streams={"gps": none}), STAMPS, noise)
     empty = SensorLog(name="l", streams={"vel": controls().take(slice(0, 0))})
     with pytest.raises(MissingDataError, match="empty"):
-        dead_reckoning(empty, STAMPS, noise)
+        dead_reckoned_increments(empty, STAMPS, noise)
 
 
 def test_impossible_requests_are_refused(rng):

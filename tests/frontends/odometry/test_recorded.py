@@ -16,16 +16,16 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry
-from graphslam.io.catalog import load
+from graphslam.io.catalog import load_recording
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion import MotionNoise, recorded_odometry
 from graphslam_frontends.odometry.recorded import (
     RecordedErrors,
     add_yaw_bias,
-    bridge,
-    chain,
+    bias_effect,
+    bridge_gap,
+    chain_odometry,
     cut_odometry,
-    lasting_effect,
 )
 from graphslam_frontends.odometry.step_config import StepConfig
 
@@ -94,7 +94,7 @@ def test_errors_over_an_interval_are_as_stated(dim: int) -> None:
 def test_lasting_effect_equals_finite_differences(dim: int) -> None:
     step, seconds, eps = winding(dim).increments[13], 0.2, 1e-6
     xi = log(step)
-    J = lasting_effect(step, seconds)
+    J = bias_effect(step, seconds)
     turned, longer = xi.copy(), xi.copy()
     turned[2] += eps * seconds
     distances = slice(0, 2) if dim == 2 else slice(3, 6)
@@ -108,7 +108,7 @@ def test_cutting_equals_composing_piece_by_piece(dim: int) -> None:
     o = winding(dim)
     times = np.array([0.1, 0.5, 0.55, 0.6, 3.0, 20.0])
     cut = cut_odometry(o, times, NOISE)
-    path = chain(o)
+    path = chain_odometry(o)
     np.testing.assert_allclose(
         log(between(cut.increments[1:], between(*(path.interpolate(t) for t in (times[:-1], times[1:]))))), 0, atol=1e-9
     )
@@ -143,7 +143,7 @@ def test_whole_records_come_back_as_they_were() -> None:
 def test_a_yaw_bias_turns_by_what_it_says(dim: int) -> None:
     o = winding(dim)
     still = Odometry(times=o.times, increments=exp(np.zeros_like(log(o.increments))), covariances=o.covariances)
-    biased = chain(add_yaw_bias(still, 0.01)).poses[-1]
+    biased = chain_odometry(add_yaw_bias(still, 0.01)).poses[-1]
     assert log(biased)[2] == pytest.approx(0.01 * 20.0)
     np.testing.assert_allclose(add_yaw_bias(add_yaw_bias(o, 0.02), -0.02).increments, o.increments, atol=1e-12)
 
@@ -151,7 +151,7 @@ def test_a_yaw_bias_turns_by_what_it_says(dim: int) -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_bridges_cost_certainty(dim: int) -> None:
     o = winding(dim)
-    path = chain(o)
+    path = chain_odometry(o)
     keep = np.r_[0:30, 45:101]
     gap = Odometry(
         times=o.times[keep],
@@ -159,7 +159,7 @@ def test_bridges_cost_certainty(dim: int) -> None:
         covariances=o.covariances[keep],
     )
     drops = DropCounter()
-    sure, gaps = bridge(gap, 5.0, where="odometry", drops=drops)
+    sure, gaps = bridge_gap(gap, 5.0, where="odometry", drops=drops)
     np.testing.assert_allclose([gaps.begin[0], gaps.end[0]], gap.times[[29, 30]])
     assert drops.counts == {"odometry: gap bridged": 1}
     changed = np.flatnonzero(np.any(sure.covariances != gap.covariances, axis=(1, 2)))
@@ -168,16 +168,16 @@ def test_bridges_cost_certainty(dim: int) -> None:
     metres = np.linalg.norm(log(gap.increments[30])[x : x + dim])
     assert np.sqrt(sure.covariances[30, x, x]) == pytest.approx(0.2 * metres, rel=0.01)
     with pytest.raises(DataError, match=r"odometry: gap without records: 3\.200 s after record 29"):
-        bridge(gap, 3.0, where="odometry")
-    assert bridge(o, 1.0, where="odometry")[0] is not None
+        bridge_gap(gap, 3.0, where="odometry")
+    assert bridge_gap(o, 1.0, where="odometry")[0] is not None
     # records that are lost, not late: the one after tells its own motion only, and the body drove on meanwhile
-    lost, _ = bridge(o.take(keep), 5.0, where="odometry")
+    lost, _ = bridge_gap(o.take(keep), 5.0, where="odometry")
     speed = np.linalg.norm(log(o.increments[29])[x : x + dim]) / np.diff(o.times)[28]
     assert np.sqrt(lost.covariances[30, x, x]) == pytest.approx(3.2 * speed, rel=0.2)
     # a long record at the beginning, in which the body stood: it set off afterwards, and nothing was lost
     stood = replace(o, times=np.r_[o.times[0] - 3.0, o.times[1:]], increments=o.increments.copy())
     stood.increments[1] *= 0.0
-    still, gaps = bridge(stood, 5.0, where="odometry")
+    still, gaps = bridge_gap(stood, 5.0, where="odometry")
     assert len(gaps.begin) == 1
     np.testing.assert_array_equal(still.covariances, stood.covariances)
 
@@ -198,7 +198,7 @@ def test_intervals_that_are_not_there() -> None:
 )
 def test_recorded_lidars_become_steps(data_dir: Path, name: str, scans: int, gaps: int) -> None:
     """One step a scan and several steps a scan: the same robot drives the same way."""
-    recorded = load(name)
+    recorded = load_recording(name)
     if name == "lidar3d-balm-hall":  # 30 s of it: its scans are large
         recorded = recorded.slice(recorded.interval[0], recorded.interval[0] + 30.0)
     drops = DropCounter()
@@ -206,7 +206,7 @@ def test_recorded_lidars_become_steps(data_dir: Path, name: str, scans: int, gap
     assert (steps.dim, len(steps)) == (3, scans)
     assert drops.counts.get(f"{recorded.name}/odometry: gap bridged", 0) == gaps
     assert np.diff(steps.offsets).min() > 0
-    path = chain(recorded["odometry"])
+    path = chain_odometry(recorded["odometry"])
     T, C = steps.errors.between(0, scans - 1)
     np.testing.assert_allclose(T, se3.se3_between(path.poses[0], path.poses[-1]), atol=1e-6)
     np.linalg.cholesky(C)
@@ -229,7 +229,7 @@ def test_recorded_lidars_become_steps(data_dir: Path, name: str, scans: int, gap
 
 
 def test_several_clouds_in_a_step(data_dir: Path) -> None:
-    recorded = load("lidar3d-hku1")
+    recorded = load_recording("lidar3d-hku1")
     steps = make_steps(recorded, StepConfig(period=2.0, most_points=100_000))
     per_step = np.diff(steps.offsets)
     assert len(steps) == pytest.approx(recorded.duration / 2.0, abs=2)

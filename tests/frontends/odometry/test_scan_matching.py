@@ -10,8 +10,8 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import DropCounter
-from graphslam_frontends.odometry.recorded import chain
-from graphslam_frontends.odometry.scan_matching import fuse, match_neighbours
+from graphslam_frontends.odometry.recorded import chain_odometry
+from graphslam_frontends.odometry.scan_matching import fuse_motions, match_neighbours
 from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring
 
@@ -56,7 +56,7 @@ def test_without_beams_and_where_the_robot_stands_the_odometry_stays() -> None:
     standing = dataclasses.replace(
         steps, odometry=dataclasses.replace(o, increments=np.zeros_like(o.increments)), errors=None
     )
-    assert np.abs(chain(match_neighbours(standing).odometry).poses).max() == 0.0
+    assert np.abs(chain_odometry(match_neighbours(standing).odometry).poses).max() == 0.0
 
 
 def test_a_scan_of_another_place_is_counted_and_left_out() -> None:
@@ -72,7 +72,7 @@ def test_a_scan_of_another_place_is_counted_and_left_out() -> None:
 
 def test_fusion_lies_between_and_equals_the_information_form() -> None:
     P, R = np.diag([0.04, 0.01, 0.02]), np.diag([0.01, 100.0, 0.001])
-    T, Q = fuse(np.zeros(3), P, np.array([0.1, 0.5, 0.0]), R)
+    T, Q = fuse_motions(np.zeros(3), P, np.array([0.1, 0.5, 0.0]), R)
     np.testing.assert_allclose(Q, np.linalg.inv(np.linalg.inv(P) + np.linalg.inv(R)))
     np.testing.assert_allclose(T, Q @ np.linalg.inv(R) @ [0.1, 0.5, 0.0], atol=1e-9)
     assert abs(T[1]) < 1e-3  # a direction that the match does not hold

@@ -11,9 +11,9 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.point_clouds import PointClouds
-from graphslam_frontends.odometry.deskew import assign, cut_beams, spread
+from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath
+from graphslam_frontends.odometry.deskew import assign_steps, cut_beams, stratified_indices
 from graphslam_frontends.odometry.make_steps import level_on_the_whole, make_steps
-from graphslam_frontends.odometry.reckoned import Reckoned
 from graphslam_frontends.odometry.step_config import StepConfig
 from tests.frontends.step_logs import HALF, odometry_of, planar_log, room_log, spoiled
 from tests.reference.imu_drive import drive
@@ -82,7 +82,7 @@ def test_thinning_is_spread_and_always_the_same(room: SensorLog) -> None:
     assert np.all(np.diff(thin.offsets) == 20)
     assert drops.counts["scanner: beams thinned out (20 per step kept)"] == len(full.points) - len(thin.points)
     for k in range(len(full)):
-        chosen = spread(int(full.offsets[k + 1] - full.offsets[k]), 20)
+        chosen = stratified_indices(int(full.offsets[k + 1] - full.offsets[k]), 20)
         for a, b in zip(thin.scan(k), full.scan(k)):
             np.testing.assert_array_equal(a, b[chosen])
     again = make_steps(room, StepConfig(most_points=20))
@@ -91,7 +91,7 @@ def test_thinning_is_spread_and_always_the_same(room: SensorLog) -> None:
 
 @pytest.mark.parametrize(("n", "most"), [(0, 5), (5, 5), (6, 5), (1000, 400), (905, 60), (2715, 400), (800, 400)])
 def test_spread(n: int, most: int) -> None:
-    chosen = spread(n, most)
+    chosen = stratified_indices(n, most)
     assert len(chosen) == min(n, most)
     assert np.all(np.diff(chosen) > 0)
     assert np.all((chosen >= 0) & (chosen < n))
@@ -102,7 +102,7 @@ def test_spread(n: int, most: int) -> None:
 
 def test_spread_does_not_fall_into_step_with_scans() -> None:
     """Half of the beams of scans of 60: every beam of the fan gets its turn, none twice as often as another."""
-    counts = np.bincount(spread(6000, 3000) % 60, minlength=60)
+    counts = np.bincount(stratified_indices(6000, 3000) % 60, minlength=60)
     assert counts.min() > 35
     assert counts.max() < 65
 
@@ -116,7 +116,7 @@ def test_directions_equal_those_of_whole_scans(room: SensorLog, rng: np.random.G
 def test_beams_belong_to_the_step_they_end_in() -> None:
     steps = np.array([1.0, 2.0])
     beams = np.array([0.4, 0.5, 1.0, 1.0 + 1e-12, 2.0, 2.1])
-    np.testing.assert_array_equal(assign(beams, steps, 0.5), [-1, 0, 0, 1, 1, -1])
+    np.testing.assert_array_equal(assign_steps(beams, steps, 0.5), [-1, 0, 0, 1, 1, -1])
 
 
 def test_long_beams_are_cut_and_met_nothing(room: SensorLog) -> None:
@@ -176,7 +176,7 @@ def test_motion_of_an_imu_and_wheels() -> None:
     assert steps.tilt.shape == (len(steps), 2)
     assert steps.tilt_sigma == pytest.approx(d.imu.noise.attitude)
     assert steps.tilt_time == d.imu.noise.attitude_time
-    assert isinstance(steps.errors, Reckoned)
+    assert isinstance(steps.errors, DeadReckonedPath)
     assert steps.uses == {"imu", "wheels", "scanner"}
     # moved by the estimated motion inside a step only: within centimetres of the truth
     exact = make_steps(SensorLog(name="exact", streams={"scanner": scans, "odometry": odometry_of(d.truth)}))

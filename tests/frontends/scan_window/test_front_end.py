@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import chained, group_of
+from graphslam.core.poses import compose_increments, group_of
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LaserScans
 from graphslam.core.submap import Submap
@@ -25,14 +25,14 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.config import ScanWindowConfig
-from graphslam_frontends.scan_window.followed import FollowedErrors, followed
 from graphslam_frontends.scan_window.front_end import (
     ScanWindow,
     ScanWindowFrontEndConfig,
     WindowSubmapConfig,
-    window_submaps,
+    scan_window_submaps,
 )
-from graphslam_frontends.scan_window.tracker import track
+from graphslam_frontends.scan_window.scan_odometry_steps import ScanOdometryErrors, odometry_from_scans
+from graphslam_frontends.scan_window.tracker import track_steps
 from graphslam_frontends.segslam.config import SegSlamConfig
 from graphslam_frontends.segslam.front_end import SegSlam, SegSlamFrontEndConfig
 from tests.frontends.grid_world import ring
@@ -87,7 +87,7 @@ def test_submaps_of_a_log(log: SensorLog, submaps: list[Submap]) -> None:
     g = group_of(poses[0])
     for a, b in pairwise(submaps):
         assert a.interval[1] == b.interval[0]
-    made = track(steps, WINDOW)
+    made = track_steps(steps, WINDOW)
     for s in submaps:
         assert s.uses == {"laser", "odometry"}
         assert s.trajectory is not None
@@ -131,7 +131,7 @@ def test_resumed_and_repeated_runs_are_the_same(log: SensorLog, submaps: list[Su
 
 
 def test_a_submap_is_there_as_soon_as_its_last_step_is(log: SensorLog, submaps: list[Submap]) -> None:
-    stream: Iterator[Submap] = window_submaps(FRONT.steps(log), WINDOW, FRONT.config.submap)
+    stream: Iterator[Submap] = scan_window_submaps(FRONT.steps(log), WINDOW, FRONT.config.submap)
     assert same(next(stream), submaps[0])
 
 
@@ -140,7 +140,7 @@ def test_in_space_bases_stand_level_and_errors_are_those_of_the_body() -> None:
     for seed in range(6):
         steps = ring(seed, 3, length=14.0, step=0.3, beams=150, yaw_bias=0.0)
         assert steps.truth is not None
-        made = list(window_submaps(steps, WINDOW, WindowSubmapConfig(length=6.0, seconds=4.0)))
+        made = list(scan_window_submaps(steps, WINDOW, WindowSubmapConfig(length=6.0, seconds=4.0)))
         g, truth = group_of(made[0].exit_pose), steps.truth.poses
         for s in made:
             assert s.trajectory is not None
@@ -160,20 +160,22 @@ def test_lost_scans_are_a_line_of_the_verdict() -> None:
     steps = ring(3, 2, length=20.0, beams=90, yaw_bias=0.0)
     returns = steps.returns.copy()
     returns[int(steps.offsets[30]) : int(steps.offsets[42])] = False
-    made = list(window_submaps(replace(steps, returns=returns), WINDOW, WindowSubmapConfig(length=8.0, seconds=4.0)))
+    made = list(
+        scan_window_submaps(replace(steps, returns=returns), WINDOW, WindowSubmapConfig(length=8.0, seconds=4.0))
+    )
     said = [f["code"] for s in made for f in s.report.get("findings", ())]
     assert "scans-lost" in said
     assert "motion-uncorrected" in said
     assert sum(s.report["scans_lost"] for s in made) >= 12
     assert all("lost" not in s.report["scans_lost_why"] for s in made)
-    clean = list(window_submaps(steps, WINDOW, WindowSubmapConfig(length=8.0, seconds=4.0)))
+    clean = list(scan_window_submaps(steps, WINDOW, WindowSubmapConfig(length=8.0, seconds=4.0)))
     assert all("findings" not in s.report for s in clean)
 
 
 def test_what_makes_no_submap_is_refused() -> None:
     short = ring(0, 2, length=0.3, beams=20)
     with pytest.raises(DataError, match="too few steps"):
-        list(window_submaps(short, WINDOW, WindowSubmapConfig()))
+        list(scan_window_submaps(short, WINDOW, WindowSubmapConfig()))
     for bad in ({"length": 0.0}, {"voxel_size": np.nan}, {"lift": 2.0}, {"seconds": -1.0}):
         with pytest.raises(ConfigError, match="submap"):
             WindowSubmapConfig(**bad)  # type: ignore[arg-type]
@@ -181,11 +183,11 @@ def test_what_makes_no_submap_is_refused() -> None:
 
 def test_followed_steps_know_their_errors_over_any_interval() -> None:
     steps = ring(5, 3, length=16.0, step=0.3, beams=150, yaw_bias=0.0006)
-    there = followed(steps, WINDOW)
-    made, g = track(steps, WINDOW, [20]), group_of(steps.odometry.increments)
-    path = chained(there.odometry.increments[1:])
+    there = odometry_from_scans(steps, WINDOW)
+    made, g = track_steps(steps, WINDOW, [20]), group_of(steps.odometry.increments)
+    path = compose_increments(there.odometry.increments[1:])
     assert g.between(path[20], path[45]) == pytest.approx(g.between(made.poses[20], made.poses[45]), abs=1e-9)
-    assert isinstance(there.errors, FollowedErrors)
+    assert isinstance(there.errors, ScanOdometryErrors)
     T, C = there.errors.between(20, 45)
     assert g.log(g.between(T, g.between(made.poses[20], made.poses[45]))) == pytest.approx(0.0, abs=1e-9)
     # a pose of the past and the pose of now have most of their errors in common
@@ -211,7 +213,7 @@ def test_segslam_follows_scans_inside_its_segments(log: SensorLog) -> None:
         )
         made[inside] = list(front.submaps(log, seed=SeedTree(1)))
     (*_, sampled), (*_, scans) = made["filter"], made["scan-window"]
-    path = track(FRONT.steps(log), WINDOW).poses
+    path = track_steps(FRONT.steps(log), WINDOW).poses
     assert scans.trajectory is not None
     # particles stay near the path of the scans, and the exit is as sure as that
     g = group_of(path)
@@ -238,4 +240,4 @@ def test_it_is_registered_and_its_presets_are_options_of_it() -> None:
     presets = sorted((root / "graphslam" / "app" / "presets").glob("*.scan-window.toml"))
     assert {p.name.partition(".")[0] for p in presets} >= {"garage", "mine", "building", "court"}
     for file in presets:
-        build(ScanWindowFrontEndConfig, tomllib.loads(file.read_text())["frontend"], "frontend")
+        build_config(ScanWindowFrontEndConfig, tomllib.loads(file.read_text())["frontend"], "frontend")

@@ -11,15 +11,15 @@ import pytest
 from graphslam.core.errors import ConfigError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, se2_between
-from graphslam.core.poses import SE2, SE3, chained, group_of
+from graphslam.core.poses import SE2, SE3, compose_increments, group_of
 from graphslam.core.records import Odometry
 from graphslam.core.se3 import matrix_to_quat
 from graphslam.core.trajectory import Trajectory
-from graphslam.registration.plane_kernels import Pairs, plane_residuals
+from graphslam.registration.plane_kernels import PlanePairs, plane_residuals
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.config import ScanWindowConfig
-from graphslam_frontends.scan_window.exits import relative_covariance
-from graphslam_frontends.scan_window.tracker import Track, Tracker, effects, track
+from graphslam_frontends.scan_window.relative_covariance import relative_covariance
+from graphslam_frontends.scan_window.tracker import ScanToWindowOdometry, TrackedPath, bias_effects, track_steps
 from tests.frontends.grid_world import ring
 
 CONFIG = ScanWindowConfig(lay=2.0)
@@ -53,7 +53,7 @@ def drawn_ring(seed: int, dim: int, length: float, gravity: bool = True) -> Step
     return replace(steps, odometry=replace(steps.odometry, increments=u))
 
 
-def errors(steps: Steps, made: Track, start: int, end: int) -> tuple[Array, Array]:
+def errors(steps: Steps, made: TrackedPath, start: int, end: int) -> tuple[Array, Array]:
     """Error ``(d,)`` of the motion between two steps, and its covariance."""
     assert steps.truth is not None
     g, truth = group_of(made.poses), steps.truth.poses
@@ -75,7 +75,7 @@ def test_what_lasting_errors_take_off_a_motion(dim: int) -> None:
     for moved in (-p, *away)[:dim]:
         true.append(np.concatenate([p + h * moved, u[dim:]]))
     wanted = np.column_stack([g.log(g.between(u, T)) / h for T in true])
-    assert effects(u, dt) == pytest.approx(wanted, abs=1e-5)
+    assert bias_effects(u, dt) == pytest.approx(wanted, abs=1e-5)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -84,8 +84,8 @@ def test_how_errors_move_with_the_body(dim: int) -> None:
     steps, g = drawn_ring(1, dim, 3.0), SE2 if dim == 2 else SE3
     rng = np.random.default_rng(0)
 
-    def tracker() -> Tracker:
-        t = Tracker(steps, CONFIG)
+    def tracker() -> ScanToWindowOdometry:
+        t = ScanToWindowOdometry(steps, CONFIG)
         t.k, t.pose = 3, g.exp(np.random.default_rng(1).normal(size=g.dof))
         t.lasting = 1e-3 * np.random.default_rng(2).normal(size=len(t.lasting))
         return t
@@ -111,7 +111,7 @@ def test_how_errors_move_with_the_body(dim: int) -> None:
 def test_what_a_scan_says_of_two_poses(dim: int) -> None:
     """Blocks of information against a plain sum over finite differences of the residuals."""
     steps, g = drawn_ring(2, dim, 8.0), SE2 if dim == 2 else SE3
-    t = Tracker(steps, CONFIG)
+    t = ScanToWindowOdometry(steps, CONFIG)
     for _ in range(20):
         t.step()
     rng = np.random.default_rng(3)
@@ -120,7 +120,7 @@ def test_what_a_scan_says_of_two_poses(dim: int) -> None:
     t.points[source] = rng.normal(size=(40, dim))
     t._place(t.NOW, t.pose)
     slot = q // t.rows
-    pairs = Pairs(source, q, np.full(40, t.NOW), slot)
+    pairs = PlanePairs(source, q, np.full(40, t.NOW), slot)
     information, slots = rng.uniform(1.0, 2.0, size=40), np.unique(slot)
     poses = {t.NOW: t.pose} | {int(s): pose_of(t, int(s)) for s in slots}
 
@@ -144,7 +144,7 @@ def test_what_a_scan_says_of_two_poses(dim: int) -> None:
     assert b == pytest.approx((J[:, : t.w].T * information) @ r, abs=1e-3)
 
 
-def pose_of(t: Tracker, slot: int) -> Array:
+def pose_of(t: ScanToWindowOdometry, slot: int) -> Array:
     """Pose at which the scan of a slot was laid."""
     if t.group.dim == 2:
         return np.append(t.t[slot], np.arctan2(t.R[slot, 1, 0], t.R[slot, 0, 0]))
@@ -170,7 +170,7 @@ def test_covariance_of_a_motion_between_frames_beside_the_body(dim: int) -> None
 @pytest.mark.parametrize("dim", [2, 3])
 def test_what_was_said_of_a_step_stays_said(dim: int) -> None:
     steps = drawn_ring(4, dim, 14.0)
-    whole, part = track(steps, CONFIG, [12]), track(head(steps, 31), CONFIG, [12])
+    whole, part = track_steps(steps, CONFIG, [12]), track_steps(head(steps, 31), CONFIG, [12])
     for a, b in zip((whole.poses, whole.joints, whole.lasting), (part.poses, part.joints, part.lasting)):
         assert a[:31].tobytes() == b.tobytes()
     assert sum(f.lost == "" for f in part.found) > 10
@@ -184,13 +184,13 @@ def test_exits_are_as_far_off_as_they_say(dim: int, gravity: bool) -> None:
     for seed in range(24 if dim == 2 else 10):
         steps = drawn_ring(100 + seed, dim, 24.0, gravity)
         starts = [0, 40, len(steps) - 1]
-        made = track(steps, CONFIG, starts)
+        made = track_steps(steps, CONFIG, starts)
         for start, end in pairwise(starts):
             e, C = errors(steps, made, start, end)
             values.append(float(e @ np.linalg.solve(C, e)))
         assert steps.truth is not None
         g, truth = group_of(made.poses), steps.truth.poses
-        reckoned = chained(steps.odometry.increments)[-1]
+        reckoned = compose_increments(steps.odometry.increments)[-1]
         wrong = [np.linalg.norm(g.between(p, g.between(truth[0], truth[-1]))[:dim])
                  for p in (g.between(made.poses[0], made.poses[-1]), reckoned)]  # fmt: skip
         better.append(wrong)
@@ -235,7 +235,7 @@ def test_a_corridor_stays_wide() -> None:
     values = []
     for seed in range(16):
         steps = corridor(seed)
-        made = track(steps, CONFIG)
+        made = track_steps(steps, CONFIG)
         e, C = errors(steps, made, 0, len(steps) - 1)
         values.append(float(e @ np.linalg.solve(C, e)))
         own = float(steps.odometry.covariances[1:, 0, 0].sum()) + (0.01 * 19.8) ** 2  # noise and scale of the wheels
@@ -252,13 +252,13 @@ def test_what_is_lost_is_told_and_widens() -> None:
     rows = slice(int(steps.offsets[40]), int(steps.offsets[55]))
     blind[rows] = False
     far[rows] *= np.random.default_rng(0).uniform(0.2, 1.0, size=(rows.stop - rows.start, 1))  # dust
-    known = track(steps, CONFIG)
+    known = track_steps(steps, CONFIG)
     cases = (
         (replace(steps, returns=blind), {"points"}),
         (replace(steps, points=far), {"overlap", "spread", "surprise"}),
     )
     for other, why in cases:
-        made = track(other, CONFIG)
+        made = track_steps(other, CONFIG)
         assert {f.lost for f in made.found[40:55]} <= {*why, ""}
         assert sum(f.lost in why for f in made.found[40:55]) >= 12
         assert sum(f.lost in why for f in made.found[:40]) == 0
@@ -274,7 +274,7 @@ def test_a_place_that_nobody_saw_before_is_no_place(caplog: pytest.LogCaptureFix
     k = 40
     points = steps.points.copy()
     points[int(steps.offsets[k]) :] += np.array([0.6, -0.45])  # the mast was hit
-    made = track(replace(steps, points=points), CONFIG)
+    made = track_steps(replace(steps, points=points), CONFIG)
     assert made.found[k].lost in {"overlap", "spread", "surprise"}
     e, C = errors(steps, made, 0, k)
     assert e @ np.linalg.solve(C, e) < chi2_quantile(0.9999, 3)
@@ -299,7 +299,7 @@ def test_where_the_map_lies_is_no_matter_of_the_path(dim: int) -> None:
     """A map that may lie tens of metres off, and be turned by a radian: scans see nothing of it, nor does it cost."""
     steps, made = drawn_ring(5, dim, 16.0), []
     for far in (0.0, 1.0):
-        t = Tracker(steps, CONFIG)
+        t = ScanToWindowOdometry(steps, CONFIG)
         g, unsure = t.group, np.zeros(t.w)
         unsure[g.position], unsure[g.heading] = 30.0 * far, 1.0 * far
         A = g.adjoint(g.inverse(t.pose))

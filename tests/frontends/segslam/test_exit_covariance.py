@@ -18,10 +18,10 @@ from graphslam.core.poses import (
     frame_between,
     group_of,
     heading_of,
-    level,
-    normalised,
+    normalise_weights,
     pose_mean,
     pose_scatter,
+    remove_roll_pitch,
 )
 from graphslam_frontends.segslam.covariance import exit_covariance, exit_nees
 
@@ -82,13 +82,13 @@ def test_scatter_of_a_worked_cloud() -> None:
 def test_level_frames_keep_place_and_heading() -> None:
     rng = np.random.default_rng(0)
     p = SE3.exp(rng.normal(0.0, 0.4, (50, 6)))
-    flat = level(p)
+    flat = remove_roll_pitch(p)
     np.testing.assert_array_equal(flat[:, :3], p[:, :3])
     np.testing.assert_allclose(heading_of(flat), heading_of(p), atol=1e-12)
     np.testing.assert_allclose(se3.quat_rotate(flat[:, 3:], np.array([0.0, 0, 1])), [[0.0, 0, 1]] * 50, atol=1e-12)
     ahead = se3.quat_rotate(p[:, 3:], np.array([1.0, 0, 0]))  # heading is where x points, seen from above
     np.testing.assert_allclose(heading_of(p), np.arctan2(ahead[:, 1], ahead[:, 0]), atol=1e-12)
-    np.testing.assert_array_equal(level([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(remove_roll_pitch([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])
     # frames that differ by a turn about z: exactly that turn comes back, however the body leans
     a = np.concatenate([[3.0, -2.0, 1.0], se3.so3_exp([0.0, 0.0, 0.8])])
     T_a_b = frame_between(se3.se3_compose(np.broadcast_to(a, p.shape), p), p, gravity=True)
@@ -102,7 +102,7 @@ def test_impossible_poses_and_weights_are_refused() -> None:
         pose_mean(np.zeros((0, 3)))
     for bad in ([0.0, 0.0], [1.0, -0.5], [1.0, np.nan], [1.0]):
         with pytest.raises(GeometryError, match="impossible weights"):
-            normalised(bad, 2)
+            normalise_weights(bad, 2)
 
 
 def test_an_exit_has_the_particles_and_the_drift() -> None:

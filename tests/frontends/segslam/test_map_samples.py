@@ -12,19 +12,19 @@ from scipy import stats
 from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_compose, se2_inverse
-from graphslam.core.poses import frame_between, level
-from graphslam_frontends.segslam.paths import concatenate, seams
+from graphslam.core.poses import frame_between, remove_roll_pitch
+from graphslam_frontends.segslam.paths import concatenate_segments, find_seams
 from graphslam_frontends.segslam.sampling import (
     OPEN,
     _draw,
     draw_weights,
-    grow,
+    grow_sample,
     nearest_step,
-    probabilities,
     root_of_particle,
     root_of_segment,
+    segment_probabilities,
 )
-from graphslam_frontends.segslam.segmap import SAME, Entry, SegMap
+from graphslam_frontends.segslam.segmap import SAME, SegMap, SegmentEntry
 from tests.reference.segmap_twin import all_samples, flat_grid, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)
@@ -37,20 +37,20 @@ def square(particles: int = 2) -> SegMap:
     """
     m = small_segmap(12, particles)
     for k in range(4):
-        m.open(2 * k, [Entry(T_entry=ZERO)] * particles)
+        m.open(2 * k, [SegmentEntry(T_entry=ZERO)] * particles)
         paths = []
         for p in range(particles):
             path = straight(ZERO, 2.0 + 0.1 * p, 2)
             path[-1, 2] = np.pi / 2
             paths.append(path)
         m.close(2 * k + 2, [flat_grid() for _ in range(particles)], paths)
-    m.open(8, [match_entry(np.array([0.2, 0.0, 0.0]), 0), *[Entry(T_entry=ZERO)] * (particles - 1)])
+    m.open(8, [match_entry(np.array([0.2, 0.0, 0.0]), 0), *[SegmentEntry(T_entry=ZERO)] * (particles - 1)])
     return m
 
 
 def test_a_sample_holds_one_segment_of_each_interval_in_its_place() -> None:
     m = square()
-    sample = grow(m, root_of_segment(m, 6), np.random.default_rng(0))
+    sample = grow_sample(m, root_of_segment(m, 6), np.random.default_rng(0))
     assert len(sample) == 4
     assert sorted(map(tuple, sample.intervals.tolist())) == [(0, 2), (2, 4), (4, 6), (6, 8)]
     assert sample.segments[sample.in_time].tolist() == [
@@ -70,7 +70,7 @@ def test_a_sample_holds_one_segment_of_each_interval_in_its_place() -> None:
 def test_a_match_places_older_segments_where_the_closure_says() -> None:
     m = square()
     step = 10
-    sample = grow(m, root_of_particle(m, 0, step), np.random.default_rng(1))
+    sample = grow_sample(m, root_of_particle(m, 0, step), np.random.default_rng(1))
     assert sample.segments[0] == OPEN
     k = sample.segments.tolist().index(0)
     # one link away, in the very frame of the particle, not at the end of a chain of four
@@ -81,7 +81,7 @@ def test_a_match_places_older_segments_where_the_closure_says() -> None:
     assert sample.travelled[k] == pytest.approx(2.0)
     # the interval after it hangs from it or from the other side, both two links away; particle 1 goes the long way
     assert sample.depth.max() == 2 + 0
-    other = grow(m, root_of_particle(m, 1, step), np.random.default_rng(1))
+    other = grow_sample(m, root_of_particle(m, 1, step), np.random.default_rng(1))
     assert other.depth.max() == 4
     assert other.travelled.max() == pytest.approx(2.0 + 6.0)
 
@@ -96,7 +96,7 @@ def test_samples_come_as_often_as_enumeration_says(root: str, weighted: bool) ->
     assert sum(table.values()) == Fraction(1)
     rng = np.random.default_rng(7)
     n = 3000
-    seen = Counter(tuple(sorted(grow(m, r, rng, weights=weights, **reach).segments.tolist())) for _ in range(n))
+    seen = Counter(tuple(sorted(grow_sample(m, r, rng, weights=weights, **reach).segments.tolist())) for _ in range(n))
     keys = sorted(k for k, v in table.items() if v > 0)
     assert set(seen) <= set(keys)
     assert stats.chisquare([seen[k] for k in keys], [n * float(table[k]) for k in keys]).pvalue > 1e-3
@@ -116,9 +116,9 @@ def test_enumeration_on_a_chain_is_the_product_of_the_choices() -> None:
 def test_segments_that_fit_are_drawn_by_weight_or_alike_where_none_has_any() -> None:
     fits = np.array([4, 1, 3])
     weights = np.array([9.0, 1.0, 9.0, 0.0, 3.0])
-    assert probabilities(fits, weights).tolist() == [0.75, 0.25, 0.0]
+    assert segment_probabilities(fits, weights).tolist() == [0.75, 0.25, 0.0]
     for none in (None, np.zeros(5)):
-        np.testing.assert_allclose(probabilities(fits, none), 1 / 3)
+        np.testing.assert_allclose(segment_probabilities(fits, none), 1 / 3)
 
 
 @pytest.mark.parametrize("number", [0.0, 0.3, np.nextafter(1.0, 0.0)])
@@ -138,23 +138,23 @@ def test_rounding_never_draws_a_segment_without_weight(number: float) -> None:
 def test_of_segments_with_one_boundary_in_common_only_those_that_fit_are_drawn(first: int) -> None:
     """One that begins earlier would overlap with what is there, wherever it stands in the list."""
     m = small_segmap(8, 2)
-    m.open(0, [Entry(T_entry=ZERO)] * 2)
+    m.open(0, [SegmentEntry(T_entry=ZERO)] * 2)
     early, late = first, 1 - first
     m.close(2, [flat_grid()], [straight(ZERO, 2.0, 2)], which=[late])
-    m.open(2, [Entry(T_entry=ZERO)], which=[late])
+    m.open(2, [SegmentEntry(T_entry=ZERO)], which=[late])
     order = (early, late) if first == 0 else (late, early)
     for p in order:
         m.close(4, [flat_grid()], [straight(ZERO, 4.0 if p == early else 2.0, 4 if p == early else 2)], which=[p])
-    m.open(4, [Entry(T_entry=ZERO)] * 2)
+    m.open(4, [SegmentEntry(T_entry=ZERO)] * 2)
     lengths = Counter[int]()
     for seed in range(30):
-        s = grow(m, root_of_particle(m, 0, 5), np.random.default_rng(seed))
+        s = grow_sample(m, root_of_particle(m, 0, 5), np.random.default_rng(seed))
         spans = sorted(map(tuple, s.intervals.tolist()))
         assert spans in ([(0, 4), (4, 5)], [(0, 2), (2, 4), (4, 5)])
         lengths[len(s)] += 1
     assert min(lengths[2], lengths[3]) > 5
     # from the first of the short ones on: what comes after it is the other short one, never the long one
-    assert sorted(map(tuple, grow(m, root_of_segment(m, 0), np.random.default_rng(0)).intervals.tolist())) == [
+    assert sorted(map(tuple, grow_sample(m, root_of_segment(m, 0), np.random.default_rng(0)).intervals.tolist())) == [
         (0, 2),
         (2, 4),
     ]
@@ -166,11 +166,11 @@ def test_without_gravity_frames_are_whole_poses_in_both_directions() -> None:
     m = SegMap(np.arange(9.0), np.arange(9.0), 1, dim=3, gravity=False)
     for k in range(3):
         path = se3.se3_exp(0.4 * rng.normal(size=(3, 6)))
-        m.open(2 * k, [Entry(T_entry=path[0])])
+        m.open(2 * k, [SegmentEntry(T_entry=path[0])])
         m.close(2 * k + 2, [flat_grid(dim=3)], [path])
-    m.open(6, [Entry(T_entry=se3.se3_exp(0.4 * rng.normal(size=6)))])
+    m.open(6, [SegmentEntry(T_entry=se3.se3_exp(0.4 * rng.normal(size=6)))])
     for root in (root_of_segment(m, 1), root_of_segment(m, 0), root_of_particle(m, 0, 7)):
-        s = grow(m, root, np.random.default_rng(0))
+        s = grow_sample(m, root, np.random.default_rng(0))
         assert s.poses.shape == (len(s), 7)
         place = {int(i): k for k, i in enumerate(s.segments)}
         assert len(s) == 3 + (root.segment == OPEN)
@@ -189,7 +189,7 @@ def test_ties_are_broken_at_random() -> None:
     m = square()
     ways = set()
     for seed in range(40):
-        s = grow(m, root_of_particle(m, 0, 9), np.random.default_rng(seed))
+        s = grow_sample(m, root_of_particle(m, 0, 9), np.random.default_rng(seed))
         place = {tuple(i): k for k, i in enumerate(s.intervals.tolist())}
         for q in ((2, 4), (4, 6), (6, 8)):
             ways.add((q, tuple(s.intervals[s.via[place[q]]].tolist()), int(s.depth[place[q]])))
@@ -199,7 +199,7 @@ def test_ties_are_broken_at_random() -> None:
 
 def test_the_same_generator_gives_the_same_sample() -> None:
     m = square()
-    a, b = (grow(m, root_of_particle(m, 1, 9), np.random.default_rng(3)) for _ in range(2))
+    a, b = (grow_sample(m, root_of_particle(m, 1, 9), np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(a.segments, b.segments)
     np.testing.assert_array_equal(a.poses, b.poses)
 
@@ -207,21 +207,21 @@ def test_the_same_generator_gives_the_same_sample() -> None:
 def test_local_samples_stop_at_their_reach() -> None:
     m = square()
     root = root_of_particle(m, 1, 10)
-    near = grow(m, root, np.random.default_rng(0), local_length=3.0)
+    near = grow_sample(m, root, np.random.default_rng(0), local_length=3.0)
     # 2 m to the entry, 4 m to that of the segment before: from there it does not grow on
     assert sorted(map(tuple, near.intervals.tolist())) == [(4, 6), (6, 8), (8, 10)]
-    assert len(grow(m, root, np.random.default_rng(0), local_depth=1)) == 2
-    assert len(grow(m, root, np.random.default_rng(0))) == 5
+    assert len(grow_sample(m, root, np.random.default_rng(0), local_depth=1)) == 2
+    assert len(grow_sample(m, root, np.random.default_rng(0))) == 5
 
 
 def test_going_on_in_the_same_map_leads_to_what_it_went_on_from() -> None:
     m = small_segmap(9, 2)
-    m.open(0, [Entry(T_entry=ZERO)] * 2)
+    m.open(0, [SegmentEntry(T_entry=ZERO)] * 2)
     m.close(2, [flat_grid(), flat_grid()], [straight(ZERO, 1.0 + p, 2) for p in range(2)])
-    m.open(2, [Entry(T_entry=m[p].T_exit, kind=SAME, source=p) for p in range(2)])
+    m.open(2, [SegmentEntry(T_entry=m[p].T_exit, kind=SAME, source=p) for p in range(2)])
     for seed in range(10):
         for p in range(2):
-            s = grow(m, root_of_particle(m, p, 3), np.random.default_rng(seed))
+            s = grow_sample(m, root_of_particle(m, p, 3), np.random.default_rng(seed))
             assert s.segments.tolist() == [OPEN, p]  # whose map it has, and no other particle's
             np.testing.assert_allclose(s.poses[1], 0.0, atol=1e-12)
 
@@ -236,7 +236,8 @@ def twice(weights: tuple[float, ...] = (0.25, 0.25, 0.25, 0.25)) -> SegMap:
     for k in range(5):
         sources = {2: (0, 1), 4: (1, 1)}.get(k)
         entries = [
-            Entry(T_entry=ZERO) if sources is None else match_entry(np.array([0.1, 0, 0]), i) for i in sources or (0, 0)
+            SegmentEntry(T_entry=ZERO) if sources is None else match_entry(np.array([0.1, 0, 0]), i)
+            for i in sources or (0, 0)
         ]
         m.open(2 * k, entries)
         grids, paths = (
@@ -244,7 +245,7 @@ def twice(weights: tuple[float, ...] = (0.25, 0.25, 0.25, 0.25)) -> SegMap:
             [straight(e.T_entry, 2.0 + 0.3 * p, 2) for p, e in enumerate(entries)],
         )
         m.close(2 * k + 2, grids, paths, weights[:2])
-    m.open(10, [Entry(T_entry=ZERO)] * 2)
+    m.open(10, [SegmentEntry(T_entry=ZERO)] * 2)
     return m
 
 
@@ -253,7 +254,7 @@ def test_a_place_driven_through_twice_is_one_place() -> None:
     m = twice()
     drawn = Counter[bool]()
     for seed in range(20):
-        s = grow(m, root_of_segment(m, 8 + seed % 2), np.random.default_rng(seed), weights=draw_weights(m))
+        s = grow_sample(m, root_of_segment(m, 8 + seed % 2), np.random.default_rng(seed), weights=draw_weights(m))
         place = {int(i): k for k, i in enumerate(s.segments.tolist())}
         assert len(s) == 5  # every interval has one
         assert place[1] == 1  # of the first, what was found again
@@ -317,7 +318,7 @@ def _draw_weights_twin(m: SegMap) -> list[float]:
 def test_a_pruned_source_is_no_link() -> None:
     m = square()
     m._release(np.array([0]))
-    s = grow(m, root_of_particle(m, 0, 9), np.random.default_rng(0))
+    s = grow_sample(m, root_of_particle(m, 0, 9), np.random.default_rng(0))
     assert 0 not in s.segments
     assert s.depth.max() == 4
 
@@ -326,24 +327,24 @@ def test_the_path_of_a_sample_is_one_trajectory() -> None:
     m = square(1)
     m.resample([0])
     open_path = straight(np.array([0.2, 0.0, 0.0]), 1.0, 2)
-    s = grow(m, root_of_particle(m, 0, 10), np.random.default_rng(0))
-    path = concatenate(m, s, open_path)
+    s = grow_sample(m, root_of_particle(m, 0, 10), np.random.default_rng(0))
+    path = concatenate_segments(m, s, open_path)
     assert path.times.tolist() == list(range(11))
     np.testing.assert_allclose(path.poses[9:], open_path[1:], atol=1e-12)
     # segment 0 is in the frame of the root: the closure is exact at the entered map
     np.testing.assert_allclose(path.poses[0], 0.0, atol=1e-12)
     # a chain without a closure is the product of its increments
-    s = grow(m, root_of_segment(m, 3), np.random.default_rng(0))
-    path = concatenate(m, s)
+    s = grow_sample(m, root_of_segment(m, 3), np.random.default_rng(0))
+    path = concatenate_segments(m, s)
     first = se2_compose(se2_inverse(path.poses[0]), path.poses)
     assert path.times.tolist() == list(range(9))
     np.testing.assert_allclose(first[[2, 4, 6, 8], :2], [[2, 0], [2, 2], [0, 2], [0, 0]], atol=1e-12)
     with pytest.raises(DataError, match="wrong length"):
-        concatenate(m, grow(m, root_of_particle(m, 0, 10), np.random.default_rng(0)), open_path[:2])
+        concatenate_segments(m, grow_sample(m, root_of_particle(m, 0, 10), np.random.default_rng(0)), open_path[:2])
     single = small_segmap(4, 1)
-    single.open(0, [Entry(T_entry=ZERO)])
+    single.open(0, [SegmentEntry(T_entry=ZERO)])
     with pytest.raises(DataError, match="without any path"):
-        concatenate(single, grow(single, root_of_particle(single, 0, 2), np.random.default_rng(0)))
+        concatenate_segments(single, grow_sample(single, root_of_particle(single, 0, 2), np.random.default_rng(0)))
     with pytest.raises(DataError, match="in no segment"):
         root_of_particle(square(), 5, 9)
 
@@ -351,14 +352,14 @@ def test_the_path_of_a_sample_is_one_trajectory() -> None:
 def test_segments_that_overlap_in_time_are_never_in_one_sample() -> None:
     """Particles that cut at different times: 0 at 2 and 4, 1 at 3; only chains without gap or overlap come."""
     m = small_segmap(8, 2)
-    m.open(0, [Entry(T_entry=ZERO)] * 2)
+    m.open(0, [SegmentEntry(T_entry=ZERO)] * 2)
     m.close(2, [flat_grid()], [straight(ZERO, 2.0, 2)], which=[0])  # 0: (0, 2)
-    m.open(2, [Entry(T_entry=ZERO)], which=[0])
+    m.open(2, [SegmentEntry(T_entry=ZERO)], which=[0])
     m.close(3, [flat_grid()], [straight(ZERO, 3.0, 3)], which=[1])  # 1: (0, 3)
-    m.open(3, [Entry(T_entry=ZERO)], which=[1])
+    m.open(3, [SegmentEntry(T_entry=ZERO)], which=[1])
     m.close(4, [flat_grid()], [straight(ZERO, 2.0, 2)], which=[0])  # 2: (2, 4)
     m.close(4, [flat_grid()], [straight(ZERO, 1.0, 1)], which=[1])  # 3: (3, 4)
-    m.open(4, [Entry(T_entry=ZERO)] * 2)
+    m.open(4, [SegmentEntry(T_entry=ZERO)] * 2)
     table = all_samples(m, root_of_particle(m, 0, 5))
     assert table == {(-1, 0, 2): Fraction(1, 2), (-1, 1, 3): Fraction(1, 2)}
 
@@ -372,14 +373,14 @@ def test_frames_stay_level_whatever_particles_think_of_gravity() -> None:
         return np.concatenate([[x, y, z], turn])
 
     m = SegMap(np.arange(8.0), np.arange(8.0), 2, dim=3, gravity=True)
-    m.open(0, [Entry(T_entry=body(0, 0, 0, 0.0)) for _ in range(2)])
+    m.open(0, [SegmentEntry(T_entry=body(0, 0, 0, 0.0)) for _ in range(2)])
     starts = [e.T_entry for e in m.entries if e is not None]
     m.close(
         2,
         [flat_grid(dim=3) for _ in range(2)],
         [np.stack([s, body(1, 0, 0, 0.3), body(2, 0, 0.1, 0.7)]) for s in starts],
     )
-    m.open(2, [Entry(T_entry=body(0, 0, 0, 0.0)) for _ in range(2)])
+    m.open(2, [SegmentEntry(T_entry=body(0, 0, 0, 0.0)) for _ in range(2)])
     starts = [e.T_entry for e in m.entries if e is not None]
     m.close(
         4,
@@ -389,17 +390,17 @@ def test_frames_stay_level_whatever_particles_think_of_gravity() -> None:
     # a match far from the origin of its frame, where a tilt would be a long lever
     source_entry = body(40.0, 30.0, 1.0, 2.0)
     cov = np.eye(6) * 1e-4
-    m.open(4, [Entry(T_entry=source_entry, kind=1, source=0, covariance=cov, fitness=0.9)] * 2)
+    m.open(4, [SegmentEntry(T_entry=source_entry, kind=1, source=0, covariance=cov, fitness=0.9)] * 2)
     # the sample's own arithmetic against whole poses; another particle's segment may come before the match
     seen = set()
     for seed in range(20):
-        s = grow(m, root_of_particle(m, 0, 5), np.random.default_rng(seed))
+        s = grow_sample(m, root_of_particle(m, 0, 5), np.random.default_rng(seed))
         assert s.segments[1] == 0
         np.testing.assert_array_equal(s.poses[1], [0, 0, 0, 0, 0, 0, 1])  # the entered map is that of the root
         i, by_root = int(s.segments[2]), s.via[2] == 0
         before, after = (source_entry, m[i].T_exit) if by_root else (m[0].T_exit, m[i].T_entry)
         T = frame_between(before, after, gravity=True)
-        np.testing.assert_array_equal(level(T), T)
+        np.testing.assert_array_equal(remove_roll_pitch(T), T)
         seen.add((i, bool(by_root)))
         np.testing.assert_allclose(s.poses[2], T, atol=1e-12)
         np.testing.assert_allclose(se3.se3_compose(T, after)[:3], before[:3], atol=1e-12)
@@ -419,12 +420,12 @@ def test_frames_without_gravity_are_whole_poses() -> None:
     rng = np.random.default_rng(2)
     m = SegMap(np.arange(9.0), np.arange(9.0), 1, dim=3, gravity=False)
     for k in range(3):
-        m.open(2 * k, [Entry(T_entry=np.array([0.0, 0, 0, 0, 0, 0, 1]))])
+        m.open(2 * k, [SegmentEntry(T_entry=np.array([0.0, 0, 0, 0, 0, 0, 1]))])
         path = se3.se3_exp(np.cumsum(rng.normal(0.0, 0.5, (3, 6)), axis=0) * [[0], [1], [1]])
         path[0] = [0, 0, 0, 0, 0, 0, 1]
         m.close(2 * k + 2, [flat_grid(dim=3)], [path])
-    s = grow(m, root_of_segment(m, 2), np.random.default_rng(0))
-    path = concatenate(m, s)
+    s = grow_sample(m, root_of_segment(m, 2), np.random.default_rng(0))
+    path = concatenate_segments(m, s)
     whole = se3.se3_compose(se3.se3_compose(m[0].T_exit, m[1].T_exit), m[2].T_exit)
     np.testing.assert_allclose(
         se3.pose_to_matrix(se3.se3_between(path.poses[0], path.poses[-1])), se3.pose_to_matrix(whole), atol=1e-12
@@ -438,8 +439,8 @@ def test_a_sample_has_a_seam_where_its_fronts_met() -> None:
     root = root_of_particle(m, 0, 10)
     seen, places = set(), set()
     for seed in range(30):
-        s = grow(m, root, np.random.default_rng(seed))
-        ((a, b, T),) = seams(m, s)
+        s = grow_sample(m, root, np.random.default_rng(seed))
+        ((a, b, T),) = find_seams(m, s)
         at = int(s.intervals[b, 0])
         assert s.intervals[a, 1] == at
         places.add(at)
@@ -447,11 +448,11 @@ def test_a_sample_has_a_seam_where_its_fronts_met() -> None:
         sides = [2.0 + 0.1 * (s.segments[k] % 2) for k in s.in_time[:4].tolist()]
         missing = np.hypot(sides[0] - sides[2] - 0.2, sides[1] - sides[3])
         assert np.hypot(*T[:2]) == pytest.approx(missing, abs=1e-9)
-        path = concatenate(m, s, straight(np.array([0.2, 0.0, 0.0]), 2.0, 2))
+        path = concatenate_segments(m, s, straight(np.array([0.2, 0.0, 0.0]), 2.0, 2))
         step = 0.5 * sides[at // 2] * np.array([1.0, 0.0])
         jump = se2_compose(se2_inverse(path.poses[at]), path.poses[at + 1])[:2] - step
         np.testing.assert_allclose(np.hypot(*jump), missing, atol=1e-9)
         seen.add(round(float(missing), 6))
     assert len(seen) > 2
     assert places == {4, 6}  # on either side of where the fronts meet
-    assert seams(m, grow(m, root_of_segment(m, 6), np.random.default_rng(0))) == []
+    assert find_seams(m, grow_sample(m, root_of_segment(m, 6), np.random.default_rng(0))) == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from graphslam_frontends.segslam import matching
-from graphslam_frontends.segslam.matching import Recent
+from graphslam_frontends.segslam.matching import RecentCache
 
 
 def test_what_was_asked_for_longest_ago_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,7 +19,7 @@ def test_what_was_asked_for_longest_ago_goes_first(monkeypatch: pytest.MonkeyPat
 
         return make
 
-    kept: Recent[str, bytes] = Recent(len)
+    kept: RecentCache[str, bytes] = RecentCache(len)
     for key in ("a", "b", "a"):
         kept.of(key, maker(key, 4))
     assert made == ["a", "b"]

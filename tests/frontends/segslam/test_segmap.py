@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from graphslam.core.errors import CovarianceError, DataError, GeometryError, GridLockedError
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
-from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, Entry, SegMap
+from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, SegMap, SegmentEntry
 from tests.reference.segmap_twin import PlainSegMap, flat_grid, mark, marked, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)
 
 
-def _new(T: np.ndarray = ZERO) -> Entry:
-    return Entry(T_entry=T)
+def _new(T: np.ndarray = ZERO) -> SegmentEntry:
+    return SegmentEntry(T_entry=T)
 
 
 def test_a_particle_goes_out_and_comes_back_into_its_first_map() -> None:
@@ -50,7 +50,7 @@ def test_a_particle_goes_out_and_comes_back_into_its_first_map() -> None:
     assert m.intervals().tolist() == [[0, 2], [2, 4], [4, 6]]
     assert m.entered(0) == 1
     assert m.entered(1) == 0
-    m.open(6, [Entry(T_entry=m[2].T_exit, kind=SAME, source=2)])  # going on is not entering
+    m.open(6, [SegmentEntry(T_entry=m[2].T_exit, kind=SAME, source=2)])  # going on is not entering
     assert m.entered(2) == 0
 
 
@@ -238,7 +238,7 @@ def test_impossible_entries_and_exits_are_refused() -> None:
     with pytest.raises(DataError, match="no such segment"):
         m.open(0, [_new(), match_entry(ZERO, 3)])
     with pytest.raises(DataError, match="enters impossibly"):
-        m.open(0, [_new(), Entry(T_entry=ZERO, kind=MATCH)])
+        m.open(0, [_new(), SegmentEntry(T_entry=ZERO, kind=MATCH)])
     m.open(0, [_new()] * 2)  # what was refused left nothing behind
     with pytest.raises(DataError, match="before it left"):
         m.open(0, [_new()] * 2)
@@ -259,9 +259,9 @@ def test_impossible_entries_and_exits_are_refused() -> None:
     with pytest.raises(DataError, match="elsewhere"):
         m.open(3, [_new()] * 2)
     with pytest.raises(CovarianceError, match="without a covariance"):
-        m.open(2, [Entry(T_entry=ZERO, kind=MATCH, source=0)] * 2)
+        m.open(2, [SegmentEntry(T_entry=ZERO, kind=MATCH, source=0)] * 2)
     with pytest.raises(CovarianceError, match="not positive definite"):
-        m.open(2, [Entry(T_entry=ZERO, kind=MATCH, source=0, covariance=np.zeros((3, 3)))] * 2)
+        m.open(2, [SegmentEntry(T_entry=ZERO, kind=MATCH, source=0, covariance=np.zeros((3, 3)))] * 2)
     with pytest.raises(GeometryError):
         SegMap(np.arange(3.0), [0.0, 1.0, 0.5], 1)
     with pytest.raises(DataError):
@@ -334,7 +334,7 @@ def test_any_history_gives_what_the_plain_twin_has(ops: list[tuple], seed: int) 
                     kind, source = MATCH, int(living[op[2] % len(living)])
                 elif op[1][p] == 3:
                     kind, source = SAME, int(m.previous[p])
-                entry = match_entry(T, source) if kind == MATCH else Entry(T_entry=T, kind=kind, source=source)
+                entry = match_entry(T, source) if kind == MATCH else SegmentEntry(T_entry=T, kind=kind, source=source)
                 (made,) = m.open(now, [entry], [p])
                 grids[p] = flat_grid(pool) if made is None else made
                 paths[p] = [T]

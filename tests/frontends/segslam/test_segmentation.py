@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
-from graphslam.core.config import build
+from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam_frontends.segslam.config import SegmentationConfig, SegSlamConfig
-from graphslam_frontends.segslam.segmentation import Segmenter, few, gather_window, motion_error, predictive_score
+from graphslam_frontends.segslam.segmentation import (
+    Segmenter,
+    gather_window,
+    motion_error,
+    predictive_score,
+    representative_particles,
+)
 
 NAN = math.nan
 UP = np.array([0.0, 0, 0, 0, 0, 0, 1])
@@ -225,7 +231,9 @@ def test_decisions_come_at_their_rate_and_copies_go_their_own_way() -> None:
 
 
 def test_configurations_are_checked_and_built_from_tables() -> None:
-    c = build(SegSlamConfig, {"segmentation": {"period": 20}, "winnowing": {"gap": 30.0}, "search": {"starts": 3}})
+    c = build_config(
+        SegSlamConfig, {"segmentation": {"period": 20}, "winnowing": {"gap": 30.0}, "search": {"starts": 3}}
+    )
     assert (c.segmentation.period, c.winnowing.gap, c.search.starts) == (20.0, 30.0, 3)
     assert c.winnowing.drift(100.0) == pytest.approx(4.5)
     assert c.search.yaw_width(1000.0) == 0.8
@@ -244,7 +252,7 @@ def test_configurations_are_checked_and_built_from_tables() -> None:
         {"lock_after": -1},
     ):
         with pytest.raises(ConfigError):
-            build(SegSlamConfig, bad)
+            build_config(SegSlamConfig, bad)
 
 
 def test_se3_windows_score_in_three_dimensions() -> None:
@@ -264,7 +272,7 @@ def test_se3_windows_score_in_three_dimensions() -> None:
 def test_few_particles_speak_for_all() -> None:
     rng = np.random.default_rng(3)
     w = rng.dirichlet(np.full(40, 0.3))
-    rows, shares = few(w, 8)
+    rows, shares = representative_particles(w, 8)
     assert len(rows) <= 8
     assert shares.sum() == pytest.approx(1.0)
     assert np.all(np.diff(rows) > 0)
@@ -272,9 +280,9 @@ def test_few_particles_speak_for_all() -> None:
     assert np.all(np.abs(shares - w[rows]) <= 2.0 / 8)
     x = np.sort(rng.normal(size=40))  # what changes slowly from one to the next is told well
     assert abs(shares @ x[rows] - w @ x) < 0.5 * x.std()
-    everybody, same = few(w, 40)
+    everybody, same = representative_particles(w, 40)
     np.testing.assert_array_equal(everybody, np.arange(40))
     np.testing.assert_array_equal(same, w)
-    alone, all_of_it = few(np.array([0.0, 1.0, 0.0]), 2)
+    alone, all_of_it = representative_particles(np.array([0.0, 1.0, 0.0]), 2)
     assert alone.tolist() == [1]
     assert all_of_it.tolist() == [1.0]

@@ -17,8 +17,8 @@ from graphslam_frontends.segslam.config import (
     CandidateSearch,
     ChoiceConfig,
     SegmentationConfig,
+    SegmentCandidateConfig,
     SegSlamConfig,
-    WinnowConfig,
 )
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
@@ -26,7 +26,7 @@ from tests.frontends.grid_world import ring
 
 CONFIG = SegSlamConfig(
     segmentation=SegmentationConfig(window=2.0, min_seconds=6.0, min_length=5.0, max_length=14.0, excluded=3.0),
-    winnowing=WinnowConfig(gap=15.0),
+    winnowing=SegmentCandidateConfig(gap=15.0),
     search=CandidateSearch(source_radius=8.0),
     choice=ChoiceConfig(every=2.0),
 )
@@ -122,7 +122,7 @@ def test_paths_go_on_where_they_were(dim: int) -> None:
 
 def test_one_particle_without_matches_is_dead_reckoning() -> None:
     steps = world(0, 2, 0.002)
-    config = replace(CONFIG, winnowing=WinnowConfig(gap=1e6))
+    config = replace(CONFIG, winnowing=SegmentCandidateConfig(gap=1e6))
     r = run_segslam(steps, GridFilterConfig(particles=1), config, SeedTree(0))
     assert len(r.boundaries) > 3
     np.testing.assert_allclose(r.final_pose, _dead_reckoning(steps), atol=1e-9)
@@ -135,7 +135,7 @@ def test_ground_driven_again_does_not_fill_a_segment() -> None:
         segmentation = SegmentationConfig(
             window=2.0, max_length=45.0, score=0.0, relative_score=1e-6, excluded=3.0, known_gap=10.0, **more
         )
-        config = replace(CONFIG, segmentation=segmentation, winnowing=WinnowConfig(gap=1e6))
+        config = replace(CONFIG, segmentation=segmentation, winnowing=SegmentCandidateConfig(gap=1e6))
         r = run_segslam(world(0, 2, 0.002), GridFilterConfig(particles=10), config, SeedTree(0))
         return [b.why for b in r.boundaries]
 

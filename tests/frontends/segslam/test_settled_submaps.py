@@ -11,13 +11,13 @@ import pytest
 from graphslam.core import se3
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse
-from graphslam.core.poses import SE3, level, pose_mean
+from graphslam.core.poses import SE3, pose_mean, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam_frontends.segslam.config import HandoverConfig
-from graphslam_frontends.segslam.segmap import SAME, Entry, SegMap
-from graphslam_frontends.segslam.submaps import Drift, drift_by_errors, settle, settled_chain
+from graphslam_frontends.segslam.segmap import SAME, SegMap, SegmentEntry
+from graphslam_frontends.segslam.submaps import Drift, common_ancestor_chain, drift_by_errors, submaps_of_segments
 from tests.reference.segmap_twin import flat_grid, mark, marked, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)
@@ -46,7 +46,7 @@ def loop(fitness: tuple[float, ...] = (0.9, 0.95, 0.9, 0.9)) -> SegMap:
     m, n = small_segmap(15, 4), 4
     w = np.array([4.0, 3.0, 2.0, 1.0])
     for k in range(4):
-        m.open(2 * k, [Entry(T_entry=ZERO)] * n)
+        m.open(2 * k, [SegmentEntry(T_entry=ZERO)] * n)
         paths, grids = [], [flat_grid() for _ in range(n)]
         for p in range(n):
             path = straight(ZERO, 4.0 + 0.01 * p, 2)
@@ -55,7 +55,7 @@ def loop(fitness: tuple[float, ...] = (0.9, 0.95, 0.9, 0.9)) -> SegMap:
             mark(grids[p], 4 * k, p)
         m.close(2 * k + 2, grids, paths, w)
     entries = [match_entry(np.array([0.5, 0.1 * p, 0.0]), source, fitness[p]) for p, source in enumerate((0, 0, 1))]
-    maps = m.open(8, [*entries, Entry(T_entry=ZERO)])
+    maps = m.open(8, [*entries, SegmentEntry(T_entry=ZERO)])
     paths = [straight(e.T_entry, 3.0, 2) for e in entries] + [straight(ZERO, 3.0, 2)]
     grids = [flat_grid() if g is None else g for g in maps]
     m.close(10, grids, paths, w)
@@ -64,9 +64,11 @@ def loop(fitness: tuple[float, ...] = (0.9, 0.95, 0.9, 0.9)) -> SegMap:
 
 def test_a_chain_becomes_submaps_whose_exits_are_the_next_bases() -> None:
     m = loop()
-    chain = settled_chain(m, 16)
+    chain = common_ancestor_chain(m, 16)
     assert chain.tolist() == [0, 4, 8, 12, 16]
-    submaps = settle(m, chain, drift, uses=frozenset({"laser"}), reasons={2: "score", 10: "end-of-log"}, first_key=3)
+    submaps = submaps_of_segments(
+        m, chain, drift, uses=frozenset({"laser"}), reasons={2: "score", 10: "end-of-log"}, first_key=3
+    )
     assert [s.key for s in submaps] == [3, 4, 5, 6, 7]
     assert [s.interval for s in submaps] == [(0.0, 2.0), (2.0, 4.0), (4.0, 6.0), (6.0, 8.0), (8.0, 10.0)]
     for s in submaps[:4]:
@@ -85,18 +87,18 @@ def test_a_chain_becomes_submaps_whose_exits_are_the_next_bases() -> None:
 
 def test_the_exit_covariance_is_particles_about_the_chosen_one_plus_drift() -> None:
     m = loop()
-    s = settle(m, [0], drift)[0]
+    s = submaps_of_segments(m, [0], drift)[0]
     w = np.array([0.4, 0.3, 0.2, 0.1])
     ahead = 0.01 * np.arange(4)  # along x of the start, which is -y at an exit that looks to the left
     np.testing.assert_allclose(s.exit_covariance, 3 * D + np.diag([0.0, w @ ahead**2, 0.0]), atol=1e-12)
-    paper = settle(m, [0], drift, HandoverConfig(matched_only=True))[0]
+    paper = submaps_of_segments(m, [0], drift, HandoverConfig(matched_only=True))[0]
     spread = w @ (ahead - w @ ahead) ** 2
     np.testing.assert_allclose(paper.exit_covariance, np.diag([1e-4, spread + 1e-4, 1e-6]), atol=1e-12)
     assert paper.report["covariance"] == "moment-matched"
-    scaled = settle(m, [0], drift, HandoverConfig(drift_scale=2.0))[0]
+    scaled = submaps_of_segments(m, [0], drift, HandoverConfig(drift_scale=2.0))[0]
     np.testing.assert_allclose(scaled.exit_covariance - s.exit_covariance, 3 * D, atol=1e-12)
     with pytest.raises(CovarianceError):
-        settle(m, [0], lambda start, end, *, level_end: np.zeros((3, 3)))
+        submaps_of_segments(m, [0], lambda start, end, *, level_end: np.zeros((3, 3)))
     # along the path it grows from the start to the end
     assert s.trajectory is not None
     P = s.trajectory.covariances
@@ -108,7 +110,7 @@ def test_the_exit_covariance_is_particles_about_the_chosen_one_plus_drift() -> N
 
 def test_matches_go_along_with_their_support() -> None:
     m = loop()
-    last = settle(m, settled_chain(m, 16), drift)[-1]
+    last = submaps_of_segments(m, common_ancestor_chain(m, 16), drift)[-1]
     (match,) = last.matches  # all three lead to the first submap of the chain
     assert match.target == 0
     assert match.support == pytest.approx(0.9)
@@ -121,85 +123,85 @@ def test_matches_go_along_with_their_support() -> None:
     np.testing.assert_allclose(match.covariance, 1e-4 * np.eye(3) + np.diag([0, scatter, 0]), atol=1e-12)
     assert last.report["entered_share"] == pytest.approx({"new": 0.1, "match": 0.9, "same": 0.0})
     # a chain by the particle that did not take it: the others' match is still handed over, the heaviest's
-    other = settle(m, [0, 4, 8, 12, 19], drift)[-1]
+    other = submaps_of_segments(m, [0, 4, 8, 12, 19], drift)[-1]
     assert other.report["entered"] == "new"
     (match,) = other.matches
     assert match.support == pytest.approx(0.9)
     np.testing.assert_allclose(match.T_target_here, [0.5, 0.0, 0.0], atol=1e-12)
-    assert settle(m, [0, 4, 8, 12, 19], drift, HandoverConfig(minimum_support=0.95))[-1].matches == ()
+    assert submaps_of_segments(m, [0, 4, 8, 12, 19], drift, HandoverConfig(minimum_support=0.95))[-1].matches == ()
     # with another particle's first segment in the chain, the same place
-    (match,) = settle(m, [2, 4, 8, 12, 16], drift)[-1].matches
+    (match,) = submaps_of_segments(m, [2, 4, 8, 12, 16], drift)[-1].matches
     np.testing.assert_allclose(match.T_target_here, [0.5, 0.0, 0.0], atol=1e-12)
 
 
 def test_a_match_into_another_particles_map_is_carried_over_where_the_body_passed() -> None:
     """Near the end of the first segment, the two particles' paths differ by 2 cm: so does what the match says."""
     m, n = small_segmap(9, 2), 2
-    m.open(0, [Entry(T_entry=ZERO)] * n)
+    m.open(0, [SegmentEntry(T_entry=ZERO)] * n)
     m.close(4, [flat_grid(), flat_grid()], [straight(ZERO, 8.0, 4), straight(ZERO, 8.08, 4)])
     m.open(4, [match_entry(np.array([6.1, 0.3, 0.2]), 1)] * n)
     m.close(6, [flat_grid(), flat_grid()], [straight(np.array([6.1, 0.3, 0.2]), 1.0 + 0.01 * p, 2) for p in range(n)])
-    (match,) = settle(m, [0, 2], drift)[1].matches
+    (match,) = submaps_of_segments(m, [0, 2], drift)[1].matches
     np.testing.assert_allclose(match.T_target_here, [6.1 - 0.06, 0.3, 0.2], atol=1e-12)
-    (match,) = settle(m, [1, 2], drift)[1].matches
+    (match,) = submaps_of_segments(m, [1, 2], drift)[1].matches
     np.testing.assert_allclose(match.T_target_here, [6.1, 0.3, 0.2], atol=1e-12)
 
 
 def test_matches_whose_target_is_gone_are_counted() -> None:
     m = loop()
     m._release(np.array([1]))
-    last = settle(m, settled_chain(m, 16), drift)[-1]
+    last = submaps_of_segments(m, common_ancestor_chain(m, 16), drift)[-1]
     assert last.report["matches_without_target"] == 1
     assert last.matches[0].support == pytest.approx(0.7)
-    assert settle(m, [16], drift)[0].matches == ()  # the chain does not hold what was entered
+    assert submaps_of_segments(m, [16], drift)[0].matches == ()  # the chain does not hold what was entered
 
 
 def test_maps_are_handed_over_in_the_frames_of_their_bases() -> None:
     m, entry = small_segmap(9, 1), np.array([3.0, 2.0, np.pi / 2])
-    m.open(0, [Entry(T_entry=ZERO)])
+    m.open(0, [SegmentEntry(T_entry=ZERO)])
     grid = flat_grid()
     mark(grid, 5, 2)
     m.close(2, [grid], [straight(ZERO, 1.0, 2)])
     m.open(2, [match_entry(entry, 0)])
     m.close(4, [m.map_of(0)[0].copy()], [straight(entry, 1.0, 2)])
-    first, second = settle(m, [0, 1], drift)
+    first, second = submaps_of_segments(m, [0, 1], drift)
     assert isinstance(first.grid, EvidenceGrid)
     assert isinstance(second.grid, EvidenceGrid)
     assert first.grid.same_as(m.map_of(0)[0])
     assert marked(first.grid) == {(5, 2)}
     # voxel (5, 2) has its centre at (5.5, 2.5): 0.5 m ahead and 2.5 m to the right of a body at (3, 2) facing left
     assert marked(second.grid) == {(0, -3)}
-    assert settle(m, [0], drift, with_grids=False)[0].grid is None
+    assert submaps_of_segments(m, [0], drift, with_grids=False)[0].grid is None
     m.merge(1, 0)
-    assert marked(settle(m, [0], drift)[0].grid) == {(5, 2)}  # type: ignore[arg-type]
+    assert marked(submaps_of_segments(m, [0], drift)[0].grid) == {(5, 2)}  # type: ignore[arg-type]
 
 
 def test_a_chain_with_gaps_is_refused_and_holes_in_a_history_are_filled() -> None:
     m = loop()
     with pytest.raises(DataError, match="does not follow"):
-        settle(m, [0, 8], drift)
+        submaps_of_segments(m, [0, 8], drift)
     m._release(np.array([8]))
-    assert settled_chain(m, 16).tolist() == [1, 5, 9, 12, 16]  # the heaviest that fits
+    assert common_ancestor_chain(m, 16).tolist() == [1, 5, 9, 12, 16]  # the heaviest that fits
     with pytest.raises(DataError, match="pruned"):
-        settle(m, [8], drift)
+        submaps_of_segments(m, [8], drift)
 
 
 def test_an_interval_of_which_nothing_heavy_is_left_is_still_handed_over() -> None:
     m = loop()
     m.table.weight[:4] = 0.0
-    s = settle(m, [0], drift)[0]
+    s = submaps_of_segments(m, [0], drift)[0]
     ahead = 0.01 * np.arange(4)
     np.testing.assert_allclose(s.exit_covariance, 3 * D + np.diag([0.0, np.mean(ahead**2), 0.0]), atol=1e-12)
 
 
 def test_going_on_in_the_same_map_is_no_match() -> None:
     m = small_segmap(5, 1)
-    m.open(0, [Entry(T_entry=ZERO)])
+    m.open(0, [SegmentEntry(T_entry=ZERO)])
     m.close(2, [flat_grid()], [straight(ZERO, 1.0, 2)])
-    (grid,) = m.open(2, [Entry(T_entry=m[0].T_exit, kind=SAME, source=0)])
+    (grid,) = m.open(2, [SegmentEntry(T_entry=m[0].T_exit, kind=SAME, source=0)])
     assert grid is not None
     m.close(4, [grid], [straight(m[0].T_exit, 1.0, 2)])
-    s = settle(m, [0, 1], drift)[1]
+    s = submaps_of_segments(m, [0, 1], drift)[1]
     assert s.matches == ()
     assert s.report["entered"] == "same"
     np.testing.assert_allclose(s.exit_pose, [1.0, 0.0, 0.0], atol=1e-12)
@@ -217,11 +219,11 @@ def test_in_three_dimensions_bases_are_level_and_paths_keep_their_tilt() -> None
 
     m = SegMap(np.arange(7.0), np.arange(7.0), 1, dim=3, gravity=True)
     entry = body(pose(0, 0, 0, 0))
-    m.open(0, [Entry(T_entry=entry)])
+    m.open(0, [SegmentEntry(T_entry=entry)])
     m.close(2, [flat_grid(dim=3)], [np.stack([entry, body(pose(1, 0, 0, 0)), body(pose(2, 1, 0.3, 0.9))])])
     entry = body(pose(5, 6, 1, -2.0))
     own = np.diag([1e-6, 2e-6, 3e-6, 1e-2, 2e-2, 3e-2])
-    m.open(2, [Entry(T_entry=entry, kind=1, source=0, covariance=own, fitness=0.9)])
+    m.open(2, [SegmentEntry(T_entry=entry, kind=1, source=0, covariance=own, fitness=0.9)])
     path = np.stack([entry, body(pose(6, 6, 1, -2.0)), body(pose(7, 6, 1.2, -1.0))])
     m.close(4, [flat_grid(dim=3)], [path])
     asked: list[tuple[bool, bool]] = []
@@ -231,12 +233,12 @@ def test_in_three_dimensions_bases_are_level_and_paths_keep_their_tilt() -> None
             asked.append((level_start, level_end))
             return None, np.eye(6) * 1e-3
 
-    a, b = settle(m, [0, 1], drift_by_errors(Errors(), gravity=True))
+    a, b = submaps_of_segments(m, [0, 1], drift_by_errors(Errors(), gravity=True))
     assert (True, True) in asked
     np.testing.assert_allclose(a.exit_pose, pose(2, 1, 0.3, 0.9), atol=2e-3)
-    np.testing.assert_allclose(a.exit_pose, level(a.exit_pose), atol=1e-15)
-    base = level(entry)
-    np.testing.assert_allclose(b.exit_pose, level(se3.se3_between(base, path[-1])), atol=1e-12)
+    np.testing.assert_allclose(a.exit_pose, remove_roll_pitch(a.exit_pose), atol=1e-15)
+    base = remove_roll_pitch(entry)
+    np.testing.assert_allclose(b.exit_pose, remove_roll_pitch(se3.se3_between(base, path[-1])), atol=1e-12)
     assert b.trajectory is not None
     np.testing.assert_allclose(
         se3.pose_to_matrix(b.trajectory.poses),
@@ -244,7 +246,7 @@ def test_in_three_dimensions_bases_are_level_and_paths_keep_their_tilt() -> None
         atol=1e-12,
     )
     (match,) = b.matches
-    expected = se3.se3_between(level(m[0].T_entry), level(entry))
+    expected = se3.se3_between(remove_roll_pitch(m[0].T_entry), remove_roll_pitch(entry))
     np.testing.assert_allclose(match.T_target_here, expected, atol=1e-12)
     np.testing.assert_allclose(match.T_target_here[:3], [5, 6, 1], atol=2e-3)  # a lean turns headings a little
     np.testing.assert_allclose(match.T_target_here[3:5], 0.0, atol=1e-15)
@@ -261,7 +263,9 @@ def test_in_three_dimensions_bases_are_level_and_paths_keep_their_tilt() -> None
 def test_chained_submaps_are_the_path_that_was_driven() -> None:
     """Composed exits take the base of each submap to where the sample has it."""
     m = loop()
-    submaps = settle(m, settled_chain(m, 19), drift_by_length(m.path_length, lambda s: D * (1 + s)))
+    submaps = submaps_of_segments(
+        m, common_ancestor_chain(m, 19), drift_by_length(m.path_length, lambda s: D * (1 + s))
+    )
     T = ZERO
     for s in submaps:
         T = se2_compose(T, s.exit_pose)
@@ -273,7 +277,7 @@ def test_chained_submaps_are_the_path_that_was_driven() -> None:
 
 def test_submaps_go_to_disk_and_come_back(tmp_path) -> None:  # type: ignore[no-untyped-def]
     m = loop()
-    submaps = settle(m, settled_chain(m, 16), drift)
+    submaps = submaps_of_segments(m, common_ancestor_chain(m, 16), drift)
     write_submaps(tmp_path, submaps)
     back = list(read_submaps(tmp_path))
     assert len(back) == 5
@@ -289,9 +293,9 @@ def test_bases_stand_on_the_lattice_of_their_maps() -> None:
         for k, rise in ((0, 0.3), (2, -0.2)):
             path = np.tile(up, (3, 1))
             path[:, 0], path[:, 2] = [0.0, 1.0, 2.0], lift + rise * np.array([0.0, 0.5, 1.0])
-            m.open(k, [Entry(T_entry=path[0])])
+            m.open(k, [SegmentEntry(T_entry=path[0])])
             m.close(k + 2, [flat_grid(dim=3)], [path])
-        return settle(m, [0, 1], drift_by_length(m.path_length, lambda s: np.eye(6) * 1e-3))
+        return submaps_of_segments(m, [0, 1], drift_by_length(m.path_length, lambda s: np.eye(6) * 1e-3))
 
     for plain, lifted in zip(settled(0.0), settled(0.05)):
         np.testing.assert_allclose(lifted.exit_pose, plain.exit_pose, atol=1e-12)

@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry
-from graphslam_frontends.segslam.window import bring_up_to_date, look_ahead
+from graphslam_frontends.segslam.window import deskew_to_now, gather_look_ahead
 from tests.frontends.grid_world import ring
 
 
@@ -23,7 +23,7 @@ def test_points_ahead_lie_where_the_true_motion_puts_them(dim: int) -> None:
     exact = np.concatenate([first, group.between(truth[:-1], truth[1:])])
     odometry = Odometry(times=steps.times, increments=exact, covariances=steps.odometry.covariances)
     steps = replace(steps, odometry=odometry)
-    ahead = look_ahead(steps, 7, 2.0)
+    ahead = gather_look_ahead(steps, 7, 2.0)
     assert (ahead.step, ahead.last, ahead.full) == (7, 12, True)
     expected = []
     for k in range(8, 13):
@@ -32,7 +32,7 @@ def test_points_ahead_lie_where_the_true_motion_puts_them(dim: int) -> None:
         expected.append(group.transform(np.broadcast_to(T, (int(returns.sum()), group.size)), p[returns]))
     np.testing.assert_allclose(ahead.window.points, np.concatenate(expected), atol=1e-9)
     assert ahead.window.beams == 5 * 40
-    np.testing.assert_allclose(bring_up_to_date(steps, truth[7:8], 7, 12), truth[12:13], atol=1e-9)
+    np.testing.assert_allclose(deskew_to_now(steps, truth[7:8], 7, 12), truth[12:13], atol=1e-9)
     near = ahead.source(25, 3.0)
     assert len(near) == 25
     assert np.linalg.norm(near, axis=1).max() <= 3.0
@@ -43,8 +43,8 @@ def test_points_ahead_lie_where_the_true_motion_puts_them(dim: int) -> None:
 def test_at_the_end_of_the_log_the_window_is_not_full() -> None:
     steps = ring(1, 2, length=8.0, beams=20)
     n = len(steps)
-    assert look_ahead(steps, n - 6, 2.0).full
-    short = look_ahead(steps, n - 5, 2.0)
+    assert gather_look_ahead(steps, n - 6, 2.0).full
+    short = gather_look_ahead(steps, n - 5, 2.0)
     assert (short.full, short.last) == (False, n - 1)
-    empty = look_ahead(steps, n - 1, 2.0)
+    empty = gather_look_ahead(steps, n - 1, 2.0)
     assert (empty.last, len(empty.window), len(empty.source(10, 5.0))) == (n - 1, 0, 0)

@@ -9,11 +9,11 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, GeometryError
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.core.poses import SE3, upright
+from graphslam.core.poses import SE3, level_poses
 from graphslam.core.se3 import quat_multiply, quat_rotate, so3_exp
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.factors.attitude import DOWN, across, attitude_terms, turn_of, up_turn
+from graphslam.graph.factors.attitude import DOWN, attitude_terms, level_turn, tangent_basis, up_turn
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -26,10 +26,10 @@ NOISE = np.array([2 * SIGMA, 2 * SIGMA, 3e-3, 0.02, 0.02, 0.02])
 def test_across_is_an_orthonormal_basis(rng):
     d = rng.normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    B = across(d)
+    B = tangent_basis(d)
     np.testing.assert_allclose(np.swapaxes(B, 1, 2) @ B, np.broadcast_to(np.eye(2), (50, 2, 2)), atol=1e-12)
     np.testing.assert_allclose(np.einsum("kij,ki->kj", B, d), 0.0, atol=1e-12)
-    np.testing.assert_allclose(np.abs(across(DOWN)), [[1, 0], [0, 1], [0, 0]], atol=1e-15)
+    np.testing.assert_allclose(np.abs(tangent_basis(DOWN)), [[1, 0], [0, 1], [0, 0]], atol=1e-15)
 
 
 def test_the_residual_is_the_sine_of_the_angle(rng):
@@ -43,7 +43,7 @@ def test_the_residual_is_the_sine_of_the_angle(rng):
     turned[3:] = quat_multiply(so3_exp(0.7 * up), pose[3:])  # a turn about the vertical changes nothing
     np.testing.assert_allclose(attitude_terms(turned[None], tilt, seen[None])[0], 0.0, atol=1e-14)
     angle = 0.03
-    axis = across(seen)[:, 0]
+    axis = tangent_basis(seen)[:, 0]
     off = quat_rotate(so3_exp(angle * axis), seen)
     assert np.linalg.norm(attitude_terms(pose[None], tilt, off[None])[0]) == pytest.approx(np.sin(angle), rel=1e-9)
 
@@ -51,7 +51,7 @@ def test_the_residual_is_the_sine_of_the_angle(rng):
 @pytest.mark.parametrize("size", [0.0, 1e-6, 9e-5, 1.1e-4, 9e-4, 1.1e-3, 0.03, 1.0])
 def test_the_lean_turn_is_the_plain_one(size):
     E, J = up_turn(size * np.array([0.6, -0.8]))
-    lean_E, lean_J = turn_of(size * 0.6, size * -0.8)
+    lean_E, lean_J = level_turn(size * 0.6, size * -0.8)
     np.testing.assert_allclose(lean_E, E, atol=1e-13)
     np.testing.assert_allclose(lean_J, J, atol=1e-11)
 
@@ -63,7 +63,7 @@ def levelled_chain(rng: np.random.Generator, m: int = 20) -> tuple[list[Submap],
     """
     heading = np.cumsum(rng.uniform(-0.8, 0.8, m + 1))
     places = np.cumsum(np.column_stack([8 * np.cos(heading), 8 * np.sin(heading), rng.uniform(-0.3, 0.3, m + 1)]), 0)
-    true = upright(places, heading)
+    true = level_poses(places, heading)
     error = np.zeros((m + 1, 6))
     error[:, :2] = SIGMA * rng.standard_normal((m + 1, 2))
     bases = SE3.compose(true, SE3.exp(error))  # where the bases really stand
@@ -76,7 +76,7 @@ def levelled_chain(rng: np.random.Generator, m: int = 20) -> tuple[list[Submap],
         T = SE3.compose(SE3.between(bases[k], bases[k + 1]), SE3.exp(rest))
         relative = SE3.between(true[k], true[k + 1])
         half = heading[k + 1] - heading[k] + rest[2]
-        exit_pose = upright(T[:3], half)
+        exit_pose = level_poses(T[:3], half)
         assert np.abs(SE3.log(SE3.between(relative, exit_pose))).max() < 1.0
         submaps.append(Submap(key=k, interval=(10.0 * k, 10.0 * k + 10.0), exit_pose=exit_pose, exit_covariance=P))
     return submaps, SE3.between(np.broadcast_to(bases[0], bases.shape), bases)

@@ -17,8 +17,8 @@ from graphslam.graph.factors.compass import CompassRecord, DeclinationRecord, De
 from graphslam.graph.factors.range import BeaconRangeRecord, RangeRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
+from graphslam.graph.pending_measurements import CompassConfig, trilaterate
 from graphslam.graph.pose_graph import PoseGraph
-from graphslam.graph.readings import CompassConfig, trilaterate
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.gtsam_optimum import optimise_with_gtsam

@@ -12,8 +12,8 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsRecord, gps_residual
-from graphslam.graph.gps import GpsConfig, arm_of
-from graphslam.graph.noise import Robust
+from graphslam.graph.gps import GpsConfig, antenna_in_base
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key
 from graphslam.solve.batch import BatchSolver
@@ -72,7 +72,7 @@ def test_arm_covariance_by_monte_carlo(rng):
     T, lever = np.array([2.0, 1.0, 0.8]), np.array([3.0, 1.0])
     C = np.diag([0.04, 0.01, 0.0004])
     path = Trajectory(np.array([0.0, 1.0]), np.array([T, T]), np.array([C, C]))
-    arm, cov = arm_of(path, np.array([0.5]), lever)
+    arm, cov = antenna_in_base(path, np.array([0.5]), lever)
     np.testing.assert_allclose(arm[0], se2_transform(T, lever))
     draws = se2_transform(se2_compose(T, se2_exp(rng.multivariate_normal(np.zeros(3), C, 200_000))), lever)
     np.testing.assert_allclose(np.cov(draws.T), cov[0], atol=6e-4)
@@ -197,7 +197,7 @@ def test_robust_kernel_against_outliers(rng):
     error = {}
     for kind in ("none", "cauchy", "huber"):
         g = PoseGraph()
-        g.add_gps(spoilt, config=GpsConfig(robust=Robust(kind, 1.0)))
+        g.add_gps(spoilt, config=GpsConfig(robust=RobustKernel(kind, 1.0)))
         for s in chain.submaps:
             g.add_submap(s)
         BatchSolver(g).update()

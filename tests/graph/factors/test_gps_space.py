@@ -13,8 +13,8 @@ from graphslam.core.se3 import quat_multiply, so3_exp
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.gps import GpsRecord, gps_predicted_in_space, level_datum_pose
-from graphslam.graph.gps import GpsConfig, arm_of
-from graphslam.graph.noise import Robust
+from graphslam.graph.gps import GpsConfig, antenna_in_base
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -53,7 +53,7 @@ def position_error(g: PoseGraph, chain: DenseChain) -> float:
 def test_arm_covariance_by_monte_carlo(rng):
     T, C = SE3.exp([0.3, -0.2, 1.0, 2.0, 1.0, 0.5]), np.diag([4e-4, 1e-4, 9e-4, 0.04, 0.01, 0.02])
     path = Trajectory(np.array([0.0, 1.0]), np.array([T, T]), np.array([C, C]))
-    arm, cov = arm_of(path, np.array([0.5]), LEVER)
+    arm, cov = antenna_in_base(path, np.array([0.5]), LEVER)
     np.testing.assert_allclose(arm[0], SE3.transform(T, LEVER))
     draws = SE3.transform(SE3.compose(T, SE3.exp(rng.multivariate_normal(np.zeros(6), C, 50_000))), LEVER)
     np.testing.assert_allclose(np.cov(draws.T), cov[0], atol=1.5e-3)
@@ -167,7 +167,7 @@ def test_multipath_jumps_of_thirty_metres(rng, kind):
             u = rng.normal(size=3)
             positions[start : start + 5] += 30.0 * u / np.linalg.norm(u)
         spoilt = Gps(times=gps.times, positions=positions, sigma=gps.sigma, lever=gps.lever)
-        config = GpsConfig(robust=Robust(kind, 2.385))
+        config = GpsConfig(robust=RobustKernel(kind, 2.385))
         for name, stream in (("clean", gps), ("spoilt", spoilt)):
             g = built(chain, stream, config if name == "spoilt" else GpsConfig())
             BatchSolver(g).solve_to_optimum()

@@ -14,7 +14,7 @@ from graphslam.core.imu import GRAVITY
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
-from graphslam.graph.factors.imu.config import ImuConfig, places_of
+from graphslam.graph.factors.imu.config import ImuConfig, places_on_nodes
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.gps import GpsConfig
@@ -372,7 +372,7 @@ def test_the_body_is_where_the_path_says(rng):
     """Bases lean; the body on them does not, and the last exit is where the last path ends."""
     made = ring(rng, submaps=2, step=np.full(6, 1e-9), lean=0.2)
     g = chain(made)
-    places = places_of(g.submaps, 1.0)
+    places = places_on_nodes(g.submaps, 1.0)
     assert set(places) == set(range(len(g.values.poses)))
     for n, place in places.items():
         body = SE3.compose(g.values.poses[n], place.T_node_body)

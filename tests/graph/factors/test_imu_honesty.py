@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.evaluate.without_truth import class_consistency
+from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.graph.factors.imu.config import ImuConfig
 from tests.reference import imu_ring
 from tests.reference.imu_ring import STEP

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.sighting import SightingRecord
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.gtsam_values import to_gtsam
-from graphslam.graph.network import problem_of_network, values_of
-from graphslam.graph.noise import Robust
+from graphslam.graph.network import network_values, problem_of_network
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.variables import Values
 from tests.solve.network.test_model import random_network
 
@@ -20,7 +20,7 @@ def records(rng, polar: bool) -> tuple[list[SightingRecord], Values]:
     values.poses[0] = 0.0
     pairs = [(0, 7), (1, 7), (1, 20), (3, 8)]
     W = rng.standard_normal((4, 2, 2)) + 2.0 * np.eye(2)
-    robust = [Robust(), Robust("huber", 1.0), Robust("cauchy", 1.0), Robust()]
+    robust = [RobustKernel(), RobustKernel("huber", 1.0), RobustKernel("cauchy", 1.0), RobustKernel()]
     z = np.array([2.0, 4.0]) + rng.standard_normal((4, 2))
     return [SightingRecord(k, i, l, z[k], polar, W[k], robust[k]) for k, (i, l) in enumerate(pairs)], values
 
@@ -28,7 +28,7 @@ def records(rng, polar: bool) -> tuple[list[SightingRecord], Values]:
 @pytest.mark.parametrize("polar", [True, False])
 def test_jacobians_are_those_of_differences(rng, polar):
     some, values = records(rng, polar)
-    flat, h = FlatGraph(some, values.layout()), 1e-6
+    flat, h = FactorArrays(some, values.layout()), 1e-6
     batch = flat.batches[0]
     _, J = batch.whitened(values)
     columns = batch.columns.reshape(len(some), -1)
@@ -43,8 +43,8 @@ def test_jacobians_are_those_of_differences(rng, polar):
 @pytest.mark.parametrize("polar", [True, False])
 def test_gtsam_says_the_same(rng, polar):
     some, values = records(rng, polar)
-    blocks, theirs = FlatGraph(some, values.layout()).factor_blocks(values), to_gtsam(values)
-    chi2 = FlatGraph(some, values.layout()).evaluate(values, hessian=False).chi2
+    blocks, theirs = FactorArrays(some, values.layout()).factor_blocks(values), to_gtsam(values)
+    chi2 = FactorArrays(some, values.layout()).evaluate(values, hessian=False).chi2
     for k, record in enumerate(some):
         factor = gtsam_factor(record, values.poses[0])
         assert 2 * factor.error(theirs) == pytest.approx(chi2[k], rel=1e-9)
@@ -58,8 +58,8 @@ def test_gtsam_says_the_same(rng, polar):
 def test_records_and_arrays_are_one_kind(rng, kind):
     """What a file's arrays make is what a graph's records make."""
     net, poses, points = random_network(rng, 2, marks=kind)
-    flat, values = problem_of_network(net, ordered=False), values_of(net, poses, points)
-    again = FlatGraph(list(flat.records), flat.layout)
+    flat, values = problem_of_network(net, ordered=False), network_values(net, poses, points)
+    again = FactorArrays(list(flat.records), flat.layout)
     a, b = flat.evaluate(values, dense=True), again.evaluate(values, dense=False)
     np.testing.assert_allclose(b.A.toarray(), a.A, rtol=1e-12, atol=1e-12 * np.abs(a.A).max())
     np.testing.assert_allclose(b.chi2, a.chi2, rtol=1e-12)

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.solve_file import solve_file
+from graphslam.app.solve_file import solve_network_file
 from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import values_of
+from graphslam.graph.network import network_values
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
 from graphslam.io.network_file import read_network
 from graphslam.solve.batch import BatchSolver
-from graphslam.solve.descent import polish
+from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.certificate import (
     _descend,
@@ -93,7 +93,7 @@ def twisted_ring(n: int, turns: int) -> tuple[PoseNetwork, np.ndarray]:
 def test_a_wound_up_ring_is_a_local_minimum_and_refused() -> None:
     net, wound = twisted_ring(20, 1)
     problem = BatchProblem(net)
-    end = polish(problem, problem.pack(values_of(net, wound)))
+    end = descend_to_minimum(problem, problem.pack(network_values(net, wound)))
     assert end.status == "converged"
     assert end.objective == pytest.approx(20 * (2 * np.pi / 20) ** 2, rel=1e-6)
     refused = certify(net, problem.unpack(end.values).poses, end.objective)
@@ -144,11 +144,11 @@ def test_what_cannot_be_judged_says_why(rng: np.random.Generator) -> None:
 def test_report_holds_the_certificate_only_if_asked(rng: np.random.Generator, tmp_path: Path) -> None:
     net, _, _ = random_network(rng, 2, noise=0.01)
     write_g2o(tmp_path / "a.g2o", net)
-    assert "certificate" not in solve_file(tmp_path / "a.g2o")
-    report = solve_file(tmp_path / "a.g2o", certificate=True)
+    assert "certificate" not in solve_network_file(tmp_path / "a.g2o")
+    report = solve_network_file(tmp_path / "a.g2o", certificate=True)
     assert report["certificate"] == "certified"
     assert report["certificate_numbers"]["verdict"] == "certified"
-    assert "certificate" in solve_file(tmp_path / "a.g2o", "gnc", certificate=True)
+    assert "certificate" in solve_network_file(tmp_path / "a.g2o", "gnc", certificate=True)
 
 
 @pytest.mark.data
@@ -170,7 +170,7 @@ def test_a_grid_solved_from_nonsense_is_refused(data_dir: Path) -> None:
         poses = exp(np.concatenate([2.0 * rng.standard_normal((len(net), 3)), rng.standard_normal((len(net), 3))], 1))
         poses[0] = net.poses[0]
         problem = BatchProblem(net)
-        end = polish(problem, problem.pack(values_of(net, poses)))
+        end = descend_to_minimum(problem, problem.pack(network_values(net, poses)))
         if end.status != "converged" or end.objective < 1.001 * best:
             continue
         found = certify(net, problem.unpack(end.values).poses, end.objective)

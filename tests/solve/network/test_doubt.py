@@ -13,10 +13,10 @@ import graphslam.solve.network.start as starts
 import graphslam.solve.sparse as sparse
 from graphslam.core.errors import CovarianceError
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import problem_of_network, values_of
-from graphslam.solve.descent import polish
+from graphslam.graph.network import network_values, problem_of_network
+from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.network.multistart import doubt
+from graphslam.solve.network.multistart import suspicion_of_answer
 from graphslam.solve.network.solve import solve_network
 from graphslam.solve.network.start import (
     chordal_rotations,
@@ -77,10 +77,10 @@ def test_every_other_minimum_from_random_starts_is_doubted(rng: np.random.Genera
     assert best.details["doubt"] == ""
     found = 0
     for _ in range(12):
-        end = polish(problem, values_of(net, rotated(net, rng, 2.0)))
+        end = descend_to_minimum(problem, network_values(net, rotated(net, rng, 2.0)))
         worse = end.objective > 1.001 * best.objective
         found += worse
-        assert bool(doubt(net, problem, end)) == worse or end.status != "converged"
+        assert bool(suspicion_of_answer(net, problem, end)) == worse or end.status != "converged"
     assert found >= 3
 
 
@@ -149,7 +149,7 @@ def test_elimination_by_blocks_takes_the_same_step(
     rng: np.random.Generator, dim: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     net = grid_world(200, rng, dim=dim, share=0.8)
-    start = values_of(net, net.poses)
+    start = network_values(net, net.poses)
     a, fall, now = SparseProblem(problem_of_network(net)).newton_step(start)
     monkeypatch.setattr(sparse, "MANY", 0)
     b, fall_b, now_b = SparseProblem(problem_of_network(net, ordered=False)).newton_step(start)

@@ -9,13 +9,13 @@ from scipy import optimize
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.relative import relative_poses
 from tests.reference.loop_chain import chain_of, loop_of, right_loops, square_poses
 from tests.reference.loop_network import LoopNetwork
 
 
-def plain_cost(T: Array, P: Array, loops: list, poses: Array, kernel: Robust) -> float:  # type: ignore[type-arg]
+def plain_cost(T: Array, P: Array, loops: list, poses: Array, kernel: RobustKernel) -> float:  # type: ignore[type-arg]
     g, total = group_of(poses), 0.0
     for k in range(len(T)):
         r = g.log(g.between(T[k], g.between(poses[k], poses[k + 1])))
@@ -27,8 +27,8 @@ def plain_cost(T: Array, P: Array, loops: list, poses: Array, kernel: Robust) ->
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("kernel", [NO_KERNEL, Robust("huber", 1.0)])
-def test_nothing_near_the_solution_is_better(dim: int, kernel: Robust) -> None:
+@pytest.mark.parametrize("kernel", [NO_KERNEL, RobustKernel("huber", 1.0)])
+def test_nothing_near_the_solution_is_better(dim: int, kernel: RobustKernel) -> None:
     rng = np.random.default_rng(0)
     poses = square_poses(dim)
     T, P = chain_of(poses, rng)
@@ -115,7 +115,7 @@ def test_what_was_removed_is_gone() -> None:
     net = LoopNetwork(T, P)
     net.solve()
     alone = net.poses.copy()
-    fid = net.add_loop(right_loops(poses, rng, 1)[0], Robust("huber", 3.0))
+    fid = net.add_loop(right_loops(poses, rng, 1)[0], RobustKernel("huber", 3.0))
     net.solve()
     assert np.abs(net.poses - alone).max() > 1e-3
     net.remove_loop(fid)

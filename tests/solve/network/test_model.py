@@ -15,7 +15,7 @@ from graphslam.core.geometry import Array, se2_between
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.factors.batch import shared_noise
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import gtsam_key
 from graphslam.solve.network.diagnose import check_determined, check_full_rank
@@ -98,7 +98,7 @@ def test_objective_and_jacobian_equal_the_slow_twin(rng: np.random.Generator, di
     g_slow = K.T @ slow.residuals(matrices(poses), points)
     assert np.allclose(J.T @ r, g_slow, rtol=0, atol=1e-6 * np.abs(g_slow).max())
     # the problem that solvers take, in its own order of columns and in one of elimination
-    values = values_of(net, poses, points)
+    values = network_values(net, poses, points)
     for ordered in (False, True):
         flat = problem_of_network(net, ordered=ordered)
         system = flat.evaluate(values, dense=False)
@@ -118,7 +118,7 @@ def test_objective_and_jacobian_equal_the_slow_twin(rng: np.random.Generator, di
 @pytest.mark.parametrize(("dim", "marks"), [c for c in CASES if c[1] != "cartesian"])
 def test_residual_is_the_one_gtsam_evaluates(rng: np.random.Generator, dim: int, marks: str | None) -> None:
     net, poses, points = random_network(rng, dim, noise=0.8, marks=marks)
-    ours = values_of(net, poses, points)
+    ours = network_values(net, poses, points)
     values = to_gtsam(ours, held=True)
     assert 2 * to_graph(net).error(values) == pytest.approx(objective(net, poses, points), rel=1e-10)
     # … and it is the logarithm, not the chart (x, y, θ), in 2-D too
@@ -204,8 +204,8 @@ def test_singular_information_that_leaves_a_vertex_free_is_named(rng: np.random.
         information=info,
     )
     with pytest.raises(IndeterminateError) as caught:
-        check_full_rank(loose, problem_of_network(loose), values_of(loose, poses[:4]))
+        check_full_rank(loose, problem_of_network(loose), network_values(loose, poses[:4]))
     assert caught.value.variables[0] == "vertex 8"
     info[2, 2, 2] = 1e-3
     sound = replace(loose, information=info)
-    check_full_rank(sound, problem_of_network(sound), values_of(sound, poses[:4]))
+    check_full_rank(sound, problem_of_network(sound), network_values(sound, poses[:4]))

@@ -16,8 +16,8 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import SE2
 from graphslam.core.random import SeedTree
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
-from graphslam.graph.network import problem_of_network, values_of
-from graphslam.io.catalog import load
+from graphslam.graph.network import network_values, problem_of_network
+from graphslam.io.catalog import load_recording
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import loop_consensus, odometry_edges
@@ -128,7 +128,7 @@ def test_gtsams_gnc_agrees_where_it_succeeds() -> None:
     params = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers([0, *(1 + np.flatnonzero(is_odometry(mixed.network.edges))).tolist()])
-    start = values_of(mixed.network, net.poses)
+    start = network_values(mixed.network, net.poses)
     optimizer = gtsam.GncLMOptimizer(to_graph(mixed.network), to_gtsam(start, held=True), params)
     optimizer.setInlierCostThresholds(0.5 * float(answer.details["edge_limit"]))
     found = from_gtsam(optimizer.optimize(), start)
@@ -171,7 +171,7 @@ def test_options_are_checked() -> None:
     for bad in (0.0, -1.0, float("nan")):
         with pytest.raises(ConfigError, match="noise_scale"):
             solve_network(net, "gnc", noise_scale=bad)
-    assert BatchProblem(net).objective(BatchProblem(net).pack(values_of(net, net.poses))) > 0.0
+    assert BatchProblem(net).objective(BatchProblem(net).pack(network_values(net, net.poses))) > 0.0
 
 
 def drifting(network: PoseNetwork, degrees: float) -> PoseNetwork:
@@ -221,7 +221,7 @@ def test_nothing_but_wrong_loops_is_not_solved() -> None:
 @pytest.mark.data
 @pytest.mark.parametrize("degrees", [0.0, -250.0])
 def test_lecture_hall_with_a_drift_that_nobody_stated(data_dir: Path, degrees: float) -> None:
-    log = load("tuc-slam-lecture-hall")
+    log = load_recording("tuc-slam-lecture-hall")
     velocities = log.velocities.copy()
     velocities[:, 2] += np.deg2rad(degrees) / (log.times[-1] - log.times[0])
     net, times = replace(log, velocities=velocities).to_network(min_similarity=0.5)

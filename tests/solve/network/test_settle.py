@@ -10,15 +10,15 @@ from scipy import stats
 
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
-from graphslam.graph.network import problem_of_network, values_of
-from graphslam.solve.descent import polish
+from graphslam.graph.network import network_values, problem_of_network
+from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.network.settle import (
+from graphslam.solve.network.leave_one_out import (
     LARGEST,
     family_quantile,
     groups_of,
+    leave_one_out_test,
     loop_evidence,
-    settle,
     tail_limit,
 )
 from graphslam.solve.network.solve import solve_network
@@ -47,7 +47,7 @@ def test_evidence_is_that_of_a_dense_solver(dim: int) -> None:
     everything = np.ones(len(edges), bool)
     poses = solve_network(net, starts=("chordal",)).poses
     single, group, label = loop_evidence(
-        problem_of_network(net), everything, rows, values_of(net, poses), accepted=True
+        problem_of_network(net), everything, rows, network_values(net, poses), accepted=True
     )
     assert sorted(np.bincount(label).tolist()) == [1, 3, 4]
     for k, row in enumerate(rows):
@@ -58,7 +58,9 @@ def test_evidence_is_that_of_a_dense_solver(dim: int) -> None:
     out = rows[[0, 1, -1]]
     inliers = ~np.isin(np.arange(len(edges)), out)
     poses = solve_network(subnetwork(net, inliers), starts=("chordal",)).poses
-    single, group, label = loop_evidence(problem_of_network(net), inliers, out, values_of(net, poses), accepted=False)
+    single, group, label = loop_evidence(
+        problem_of_network(net), inliers, out, network_values(net, poses), accepted=False
+    )
     for k, row in enumerate(out):
         assert single[k] == pytest.approx(fall_without(net, inliers, int(row), poses), rel=1e-5)
         members = out[label == label[k]]
@@ -76,7 +78,7 @@ def test_evidence_of_right_loops_is_chi_squared(inflated: float) -> None:
         net = replace(net, information=net.information * inflated)
         rows = np.flatnonzero(~is_odometry(net.edges))
         problem = BatchProblem(net)
-        values = problem.unpack(polish(problem, problem.pack(values_of(net, net.poses))).values)
+        values = problem.unpack(descend_to_minimum(problem, problem.pack(network_values(net, net.poses))).values)
         s, g, label = loop_evidence(problem.flat, np.ones(len(net.edges), bool), rows, values, accepted=True)
         single.append(s[4])  # alone
         group += [g[np.flatnonzero(label == name)[0]] for name in np.unique(label)]
@@ -140,7 +142,7 @@ def test_a_wrong_loop_that_bends_the_map_to_itself_is_taken_out_and_a_right_one_
     costs = edge_costs(wrong, begun.poses)
     assert (costs[loops[:4]] < limit[loops[:4]]).all()
     problem = BatchProblem(wrong)
-    end = settle(problem, problem.pack(values_of(wrong, begun.poses)), inliers, limit, own_tail=False)
+    end = leave_one_out_test(problem, problem.pack(network_values(wrong, begun.poses)), inliers, limit, own_tail=False)
     assert not end.inliers[loops[:4]].any()
     assert end.inliers[loops[4:]].all()
     poses = end.problem.unpack(end.end.values).poses
@@ -151,7 +153,7 @@ def test_a_wrong_loop_that_bends_the_map_to_itself_is_taken_out_and_a_right_one_
     assert error.mean() < 0.7 * np.linalg.norm(begun.poses[:, :2] - clean[:, :2], axis=1).mean()
     # nothing to do where all is right
     problem = BatchProblem(net)
-    same = settle(problem, problem.pack(values_of(net, clean)), np.ones(len(net.edges), bool), limit)
+    same = leave_one_out_test(problem, problem.pack(network_values(net, clean)), np.ones(len(net.edges), bool), limit)
     assert same.inliers.all()
     assert same.rounds == 1
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.app.solve_file import solve_file
+from graphslam.app.solve_file import solve_network_file
 from graphslam.core.errors import (
     ConfigError,
     CovarianceError,
@@ -18,15 +18,15 @@ from graphslam.core.errors import (
     UnknownNameError,
 )
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import problem_of_network, values_of
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.io.network_file import read_network
-from graphslam.solve.descent import limits_of, polish
+from graphslam.solve.descent import descend_to_minimum, limits_of
 from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.incremental import Isam2Options, insertion_order, run_isam2
 from graphslam.solve.network.multistart import best_of_starts, canonical_start
 from graphslam.solve.network.solve import SOLVERS, solve_network
-from graphslam.solve.sparse import PcgProblem, SparseProblem, factor, pcg
+from graphslam.solve.sparse import PcgProblem, SparseProblem, factorise_sparse, pcg
 from tests.reference.best_known import BEST_KNOWN, SMALL
 from tests.reference.plain_network import objective
 from tests.reference.slow_pose_network import SlowSolver
@@ -40,7 +40,7 @@ AGREE = 1e-7
 @pytest.mark.parametrize("solver", ["lm", "isam2", "pcg"])
 @pytest.mark.parametrize("name", SMALL)
 def test_small_files_reach_the_best_known_objective(data_dir: Path, name: str, solver: str) -> None:
-    report = solve_file(data_dir / name, solver)
+    report = solve_network_file(data_dir / name, solver)
     assert report["objective"] == pytest.approx(BEST_KNOWN[name], rel=AGREE)
     assert report["converged"]
     assert report["gap"] <= AGREE * report["objective"]
@@ -74,7 +74,7 @@ def test_chordal_start_wins_where_the_file_start_is_a_local_minimum(data_dir: Pa
     assert [r.status for r in optimum.reports] == ["converged", "rejected"]
     # the rejection is right: left alone for longer, that start is still nowhere near
     problem = BatchProblem(net)
-    alone = polish(problem, problem.pack(canonical_start(net)), max_iterations=20)
+    alone = descend_to_minimum(problem, problem.pack(canonical_start(net)), max_iterations=20)
     assert alone.objective > 2.0 * optimum.best.objective
 
 
@@ -176,7 +176,7 @@ def test_gnc_finds_planted_outliers_and_reports_what_they_cost(rng: np.random.Ge
 def test_convergence_is_a_claim_about_the_objective_not_about_effort(rng: np.random.Generator) -> None:
     net, poses, _ = random_network(rng, 3, noise=0.1)
     problem = BatchProblem(net)
-    end = polish(problem, problem.pack(values_of(net, poses)))
+    end = descend_to_minimum(problem, problem.pack(network_values(net, poses)))
     assert end.converged
     # a point that is off by a predicted 1e-6 of the objective is not converged; the prediction is right
     step = np.zeros(problem.flat.layout.size)
@@ -186,7 +186,7 @@ def test_convergence_is_a_claim_about_the_objective_not_about_effort(rng: np.ran
     assert problem.decrement(values) == pytest.approx(missing, rel=0.05)
     assert not limits_of(net.residuals).reached(problem.objective(values), problem.decrement(values))
     # out of iterations is said
-    short = polish(problem, values, max_iterations=1)
+    short = descend_to_minimum(problem, values, max_iterations=1)
     assert short.status != "converged" or short.decrement <= 1e-9 * short.objective
 
 
@@ -201,10 +201,10 @@ def test_pcg_error_estimate_is_honest_on_a_long_chain(rng: np.random.Generator) 
     z[-1] = [n - 1.0, 0.0, 0.0]
     net = PoseNetwork(2, np.arange(n), poses, np.ones(n, bool), edges, z, np.tile(np.eye(3), (n, 1, 1)))
     problem = PcgProblem(problem_of_network(net))
-    values = values_of(net, poses)
+    values = network_values(net, poses)
     system = problem.flat.evaluate(values, dense=False)
     H, b = system.A, -system.g
-    exact = factor(H).solve(b)
+    exact = factorise_sparse(H).solve(b)
 
     def error(x: np.ndarray) -> float:
         return float(np.sqrt((x - exact) @ (H @ (x - exact)) / (exact @ (H @ exact))))
@@ -246,7 +246,7 @@ def test_undetermined_networks_are_named(rng: np.random.Generator, tmp_path: Pat
     write_g2o(tmp_path / "two.g2o", broken)
     for solver in SOLVERS:
         with pytest.raises(IndeterminateError) as caught:
-            solve_file(tmp_path / "two.g2o", solver)
+            solve_network_file(tmp_path / "two.g2o", solver)
         # vertex 13 has no edge, 14 to 16 are an island
         assert caught.value.variables == ("vertex 13", "vertex 14", "vertex 15", "vertex 16")
         assert "needs an edge to the rest, or a FIX" in str(caught.value)
@@ -260,7 +260,7 @@ def test_landmark_never_seen_is_named(tmp_path: Path) -> None:
     path = tmp_path / "m.g2o"
     path.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_XY 9 1 1\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     with pytest.raises(IndeterminateError, match="landmark 9 is not connected"):
-        solve_file(path)
+        solve_network_file(path)
 
 
 def test_unknown_names_and_options_are_refused(rng: np.random.Generator) -> None:
@@ -287,8 +287,8 @@ def test_solve_file_repairs_on_request_counts_and_writes(rng: np.random.Generato
     bad = tmp_path / "bad.g2o"
     bad.write_text("\n".join(lines))
     with pytest.raises(CovarianceError, match=r"indefinite: 9 -> 10"):
-        solve_file(bad)
-    report = solve_file(bad, repair=True, out=tmp_path / "out.g2o.xz")
+        solve_network_file(bad)
+    report = solve_network_file(bad, repair=True, out=tmp_path / "out.g2o.xz")
     assert report["repaired"] == 1
     assert report["converged"]
     back = read_g2o(tmp_path / "out.g2o.xz")
@@ -299,8 +299,8 @@ def test_solve_file_repairs_on_request_counts_and_writes(rng: np.random.Generato
 def test_sparse_and_gtsam_problems_take_the_same_step(rng: np.random.Generator) -> None:
     net, poses, points = random_network(rng, 2, noise=0.05, marks="bearing-range")
     ours, theirs = SparseProblem(problem_of_network(net)), BatchProblem(net)
-    a, fall, _ = ours.newton_step(values_of(net, poses, points))
-    values, predicted, _ = theirs.newton_step(theirs.pack(values_of(net, poses, points)))
+    a, fall, _ = ours.newton_step(network_values(net, poses, points))
+    values, predicted, _ = theirs.newton_step(theirs.pack(network_values(net, poses, points)))
     b = theirs.unpack(values)
     # GTSAM holds the gauge by a prior that is exact here (its mean is the start)
     assert fall == pytest.approx(predicted, rel=1e-8)

@@ -36,7 +36,7 @@ from graphslam.core.se3 import (
 from graphslam.graph.factors.attitude import up_turn
 from graphslam.graph.factors.batch import UniformBatch
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
-from graphslam.graph.variables import Layout
+from graphslam.graph.variables import VariableLayout
 
 WIDTHS = {"x_i": 6, "v_i": 3, "b_i": 6, "x_j": 6, "v_j": 3, "b_j": 6, "tilt": 2}
 XI, VI, BI, XJ, VJ, BJ, TILT = (
@@ -46,7 +46,7 @@ GYRO_ROWS = np.r_[0:3, 9:15]
 GYRO_COLUMNS = np.r_[XI, BI, XJ, BJ]
 
 
-class Ways:
+class PreintegrationArrays:
     """The constants of preintegrated ways, one row each (:class:`~graphslam.graph.factors.imu.records.ImuRecord`)."""
 
     def __init__(self, records: Sequence[ImuRecord]) -> None:
@@ -61,8 +61,8 @@ class Ways:
         self.ad_i, self.ad_j = se3_adjoint(se3_inverse(self.L_i)), se3_adjoint(se3_inverse(self.L_j))
 
 
-def way_terms(
-    ways: Ways, x_i: Array, v_i: Array, b_i: Array, x_j: Array, v_j: Array, b_j: Array, tilt: Array
+def preintegration_terms(
+    ways: PreintegrationArrays, x_i: Array, v_i: Array, b_i: Array, x_j: Array, v_j: Array, b_j: Array, tilt: Array
 ) -> tuple[Array, Array]:
     """Residuals ``(k, 15)`` and Jacobians ``(k, 15, 32)`` on (x_i, v_i, b_i, x_j, v_j, b_j, tilt), not whitened.
 
@@ -138,9 +138,9 @@ class ImuBatch(UniformBatch):
     record = ImuRecord
     slots = ("x", "velocity", "imubias", "x", "velocity", "imubias", "tilt")
 
-    def __init__(self, records: Sequence[ImuRecord], layout: Layout) -> None:
+    def __init__(self, records: Sequence[ImuRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
-        self._ways = Ways(records)
+        self._ways = PreintegrationArrays(records)
 
     @staticmethod
     def keys(record: ImuRecord) -> Sequence[int | None]:
@@ -151,7 +151,7 @@ class ImuBatch(UniformBatch):
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         x_i, v_i, b_i, x_j, v_j, b_j, tilt = blocks
-        return way_terms(self._ways, x_i, v_i, b_i, x_j, v_j, b_j, tilt[0])
+        return preintegration_terms(self._ways, x_i, v_i, b_i, x_j, v_j, b_j, tilt[0])
 
 
 class GyroBatch(UniformBatch):
@@ -160,9 +160,9 @@ class GyroBatch(UniformBatch):
     record = GyroRecord
     slots = ("x", "imubias", "x", "imubias")
 
-    def __init__(self, records: Sequence[GyroRecord], layout: Layout) -> None:
+    def __init__(self, records: Sequence[GyroRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
-        self._ways = Ways(records)
+        self._ways = PreintegrationArrays(records)
 
     @staticmethod
     def keys(record: GyroRecord) -> Sequence[int | None]:
@@ -173,7 +173,7 @@ class GyroBatch(UniformBatch):
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         x_i, b_i, x_j, b_j = blocks
         none = np.zeros((len(self), 3))
-        r, J = way_terms(self._ways, x_i, none, b_i, x_j, none, b_j, np.zeros(2))
+        r, J = preintegration_terms(self._ways, x_i, none, b_i, x_j, none, b_j, np.zeros(2))
         return r[:, GYRO_ROWS], J[:, GYRO_ROWS][:, :, GYRO_COLUMNS]
 
 
@@ -207,7 +207,7 @@ class ForceBatch(UniformBatch):
     record = ForceRecord
     slots = ("x", "imubias", "tilt")
 
-    def __init__(self, records: Sequence[ForceRecord], layout: Layout) -> None:
+    def __init__(self, records: Sequence[ForceRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
         self._L = np.array([r.T_node_imu for r in records]).reshape(-1, 7)
         self._force = np.array([r.force for r in records]).reshape(-1, 3)

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
 from graphslam.core.se3 import se3_adjoint, se3_inverse, so3_exp
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.noise import Robust
+from graphslam.graph.noise import RobustKernel
 from graphslam.graph.submap_node import SubmapNode
 from graphslam.graph.variables import Values
 
@@ -41,7 +41,7 @@ class ImuConfig:
         A body that moves less than this in a window may be still [m]; that it is, the readings must say, too.
     axes : {"refuse", "warn", "ignore"}
         What to do with an IMU whose readings contradict its mounting (:mod:`graphslam.graph.factors.imu.axes`).
-    robust : Robust
+    robust : RobustKernel
         Kernel on every way.
     """
 
@@ -53,7 +53,7 @@ class ImuConfig:
     acceleration: float = 0.3
     still: float = 0.05
     axes: Literal["refuse", "warn", "ignore"] = "refuse"
-    robust: Robust = spelled(Robust("none", 2.385), robust="kind", robust_width="k")
+    robust: RobustKernel = flattened_field(RobustKernel("none", 2.385), robust="kind", robust_width="k")
 
     def __post_init__(self) -> None:
         for name in ("longest", "pause", "window", "acceleration", "still"):
@@ -69,7 +69,7 @@ class ImuConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class BodyPlace:
     """Where the body is on a node, by the submap that holds both.
 
     Parameters
@@ -92,14 +92,14 @@ class Place:
         return SE3.compose(self.T_node_body, T_base_imu), A @ self.covariance @ A.T
 
 
-def places_of(submaps: Sequence[SubmapNode], window: float) -> dict[int, Place]:
+def places_on_nodes(submaps: Sequence[SubmapNode], window: float) -> dict[int, BodyPlace]:
     """Where the body is on every node that a path says it of.
 
     A base (or the node where one submap ends and the next begins) is a frame that may have been levelled: the body is
     where the path that begins there says. On inner nodes it is the node itself. The last exit is where the last path
     ends.
     """
-    out: dict[int, Place] = {}
+    out: dict[int, BodyPlace] = {}
     for s in submaps:
         path = s.trajectory
         if path is None or len(path) < 2 or path.dim != 3:
@@ -115,15 +115,15 @@ def places_of(submaps: Sequence[SubmapNode], window: float) -> dict[int, Place]:
             P = np.zeros((len(inner), 6, 6)) if P is None else P
             for k, Tk, Pk in zip(inner, T, P):
                 t = float(s.times[k])
-                out[s.nodes[k]] = Place(t, Tk, Pk if k == 0 else np.zeros((6, 6)), moved(t))
+                out[s.nodes[k]] = BodyPlace(t, Tk, Pk if k == 0 else np.zeros((6, 6)), moved(t))
         t = float(s.times[-1])
         if path.times[0] <= t <= path.times[-1] + 1e-9:
             T_end = path.interpolate(min(t, float(path.times[-1])))[0]
-            out[s.exit_node] = Place(t, SE3.between(s.T_base_node[-1], T_end), np.zeros((6, 6)), moved(t))
+            out[s.exit_node] = BodyPlace(t, SE3.between(s.T_base_node[-1], T_end), np.zeros((6, 6)), moved(t))
     return out
 
 
-def path_of(submaps: Sequence[SubmapNode], values: Values) -> Trajectory:
+def body_path(submaps: Sequence[SubmapNode], values: Values) -> Trajectory:
     """Path of the body in the level frame at the first base, by rigid submaps at their nodes."""
     times, poses = [np.zeros(0)], [np.zeros((0, 7))]
     level = SE3.identity.copy()

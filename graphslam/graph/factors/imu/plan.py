@@ -11,8 +11,8 @@ import numpy as np
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
-from graphslam.graph.factors.batch import Record
-from graphslam.graph.factors.imu.config import ImuConfig, Place
+from graphslam.graph.factors.batch import FactorRecord
+from graphslam.graph.factors.imu.config import BodyPlace, ImuConfig
 from graphslam.graph.factors.imu.preintegration import longest_pause
 from graphslam.graph.factors.imu.records import ForceRecord, ImuRecord
 from graphslam.graph.submap_node import SubmapNode
@@ -22,7 +22,7 @@ FEWEST = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ImuFactorPlan:
     """What readings become.
 
     Parameters
@@ -40,15 +40,15 @@ class Plan:
     dropped: Counter[str]
 
 
-def plan_of(
+def plan_factors(
     submaps: Sequence[SubmapNode],
-    records: Collection[Record],
+    records: Collection[FactorRecord],
     imu: Imu,
     stream: str,
     cfg: ImuConfig,
-    places: dict[int, Place],
+    places: dict[int, BodyPlace],
     waiting: int | None = None,
-) -> Plan:
+) -> ImuFactorPlan:
     """Pairs and nodes that get factors, besides those of ``records``, and a count of those that get none by reason.
 
     A node whose next one is still ``waiting`` for its submap may get a way to it: it does not see gravity yet.
@@ -74,7 +74,7 @@ def plan_of(
     for n, place in sorted(places.items(), key=lambda item: item[1].time):
         if not (cfg.gravity and cfg.accelerometer) or n in near:
             continue
-        begin, end = window_of(place.time, cfg)
+        begin, end = force_window(place.time, cfg)
         if n in heard:
             last = end
             continue
@@ -85,15 +85,15 @@ def plan_of(
         elif begin >= last:
             gravity.append(n)
             last = end
-    return Plan(pairs, gravity, dropped)
+    return ImuFactorPlan(pairs, gravity, dropped)
 
 
-def window_of(t: float, cfg: ImuConfig) -> tuple[float, float]:
+def force_window(t: float, cfg: ImuConfig) -> tuple[float, float]:
     """Over which the specific force about an instant is averaged."""
     return float(t) - 0.5 * cfg.window, float(t) + 0.5 * cfg.window
 
 
-def joined(old: Imu, new: Imu, stream: str) -> Imu:
+def join_readings(old: Imu, new: Imu, stream: str) -> Imu:
     """One IMU's readings in two portions."""
     if len(new.times) == 0:
         return old
@@ -113,7 +113,7 @@ def joined(old: Imu, new: Imu, stream: str) -> Imu:
     )
 
 
-def _why_not(a: Place | None, b: Place | None, t: Array, longest: float, pause: float) -> str:
+def _why_not(a: BodyPlace | None, b: BodyPlace | None, t: Array, longest: float, pause: float) -> str:
     """Why there is no way between two nodes; empty if there is one."""
     if a is None or b is None:
         return "the path does not reach the node"

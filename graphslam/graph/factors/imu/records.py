@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from graphslam.core.geometry import Array
-from graphslam.graph.noise import NO_KERNEL, Robust
+from graphslam.graph.noise import NO_KERNEL, RobustKernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +51,7 @@ class ImuRecord:
     bias: Array
     whitener: Array
     local: Array
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "imu"
 
     @property
@@ -139,7 +139,7 @@ class ForceRecord:
     T_node_imu: Array
     force: Array
     whitener: Array
-    robust: Robust = NO_KERNEL
+    robust: RobustKernel = NO_KERNEL
     group: str = "imu-gravity"
 
     @property

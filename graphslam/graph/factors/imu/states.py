@@ -47,7 +47,7 @@ class ImuStates:
         return cls(tuple(sorted(time, key=time.__getitem__)), time, velocity, bias)
 
 
-def links_wanted(
+def required_bias_links(
     states: ImuStates, records: Iterable[Any], stream: str, noise: ImuNoise
 ) -> dict[tuple[int | None, int], Array]:
     """(bias before or None, bias) → σ ``(6,)``: the start of the first, and walks where no way ties two."""
@@ -62,7 +62,7 @@ def links_wanted(
     return out
 
 
-def compacted(records: Mapping[int, Any]) -> tuple[dict[int, Any], list[int], list[int]]:
+def renumber_states(records: Mapping[int, Any]) -> tuple[dict[int, Any], list[int], list[int]]:
     """Records with the rows of velocities and biases counted anew, as far as they change, and the old rows kept."""
     v = sorted({k for r in records.values() if isinstance(r, ImuRecord) for k in r.velocities if k >= 0})
     b = sorted(

@@ -17,12 +17,12 @@ from graphslam.core.errors import DataError, SolverError
 from graphslam.core.geometry import Array, ArrayLike, rotation2, se2_adjoint, se2_compose, se2_inverse
 from graphslam.core.records import LandmarkObservations
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.between import BetweenBatch
 from graphslam.graph.factors.sighting import SightingBatch
-from graphslam.graph.flat import FlatGraph
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import limits_of, polish
+from graphslam.solve.descent import descend_to_minimum, limits_of
 from graphslam.solve.sparse import SparseProblem
 
 Ids = npt.NDArray[np.int64]
@@ -124,9 +124,9 @@ def full_batch(
         BetweenBatch.of_arrays(np.column_stack([steps, steps + 1]), measured, W, layout),
         SightingBatch.of_arrays(seen, z, True, (1.0 / sigma)[:, :, None] * np.eye(2), layout),
     ]
-    flat = FlatGraph((), layout, batches)
+    flat = FactorArrays((), layout, batches)
     problem = SparseProblem(flat)
-    best = polish(problem, values, max_iterations=max_iterations)
+    best = descend_to_minimum(problem, values, max_iterations=max_iterations)
     if not np.isfinite(best.objective):
         raise SolverError(f"full batch diverged: objective {best.objective}; wanted a finite one")
     return FullBatch(

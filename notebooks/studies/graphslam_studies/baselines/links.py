@@ -13,7 +13,7 @@ from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se
 from graphslam.skeleton.problem import SkeletonProblem
 
 
-class Links(NamedTuple):
+class RelativeLinks(NamedTuple):
     """Relative poses with what is known of them, once and for all.
 
     Parameters
@@ -30,7 +30,7 @@ class Links(NamedTuple):
     information: Array
 
 
-def relative_links(problem: SkeletonProblem, *, shared: int = 4, gap: int = 20) -> Links:
+def relative_links(problem: SkeletonProblem, *, shared: int = 4, gap: int = 20) -> RelativeLinks:
     """Links of every pose to the one before and, of each earlier pass, to the pose with which it shares most landmarks.
 
     Each is the least-squares alignment of the two point sets, weighted by the noise of both. A measurement has a part
@@ -53,7 +53,7 @@ def relative_links(problem: SkeletonProblem, *, shared: int = 4, gap: int = 20) 
                 with_pose.setdefault(k, []).append((other, m))
         for k in _chosen(i, {k: len(v) for k, v in with_pose.items()}, shared, gap):
             a, b = np.array(with_pose[k]).T
-            T, info = align(problem, problem.points[a].astype(np.float64), problem.points[b].astype(np.float64))
+            T, info = align_points(problem, problem.points[a].astype(np.float64), problem.points[b].astype(np.float64))
             edges.append((k, i))
             measured.append(T)
             information.append(info)
@@ -61,7 +61,7 @@ def relative_links(problem: SkeletonProblem, *, shared: int = 4, gap: int = 20) 
             seen.setdefault(int(problem.landmark[m]), []).append((i, m))
     if not edges:
         raise DataError("no two poses share enough landmarks for a link", wanted=f"{shared} landmarks")
-    return Links(np.array(edges, dtype=np.int64), np.array(measured), np.array(information))
+    return RelativeLinks(np.array(edges, dtype=np.int64), np.array(measured), np.array(information))
 
 
 def _chosen(i: int, counts: dict[int, int], shared: int, gap: int) -> list[int]:
@@ -77,7 +77,7 @@ def _chosen(i: int, counts: dict[int, int], shared: int, gap: int) -> list[int]:
     return out
 
 
-def align(problem: SkeletonProblem, a: Array, b: Array, iterations: int = 5) -> tuple[Array, Array]:
+def align_points(problem: SkeletonProblem, a: Array, b: Array, iterations: int = 5) -> tuple[Array, Array]:
     """Pose of the points ``b (n, 3)`` in the frame of ``a``, and its information."""
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     U, _, Vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))

@@ -22,12 +22,12 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import Consistency, nees, vector_pose_error
 from graphslam.join.ekf import join_ekf
-from graphslam.join.joined_map import MapView, landmark_scalars, pose_scalars
+from graphslam.join.joined_map import JoinedMapView, landmark_scalars, pose_scalars
 from graphslam.join.online import RelinearisationPolicy, join_online
+from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
-from graphslam.join.polish import polish
 from graphslam.join.submap_blocks import SubmapProblem, check_identified
-from graphslam.join.submap_solver import SubmapEstimate, minimise
+from graphslam.join.submap_solver import SubmapEstimate, minimise_submaps
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ def objectives_along(submaps: Sequence[Submap], method: str, *, progress: bool =
         return _isam2_along(submaps, progress=progress)
     found = np.empty(len(submaps))
 
-    def note(k: int, view: MapView) -> None:
+    def note(k: int, view: JoinedMapView) -> None:
         x = view.x[np.concatenate([pose_scalars(view.pose_at).ravel(), landmark_scalars(view.landmark_at).ravel()])]
         # both number their landmarks by first sighting; headings need no wrapping, residuals are wrapped
         found[k] = SubmapProblem(submaps[: k + 1], ids=[view.ids[e] for e in view.entries]).objective(x)
@@ -154,7 +154,7 @@ def pose_consistency_along(
             raise UnknownNameError("method with covariances along a sequence", method, _JOINERS)
         d2 = np.empty(len(submaps))
 
-        def note(k: int, view: MapView, d2: Array = d2) -> None:
+        def note(k: int, view: JoinedMapView, d2: Array = d2) -> None:
             d2[k] = nees(vector_pose_error(view.pose(), ends[k]), view.pose_covariance())
 
         _JOINERS[method](submaps, on_join=note, progress=progress)
@@ -195,7 +195,7 @@ def gap_by_tree(submaps: Sequence[Submap], *, classical: bool = False, progress:
     for level, first, end in tqdm(spans, desc="tree", unit="join", disable=not progress):
         below = submaps[first:end]
         joined = join_tree(below, classical=classical)
-        best = polish(below, joined).objective_polished
+        best = optimise_from_join(below, joined).objective_polished
         assert best is not None
         gap = joined.objective - best
         middle = first + 2 ** (level - 1)
@@ -215,8 +215,8 @@ def polish_history(
     start : SubmapEstimate, optional
         Map to start from, of these submaps and unpolished; default the chain of submaps.
     rtol, max_iterations
-        See :func:`~graphslam.join.submap_solver.minimise`.
+        See :func:`~graphslam.join.submap_solver.minimise_submaps`.
     """
     problem = SubmapProblem(submaps)
     x = problem.initial() if start is None else problem.initial(start.poses[1:], start.landmarks)
-    return np.array(minimise(problem, x, rtol=rtol, max_iterations=max_iterations).history)
+    return np.array(minimise_submaps(problem, x, rtol=rtol, max_iterations=max_iterations).history)

@@ -87,7 +87,7 @@ def relation_error(estimate: Trajectory, reference: Trajectory, pairs: tuple[Ind
     )
 
 
-def covered(reference: Trajectory, estimate: Trajectory) -> Trajectory:
+def covered_part(reference: Trajectory, estimate: Trajectory) -> Trajectory:
     """The part of the reference that the estimate covers in time."""
     inside = (reference.times >= estimate.times[0]) & (reference.times <= estimate.times[-1])
     return reference.take(np.flatnonzero(inside))

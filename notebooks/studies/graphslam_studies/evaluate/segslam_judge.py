@@ -9,24 +9,30 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.geometry import Array, arc_length, wrap_angle
-from graphslam.core.poses import group_of, heading_of, level
+from graphslam.core.poses import group_of, heading_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.entropy import Clarity, clarity_of, placements
+from graphslam.maps.entropy import MapEntropy, grid_placements, mean_map_entropy
 from graphslam.sim.route import Route
-from graphslam_frontends.grid.filter_drift import FilterDrift
-from graphslam_frontends.grid.motion import move, tilted
+from graphslam_frontends.grid.filter_error_model import FilterDrift
+from graphslam_frontends.grid.motion import move_poses, with_roll_pitch
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.config import HandoverConfig
-from graphslam_frontends.segslam.covariance import Nees, exit_nees
-from graphslam_frontends.segslam.paths import concatenate
+from graphslam_frontends.segslam.covariance import ExitNees, exit_nees
+from graphslam_frontends.segslam.paths import concatenate_segments
 from graphslam_frontends.segslam.result import SegSlamResult
-from graphslam_frontends.segslam.sampling import draw_weights, grow, nearest_step, root_of_segment
+from graphslam_frontends.segslam.sampling import draw_weights, grow_sample, nearest_step, root_of_segment
 from graphslam_frontends.segslam.segmap import MATCH, SegMap
-from graphslam_frontends.segslam.submaps import Drift, drift_by_errors, drift_by_path, settle, settled_chain
+from graphslam_frontends.segslam.submaps import (
+    Drift,
+    common_ancestor_chain,
+    drift_by_errors,
+    drift_by_path,
+    submaps_of_segments,
+)
 
 Ints = npt.NDArray[np.int64]
 
@@ -39,7 +45,7 @@ CLOSED_DISTANCE = 1.0
 def relative(poses: Array) -> Array:
     """Poses ``(n, d)`` in the level frame of the first."""
     group = group_of(poses)
-    return group.between(np.broadcast_to(level(poses[0]), poses.shape), poses)
+    return group.between(np.broadcast_to(remove_roll_pitch(poses[0]), poses.shape), poses)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +80,7 @@ def path_errors(path: Trajectory, truth: Array, final_pose: Array | None = None)
     """
     est, true = relative(path.poses), relative(truth)
     group = group_of(est)
-    last = est[-1] if final_pose is None else group.between(level(path.poses[0]), final_pose)
+    last = est[-1] if final_pose is None else group.between(remove_roll_pitch(path.poses[0]), final_pose)
     reference = Trajectory(path.times, true)
     moved = Trajectory(path.times, est)
     return PathErrors(
@@ -244,13 +250,13 @@ def path_at(result: SegSlamResult, step: int, number: int = 0) -> Trajectory:
     What the filter believes of earlier places depends on where it looks from (A6): at a revisit it is asked there.
     """
     segmap = result.segmap
-    chain = settled_chain(segmap, int(result.closed[result.best]))
+    chain = common_ancestor_chain(segmap, int(result.closed[result.best]))
     t = segmap.table
     inside = chain[(t.start[chain] < step) & (t.end[chain] >= step)]
     at = int(inside[0]) if len(inside) else int(chain[0])
     rng = result.seed.child("visit", step, number).generator()
-    sample = grow(segmap, root_of_segment(segmap, at), rng, weights=draw_weights(segmap))
-    return concatenate(segmap, sample)
+    sample = grow_sample(segmap, root_of_segment(segmap, at), rng, weights=draw_weights(segmap))
+    return concatenate_segments(segmap, sample)
 
 
 def legs(route: Route, arc: Array, shortest: float = 10.0) -> list[tuple[int, int]]:
@@ -291,18 +297,18 @@ class ExitErrors:
     ----------
     lengths : (m,)
         Of the segments [m].
-    default, matched, stated : Nees
+    default, matched, stated : ExitNees
         Particles and drift model; the paper's moment matching; particles and the drift that the motion's noise states
         (as ``default`` where the steps do not know it).
-    blocks : mapping of str to Nees
+    blocks : mapping of str to ExitNees
         ``default`` by block: ``heading``, ``plan``, and in space ``height``.
     """
 
     lengths: Array
-    default: Nees
-    matched: Nees
-    stated: Nees
-    blocks: Mapping[str, Nees]
+    default: ExitNees
+    matched: ExitNees
+    stated: ExitNees
+    blocks: Mapping[str, ExitNees]
 
 
 def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> ExitErrors:
@@ -315,20 +321,20 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     """
     segmap, steps = result.segmap, result.steps
     g = segmap.group
-    chain = settled_chain(segmap, int(result.closed[result.best]))
+    chain = common_ancestor_chain(segmap, int(result.closed[result.best]))
     by_path = drift_by_path(segmap, chain, drift, steps)
     stated: Drift = by_path if steps.errors is None else drift_by_errors(steps.errors, gravity=segmap.gravity)
     made = [
-        settle(segmap, chain, d, HandoverConfig(matched_only=m), with_grids=False)
+        submaps_of_segments(segmap, chain, d, HandoverConfig(matched_only=m), with_grids=False)
         for d, m in ((by_path, False), (by_path, True), (stated, False))
     ]
     t = segmap.table
-    ends = level(truth) if segmap.gravity else truth
+    ends = remove_roll_pitch(truth) if segmap.gravity else truth
     true = g.between(ends[t.start[chain]], ends[t.end[chain]])
     # roll and pitch of level frames are exact by definition
     components = (2, 3, 4, 5) if segmap.gravity else None
 
-    def score(made: Sequence[Submap], components: Sequence[int] | None) -> Nees:
+    def score(made: Sequence[Submap], components: Sequence[int] | None) -> ExitNees:
         poses, covariances = (np.array([getattr(s, f"exit_{what}") for s in made]) for what in ("pose", "covariance"))
         return exit_nees(poses, covariances, true, components=components)
 
@@ -339,7 +345,7 @@ def exit_errors(result: SegSlamResult, truth: Array, drift: FilterDrift) -> Exit
     return ExitErrors(lengths, scores[0], scores[1], scores[2], by_block)
 
 
-def end_errors(submap: Submap, truth: Array) -> dict[str, Nees]:
+def end_errors(submap: Submap, truth: Array) -> dict[str, ExitNees]:
     """Where a submap of a whole log ends, in space: all four components that are not gravity's (``""``), and by block.
 
     Parameters
@@ -348,7 +354,7 @@ def end_errors(submap: Submap, truth: Array) -> dict[str, Nees]:
         At the steps.
     """
     g = group_of(truth)
-    true = g.between(level(truth[0]), truth[-1])
+    true = g.between(remove_roll_pitch(truth[0]), truth[-1])
     blocks = {"": (2, 3, 4, 5), "heading": (2,), "plan": (3, 4), "height": (5,)}
     return {k: exit_nees(submap.exit_pose, submap.exit_covariance[None], true, components=c) for k, c in blocks.items()}
 
@@ -365,7 +371,7 @@ def fused_grid(steps: Steps, path: Array, *, voxel_size: float = 0.2, model: Bea
 
 def clarity(
     steps: Steps, path: Array, *, voxel_size: float = 0.2, model: BeamModel | None = None, count: int = 1
-) -> Clarity:
+) -> MapEntropy:
     """Entropy of all scans along a path ``(n, d)``, in grids that stand in ``count`` different ways.
 
     Where the voxels lie counts: a floor in the middle of its layer is clear, one between two layers is not. A filter
@@ -375,9 +381,9 @@ def clarity(
     group = group_of(path)
     grids = [
         fused_grid(steps, group.compose(np.broadcast_to(T, path.shape), path), voxel_size=voxel_size, model=model)
-        for T in placements(count, voxel_size, steps.dim)
+        for T in grid_placements(count, voxel_size, steps.dim)
     ]
-    return clarity_of(grids)
+    return mean_map_entropy(grids)
 
 
 def quarters(seconds: Array) -> tuple[float, float]:
@@ -399,6 +405,6 @@ def dead_reckoned(steps: Steps) -> Trajectory:
     poses = np.array(steps.odometry.increments)
     poses[0] = group_of(poses).identity
     for k in range(len(poses)):
-        at = poses[:1] if k == 0 else move(poses[k - 1 : k], steps.odometry.increments[k], None)
-        poses[k] = at[0] if steps.tilt is None else tilted(at, steps.tilt[k : k + 1])[0]
+        at = poses[:1] if k == 0 else move_poses(poses[k - 1 : k], steps.odometry.increments[k], None)
+        poses[k] = at[0] if steps.tilt is None else with_roll_pitch(at, steps.tilt[k : k + 1])[0]
     return Trajectory(steps.times, poses)

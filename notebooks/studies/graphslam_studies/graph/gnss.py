@@ -10,18 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.config import spelled
+from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.gnss import Pseudoranges, TangentPlane
 from graphslam.core.poses import SE3
 from graphslam.core.records import Odometry
+from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.odometer import OdometerPriorRecord, OdometerRecord
 from graphslam.graph.factors.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
 from graphslam.graph.gps import datum_columns, start_datum
-from graphslam.graph.graph_record import GraphRecord
-from graphslam.graph.noise import NO_KERNEL, Robust, covariance_whiteners
+from graphslam.graph.noise import NO_KERNEL, RobustKernel, covariance_whiteners
 
 Index = npt.NDArray[np.int64]
 UNKNOWNS = 4
@@ -54,7 +54,7 @@ class PseudorangeConfig:
     """Walk of the receiver's clock beside its drift [m/√s]."""
     drift_walk: float = 0.05
     """Walk of that drift [m/s/√s]."""
-    robust: Robust = spelled(NO_KERNEL, robust="kind", robust_width="k")
+    robust: RobustKernel = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each pseudorange, and its width in standard deviations."""
 
     def __post_init__(self) -> None:
@@ -87,13 +87,13 @@ class OdometerConfig:
 
 
 def add_odometer(
-    graph: GraphRecord, odometry: Odometry, *, stream: str = "odometry", config: OdometerConfig | None = None
+    graph: FactorGraphState, odometry: Odometry, *, stream: str = "odometry", config: OdometerConfig | None = None
 ) -> Index:
     """A node at every record of an odometry in space, from node 0 on; bias of the turn rate and scale are solved for.
 
     Parameters
     ----------
-    graph : GraphRecord
+    graph : FactorGraphState
         In space, with the first base alone.
     stream : str
         Its name in the ledger.
@@ -124,12 +124,12 @@ def add_odometer(
     graph.insert(OdometerPriorRecord(graph.next_factor(), row, (cfg.rate_sigma, cfg.scale_sigma)))
     for k in range(n - 1):
         graph.insert(OdometerRecord(graph.next_factor(), k, k + 1, row, twists[k], float(seconds[k]), W[k]))
-    graph.note("odometer", stream=stream, nodes=n)
+    graph.log_event("odometer", stream=stream, nodes=n)
     return np.arange(n)
 
 
 def add_pseudoranges(
-    graph: GraphRecord,
+    graph: FactorGraphState,
     ranges: Pseudoranges,
     plane: TangentPlane,
     nodes: npt.ArrayLike,
@@ -143,7 +143,7 @@ def add_pseudoranges(
 
     Parameters
     ----------
-    graph : GraphRecord
+    graph : FactorGraphState
         In space, with nodes that have start values.
     plane : TangentPlane
         East, north and up of the GPS frame.
@@ -186,7 +186,7 @@ def add_pseudoranges(
         up = float(np.median(fixes[:, 2] - world[:, 2]))
         graph.values.datum = np.array([*level[:2], up, level[2]])
         graph.gps_origin = np.zeros(3)
-        graph.note("datum", fixes=len(enough), T_gps_world=graph.values.datum.tolist())
+        graph.log_event("datum", fixes=len(enough), T_gps_world=graph.values.datum.tolist())
     clocks = _add_clocks(graph, ranges.times[epochs], ranges.times[enough], fixes[:, 3], cfg)
     clock_of = dict(zip(epochs.tolist(), clocks))
     own = _add_biases(graph, ranges, used, growth, cfg)
@@ -205,7 +205,7 @@ def add_pseudoranges(
         )  # fmt: skip
         ids.append(fid)
     left = len(ranges.ranges) - len(used)
-    graph.note("pseudoranges", stream=stream, factors=len(ids), epochs=len(epochs), dropped=left)
+    graph.log_event("pseudoranges", stream=stream, factors=len(ids), epochs=len(epochs), dropped=left)
     return ids
 
 
@@ -227,7 +227,9 @@ def _fix(satellites: Array, distances: Array, sigma: Array) -> Array:
     return x
 
 
-def _add_clocks(graph: GraphRecord, times: Array, known: Array, offsets: Array, cfg: PseudorangeConfig) -> list[int]:
+def _add_clocks(
+    graph: FactorGraphState, times: Array, known: Array, offsets: Array, cfg: PseudorangeConfig
+) -> list[int]:
     """Rows of the clocks of all epochs, tied to each other; they start on a robust straight line."""
     drift = float(np.median(np.diff(offsets) / np.diff(known)))
     line = float(np.median(offsets - drift * known)) + drift * times
@@ -239,7 +241,7 @@ def _add_clocks(graph: GraphRecord, times: Array, known: Array, offsets: Array, 
 
 
 def _add_biases(
-    graph: GraphRecord, ranges: Pseudoranges, used: Index, growth: Array, cfg: PseudorangeConfig
+    graph: FactorGraphState, ranges: Pseudoranges, used: Index, growth: Array, cfg: PseudorangeConfig
 ) -> list[int | None]:
     """Row of ``satbias`` of every used pseudorange.
 
@@ -273,7 +275,7 @@ def _add_biases(
     return out
 
 
-def _add_systems(graph: GraphRecord, systems: Index) -> dict[int, int]:
+def _add_systems(graph: FactorGraphState, systems: Index) -> dict[int, int]:
     """Row of ``satbias`` of every system but the one that is seen most: its time is that of the clock."""
     seen, count = np.unique(systems, return_counts=True)
     rows = {}
@@ -285,7 +287,7 @@ def _add_systems(graph: GraphRecord, systems: Index) -> dict[int, int]:
     return rows
 
 
-def antenna_positions(graph: GraphRecord, nodes: npt.ArrayLike, arm: Array) -> tuple[Array, Array]:
+def antenna_positions(graph: FactorGraphState, nodes: npt.ArrayLike, arm: Array) -> tuple[Array, Array]:
     """Where an antenna stands in the GPS frame at nodes, and how sure that is.
 
     Parameters

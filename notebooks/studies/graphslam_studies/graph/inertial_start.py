@@ -72,7 +72,7 @@ def _settled(imu: Imu, times: Array, positions: Array, bias: Array) -> tuple[flo
     return here
 
 
-def turned_on(attitude: Array, imu: Imu, times: Array, bias: Array) -> Array:
+def integrate_attitude(attitude: Array, imu: Imu, times: Array, bias: Array) -> Array:
     """Attitudes ``(n, 4)`` at ``times`` ``(n,)`` by the gyro less its bias ``(3,)``, from that at the first."""
     R = [quat_to_matrix(attitude)]
     for turn in preintegrate(imu, times[:-1], times[1:], np.append(bias, np.zeros(3))).R:

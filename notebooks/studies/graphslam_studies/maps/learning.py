@@ -104,7 +104,8 @@ def fit_weights(
 
 
 def fit_calibration(probability: Array, hazard: npt.NDArray[np.bool_]) -> Array:
-    """Weights ``u, v`` of :func:`~graphslam.maps.terrain.tables.calibrated` by maximum likelihood, ``v > 0``.
+    """Weights ``u, v`` of :func:`~graphslam.maps.terrain.tables.calibrate_probability` by maximum likelihood, ``v >
+    0``.
 
     The noisy-OR was fitted to cells in which slopes weigh more than they are many; here every cell counts once.
 

@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
-from graphslam.core.cluster import connect
+from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.extras import import_extra
 
@@ -235,7 +235,7 @@ def _processes(jobs: Sequence[Job], count: int, prepare: Callable[[], object] | 
 
 def _dask(jobs: Sequence[Job], address: str, prepare: Callable[[], object] | None) -> Generator[Outcome, None, None]:
     distributed = import_extra("distributed", "a Dask cluster")
-    client = connect(address)
+    client = connect_cluster(address)
     try:
         futures = {client.submit(attempt, j.trial, j.seed, prepare, pure=False): j for j in jobs}
         try:

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from graphslam.app.folders.generations import check_links, is_empty, sweep
-from graphslam.app.folders.lock import locked, make_folder
+from graphslam.app.folders.generations import check_links, is_empty, remove_stale_files
+from graphslam.app.folders.lock import lock_folder, make_folder
 from graphslam.core.atomic import read_json, read_npz, sweep_parts, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
 from graphslam.core.npz import flags, floats, ints, texts
@@ -114,13 +114,13 @@ class StudyFolder:
         marker = folder.path / "study.json"
         if not marker.is_file() and not is_empty(folder.path):  # before a lock is put there
             raise RunFolderError(f"{folder.path}: not empty and not a study; choose another --out")
-        with locked(folder.path):
+        with lock_folder(folder.path):
             if marker.is_file():
                 folder._check_same(identity)
             else:
                 check_links(folder.path)
                 write_json(marker, {"format": STUDY_FORMAT, **identity})
-            sweep(folder.path)
+            remove_stale_files(folder.path)
             for trials in (folder.path / "trials").glob("*"):
                 sweep_parts(trials)
             yield folder

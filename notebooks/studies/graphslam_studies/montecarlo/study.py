@@ -15,8 +15,8 @@ from tqdm import tqdm
 from graphslam.app.folders.generations import new_generation
 from graphslam.app.machine import hold_one_thread, one_blas_thread, versions
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
-from graphslam.core.interrupt import heeded_interrupts
-from graphslam.core.markup import element, frame, join, table
+from graphslam.core.interrupt import watch_interrupts
+from graphslam.core.markup import html_element, html_frame, html_table, join_parts
 from graphslam.core.plugins import plugins
 from graphslam_studies.montecarlo.definition import GROUP, StudyDefinition, find_study, fingerprint, source_digest
 from graphslam_studies.montecarlo.executors import Executor, Job, execute
@@ -121,16 +121,16 @@ class Study:
             {"world": w, "runs": n, "failed": int((self.failures["world"] == w).sum())} for w, n in self.runs.items()
         ]
         parts: list[str] = [
-            element("b", f"Study {self.definition.name}"),
+            html_element("b", f"Study {self.definition.name}"),
             f": {self.definition.description}",
-            table(runs, ["world", "runs", "failed"]),
+            html_table(runs, ["world", "runs", "failed"]),
         ]
         try:
             for title, rows in self.report().items():
-                parts += [element("h4", title), frame(rows)]
+                parts += [html_element("h4", title), html_frame(rows)]
         except GraphSlamError as error:
-            parts.append(element("p", f"no report: {error}"))
-        return join(parts)
+            parts.append(html_element("p", f"no report: {error}"))
+        return join_parts(parts)
 
 
 def study(
@@ -198,7 +198,7 @@ def _run(
     )
     try:
         with (
-            heeded_interrupts() as interrupt,
+            watch_interrupts() as interrupt,
             closing(outcomes),  # ends the workers, whatever happens here
             one_blas_thread(),
             tqdm(total=len(wanted), desc=definition.name, disable=not progress) as bar,

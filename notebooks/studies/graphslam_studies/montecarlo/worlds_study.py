@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 import pandas as pd
 
 from graphslam.core.errors import UnknownNameError
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.plots.association import plot_runs
 
@@ -63,5 +63,5 @@ def draw_runs(table: pd.DataFrame, drawn: Mapping[str, str], folder: Path) -> li
     for quantity, label in drawn.items():
         rows = whole(table, quantity)
         if not rows.empty:
-            made.append(save(plot_runs(rows, label=label), folder / f"{quantity}.png"))
+            made.append(save_figure(plot_runs(rows, label=label), folder / f"{quantity}.png"))
     return made

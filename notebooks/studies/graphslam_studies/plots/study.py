@@ -22,7 +22,7 @@ from graphslam.core.geometry import Array, ArrayLike
 from graphslam.plots import style
 from graphslam_studies.evaluate.tables import values_of
 from graphslam_studies.plots.algorithms import algorithm_label, algorithm_line
-from graphslam_studies.plots.study_local import plot_local_honesty as plot_local_honesty
+from graphslam_studies.plots.study_local import plot_local_consistency as plot_local_consistency
 from graphslam_studies.plots.study_table import algorithms_with, curve_of
 from graphslam_studies.plots.study_time import plot_cumulative_time as plot_cumulative_time
 

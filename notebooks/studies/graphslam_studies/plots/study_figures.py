@@ -8,10 +8,10 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.axes import Axes
 
-from graphslam.plots.save import save
+from graphslam.plots.save import save_figure
 from graphslam_studies.plots.algorithms import algorithm_label
 from graphslam_studies.plots.study import plot_ci, plot_error_panels, plot_rms_panels
-from graphslam_studies.plots.study_local import plot_local_honesty
+from graphslam_studies.plots.study_local import plot_local_consistency
 from graphslam_studies.plots.study_table import algorithms_with
 from graphslam_studies.plots.study_time import plot_cumulative_time
 
@@ -40,7 +40,7 @@ def save_paper_figures(table: pd.DataFrame, timings: pd.DataFrame, folder: Path)
         t, seconds = table[table["world"] == world], timings[timings["world"] == world]
 
         def keep(ax: Axes, name: str, world: str = str(world)) -> None:
-            made.append(save(ax, folder / f"{name}-{world}.png"))
+            made.append(save_figure(ax, folder / f"{name}-{world}.png"))
 
         for name in _present(t, "error_x", ERRORS_OF):
             title = f"World {world}: {algorithm_label(name)}, one run"
@@ -58,7 +58,7 @@ def save_paper_figures(table: pd.DataFrame, timings: pd.DataFrame, folder: Path)
                 keep(plot_cumulative_time(None, seconds, algorithms=present, title=f"World {world}"), figure)
         maps = _present(t, "local_joint_nees", LOCAL)
         if maps:
-            keep(plot_local_honesty(None, t, algorithms=maps, title=f"World {world}"), "local-maps")
+            keep(plot_local_consistency(None, t, algorithms=maps, title=f"World {world}"), "local-maps")
     return made
 
 

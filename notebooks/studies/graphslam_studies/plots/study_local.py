@@ -16,7 +16,7 @@ from graphslam_studies.plots.algorithms import algorithm_label, algorithm_line
 from graphslam_studies.plots.study_table import algorithms_with, curve_of
 
 
-def plot_local_honesty(
+def plot_local_consistency(
     ax: Axes | None,
     table: pd.DataFrame,
     *,

@@ -28,7 +28,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.sim.campus import PANNING_MOUNT, Balancing
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import cast_scans, ornstein_uhlenbeck
-from graphslam.sim.drive import DriveConfig, Way
+from graphslam.sim.drive import DriveConfig, SampledRoute
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.raycast import RayCaster
 
@@ -422,7 +422,7 @@ def drive_street(
         yaw = -0.5 * np.pi
     z = street.base(x, y)
     rise = np.gradient(z, 0.02)
-    way = Way(
+    way = SampledRoute(
         step=0.02,
         positions=np.column_stack([x, y, z]),
         yaw=np.full(len(x), yaw),

@@ -1,0 +1,77 @@
+"""Constant errors of wheels and sensor beside a smoothed submap, for a graph to estimate
+(:mod:`graphslam.core.sensor_biases`).
+
+What is measured is taken to be: turns ``b`` too large for each second in motion, or each metre driven; distances too
+long by the factor ``e^s``; ranges too long by ``o``; the sensor turned to the left by ``y``, or ranges that have no
+bearing too long by the factor ``e^y``; the sensor stands ``x`` further ahead, and ``y`` further to the left.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphslam.core.geometry import Array, rotation2, se2_between
+from graphslam.core.sensor_biases import CONSTANTS, SensorBiases
+from graphslam_frontends.landmarks.config import SensorBiasConfig
+from graphslam_frontends.landmarks.fix_points import FixPlacement
+from graphslam_frontends.landmarks.smoothing_kernels import bias_sensitivities
+from graphslam_frontends.landmarks.summarise import SmoothingResult
+
+MOVING = 1e-6
+"""An increment of the odometry that is shorter and turns less is rest [m, rad]."""
+
+
+def estimate_sensor_biases(
+    config: SensorBiasConfig, smoothed: SmoothingResult, seconds: Array, way: FixPlacement | None, *, base: bool
+) -> SensorBiases:
+    """What a smoothed submap is with constant errors, and what it says of them.
+
+    Parameters
+    ----------
+    seconds : (T,)
+        Of each increment of the odometry.
+    way : FixPlacement or None
+        Points of the path at fixes.
+    base : bool
+        The trajectory begins with the base, which does not move.
+    """
+    names, sigmas = config.chosen()
+    evidence, T = smoothed.evidence, len(smoothed.poses)
+    ob, x = evidence.ob, smoothed.poses
+    # errors are shares of the motion and the ranges as smoothed: noise of what was measured would feign a scale
+    u = se2_between(np.concatenate([np.zeros((1, 3)), x[:-1]]), x)
+    still = np.hypot(evidence.u[:, 0], evidence.u[:, 1]) + np.abs(evidence.u[:, 2]) < MOVING
+    at = x[evidence.ob_pose]
+    off = np.einsum("kji,kj->ki", rotation2(at[:, 2]), smoothed.landmarks[evidence.ob_lm] - at[:, :2])
+    off -= evidence.sensor[:2]  # from the sensor, in the axes of the body
+    ranges = np.maximum(np.linalg.norm(off, axis=1), 1e-6)
+    metres = np.hypot(u[:, 0], u[:, 1])
+    R_end = rotation2(u[:, 2])
+    along, seen = np.zeros((T, 3, len(CONSTANTS))), np.zeros((len(ob), 2, len(CONSTANTS)))
+    if names[0]:
+        weight = metres if names[0] == "turn_per_metre" else seconds * ~still
+        half = 0.5 * np.stack([-u[:, 1], u[:, 0]], -1)  # the heading errs by half of it on the way
+        along[:, :2, 0] = weight[:, None] * np.einsum("kji,kj->ki", R_end, half)
+        along[:, 2, 0] = weight
+    if names[1]:
+        along[:, :2, 1] = np.einsum("kji,kj->ki", R_end, u[:, :2])
+    if names[2]:
+        seen[:, 0, 2] = -1.0
+    if names[3] == "range_scale":
+        seen[:, 0, 3] = -ranges
+    elif names[3]:
+        seen[:, 1, 3] = 1.0
+    if names[4]:  # a bearing by its own inverse range has no bound: nearer than its σ a range tells no place
+        ahead, near = off / ranges[:, None], np.maximum(ranges, np.sqrt(ob[:, 2]))
+        seen[:, 0, 4], seen[:, 0, 5] = ahead[:, 0], ahead[:, 1]
+        seen[:, 1, 4], seen[:, 1, 5] = -ahead[:, 1] / near, ahead[:, 0] / near
+    moved, shifted, score, information = bias_sensitivities(smoothed.poses, smoothed.landmarks, evidence, along, seen)
+    exit_moved = moved[-1].copy()
+    exit_moved[:2] = rotation2(smoothed.poses[-1, 2]) @ exit_moved[:2]  # right tangent → plain vector of eq. 15
+    points, before = np.zeros((0, len(CONSTANTS))), np.concatenate([np.zeros((1, 3, len(CONSTANTS))), moved])
+    if way is not None:
+        points = (way.by_first @ before[way.at + 1] + way.by_second @ before[way.at + 2]).reshape(-1, len(CONSTANTS))
+    return SensorBiases(
+        names=names, sigmas=sigmas, response=np.concatenate([exit_moved, shifted]), score=score,
+        information=information, path=before if base else moved, points=points,
+    )  # fmt: skip

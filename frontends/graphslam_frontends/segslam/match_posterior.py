@@ -1,0 +1,204 @@
+"""Which match is believed (A9): gates, weights, and a draw that always holds the null match.
+
+A false match does more harm than ten right ones do good, and nothing on top repairs it; so the gates are strict. What
+passes them is still drawn, not decided: particles hold several topologies at once, and those that chose wrongly lose
+their weight later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.registration import gates
+from graphslam.registration.config import RegistrationConfig
+from graphslam.registration.gates import failed_match_gates, height_between, shift_between, tilt_between
+from graphslam.registration.register import Registration
+from graphslam_frontends.segslam.config import ChoiceConfig
+from graphslam_frontends.segslam.localisation import ScanLocalisation
+from graphslam_frontends.segslam.segmap import MATCH, SegmentEntry
+
+NULL = -1
+"""The draw's answer for no match."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """One registration of what a particle sees into an older map.
+
+    Parameters
+    ----------
+    segment : int
+        The older segment.
+    registration : Registration
+        ``T_map_body`` with its quality.
+    T_prior : (7,) or (3,)
+        Where the map sample puts the body in that map.
+    sigma : float
+        σ of the path-length model at that place [m].
+    rise : float
+        What heights may have drifted by over the way from there to the body [m].
+    localisation : ScanLocalisation or None
+        What the throw-away particle filter says of it.
+    """
+
+    segment: int
+    registration: Registration
+    T_prior: Array
+    sigma: float
+    rise: float = 0.0
+    localisation: ScanLocalisation | None = None
+
+    @property
+    def T(self) -> Array:
+        """The match, ``T_map_body``; of the localisation where there is one."""
+        return self.registration.T_target_source if self.localisation is None else self.localisation.pose
+
+    @property
+    def fitness(self) -> float:
+        """Share of the points it explains."""
+        return self.registration.best_fitness
+
+    @property
+    def shift(self) -> float:
+        """From the prediction to the match, horizontally [m]."""
+        return shift_between(self.T, self.T_prior)
+
+    @property
+    def height(self) -> float:
+        """From the prediction to the match, vertically [m]; 0 in two dimensions."""
+        return height_between(self.T, self.T_prior)
+
+    @property
+    def tilt(self) -> float:
+        """Between the vertical of the match and that of the prediction [rad]; 0 in two dimensions."""
+        return tilt_between(self.T, self.T_prior)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchPosterior:
+    """What became of the proposals of one particle.
+
+    Parameters
+    ----------
+    proposals : tuple of m Proposal
+    why : tuple of m str
+        The gates each fails, in words; empty for those that may be drawn.
+    weights : (m,)
+        Unnormalised (eq. 18, 19); 0 of those that fail.
+    margins : (m,)
+        Fitness less that of the best other place in the same map; 1 where there is none.
+    null : float
+        Weight of no match.
+    """
+
+    proposals: tuple[Proposal, ...]
+    why: tuple[str, ...]
+    weights: Array
+    margins: Array
+    null: float
+
+    @property
+    def accepted(self) -> npt.NDArray[np.int64]:
+        """Those that may be drawn."""
+        return np.flatnonzero(self.weights > 0).astype(np.int64)
+
+    @property
+    def probabilities(self) -> Array:
+        """Of the proposals, and last of no match ``(m + 1,)``."""
+        p = np.append(self.weights, self.null)
+        return np.asarray(p / p.sum())
+
+    def counts(self) -> dict[str, int]:
+        """How many proposals failed each gate (one may fail several), and how many were accepted."""
+        names = Counter(t.split()[0].rstrip(":") for text in self.why for t in text.split("; ") if t)
+        return {**dict(sorted(names.items())), "accepted": len(self.accepted)}
+
+    def draw(self, uniform: float) -> int:
+        """The proposal that a uniform number in [0, 1) chooses, or `NULL`."""
+        k = int(np.searchsorted(np.cumsum(self.probabilities), uniform, side="right"))
+        # rounding of the sum must not choose one without weight
+        return k if k < len(self.proposals) and self.weights[k] > 0 else NULL
+
+    def entry(self, k: int, config: ChoiceConfig) -> SegmentEntry:
+        """How a particle that drew proposal ``k`` enters the older segment."""
+        p = self.proposals[k]
+        return SegmentEntry(
+            T_entry=p.T,
+            kind=MATCH,
+            source=p.segment,
+            covariance=match_covariance(p, config),
+            fitness=p.fitness,
+        )
+
+
+def match_posterior(
+    proposals: Sequence[Proposal], config: ChoiceConfig, registration: RegistrationConfig | None = None
+) -> MatchPosterior:
+    """Gate and weigh the proposals of one particle at one time (A9).
+
+    Gates: those of the registration (fitness, degeneracy, tilt), a finite result, height and shift against the
+    prediction, and a margin to the second place in the same map, whether that passes its own gates or not.
+    Weights: ``exp(-½ ((1 - fitness)/σ_f)²) exp(-½ (shift/σ)²)``, σ of the path-length model (eq. 18); with a
+    localisation ``exp(-½ err_X/σ_e²) exp(-½ |Σ_X|/σ_s²)`` in place of, or beside, the fitness (eq. 19).
+
+    Parameters
+    ----------
+    registration : RegistrationConfig, optional
+        Whose gates are asked; default the standard ones.
+    """
+    rules = RegistrationConfig() if registration is None else registration
+    margins = proposal_margins(proposals, config.mode_distance)
+    why, weights = [], np.zeros(len(proposals))
+    for k, p in enumerate(proposals):
+        fails = _fails(p, float(margins[k]), config, rules)
+        why.append("; ".join(fails))
+        if not fails:
+            weights[k] = math.exp(_log_weight(p, config))
+    return MatchPosterior(
+        proposals=tuple(proposals), why=tuple(why), weights=weights, margins=margins, null=config.null_weight
+    )
+
+
+def proposal_margins(proposals: Sequence[Proposal], apart: float) -> Array:
+    """Fitness of each proposal less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``; see
+    :func:`graphslam.registration.gates.match_margins`."""
+    return gates.match_margins([p.registration for p in proposals], [p.segment for p in proposals], apart)
+
+
+def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
+    """Covariance of ``T_map_body`` of a match ``(d, d)``, right tangent: its own, and what no registration knows."""
+    g = group_of(p.T)
+    floor = np.full(g.dof, config.angle_sigma**2)
+    floor[g.position] = config.position_sigma**2
+    own = p.registration.covariance if p.localisation is None else p.localisation.covariance
+    return np.asarray(own + np.diag(floor))
+
+
+def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfig) -> list[str]:
+    fails = failed_match_gates(
+        p.registration, p.T_prior, c, rules, sigma=p.sigma, margin=margin, rise=p.rise, T=p.T,
+        ask_vague=p.localisation is None,
+    )  # fmt: skip
+    if fails and fails[0].startswith("nothing"):
+        return fails
+    if c.method != "registration" and p.localisation is None:
+        fails.append("localisation: there is none")
+    return fails
+
+
+def _log_weight(p: Proposal, c: ChoiceConfig) -> float:
+    total = -0.5 * (p.shift / p.sigma) ** 2  # p(‖τ_m‖²)
+    if c.method != "localisation":
+        total += -0.5 * ((1.0 - p.fitness) / c.fitness_sigma) ** 2  # p(err_ICP | T_m), eq. 18
+    if c.method != "registration" and p.localisation is not None:
+        total += -0.5 * p.localisation.error / c.error_sigma**2  # p(err_X), eq. 19
+        total += -0.5 * (p.localisation.spread / c.spread_sigma) ** 2  # p(|Σ_X|)
+    return total

@@ -1,0 +1,135 @@
+"""What a run takes of its log beside the submaps: enough to make its graph, figures and files again without the log.
+
+Fixes, used and withheld, IMUs, motion and truth are kept as they are; of streams that only the front end reads, stamps
+alone. In a run folder: ``inputs/`` (a log, :mod:`graphslam.io.log_store`) and ``taken.npz``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.app.run.files import generation_of
+from graphslam.core.atomic import read_npz, write_npz
+from graphslam.core.errors import FormatError, MissingDataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.imu import Imu
+from graphslam.core.log import SensorLog
+from graphslam.core.records import (
+    Compass,
+    Gps,
+    LandmarkObservations,
+    Odometry,
+    SteeringControls,
+    VelocityControls,
+    check_times,
+)
+from graphslam.evaluate.stream_checks import StreamFinding
+from graphslam.io.log_store import INDEX_NAME, load_log, save_log
+from graphslam.refine.scans import Scans
+
+TAKEN_FORMAT = "graphslam.taken/1"
+INPUTS = "inputs"
+SCANS = "scans.npz"
+KEPT = (Compass, Gps, Imu, LandmarkObservations, Odometry, SteeringControls, VelocityControls)
+
+
+@dataclass(frozen=True, slots=True)
+class TimestampsOnly:
+    """A stream of which the stamps alone are kept.
+
+    Parameters
+    ----------
+    times : (n,)
+    """
+
+    times: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", check_times(self.times))
+
+    def take(self, index: Any) -> TimestampsOnly:
+        """See :class:`graphslam.core.records.Stream`."""
+        return replace(self, times=self.times[index])
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """What the back end and the figures of a run are made of, beside its submaps.
+
+    Parameters
+    ----------
+    log : SensorLog
+        Its ``read`` counts every stream, its ``dropped`` what the reader and the front end dropped.
+    identities : (q,) int64 or None
+        Of the log's observations of landmarks, by a reference that the run never saw (−1 = none).
+    noticed : tuple of StreamFinding
+        What was seen in its streams before the run.
+    scans : Scans or None
+        What a refinement of the path reads; None where there is none.
+    """
+
+    log: SensorLog
+    identities: npt.NDArray[np.int64] | None = None
+    noticed: tuple[StreamFinding, ...] = ()
+    scans: Scans | None = None
+
+
+def collect_inputs(
+    log: SensorLog,
+    dropped: Mapping[str, int],
+    identities: npt.NDArray[np.int64] | None,
+    noticed: Sequence[StreamFinding] = (),
+    scans: Scans | None = None,
+) -> RunInputs:
+    """What is kept of a log; ``dropped`` counts what its front end dropped."""
+    streams: dict[str, Any] = {n: s if isinstance(s, KEPT) else TimestampsOnly(s.times) for n, s in log.streams.items()}
+    read = dict(log.read) or {k: len(s.times) for k, s in log.streams.items()}
+    return RunInputs(
+        replace(log, streams=streams, read=read, dropped={**log.dropped, **dropped}), identities, tuple(noticed), scans
+    )
+
+
+def write_inputs(folder: Path, taken: RunInputs, generation: str) -> None:
+    """Write it into the folder of a run's files."""
+    log = taken.log
+    save_log(replace(log, streams={n: s for n, s in log.streams.items() if isinstance(s, KEPT)}), folder / INPUTS)
+    arrays: dict[str, Any] = {"format": TAKEN_FORMAT, "generation": generation, "names": np.array([*log.streams], "U")}
+    for k, stream in enumerate(log.streams.values()):
+        if not isinstance(stream, KEPT):
+            arrays[f"times_{k}"] = stream.times
+    said = [(n.stream, n.finding.level, n.finding.code, n.finding.text) for n in taken.noticed]
+    arrays["noticed"] = np.array(said, "U").reshape(-1, 4)
+    if taken.identities is not None:
+        arrays["identities"] = taken.identities
+    write_npz(folder / "taken.npz", arrays)
+    if taken.scans is not None:
+        taken.scans.save(folder / SCANS)
+
+
+def read_inputs(folder: Path) -> tuple[RunInputs, str | None]:
+    """Read it, and the generation that it is of."""
+    if not (folder / "taken.npz").is_file() or not (folder / INPUTS / INDEX_NAME).is_file():
+        raise MissingDataError(
+            "the run folder has no inputs of its graph (taken.npz, inputs/)",
+            where=str(folder),
+            wanted="a run of this version; run it again with --resume, finished submaps are reused",
+        )
+    log, a = load_log(folder / INPUTS), read_npz(folder / "taken.npz", fmt=TAKEN_FORMAT)
+    try:
+        streams: dict[str, Any] = {
+            str(n): TimestampsOnly(a[f"times_{k}"]) if f"times_{k}" in a else log.streams[str(n)]
+            for k, n in enumerate(a["names"])
+        }
+        rows = [(str(s), Finding.from_row(dict(zip(("level", "code", "text"), map(str, r))))) for s, *r in a["noticed"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise FormatError(f"stream or array {error} is missing", where=str(folder / "taken.npz")) from None
+    noticed = tuple(StreamFinding(stream, finding) for stream, finding in rows if finding is not None)
+    scans = Scans.load(folder / SCANS, log.name) if (folder / SCANS).is_file() else None
+    return RunInputs(replace(log, streams=streams), a.get("identities"), noticed, scans), generation_of(a)

@@ -1,0 +1,425 @@
+"""Calibration of logs with landmarks: of range and bearing in windows, of ranges alone over one stretch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from graphslam.calibrate import landmarks as L
+from graphslam.calibrate.corrections import Corrections
+from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, round_digits
+from graphslam.calibrate.prediction_check import predict_withheld_sightings
+from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Ints, Smoothing, SmoothingWindow, rebuild_window
+from graphslam.calibrate.windows import SightingLog, window_scans
+from graphslam.core.errors import DataError
+from graphslam.core.findings import Finding
+from graphslam.core.geometry import Array
+from graphslam.core.records import SteeringControls
+from graphslam_frontends.odometry.motion import MotionNoise, motion_stream
+
+SHORT, LONG = 15.0, 60.0
+"""Lengths of the windows [s]."""
+VISITS = 240.0
+"""… and of those that hold several visits of a landmark."""
+FEW = 40
+"""Landmarks of a log that is looked at for errors of visits in any case: it costs little."""
+RAN_AWAY = 5.0
+"""A constant so many σ from what was known of it beforehand was not found, but ran away: noise so large that the wheels
+say nothing, and wheels so wrong that they need not, are likely together wherever sightings are sparse."""
+PERHAPS = 0.15
+"""Residuals that are so alike from one to the next are looked at for errors that last as long as a visit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationBudget:
+    """How much of a log is looked at, and how hard."""
+
+    windows: int | None = 20
+    """Short windows at most; a quarter as many long ones. None: all of the log."""
+    poses: int = 2000
+    """Poses of all short windows together; of the one stretch of ranges alone."""
+    clock: bool = True
+    """Is the offset of the clocks looked for?"""
+    again: bool = False
+    """Is an estimate of ranges and bearings made once more, of all data, when withheld ones have judged it? That of
+    ranges alone always is."""
+
+
+QUICK = CalibrationBudget()
+FULL = CalibrationBudget(windows=60, poses=6000, again=True)
+
+
+def calibrate_sightings(
+    seen: SightingLog, effort: CalibrationBudget = QUICK, *, seed: int = 0, noise: MotionNoise | None = None
+) -> Calibration:
+    """What wheels and sightings say of their own noise and lasting errors, as far as it foretells what was withheld.
+
+    Parameters
+    ----------
+    noise : MotionNoise, optional
+        Of controls, as it is without a calibration.
+    """
+    held, noise = seen.holding(), noise or MotionNoise()
+    blind = not np.any(seen.sightings.has_bearing)
+    if blind:
+        found, whole = _ranges_alone(held, effort, seed)
+        scans = [window_scans(seen, 1e9)[0][: len(whole.windows[0].poses)]]
+        foretell = partial(
+            predict_withheld_sightings, held, found, scans, noise, partial(_along, whole, seen.sightings.ids)
+        )
+    else:
+        found = _range_and_bearing(held, effort)
+        foretell = partial(predict_withheld_sightings, held, found, _tested(held, effort), noise)
+    prediction = None if found.contradictions() else foretell()
+    if blind or effort.again:  # what was withheld is data like the rest once it has judged
+        found = _ranges_alone(seen, effort, seed)[0] if blind else _range_and_bearing(seen, effort)
+    return found if prediction is None or found.contradictions() else found.judged(prediction)
+
+
+def _tested(held: SightingLog, effort: CalibrationBudget) -> list[Ints]:
+    """Scans of long windows in which something is withheld, spread over the log."""
+    s = held.sightings
+    assert held.withheld is not None
+    hidden = np.concatenate([[0], np.cumsum(held.withheld)])[s.offsets]
+    there = [k for k in window_scans(held, LONG) if np.any(hidden[k + 1] > hidden[k])]
+    count = max(int(0.5 * effort.poses / max(_rate(held) * LONG, 1.0)), 3)
+    return [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(count, len(there))).round().astype(int))]
+
+
+def _along(whole: Smoothing, ids: Ints | None, w: SmoothingWindow) -> SmoothingWindow | None:
+    """A window of ranges with its states where those of a fitted one are; None where that has none of its beacons."""
+    first = whole.windows[0]
+    if ids is None:
+        return None
+    names = np.full(len(first.nuisance), -1)
+    names[first.slots[:, 0]] = ids[first.rows]
+    place = dict(zip(names.tolist(), first.nuisance))
+    own = ids[w.rows]
+    w = rebuild_window(replace(w, poses=first.poses.copy()), np.isin(own, names))
+    for j, name in zip(w.slots[:, 0].tolist(), ids[w.rows].tolist()):
+        w.nuisance[j] = place[name]
+    return w if len(w.rows) else None
+
+
+def _rate(seen: SightingLog) -> float:
+    """Scans a second."""
+    return len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
+
+
+def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple[str, ...] = ()) -> Calibration:
+    """``held``: constants that ran away before."""
+    steers = isinstance(motion_stream(seen.log)[1], SteeringControls)
+    named = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
+    free = tuple(c for c in named if c not in held)
+    count = _count(seen, SHORT, effort)
+    short, short_value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
+    wild = tuple(c for c in free if abs(short.constants[CONSTANTS.index(c)]) > RAN_AWAY * PRIOR[CONSTANTS.index(c)])
+    if wild:
+        held, free = (*held, *wild), tuple(c for c in free if c not in wild)
+        short, short_value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
+    _enough(short, seen)
+    start = dict(short.sigmas), short.constants.copy()
+    long = L.smooth_sightings(seen, LONG, None if count is None else max(count // 4, 3), free)
+    long.sigmas, long.constants = dict(start[0]), start[1].copy()
+    clock = None
+    long, _ = L.fit_noise(long, trims=L.TRIMS[1:])
+    _enough(long, seen)
+    notes: list[Finding] = []
+    if held:
+        text = f"{', '.join(held)}: not observable in this log — the values of the log are kept."
+        notes.append(Finding("", "calibrated", text))
+    if effort.clock:
+        clock = profile_clock(short, seen)
+    if clock is not None and clock.applied:
+        return _again(seen, clock, effort, held)
+    estimates, short, long = cross_check_windows(short, short_value, long)
+    if clock is not None:
+        estimates.append(clock)
+    noise, lasts = combine_noise(short, long)
+    alike = residual_autocorrelation(long)
+    few = len(np.unique(seen.sightings.ids)) <= FEW if seen.sightings.ids is not None else False
+    if lasts or alike > PERHAPS or few:
+        two, estimates = fit_two_level_noise(seen, long, effort, estimates)
+        noise |= two
+        if two or lasts or alike > ALIKE:
+            notes.append(_lasting_note(short, long, alike))
+    return calibration_of("sightings", estimates, noise, notes, _data(short))
+
+
+def _again(seen: SightingLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:
+    """The calibration with the motion's clock put right."""
+    found = _range_and_bearing(
+        seen.mended(Corrections(clock=round_digits(clock.value))), replace(effort, clock=False), held
+    )
+    if found.contradictions():
+        return found
+    corrections = replace(found.corrections, clock=round_digits(clock.value))
+    return replace(found, corrections=corrections, estimates=(*found.estimates, clock))
+
+
+def _ranges_alone(seen: SightingLog, effort: CalibrationBudget, seed: int) -> tuple[Calibration, Smoothing]:
+    begin, end = seen.span
+    until = end - begin if effort.windows is None else min(effort.poses / max(_rate(seen), 1e-9), end - begin)
+    found = L.smooth_ranges(seen, until, seed=seed)
+    if found is None:
+        raise DataError("too few ranges to calibrate", where=seen.log.name)
+    whole, half = found
+    estimates, whole, half = cross_check_windows(whole, whole.objective(), half)
+    noise, lasts = combine_noise(half, whole)
+    alike = residual_autocorrelation(whole)
+    notes = []
+    ratio = next(e for e in estimates if e.name == "range_scale")
+    if ratio.applied:
+        size = "large" if ratio.value < 0 else "small"
+        text = (
+            f"scale: ranges and wheels differ by {abs(ratio.value):.1%} — the scale of the wheels is used. If the "
+            f"ranges are right, path and map are that much too {size}; the covariances do not include this."
+        )
+        notes.append(Finding("look", "metre", text))
+    if lasts or alike > ALIKE:
+        notes.append(_lasting_note(half, whole, alike))
+    data = f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})"
+    return calibration_of("ranges", estimates, noise, notes, data), whole
+
+
+def cross_check_windows(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate], Smoothing, Smoothing]:
+    """The constants of a smoothing, held against those of windows of another length; and both with none but those that
+    are applied.
+    """
+    out = []
+    first = s
+    sd = np.sqrt(np.diag(s.covariance))
+    for name in first.free:
+        i = CONSTANTS.index(name)
+        gain = math.nan
+        if abs(s.constants[i]) > SURE * sd[i]:
+            alone, alone_value = L.fit_without(s, name)
+            gain = alone_value - value
+            if gain < 0.0:
+                s, value, sd = alone, alone_value, np.nan_to_num(np.sqrt(np.diag(alone.covariance)), nan=0.0)
+                out.append(_estimate(name, first, other, gain))
+                continue
+        out.append(_estimate(name, s, other, gain))
+    applied = tuple(e.name for e in out if e.applied)
+    if applied == first.free:
+        return out, s, other
+    left = []
+    for x in (s, other):
+        alone = x.copy(free=applied)
+        for name in set(first.free) - set(applied):
+            alone.constants[CONSTANTS.index(name)] = 0.0
+        alone.fit(budget=200, rounds=3)
+        left.append(alone)
+    again = [e if not e.applied else replace(e, **_values(e.name, *left)) for e in out]
+    return again, left[0], left[1]
+
+
+def _values(name: str, s: Smoothing, other: Smoothing) -> dict[str, Any]:
+    i = CONSTANTS.index(name)
+    found = {"value": s.constants[i], "sigma": np.sqrt(s.covariance[i, i])}
+    found |= {"other": other.constants[i], "other_sigma": np.sqrt(other.covariance[i, i])}
+    return {k: float(v) for k, v in found.items()}
+
+
+def _estimate(name: str, s: Smoothing, other: Smoothing, gain: float) -> Estimate:
+    return Estimate(name=name, gain=float(gain), **_values(name, s, other)).gated()
+
+
+def combine_noise(short: Smoothing, long: Smoothing) -> tuple[dict[str, float], bool]:
+    """The larger of two σ, the motion's as one model; and whether noise of either kind lasts."""
+    pairs = [(s, _typical(s)) for s in (short, long)]
+    heading = [_heading_variance(s, t) for s, t in pairs]
+    best = long if heading[1] >= heading[0] else short
+    noise = {k: best.sigmas[k] for k in ("heading_metre", "heading_radian", "heading_second")}
+    along = [s.sigmas["along_metre"] ** 2 * t[0] + s.sigmas["along_second"] ** 2 * t[2] for s, t in pairs]
+    best = long if along[1] >= along[0] else short
+    noise |= {k: best.sigmas[k] for k in ("along_metre", "along_second")}
+    noise["lateral_metre"] = max(short.sigmas["lateral_metre"], long.sigmas["lateral_metre"])
+    lasts = False
+    for k in ("range", "bearing"):
+        if k in short.fitted:
+            noise[f"{k}_sigma"] = max(short.sigmas[k], long.sigmas[k])
+            lasts |= long.sigmas[k] > LASTS * short.sigmas[k]
+    return noise, lasts
+
+
+def _typical(s: Smoothing) -> Array:
+    """Metres, radians and seconds of a typical step."""
+    steps = np.concatenate([w.steps[1:] for w in s.windows])
+    return np.array([steps[:, 4].mean(), np.abs(steps[:, 2]).mean(), steps[:, 3].mean()])
+
+
+def _heading_variance(s: Smoothing, step: Array) -> float:
+    v = [s.sigmas[k] ** 2 for k in ("heading_metre", "heading_radian", "heading_second")]
+    return float(v @ step)
+
+
+def residual_autocorrelation(s: Smoothing) -> float:
+    """Correlation of residuals of one landmark from one sighting to the next, the larger of range and bearing."""
+    seen, _ = s.residuals()
+    products, squares = np.zeros(2), np.zeros(2)
+    for w, r in zip(s.windows, seen):
+        for l in np.unique(w.slots[:, 0]):
+            x = np.nan_to_num(r[w.slots[:, 0] == l])
+            if len(x) > 2:
+                products += (x[1:] * x[:-1]).sum(axis=0)
+                squares += (x**2).sum(axis=0) * (len(x) - 1) / len(x)
+    return float(np.max(products / np.maximum(squares, 1e-12)))
+
+
+def fit_two_level_noise(
+    seen: SightingLog, long: Smoothing, effort: CalibrationBudget, estimates: list[Estimate]
+) -> tuple[dict[str, float], list[Estimate]]:
+    """Noise of sightings with a constant for each landmark and visit; nothing where the log is no likelier with it.
+
+    The windows hold several visits of a landmark, or its place could not be told from the constant. Constants that
+    passed the gates must pass them again: errors of visits may have feigned them.
+    """
+    count = max(int(effort.poses / max(_rate(seen) * VISITS, 1.0)), 1)
+    values, fits = [], []
+    for visits in (False, True):
+        s = L.smooth_sightings(seen, VISITS, count, long.free, visits=visits)
+        for k in long.fitted:
+            s.sigmas[k] = long.sigmas[k]
+        s.constants = long.constants.copy()
+        s, value = L.fit_noise(s, trims=(), budget=200)
+        values.append(value)
+        fits.append(s)
+    if not values[0] - values[1] > GAIN:
+        return {}, estimates
+    s, value = fits[1], values[1]
+    again = []
+    for e in estimates:
+        if e.applied and e.name in s.free:
+            gain = float(L.fit_without(s, e.name)[1] - value)
+            e = replace(e, **_values(e.name, s, s), gain=min(gain, e.gain)).gated()
+        again.append(e)
+    if any(e.name in s.free and not e.applied for e in again):
+        s = s.copy(free=tuple(e.name for e in again if e.applied and e.name in s.free))
+        for e in again:
+            if not e.applied and e.name in CONSTANTS:
+                s.constants[CONSTANTS.index(e.name)] = 0.0
+        s.fit(budget=200, rounds=2)
+    out = {}
+    for k in ("range", "bearing"):
+        for of_fit, of_noise in ((k, f"{k}_sigma"), (f"visit_{k}", f"{k}_visit")):
+            if of_fit in s.fitted:
+                out[of_noise] = s.sigmas[of_fit]
+    there = 1.0 if seen.withheld is None else 1.0 - float(seen.withheld.mean())
+    return out | {"visit_sightings": sightings_of_a_visit(s.windows) / there} | motion_noise(s), again
+
+
+def motion_noise(s: Smoothing) -> dict[str, float]:
+    """Noise of the motion of one smoothing."""
+    return {k: s.sigmas[k] for k in L.WHEELS}
+
+
+def sightings_of_a_visit(windows: Sequence[SmoothingWindow]) -> float:
+    """Sightings of the visit that a sighting, drawn at random, belongs to."""
+    n = np.concatenate([np.bincount(w.slots[w.slots[:, 1] >= 0, 1]) for w in windows])
+    n = n[n > 0]
+    return float((n**2).sum() / max(n.sum(), 1))
+
+
+def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
+    """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
+
+    Parameters
+    ----------
+    s : Smoothing
+        Fitted without an offset.
+    """
+    period = seen.period
+    scores: dict[int, float] = {}
+
+    def score(k: int) -> float:
+        if k not in scores:
+            moved = L.shift_motion(s, seen, k * 0.5 * period)
+            moved.settle(8)
+            moved.fit(budget=60, rounds=1)
+            scores[k] = moved.objective()
+        return scores[k]
+
+    best = min((0, 2, -2), key=score)
+    while True:
+        near = min((best - 2, best, best + 2), key=score)
+        if near == best or abs(near) > 40:
+            break
+        best = near
+    best = min((best - 1, best, best + 1), key=score)
+    a, b, c = score(best - 1), score(best), score(best + 1)
+    bend = max(a - 2.0 * b + c, 1e-6)
+    at = best + float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5))
+    # of a straight course every offset fits; noise of the records themselves blurs it by their spacing
+    sigma = max(0.5 * period / math.sqrt(bend), 0.1 * period)
+    return Estimate(
+        name="clock",
+        value=at * 0.5 * period,
+        sigma=sigma,
+        gain=score(0) - b,
+        other=at * 0.5 * period,
+        other_sigma=sigma,
+    ).gated()
+
+
+def _count(seen: SightingLog, seconds: float, effort: CalibrationBudget) -> int | None:
+    """Windows that keep the number of poses within bounds."""
+    if effort.windows is None:
+        return None
+    return int(np.clip(effort.poses / max(_rate(seen) * seconds, 1.0), 6, effort.windows))
+
+
+def _enough(s: Smoothing, seen: SightingLog) -> None:
+    n = sum(len(w.rows) for w in s.windows)
+    if n < 50:
+        raise DataError(
+            "too few observations of landmarks that are observed twice", where=seen.log.name, got=n, wanted=50
+        )
+
+
+def _data(s: Smoothing) -> str:
+    n = sum(len(w.rows) for w in s.windows)
+    return f"{len(s.windows)} windows with {n} observations"
+
+
+def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
+    r = [s.sigmas["range"] for s in (short, long)]
+    text = f"range errors: σ {r[0]:.3g} m in short windows, {r[1]:.3g} m in long ones, autocorrelation per landmark "
+    text += f"{alike:.2f} — time-correlated. Treat landmarks seen from one side only as less certain than reported."
+    return Finding("look", "errors-last", text)
+
+
+def calibration_of(
+    kind: str, estimates: Sequence[Estimate], noise: dict[str, float], notes: Sequence[Finding], data: str
+) -> Calibration:
+    """A calibration with what is applied of it: nothing where streams contradict each other."""
+    found = Calibration(
+        kind=kind,
+        corrections=replace(_corrections(estimates, noise), widen_only=kind == "scans"),
+        estimates=tuple(estimates),
+        noise={k: float(v) for k, v in noise.items()},
+        notes=tuple(notes),
+        data=data,
+    )
+    return replace(found, corrections=Corrections()) if found.contradictions() else found
+
+
+def _corrections(estimates: Sequence[Estimate], noise: dict[str, float]) -> Corrections:
+    """What is applied: constants that passed the gates, and the noise."""
+    applied = {e.name: e.value for e in estimates if e.applied}
+    values: dict[str, Any] = {}
+    for name, value in applied.items():
+        if name == "distance_scale":
+            values[name] = round_digits(math.exp(value))
+        elif name in ("range_scale", "turn_scale"):
+            values[name] = round_digits(1.0 + value)
+        else:
+            values[name] = round_digits(value)
+    names = Corrections.__dataclass_fields__
+    values |= {k: round_digits(v) for k, v in noise.items() if k in names}
+    return Corrections(**values)

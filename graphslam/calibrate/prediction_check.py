@@ -1,0 +1,116 @@
+"""Withheld sightings as an estimate foretells them, and as what the log states does.
+
+With the parameters held, the likelihood of withheld data given the rest is that of all of the data over that of the
+rest: two smoothings of the same windows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.calibrate.corrections import Corrections
+from graphslam.calibrate.estimate import Calibration, Prediction
+from graphslam.calibrate.landmarks import smoothing_of, trim_outliers
+from graphslam.calibrate.smoothing import Ints, Smoothing, SmoothingWindow, keep_sightings
+from graphslam.calibrate.windows import SightingLog, make_window
+from graphslam_frontends.odometry.motion import MotionNoise
+
+TRIM = 4.0
+"""Sightings that are more σ off, by the larger of what is stated and what was found, count for neither."""
+SETTLE = 12
+
+
+def predict_withheld_sightings(
+    seen: SightingLog,
+    found: Calibration,
+    scans: list[Ints],
+    noise: MotionNoise,
+    start: Callable[[SmoothingWindow], SmoothingWindow | None] = lambda w: w,
+) -> Prediction | None:
+    """How likely withheld sightings are under a calibration, over what the log states.
+
+    Parameters
+    ----------
+    seen : SightingLog
+        As the log has it, with what was withheld.
+    found : Calibration
+        Made without them.
+    scans : list of (n,) int64
+        Of the windows in which they are foretold.
+    noise : MotionNoise
+        Of controls, as the front end states it.
+    start : function
+        Puts the states of a window where they are begun; None: the window tells nothing.
+
+    Returns
+    -------
+    Prediction or None
+        None: hardly anything was withheld.
+    """
+    assert seen.withheld is not None
+    hidden, c = seen.withheld, found.corrections
+    seen = replace(seen, stated=noise, withheld=None)
+    stated = _stated(seen)
+    kept: Ints | None = None
+
+    def score(c: Corrections) -> tuple[float, int]:
+        """Of the withheld sightings [nats], and their number; the first one chooses what counts."""
+        nonlocal kept
+        own = _sigmas(c, stated)
+        s = _smoothing(seen.mended(c), scans, start, visits=own["visit_range"] > 0.0)
+        if kept is None:
+            s.sigmas |= {k: max(own[k], stated[k]) for k in ("range", "bearing")}
+            s.settle(SETTLE)
+            s = trim_outliers(s, TRIM)
+            kept = np.concatenate([w.rows for w in s.windows]) if s.windows else np.zeros(0, dtype=np.int64)
+        else:
+            s = keep_sightings(s, [np.isin(w.rows, kept) for w in s.windows])
+        s.sigmas |= {k: v for k, v in own.items() if v > 0.0}
+        s.settle(SETTLE)
+        rest = keep_sightings(s, [~hidden[w.rows] for w in s.windows])
+        rest.settle(SETTLE)
+        n = sum(int(hidden[w.rows].sum()) for w in s.windows)
+        return s.objective() - rest.objective() + n * math.log(c.range_scale), n
+
+    every, n = score(c)
+    if n < LEAST:
+        return None
+    before = score(Corrections())[0]
+    gains = {"all": before - every}
+    if c.without_constants() != c:
+        gains["noise"] = before - score(c.without_constants())[0]
+    return Prediction(what="withheld observations", count=n, gains=gains)
+
+
+LEAST = 20
+"""Fewer withheld sightings say nothing."""
+
+
+def _stated(seen: SightingLog) -> dict[str, float]:
+    """σ of the sightings as the log has them."""
+    s = seen.sightings
+    out = {"range": float(np.median(s.sigmas[:, 0])), "visit_range": 0.0, "visit_bearing": 0.0}
+    blind = not np.any(s.has_bearing)
+    return out | {"bearing": 1.0 if blind else float(np.median(s.sigmas[s.has_bearing, 1]))}
+
+
+def _sigmas(c: Corrections, stated: dict[str, float]) -> dict[str, float]:
+    """σ of the sightings of a log to which corrections were applied."""
+    out = {"range": (c.range_sigma or stated["range"]) / c.range_scale, "bearing": c.bearing_sigma or stated["bearing"]}
+    return out | {"visit_range": c.range_visit / c.range_scale, "visit_bearing": max(c.bearing_visit, 1e-6)}
+
+
+def _smoothing(
+    seen: SightingLog, scans: list[Ints], start: Callable[[SmoothingWindow], SmoothingWindow | None], *, visits: bool
+) -> Smoothing:
+    """Windows with all their sightings; nothing is estimated but their states."""
+    begin, end = seen.span
+    t = seen.sightings.times
+    inside = [k for k in scans if t[k[0]] >= begin and t[k[-1]] <= end]
+    made = (make_window(seen, k, visits=visits) for k in inside)
+    windows = [x for w in made if w is not None and (x := start(w)) is not None]
+    return smoothing_of(windows, seen.sightings.T_base_sensor, (), visits=visits).copy(fitted=())

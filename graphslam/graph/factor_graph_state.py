@@ -1,0 +1,448 @@
+"""What a graph holds: factor records, values, landmark table, ledger, events; and every question one can ask of it."""
+
+from __future__ import annotations
+
+from collections.abc import ItemsView, Iterator, Mapping, MutableMapping, Sequence, ValuesView
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.core.errors import ConfigError, DataError, GraphSlamError
+from graphslam.core.geometry import Array, se2_transform
+from graphslam.core.markup import Markup, html_element, join_parts
+from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.diagnose import Diagnosis, diagnose
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factors.attitude import AttitudeRecord
+from graphslam.graph.factors.batch import FactorRecord, batch_of
+from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
+from graphslam.graph.factors.gps import GpsRecord
+from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
+from graphslam.graph.factors.pseudorange import PseudorangeRecord
+from graphslam.graph.gps import GpsFixes
+from graphslam.graph.imu import ImuUnits
+from graphslam.graph.ledger import Ledger
+from graphslam.graph.pending_measurements import PendingMeasurements
+from graphslam.graph.score import GraphScore, score_graph
+from graphslam.graph.submap_node import SubmapNode
+from graphslam.graph.variables import Values, VariableLayout
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BetweenBlock:
+    """Relative poses that entered together, as arrays, under consecutive numbers.
+
+    Parameters
+    ----------
+    ends, T_ij, whiteners : (m, 2), (m, 3|7), (m, d, d)
+    kept : (m,) bool
+        Those that were not removed since.
+    """
+
+    first_id: int
+    ends: npt.NDArray[np.int64]
+    T_ij: Array
+    whiteners: Array
+    group: str
+    kept: npt.NDArray[np.bool_]
+
+    def batch(self, layout: VariableLayout) -> BetweenBatch:
+        """What is kept, as a batch."""
+        k = np.flatnonzero(self.kept)
+        rows = slice(None) if len(k) == len(self.kept) else k
+        return BetweenBatch.of_arrays(
+            self.ends[rows], self.T_ij[rows], self.whiteners[rows], layout, group=self.group, ids=self.first_id + k
+        )
+
+    def record(self, factor_id: int) -> BetweenRecord:
+        """One of them."""
+        k = factor_id - self.first_id
+        i, j = self.ends[k].tolist()
+        return BetweenRecord(factor_id, i, j, self.T_ij[k], self.whiteners[k], group=self.group)
+
+
+class FactorTable(MutableMapping[int, "FactorRecord"]):
+    """Factors by number, with a journal of every change, so that a solver sees what is new without looking at the rest.
+
+    Factors that came as arrays stay arrays; a record of one is made when somebody asks for it. A record of a kind that
+    nobody registered is refused here.
+    """
+
+    def __init__(self) -> None:
+        self.single: dict[int, FactorRecord] = {}
+        self.blocks: list[BetweenBlock] = []
+        self.journal: list[int] = []
+
+    def block_of(self, factor_id: int) -> BetweenBlock | None:
+        """The arrays that hold a factor."""
+        for b in self.blocks:
+            if 0 <= factor_id - b.first_id < len(b.kept) and b.kept[factor_id - b.first_id]:
+                return b
+        return None
+
+    def add_block(self, block: BetweenBlock) -> None:
+        """Take factors as arrays."""
+        self.blocks.append(block)
+        self.journal.extend(range(block.first_id, block.first_id + len(block.kept)))
+
+    def flat(self, layout: VariableLayout) -> FactorArrays:
+        """All of them as a problem."""
+        return FactorArrays(list(self.single.values()), layout, [b.batch(layout) for b in self.blocks])
+
+    def __getitem__(self, factor_id: int) -> FactorRecord:
+        if factor_id not in self.single:
+            block = self.block_of(factor_id)
+            if block is not None:
+                return block.record(factor_id)
+        return self.single[factor_id]
+
+    def __setitem__(self, factor_id: int, record: FactorRecord) -> None:
+        batch_of(type(record))
+        if self.block_of(factor_id) is not None:
+            del self[factor_id]
+        self.single[factor_id] = record
+        self.journal.append(factor_id)
+
+    def __delitem__(self, factor_id: int) -> None:
+        block = None if factor_id in self.single else self.block_of(factor_id)
+        if block is None:
+            del self.single[factor_id]
+        else:
+            block.kept[factor_id - block.first_id] = False
+        self.journal.append(factor_id)
+
+    def __contains__(self, factor_id: object) -> bool:
+        return factor_id in self.single or (isinstance(factor_id, int) and self.block_of(factor_id) is not None)
+
+    def __iter__(self) -> Iterator[int]:
+        yield from self.single
+        for b in self.blocks:
+            yield from (b.first_id + np.flatnonzero(b.kept)).tolist()
+
+    def __len__(self) -> int:
+        return len(self.single) + sum(int(b.kept.sum()) for b in self.blocks)
+
+    def values(self) -> ValuesView[FactorRecord]:
+        """Records; those of arrays are made on the way."""
+        return super().values() if self.blocks else self.single.values()
+
+    def items(self) -> ItemsView[int, FactorRecord]:
+        """Numbers and records; those of arrays are made on the way."""
+        return super().items() if self.blocks else self.single.items()
+
+
+class ValueSource(Protocol):
+    """An incremental solver that holds newer values than the graph."""
+
+    def holds(self, name: str) -> bool:
+        """Does it hold that variable?"""
+        ...
+
+    def value(self, name: str) -> Array:
+        """Its present value."""
+        ...
+
+    def pull(self, structure: Values) -> Values:
+        """All values; those that it does not hold as they are in ``structure``."""
+        ...
+
+
+class FactorGraphState:
+    """The passive part of a :class:`~graphslam.graph.pose_graph.PoseGraph`.
+
+    Parameters
+    ----------
+    dim : int
+        2 or 3.
+
+    Attributes
+    ----------
+    structure : Values
+        Variables with values that may be old: for what depends on which variables there are, and not on where.
+    records : dict of int to FactorRecord
+        Every factor by id.
+    ledger : Ledger
+    events : list of dict
+        What happened, in order; JSON-serialisable.
+    revision : int
+        Grows with every change of factors or variables.
+    """
+
+    def __init__(self, dim: int = 2) -> None:
+        if dim not in (2, 3):
+            raise ConfigError(f"a graph is in two or in three dimensions, got dim={dim}")
+        self.dim = dim
+        self.structure = Values.empty(dim)
+        self._source: ValueSource | None = None
+        self.origin = self.structure.poses[0].copy()
+        self.records = FactorTable()
+        self.ledger = Ledger()
+        self.events: list[dict[str, Any]] = []
+        self.revision = 0
+        self.submaps: list[SubmapNode] = []
+        self._place: dict[int, int] = {}  # submap key -> place in submaps
+        self.gps, self.imu, self.readings = GpsFixes(self), ImuUnits(self), PendingMeasurements(self)
+        self.gps_origin: Array | None = None
+        self._row: dict[int, int] = {}
+        self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
+        self._attitude_of: dict[int, int] = {}  # node -> attitudes that it has
+        self._robots: dict[frozenset[str], int] = {}  # constant errors that submaps of the same streams share
+        self._retired: set[int] = set()  # ids merged away or removed: never used again
+        self._next_factor = 0
+        self._next_landmark = 0
+        self._flat: tuple[int, FactorArrays] | None = None
+        self._covariance: tuple[int, Values, JointCovariance] | None = None
+
+    # ---------------------------------------------------------------- values
+
+    @property
+    def values(self) -> Values:
+        """Best known values. Where an incremental solver knows better it is asked for all of them now."""
+        if self._source is not None:
+            source, self._source = self._source, None
+            self.structure = source.pull(self.structure)
+        return self.structure
+
+    @values.setter
+    def values(self, values: Values) -> None:
+        self._source, self.structure = None, values
+
+    def expect(self, source: ValueSource | None) -> None:
+        """From now on ``source`` knows the values; it is asked when they are needed (None: nobody does)."""
+        self._source = source
+
+    def pose(self, node: int) -> Array:
+        """Best known pose ``(3|7,)`` of one node."""
+        name = f"x{node}"
+        if self._source is not None and node and self._source.holds(name):
+            return self._source.value(name)
+        return self.structure.poses[node].copy()
+
+    @property
+    def landmark_rows(self) -> Mapping[int, int]:
+        """Landmark id → row of :attr:`Values.landmarks`."""
+        return self._row
+
+    # ---------------------------------------------------------------- changing
+
+    def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
+        """Take a factor out and give its evidence back; variables that nothing holds any more go with it.
+
+        Removing a submap also removes what hangs on its path, GPS fixes, readings and what IMUs said inside it, and, if
+        it is the last one, its nodes. The factors of a chain are one submap: with one of them all go.
+        """
+        if factor_id not in self.records:
+            raise DataError(f"factor {factor_id} is not in the graph", wanted="the id of a factor")
+        removed = self.records[factor_id]
+        owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
+        if owner is not None:
+            self.readings.detach(owner)
+            self.imu.detach(owner)
+        for fid in (factor_id,) if owner is None else owner.factor_ids:
+            if fid in self.records:
+                self.take_out(fid, reason)
+        if owner is not None:
+            self.gps.detach(owner)
+            used = {n for r in self.records.values() for n in r.variables()}
+            if owner.key == self.submaps[-1].key and not any(f"x{n}" in used for n in owner.nodes[1:]):
+                self.values.poses = self.values.poses[: owner.node + 1].copy()
+                self._place.pop(self.submaps.pop().key)
+        self.gps.remove_unused()
+        self.imu.remove_unused(removed)
+        self.readings.remove_unused()
+        if self.structure.count("tilt") and not any("tilt" in r.variables() for r in self.records.values()):
+            self.values.tilt = None
+            self.revision += 1
+
+    def take_out(self, factor_id: int, reason: str) -> None:
+        """Take out one factor, its evidence, and landmarks that nothing sees any more."""
+        block = self.records.block_of(factor_id)
+        record = self.records.pop(factor_id)
+        if isinstance(record, AttitudeRecord):
+            self._attitude_of[record.node] -= 1
+        if block is None or not block.kept.any():  # factors that came together spent their evidence together
+            self.ledger.release(factor_id if block is None else block.first_id)
+        self.revision += 1
+        if isinstance(record, SubmapRecord):
+            for i in set(record.landmark_ids.tolist()):
+                self._seen_in[i].discard(factor_id)
+            self._drop_landmarks([i for i in set(record.landmark_ids.tolist()) if not self._seen_in[i]])
+        self._event("removed", factor_id=factor_id, factor=record.label(), reason=reason)
+
+    def merge_landmarks(self, keep: int, drop: int) -> None:
+        """Two landmarks turned out to be one: factors on ``drop`` become factors on ``keep``."""
+        if keep == drop or keep not in self._row or drop not in self._row:
+            raise DataError("landmarks to merge are not two of the graph", got=(keep, drop), wanted="two known ids")
+        distance = float(np.linalg.norm(self.landmark(keep) - self.landmark(drop)))
+        for fid in self._seen_in[drop]:
+            record = self.records[fid]
+            assert isinstance(record, SubmapRecord)
+            ids = np.where(record.landmark_ids == drop, keep, record.landmark_ids)
+            self.records[fid] = replace(record, landmark_ids=ids)  # a new object: solvers see that it changed
+            self._seen_in[keep].add(fid)
+            self._path_follows(record.submap_key, ids)
+        self._seen_in[drop] = set()
+        self._drop_landmarks([drop])
+        self.revision += 1
+        self._event("merged", keep=keep, drop=drop, distance=distance)
+
+    def split_landmark(self, factor_id: int, entry: int) -> int:
+        """One sighting was of another landmark: entry ``entry`` of a submap factor gets a new landmark of its own.
+
+        Returns
+        -------
+        int
+            Id of the new landmark, which stands where the submap saw it.
+        """
+        record = self.records.get(factor_id)
+        if not isinstance(record, SubmapRecord) or not 0 <= entry < len(record.landmark_ids):
+            raise DataError(
+                "no such observation to split off", got=(factor_id, entry), wanted="a submap factor's entry"
+            )
+        old, new = int(record.landmark_ids[entry]), self._next_landmark
+        ids = record.landmark_ids.copy()
+        ids[entry] = new
+        if old not in ids and len(self._seen_in[old]) < 2:
+            raise DataError(f"landmark {old} is seen nowhere else", got=(factor_id, entry), wanted="two observations")
+        self._next_landmark += 1
+        seen = se2_transform(self.values.poses[record.start], record.z[3 + 2 * entry : 5 + 2 * entry])
+        self._start_landmarks(ids[entry : entry + 1], seen[None])
+        if old not in ids:
+            self._seen_in[old].discard(factor_id)
+        self.insert(replace(record, landmark_ids=ids))  # a new object: solvers see that it changed
+        self._path_follows(record.submap_key, ids)
+        self._event("split", factor_id=factor_id, submap=record.submap_key, landmark=old, new=new)
+        return new
+
+    def _path_follows(self, submap_key: int, ids: npt.NDArray[np.int64]) -> None:
+        """The points of a submap's path hang on the landmarks that the submap sees now."""
+        inner = self.submap(submap_key).inner_points
+        if inner is not None and inner.factor_id is not None:
+            path = self.records[inner.factor_id]
+            assert isinstance(path, PathRecord)
+            self.records[inner.factor_id] = replace(path, landmark_ids=ids)
+
+    def set_values(self, values: Values) -> None:
+        """Take a solver's values (same variables)."""
+        if not values.is_finite():
+            raise DataError("values of the graph are not finite", wanted="finite numbers")
+        if values.layout() != self.structure.layout():
+            raise DataError("values are of other variables than the graph's", wanted="the same layout")
+        self.values = values
+
+    def log_event(self, kind: str, **facts: Any) -> None:
+        """Enter something that was decided about this graph in :attr:`events`; facts must be JSON-serialisable."""
+        self._event(kind, **facts)
+
+    # ---------------------------------------------------------------- asking
+
+    def node_of(self, submap_key: int) -> int:
+        """Node at the base of a submap."""
+        return self.submap(submap_key).node
+
+    def submap(self, submap_key: int) -> SubmapNode:
+        """A submap's nodes, by its key."""
+        if submap_key in self._place:
+            return self.submaps[self._place[submap_key]]
+        raise DataError(f"submap {submap_key} is not in the graph", wanted="the key of a submap")
+
+    def landmark(self, landmark_id: int) -> Array:
+        """World position of a landmark."""
+        return self.values.landmarks[self._row[landmark_id]]
+
+    def sightings(self, landmark_id: int) -> frozenset[int]:
+        """Factors that see a landmark."""
+        return frozenset(self._seen_in[landmark_id])
+
+    def landmark_ids_of(self, submap_key: int) -> npt.NDArray[np.int64]:
+        """Graph landmark of every entry of a submap, as it stands now."""
+        record = self.records.get(self.submap(submap_key).factor_id) if submap_key in self._place else None
+        return record.landmark_ids.copy() if isinstance(record, SubmapRecord) else np.zeros(0, dtype=np.int64)
+
+    def flat(self) -> FactorArrays:
+        """Flat arrays of the factors, made once per revision."""
+        if self._flat is None or self._flat[0] != self.revision:
+            self._flat = (self.revision, self.records.flat(self.structure.layout()))
+        return self._flat[1]
+
+    def covariance(self) -> JointCovariance:
+        """Joint covariance at the current values, made once per revision and values."""
+        c = self._covariance
+        if c is None or c[0] != self.revision or c[1] is not self.values:
+            system = self.flat().evaluate(self.values)
+            try:
+                cov = JointCovariance(self.flat().layout, system.A)
+            except GraphSlamError:
+                self.diagnose().raise_if_bad()
+                raise
+            self._covariance = c = (self.revision, self.values, cov)
+        return c[2]
+
+    def objective(self, values: Values | None = None) -> GraphScore:
+        """χ² and dof per class of factor at ``values`` (default: the graph's)."""
+        flat = self.flat()
+        return score_graph(flat, flat.evaluate(values or self.values, hessian=False).chi2)
+
+    def diagnose(self, values: Values | None = None) -> Diagnosis:
+        """Unconstrained variables and what would fix them; ``.raise_if_bad()`` makes it an error."""
+        waiting = len(self.gps.waiting) + len(self.gps.tied)
+        return diagnose(self.flat(), values or self.values, waiting_fixes=waiting)
+
+    def _repr_html_(self) -> str:
+        said = f" {len(self.values.poses)} nodes, {len(self.values.landmarks)} landmarks, {len(self.records)} factors"
+        return join_parts([html_element("b", "PoseGraph"), said, Markup(self.objective()._repr_html_())])
+
+    # ---------------------------------------------------------------- inside
+
+    def insert(self, record: FactorRecord) -> None:
+        """Take a factor whose evidence is in the ledger already; one with the same id is replaced."""
+        self.records[record.factor_id] = record
+        self._next_factor = max(self._next_factor, record.factor_id + 1)
+        self.revision += 1
+        if isinstance(record, AttitudeRecord):
+            self._attitude_of[record.node] = self._attitude_of.get(record.node, 0) + 1
+        if isinstance(record, SubmapRecord):
+            for i in record.landmark_ids.tolist():
+                self._seen_in[i].add(record.factor_id)
+
+    def next_factor(self) -> int:
+        """A factor id that nobody has."""
+        self._next_factor += 1
+        return self._next_factor - 1
+
+    def _event(self, kind: str, **facts: Any) -> None:
+        self.events.append({"event": kind, **facts})
+
+    def _start_landmarks(self, ids: npt.NDArray[np.int64], world: Array) -> None:
+        new: dict[int, Array] = {}
+        for i, p in zip(ids.tolist(), world):
+            if i not in self._row and i not in new:
+                new[i] = p
+        for i in new:
+            self._row[i] = len(self._row)
+            self._seen_in[i] = set()
+        self.structure.append_landmarks(
+            np.array(list(new), dtype=np.int64), np.array(list(new.values())).reshape(-1, 2)
+        )
+
+    def _drop_landmarks(self, ids: Sequence[int]) -> None:
+        if not ids:
+            return
+        keep = ~np.isin(self.values.landmark_ids, np.asarray(ids))
+        self.values.landmark_ids = self.values.landmark_ids[keep]
+        self.values.landmarks = self.values.landmarks[keep]
+        self._row = {int(i): r for r, i in enumerate(self.values.landmark_ids)}
+        for i in ids:
+            self._seen_in.pop(i, None)
+            self._retired.add(i)
+
+    def start_tilt(self) -> None:
+        """Bring in the variable ``tilt``; fixes that took the z axis of the first base for up are turned by it."""
+        if not self.structure.count("tilt"):
+            self.structure.append("tilt", np.zeros(2))
+            for fid, r in self.records.items():
+                if isinstance(r, (GpsRecord, PseudorangeRecord)) and self.dim == 3:
+                    self.records[fid] = replace(r, tilt=True)  # a new object: solvers see that it changed
+            self.revision += 1

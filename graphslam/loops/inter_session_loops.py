@@ -1,0 +1,339 @@
+"""Where one session of dense submaps lies in another: ties by what places look like, registered, and made to agree.
+
+Nothing is known beforehand of how two sessions lie to each other, so there is no prediction to gate a match by, and in
+a building that repeats itself a place that looks right is often wrong. What decides is agreement: two ties (a, b) and
+(c, d) and the two chains between their ends must close a cycle (:mod:`~graphslam.association.consistent_set`, with the
+chain cut between the sessions). The largest set of ties that agree two by two must be large enough, stretch over
+some of the way, and leave no second set of others that is nearly as large; else the answer is that nothing is known,
+and why.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from graphslam.association.consistent_set import LoopArrays, OdometryChain, largest_consistent_set, pair_chi2
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array, arc_length
+from graphslam.core.poses import group_of
+from graphslam.core.submap import Submap
+from graphslam.evidence.views import dense_view, has_dense_view
+from graphslam.graph.inner_nodes import cut_submap
+from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
+from graphslam.loops.candidates import LoopCandidate, thin_candidates
+from graphslam.loops.measure import Loop, LoopMeasurer
+from graphslam.loops.places import Ints, Places
+from graphslam.registration.pair_config import PairConfig
+from graphslam.registration.place_descriptor import (
+    DescriptorConfig,
+    PlaceDescriptors,
+    concatenate_descriptors,
+    describe_places,
+)
+
+Mask = npt.NDArray[np.bool_]
+_APART = 1000.0  # sessions lie so far apart along the common way [m]: no two of their places are one stretch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InterSessionConfig:
+    """When ties between two sessions are believed."""
+
+    top: int = 3
+    """Of each place so many places of the other session are tried at most."""
+    alike: float = 0.5
+    """Correlation of their descriptors, at least."""
+    stretch: float = 6.0
+    """Places nearer than this along the way are one stretch [m]."""
+    keep: int = 60
+    """Candidates that are registered at most, most alike first."""
+    level: float = 0.99
+    """Two right ties agree with this probability."""
+    least: int = 3
+    """Ties that agree, at least …"""
+    reach: float = 6.0
+    """… over so much of the way of the session that is tied [m]."""
+    rival: float = 0.5
+    """A second set, of ties that the first has not, may have at most this share of its number."""
+    heard: int = 10
+    """Other places that ties bring near each other have a say where there are so many, at least …"""
+    borne: float = 0.1
+    """… of which such a share must match: blocks of houses look alike in part."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not math.isfinite(value) or value < 0 or (f.name in ("top", "keep", "least", "heard") and value < 1):
+                raise ConfigError(f"loop closures of sessions: {f.name} = {value}; wanted a positive number")
+        if not 0 < self.level < 1:
+            raise ConfigError(f"loop closures of sessions: level = {self.level}; wanted a probability in (0, 1)")
+
+
+class SessionMap:
+    """One session as a chain of nodes with the maps around them.
+
+    Parameters
+    ----------
+    submaps : sequence of Submap
+        Dense, with paths and maps.
+    spacing : float
+        Of the nodes [m]; node k is the k-th that a graph would have which begins with these submaps at this spacing.
+    """
+
+    def __init__(self, submaps: Sequence[Submap], spacing: float = 3.0) -> None:
+        if not submaps:
+            raise DataError("a session without submaps cannot be placed", wanted="at least one submap")
+        self.submaps = list(submaps)
+        nodes, which, poses, way, times, steps, covariances = [], [], [], [], [], [], []
+        node, begin = 0, 0.0
+        for k, s in enumerate(self.submaps):
+            if s.landmarks is not None or not has_dense_view(s) or s.trajectory is None or not len(s.trajectory):
+                raise DataError(f"submap {s.key} cannot be placed", wanted="a dense submap with a path and a map")
+            cut = cut_submap(s, spacing)
+            n = len(cut.increments)
+            path = s.trajectory
+            along = arc_length(path.positions)
+            nodes.append(node + np.arange(n))
+            which.append(np.full(n, k))
+            poses.append(cut.T_base_node[:-1])
+            times.append(cut.times[:-1])
+            way.append(begin + np.interp(cut.times[:-1], path.times, along))
+            steps.append(cut.increments)
+            covariances.append(cut.covariances)
+            node, begin = node + n, begin + float(along[-1])
+        self.places = Places(
+            np.concatenate(nodes).astype(np.int64),
+            np.concatenate(which).astype(np.int64),
+            np.concatenate(poses),
+            np.concatenate(way),
+            np.concatenate(times),
+        )
+        self.increments, self.covariances = np.concatenate(steps), np.concatenate(covariances)
+        self.length = begin
+        """Of the way [m]."""
+
+    @cached_property
+    def descriptors(self) -> PlaceDescriptors:
+        """Of the places; made when they are first asked for."""
+        config, out = DescriptorConfig(), []
+        for k, s in enumerate(self.submaps):
+            T = self.places.T_base_node[self.places.of_submap(k)]
+            out.append(describe_places(dense_view(s), T, config))
+        return concatenate_descriptors(out)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InterSessionLoops:
+    """What was tried to tie one session to another, and what came of it.
+
+    Parameters
+    ----------
+    loops : tuple of Loop
+        Every candidate as measured; ``i`` is a node of the map's chain, ``j`` one of the session's own chain.
+    accepted : (n,) bool
+        Those that agree with each other.
+    reasons : tuple of str
+        Of each, in words.
+    why : str
+        Why the ties as a whole are not believed; empty if they are.
+    rival : int
+        Size of the largest set of others that agree.
+    """
+
+    loops: tuple[Loop, ...]
+    accepted: Mask
+    reasons: tuple[str, ...]
+    why: str
+    rival: int
+
+    @property
+    def chosen(self) -> list[Loop]:
+        """The ties that agree; none if they are not believed."""
+        return [x for x, yes in zip(self.loops, self.accepted) if yes] if not self.why else []
+
+    def rows(self) -> list[dict[str, object]]:
+        """A row a candidate: submaps, nodes, score, verdict, why, and the figures of its gates."""
+        return [
+            {
+                "submap_map": x.submaps[0],
+                "submap_here": x.submaps[1],
+                "i": x.i,
+                "j": x.j,
+                "source": x.source,
+                "score": x.score,
+                "accepted": bool(yes) and not self.why,
+                "why": reason,
+                "gates": x.gates,
+            }
+            for x, yes, reason in zip(self.loops, self.accepted, self.reasons)
+        ]
+
+
+class TwoSessions:
+    """Two sessions side by side: candidates between them, registrations, agreement.
+
+    Parameters
+    ----------
+    known, new : SessionMap
+        The map, and the session that is to be placed in it.
+    pairs : PairConfig, optional
+        Of the registration.
+    """
+
+    def __init__(self, known: SessionMap, new: SessionMap, pairs: PairConfig | None = None) -> None:
+        self.known, self.new = known, new
+        a, b = known.places, new.places
+        if group_of(a.T_base_node).dim != group_of(b.T_base_node).dim:
+            raise DataError("a session in the plane and one in space cannot be tied")
+        self.offset = len(known.increments) + 1
+        """Of the new session's nodes in the chain of both: the end of the known one is a node, too."""
+        self.places = Places(
+            np.concatenate([a.node, self.offset + b.node]),
+            np.concatenate([a.submap, len(known.submaps) + b.submap]),
+            np.concatenate([a.T_base_node, b.T_base_node]),
+            np.concatenate([a.way, known.length + _APART + b.way]),
+            np.concatenate([a.time, b.time]),
+        )
+        self.measurer = LoopMeasurer([*known.submaps, *new.submaps], self.places, pairs)
+        bridge, d = group_of(a.T_base_node).identity[None], known.covariances.shape[1]
+        joined = np.ones(self.offset + len(new.increments), dtype=np.bool_)
+        joined[self.offset - 1] = False  # what lies between the sessions is not known
+        self.chain = OdometryChain.of(
+            np.concatenate([known.increments, bridge, new.increments]),
+            np.concatenate([known.covariances, np.eye(d)[None], new.covariances]),
+            joined,
+        )
+
+    @property
+    def within(self) -> set[tuple[int, int]]:
+        """Pairs of submaps of one session: they are not tied here."""
+        n = len(self.known.submaps)
+        m = n + len(self.new.submaps)
+        return {*combinations(range(n), 2), *combinations(range(n, m), 2)}
+
+    def candidates(self, config: InterSessionConfig) -> list[LoopCandidate]:
+        """Places of the new session that look like places of the map."""
+        appearance = AppearanceConfig(top=config.top, least=config.alike, lead=0.0, stretch=config.stretch)
+        both = concatenate_descriptors([self.known.descriptors, self.new.descriptors])
+        return appearance_candidates(self.places, both, appearance, exclude=self.within)[: config.keep]
+
+    def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
+        """Registered; ``i`` and ``j`` are nodes of the chain of both."""
+        found = self.measurer.measure(candidates, progress=progress)
+        node = self.places.node
+        loops = [replace(x, i=int(node[x.i]), j=int(node[x.j])) for x in found]
+        seen: set[tuple[int, int]] = set()
+        for k, x in enumerate(loops):
+            if x.why:
+                continue
+            if (x.i, x.j) in seen:  # two candidates that ended at the same place are one measurement
+                loops[k] = replace(x, why="the same as another candidate")
+            seen.add((x.i, x.j))
+        return loops
+
+    def agree(self, loops: Sequence[Loop], config: InterSessionConfig) -> InterSessionLoops:
+        """The largest set of measured ties that agree with each other, and whether it is to be believed.
+
+        Parameters
+        ----------
+        loops : sequence of Loop
+            From :meth:`measure`.
+
+        Returns
+        -------
+        InterSessionLoops
+            Its nodes ``j`` are those of the new session's own chain.
+        """
+        good = np.array([k for k, x in enumerate(loops) if not x.why], dtype=np.int64)
+        accepted: Mask = np.zeros(len(loops), dtype=np.bool_)
+        reasons = [f"registration: {x.why}" if x.why else "" for x in loops]
+        rival, why, reach = 0, "", 0.0
+        if len(good):
+            D = self._disagreement([loops[k] for k in good])
+            limit = float(stats.chi2.ppf(config.level, self.chain.tangent_dim))
+            best = largest_consistent_set(D, limit, against_chain=False)
+            accepted[good[best.accepted]] = True
+            for k, text in zip(good, best.reasons):
+                reasons[int(k)] = f"pairwise: {text}"
+            others = np.flatnonzero(~best.accepted)
+            if len(others):
+                rival = int(largest_consistent_set(D[np.ix_(others, others)], limit, against_chain=False).clique.sum())
+            way = self.new.places.way[self._rows([x for x, yes in zip(loops, accepted) if yes])]
+            reach = float(np.ptp(way))
+        n = int(accepted.sum())
+        counts = f"{len(loops)} places looked alike, {len(good)} of them passed the registration, {n} agree"
+        if n < config.least:
+            why = f"{counts}, wanted {config.least}"
+        elif reach < config.reach:
+            why = f"{counts}, but over {reach:.1f} m of the way only, wanted {config.reach:g} m"
+        elif rival > config.rival * n:
+            why = f"{counts}, but {rival} others agree on another pose: this could be two places"
+        own = [replace(x, j=x.j - self.offset) for x in loops]
+        return InterSessionLoops(loops=tuple(own), accepted=accepted, reasons=tuple(reasons), why=why, rival=rival)
+
+    def find(self, config: InterSessionConfig | None = None, *, progress: bool = False) -> InterSessionLoops:
+        """Candidates by appearance, registered, agreed upon."""
+        c = InterSessionConfig() if config is None else config
+        return self.agree(self.measure(self.candidates(c), progress=progress), c)
+
+    def thinned(self, loops: Sequence[Loop], stretch: float) -> list[Loop]:
+        """The most alike of ties of which no two tie one stretch [m] to one submap: their surroundings are the same.
+
+        Parameters
+        ----------
+        loops : sequence of Loop
+            Of :class:`InterSessionLoops`.
+        stretch : float
+            [m]
+        """
+        if not loops:
+            return []
+        target = self.known.places.submap[[x.i for x in loops]]
+        way = self.new.places.way[[x.j for x in loops]]
+        chosen = thin_candidates(target, way, np.array([x.score for x in loops]), stretch, len(loops))
+        return [loops[k] for k in sorted(chosen)]
+
+    def _rows(self, loops: Sequence[Loop]) -> Ints:
+        """Places of the new session that ties end at; a node that is no place is the end of the chain."""
+        return np.array([x.j - self.offset for x in loops], dtype=np.int64)
+
+    def _disagreement(self, loops: Sequence[Loop]) -> Array:
+        """``D²`` of every pair of ties; nothing says of one by itself whether it is right."""
+        ends = np.array([[x.i, x.j] for x in loops], dtype=np.int64)
+        arrays = LoopArrays.of(
+            self.chain, ends, np.stack([x.T_ij for x in loops]), np.stack([x.covariance for x in loops])
+        )
+        n = len(loops)
+        a, b = np.triu_indices(n, 1)
+        D = np.zeros((n, n))
+        D[a, b] = D[b, a] = pair_chi2(self.chain, arrays, a, b)
+        return D
+
+
+def session_start(ties: Sequence[Loop], known: Array, new: Array) -> Array:
+    """Where a session begins in the map by the middlemost of its ties: the start value of a solver.
+
+    Parameters
+    ----------
+    known : (n, 7|3)
+        Nodes of the map, in its frame.
+    new : (m, 7|3)
+        Nodes of the session, in that of its first base.
+
+    Returns
+    -------
+    (7,) or (3,)
+        Of the tie whose own start is nearest to all others'.
+    """
+    g = group_of(known)
+    starts = np.stack([g.compose(g.compose(known[x.i], x.T_ij), g.inverse(new[x.j])) for x in ties])
+    apart = np.linalg.norm(starts[:, None, : g.dim] - starts[None, :, : g.dim], axis=2)
+    return np.asarray(starts[int(np.argmin(apart.sum(axis=1)))])

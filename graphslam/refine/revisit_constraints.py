@@ -1,0 +1,132 @@
+"""What the start of a refinement says of places that were passed more than once, checked against the scans between.
+
+Scans of neighbouring steps hold the path together far better than any filter does, so that a start in which a wrong
+loop drew two places together contradicts them by many σ. The start's relative poses between passes therefore enter as
+guides with a robust kernel (graduated non-convexity), only to bring the path within reach of the scans of the other
+pass; they are no measurements, and are gone before the covariance is computed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from graphslam.core.geometry import Array
+from graphslam.core.poses import Group, group_of
+from graphslam.refine.motion import MotionTerms
+from graphslam.refine.problem import LinearisedProblem
+from graphslam.refine.surfaces import NEIGHBOURS, ScanReturns
+
+Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+POSITION, ANGLE = 0.15, 0.015
+"""σ of the start's relative pose of two passes [m], [rad]: what brings scans within the capture of the first round."""
+DOUBT = 4.0
+"""Factor on the covariance of a path that scans of neighbours alone hold together."""
+FAR = 1.0, 0.1
+"""A guide that the refined path contradicts by more is a wrong loop of the start [m], [rad]."""
+ACCEPTED = 16.8
+"""χ² of six degrees of freedom at 99 %: beyond it a guide contradicts the scans between."""
+
+
+@dataclass(frozen=True, slots=True)
+class RevisitConstraints:
+    """Relative poses of passes in the start.
+
+    Parameters
+    ----------
+    steps : (m, 2)
+        Earlier and later step.
+    poses : (m, 7|3)
+        ``T_earlier_later`` in the start.
+    """
+
+    steps: Index
+    poses: Array
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def terms(self, path: Array, weights: Array) -> MotionTerms:
+        """Factors at a path, weighted ``(m,)``."""
+        g = group_of(path)
+        a, b = self.steps.T
+        step = g.between(path[a], path[b])
+        e = g.log(g.between(self.poses, step))
+        Jr = np.linalg.inv(g.right_jacobian(e))
+        J = np.concatenate([-Jr @ g.adjoint(g.inverse(step)), Jr], axis=2)
+        W = np.sqrt(weights)[:, None] / _sigmas(g)
+        return MotionTerms(W * e, W[..., None] * J, self.steps, (g.dof, g.dof), "guides")
+
+    def squared(self, path: Array) -> Array:
+        """χ² of each ``(m,)``."""
+        g = group_of(path)
+        a, b = self.steps.T
+        e = g.log(g.between(self.poses, g.between(path[a], path[b])))
+        return np.asarray(np.sum((e / _sigmas(g)) ** 2, axis=1))
+
+    def far(self, path: Array) -> Flags:
+        """Which are wrong by more than a path is ever bent within what it knows: more than a scan could bridge."""
+        g = group_of(path)
+        a, b = self.steps.T
+        off, turned = tangent_lengths(g.log(g.between(self.poses, g.between(path[a], path[b]))), g)
+        return np.asarray((off > FAR[0]) | (turned > FAR[1]), dtype=np.bool_)
+
+    def distances(self, path: Array, solved: LinearisedProblem, width: int) -> Array:
+        """Mahalanobis distances ``(m,)``, squared, of the guides from a path whose covariance is known.
+
+        The covariance of scans of neighbours alone promises up to :data:`DOUBT` times too much.
+        """
+        g = group_of(path)
+        step = g.between(path[self.steps[:, 0]], path[self.steps[:, 1]])
+        e = g.log(g.between(self.poses, step))
+        A = -g.adjoint(g.inverse(step))
+        own = np.diag(_sigmas(g) ** 2)
+        out = np.empty(len(self))
+        for k, (a, b) in enumerate(self.steps.tolist()):
+            rows = np.concatenate([a * width + np.arange(width), b * width + np.arange(width)])
+            C = solved.factor.inverse_block(rows)
+            J = np.concatenate([A[k], np.eye(width)], axis=1)
+            out[k] = e[k] @ np.linalg.solve(DOUBT * J @ C @ J.T + own, e[k])
+        return out
+
+
+def tangent_lengths(e: Array, g: Group) -> tuple[Array, Array]:
+    """Way [m] and turn [rad] of tangents ``(m, d)``, each ``(m,)``."""
+    turn = np.delete(e, np.r_[g.position], axis=1)
+    return np.linalg.norm(e[:, g.position], axis=1), np.linalg.norm(turn, axis=1)
+
+
+def _sigmas(g: Group) -> Array:
+    s = np.full(g.dof, ANGLE)
+    s[g.position] = POSITION
+    return s
+
+
+def find_revisit_constraints(cloud: ScanReturns, start: Array, reach: float) -> RevisitConstraints:
+    """The nearest chunk of every other pass within ``reach`` [m] of each chunk, at the start ``(n, 7|3)``."""
+    d, C = cloud.points.shape[1], cloud.chunks
+    first = np.searchsorted(cloud.chunk, np.arange(C))
+    last = np.append(first[1:], len(cloud.chunk)) - 1
+    middle = (first + last) // 2
+    at = start[middle, :d]
+    pairs = cKDTree(at).query_pairs(reach, output_type="ndarray").astype(np.int64)
+    pairs = np.sort(pairs, axis=1)
+    pairs = pairs[pairs[:, 1] - pairs[:, 0] > NEIGHBOURS]
+    if not len(pairs):
+        return RevisitConstraints(np.zeros((0, 2), np.int64), np.zeros((0, start.shape[1])))
+    distance = np.linalg.norm(at[pairs[:, 1]] - at[pairs[:, 0]], axis=1)
+    order = np.lexsort((pairs[:, 0], pairs[:, 1]))
+    pairs, distance = pairs[order], distance[order]
+    # of the later chunk's partners, those that follow each other are one pass: its nearest
+    new = (np.diff(pairs[:, 1], prepend=-1) != 0) | (np.diff(pairs[:, 0], prepend=-9) > 1)
+    group = np.cumsum(new) - 1
+    best = np.lexsort((distance, group))
+    chosen = best[np.unique(group[best], return_index=True)[1]]
+    steps = middle[pairs[chosen]]
+    g = group_of(start)
+    return RevisitConstraints(steps, g.between(start[steps[:, 0]], start[steps[:, 1]]))

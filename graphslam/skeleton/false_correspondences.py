@@ -1,0 +1,81 @@
+"""Wrong unions: landmarks that hold measurements of two things, found by their χ² and split by passes and places."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2
+
+from graphslam.core.geometry import Array
+from graphslam.skeleton import correspondence_kernels, landmark_kernels
+from graphslam.skeleton.collapse import number_by_first_sighting
+from graphslam.skeleton.schur import Network
+
+Labels = npt.NDArray[np.int32]
+
+# A landmark is taken for wrong when its χ² is at least this share of the worst in view, and of the worst of all.
+_AMONG, _OF_ALL = 0.3, 0.01
+
+
+def landmark_chi2(network: Network) -> Array:
+    """``Σ eᵀ W e`` of each landmark ``(L,)`` at the network's poses."""
+    layout = network.layout
+    parts = [np.zeros(r) for r in layout.reach]
+    counts = [np.zeros(r, np.int32) for r in layout.reach]
+    layout.workers.over(
+        lambda k: landmark_kernels.landmark_chi2_kernel(
+            layout.problem.sightings, network.poses, network.landmarks, *layout.ranges[k], parts[k], counts[k]
+        ),
+        [(k,) for k in range(len(parts))],
+    )
+    out = parts[-1]
+    for part in parts[:-1]:
+        out[: len(part)] += part
+    return out
+
+
+def split_false_correspondences(network: Network, false_alarm: float = 1e-10, gap: int = 20) -> tuple[Labels, int]:
+    """Give every pass of a landmark whose χ² is impossible a landmark of its own; two, if it sees two things at once.
+
+    The poses may still be wrong, which raises the χ² of all: it is compared in units of the median over the landmarks
+    of several passes (never of less than one per degree of freedom). A wrong union also bends the poses that see it,
+    and so its neighbours: only those go that are among the worst of all that is in view with them. The rest is judged
+    again when the poses have moved.
+
+    Parameters
+    ----------
+    false_alarm : float
+        Chance for a right landmark to be taken for a wrong one.
+    gap : int
+        Poses without a sighting between two passes.
+
+    Returns
+    -------
+    landmark : (M,)
+        Numbered by first sighting; the problem's own array where nothing was wrong.
+    found : int
+        Landmarks that were split.
+    """
+    problem, counts = network.layout.problem, network.layout.counts
+    L = problem.landmarks
+    passes = np.zeros(L, np.int32)
+    correspondence_kernels.count_passes(problem.landmark, problem.first, gap, np.full(L, -1, np.int32), passes)
+    several = np.flatnonzero(passes > 1)
+    if not len(several):
+        return problem.landmark, 0
+    value = landmark_chi2(network)[several]
+    freedom = 3.0 * (counts[several] - 1)
+    scale = max(1.0, float(np.median(value / freedom)))
+    kinds, which = np.unique(freedom, return_inverse=True)
+    ratio, worst = np.zeros(L), np.zeros(L)
+    ratio[several] = value / (scale * chi2.isf(false_alarm, kinds)[which])
+    ratio[ratio < 1.0] = 0.0
+    if not ratio.any():
+        return problem.landmark, 0
+    correspondence_kernels.worst_in_view(problem.landmark, problem.first, ratio, worst)
+    wrong = np.flatnonzero((ratio > _AMONG * worst) & (ratio > _OF_ALL * ratio.max()))
+    bad = np.zeros(L, np.bool_)
+    bad[wrong] = True
+    landmark = problem.landmark.copy()
+    correspondence_kernels.split_labels(problem.sightings, network.poses, bad, (gap, 16.27), landmark, L)
+    return number_by_first_sighting(landmark)[0], len(wrong)

@@ -1,0 +1,64 @@
+"""The softest modes of a skeleton network: which long bends the measurements hold least. Approximate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse.linalg as spla
+
+from graphslam.core.geometry import Array
+from graphslam.skeleton.preconditioner import KeyframeNetwork, preconditioner_levels
+from graphslam.skeleton.schur import Network
+
+
+@dataclass(frozen=True)
+class WeakMode:
+    """How far one mode moves the poses when the objective rises by one unit of χ².
+
+    Parameters
+    ----------
+    rms, largest : float
+        Over the keyframes, and of the keyframe that moves most [m].
+    pose : int
+        Where that is.
+    """
+
+    rms: float
+    largest: float
+    pose: int
+
+
+def weakest_modes(network: Network, count: int = 3, keyframes: KeyframeNetwork | None = None) -> list[WeakMode]:
+    """The modes with the largest variance of position, softest first, by Lanczos on the factored keyframe network.
+
+    The keyframes bend the path only as rigid motion between them allows, so the true modes are at least as soft: the
+    figures are lower bounds.
+
+    Parameters
+    ----------
+    keyframes : KeyframeNetwork, optional
+        Default: one of the size of the preconditioner's is made.
+    """
+    if keyframes is None:
+        poses = network.layout.problem.poses
+        k = preconditioner_levels(poses).factored or max(1, poses // 40)
+        keyframes = KeyframeNetwork(network, k)
+    n = keyframes.frames
+
+    def spread(x: Array) -> Array:
+        full = np.zeros((n, 6))
+        full[:, 3:] = x.reshape(n, 3)
+        return keyframes.solve(full)[:, 3:].ravel()
+
+    operator = spla.LinearOperator((3 * n, 3 * n), matvec=spread, dtype=np.float64)
+    count = min(count, 3 * n - 2)
+    begin = np.cos(np.arange(3.0 * n))
+    value, vector = spla.eigsh(operator, k=count, which="LM", v0=begin, tol=1e-3)
+    modes = []
+    for i in np.argsort(-value):
+        move = np.linalg.norm(vector[:, i].reshape(n, 3), axis=1) * np.sqrt(value[i])
+        at = int(np.argmax(move))
+        pose = min(at * keyframes.k, len(network.poses.position) - 1)
+        modes.append(WeakMode(float(np.sqrt(np.mean(move**2))), float(move[at]), pose))
+    return modes

@@ -1,0 +1,354 @@
+"""What is accepted in the end: every loop and every group of loops against the posterior of all the others.
+
+A loop's cost at the answer says little: a wrong loop that bends the map to itself is cheap there, and a right one that
+alone ties a stretch is dear without it. What counts is the evidence of the others. With the whitened residual r, the
+whitened Jacobian A and H the information of what is accepted, ``B = A H⁻¹ Aᵀ``, the fall of the objective if an
+accepted loop is taken out, and its rise if a refused one is taken in, are to first order
+
+    ``D² = rᵀ (I - B)⁻¹ r`` and ``D² = rᵀ (I + B)⁻¹ r``,
+
+the same number for the same loop: χ² of the loop against the posterior of all others (Cook 1979).
+
+Wrong loops that come from one mistaken place agree with each other, so ten of them are one piece of evidence and not
+ten. A group of loops that are neighbours is therefore judged by the one thing that all of them say together, the rigid
+motion of one stretch against the other. With ``G_k`` the whitened derivative of loop k by that motion, the χ² of the
+motion against all that is not of the group, which is what the objective would fall if the motion were free (accepted),
+or rise because it is not (refused), is
+
+    ``D² = gᵀ (Gᵀ (I - B) G)⁻¹ g``, ``g = Gᵀ r`` (accepted), and the same with ``r → (I + B)⁻¹ r`` and
+    ``I - B → (I + B)⁻¹`` (refused).
+
+The limit is the file's own: recorded loops have tails of their own kind, and the bulk says nothing about them. The tail
+of the accepted D² is followed as far as it is populated (Hill 1975).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy import stats
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from graphslam.core.geometry import Array
+from graphslam.core.poses import group_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factors.between import BetweenBatch
+from graphslam.graph.variables import Values
+from graphslam.solve.descent import Optimum, descend_to_minimum
+from graphslam.solve.network.batch import BatchProblem
+from graphslam.solve.sparse import factorise_sparse
+
+Mask = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+# Loops are neighbours if their ends are so many nodes apart, both together; larger groups are not judged as groups.
+NEAR, LARGEST = 4, 40
+# Refused loops that are looked at in every round, those of least cost; columns that are solved for at a time.
+TESTED, COLUMNS = 300, 400
+# Rounds of accepting and refusing; steps of a solve between two of them.
+ROUNDS, STEPS = 15, 20
+# In a round only what is within this factor of the worst is taken out: one wrong loop makes its neighbours look bad.
+WORST = 0.25
+# The tail is told by this share of the accepted loops, with the weight of so many more of a tail index in between that
+# of a Gaussian and a Cauchy; the limit is where so many right loops are expected beyond.
+TAIL, PRIOR, INDEX, BEYOND = 0.05, 5.0, 0.5, 0.5
+# … found by following the tail from the bulk's quantile, in so many steps.
+FOLLOWED, QUANTILE = 50, 0.9999
+# Fewer loops tell neither tail nor scale: the stated noise stands.
+FEW = 30
+# With more loops than this a right one is refused by chance as seldom as with so many, not more often.
+FAMILY = 100
+# After the first round, loops and groups below this quantile, in the scale of the bulk, are not looked at again.
+DULL = 0.95
+# B comes so close to 1 where nothing but the loop itself holds its ends.
+HELD = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class RobustResult:
+    """Inliers and the solution of their least-squares problem.
+
+    Parameters
+    ----------
+    inliers : (m + k,) bool
+        Edges, then observations.
+    problem : BatchProblem
+        Of the inliers alone.
+    end : Optimum
+        Its objective is that of the inliers.
+    limit : (m + k,)
+        What a measurement pays at most, that of edges by the tail of those accepted; infinite for trusted ones.
+    truncated : float
+        Truncated cost here.
+    scale : float
+        True over stated variance of the edges: estimated (from the median D² of the accepted loops), or given.
+    rounds : int
+        Of settling until nothing changed; ``ROUNDS`` if something still did.
+    start : str
+        Which start led here.
+    reached : dict of str to float
+        Truncated cost by start.
+    """
+
+    inliers: Mask
+    problem: BatchProblem
+    end: Optimum
+    limit: Array
+    truncated: float = float("nan")
+    scale: float = 1.0
+    rounds: int = 0
+    start: str = ""
+    reached: dict[str, float] = field(default_factory=dict)
+
+
+def family_quantile(probability: float, count: int) -> float:
+    """Probability that one of ``count`` right loops is kept, so that all are as likely kept as ``FAMILY`` of them are
+    with the probability given."""
+    return 1.0 - (1.0 - probability) * min(1.0, FAMILY / max(count, 1))
+
+
+def tail_limit(D2: Array, dof: int, quantile: float = QUANTILE) -> tuple[float, float]:
+    """Where the tail of right loops ends, and the noise scale of their bulk.
+
+    Parameters
+    ----------
+    D2 : (l,)
+        Of accepted loops, wrong ones perhaps among them.
+    dof : int
+        Of one.
+    quantile : float
+        Of χ², in the scale of the bulk: the limit is at least that.
+
+    Returns
+    -------
+    limit : float
+        Where the tail ``P(D² > x) ~ x^(-1/ξ)`` has half a loop beyond it. ξ is Hill's estimate from the top twentieth
+        of what is within the limit, so what lies beyond a gap that the tail does not bridge tells nothing about it.
+    scale : float
+        Median over that of χ².
+    """
+    x = np.sort(D2[np.isfinite(D2) & (D2 >= 0.0)])
+    if not len(x):
+        return float("inf"), 1.0
+    scale = max(float(np.median(x)) / float(stats.chi2.median(dof)), np.finfo(float).tiny)
+    least = limit = scale * float(stats.chi2.ppf(quantile, dof))
+    for _ in range(FOLLOWED):
+        n = int(np.searchsorted(x, limit, side="right"))
+        k = max(int(TAIL * n), 1)
+        if n <= k:
+            break
+        begin = x[n - k - 1]
+        if not begin > 0.0:
+            break
+        index = (float(np.log(x[n - k : n] / begin).sum()) + PRIOR * INDEX) / (k + PRIOR)
+        fresh = max(least, begin * (k / BEYOND) ** index)
+        if fresh <= limit * (1.0 + 1e-6) or np.searchsorted(x, fresh, side="right") == n:
+            limit = max(fresh, limit)
+            break
+        limit = fresh
+    return limit, scale
+
+
+def groups_of(ends: npt.ArrayLike, near: int = NEAR) -> Ints:
+    """Number of the group of every loop ``(l,)``: neighbours of neighbours, by the nodes that they join ``(l, 2)``."""
+    e = np.sort(np.asarray(ends, dtype=np.float64).reshape(-1, 2), axis=1)
+    if not len(e):
+        return np.zeros(0, dtype=np.int64)
+    pairs = cKDTree(e).query_pairs(near, p=1, output_type="ndarray")
+    links = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(e), len(e)))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
+def loop_evidence(
+    flat: FactorArrays, inliers: Mask, rows: npt.ArrayLike, values: Values, *, accepted: bool
+) -> tuple[Array, Array, Ints]:
+    """``D²`` of loops and of their groups against the posterior of what is accepted, themselves left out.
+
+    Parameters
+    ----------
+    flat : FactorArrays
+        Edges come first.
+    inliers : (m + k,) bool
+        What is accepted.
+    rows : (l,) int
+        Edges, all of them accepted or all refused.
+    values : Values
+        A minimum of the accepted's objective.
+    accepted : bool
+        Whether ``rows`` are among the inliers.
+
+    Returns
+    -------
+    single : (l,)
+    group : (l,)
+        Of the group's common motion; that of the loop itself where it is alone or its group is too large.
+    label : (l,) int64
+        Which group.
+    """
+    at = np.asarray(rows, dtype=np.intp)
+    edges = flat.batches[0]
+    assert isinstance(edges, BetweenBatch)
+    d, layout = flat.layout.pose_dof, flat.layout
+    label = groups_of(edges.ends[at])
+    order = np.argsort(label, kind="stable")
+    H = sp.csc_matrix(flat.evaluate(values, dense=False, weights=inliers.astype(np.float64)).A)
+    H.eliminate_zeros()  # what is refused would fill the factor
+    lu = factorise_sparse(H)
+    ordered = BetweenBatch.of_arrays(
+        edges.ends[at[order]], edges.measured[at[order]], edges.whiteners[at[order]], layout
+    )
+    whole, J = ordered.whitened(values)
+    columns = np.broadcast_to(ordered.columns.reshape(len(at), 1, 2 * d), J.shape)
+    row = np.broadcast_to(np.arange(len(at) * d).reshape(-1, d, 1), J.shape)
+    free = columns >= 0
+    A = sp.csr_matrix((J[free], (row[free], columns[free])), shape=(len(at) * d, layout.size))
+    r = whole.ravel()
+    G = _common_motion(ordered, J, values.poses)
+    single, group = np.empty(len(at)), np.empty(len(at))
+    sign = -1.0 if accepted else 1.0
+    for first, last in _chunks(label[order], max(COLUMNS // d, 1)):
+        part = A[first * d : last * d]
+        S = np.eye((last - first) * d) + sign * np.asarray(part @ lu.solve(part.T.toarray()))
+        e = r[first * d : last * d]
+        n = last - first
+        own = S.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)] + HELD * np.eye(d)
+        x = e.reshape(n, d)
+        single[first:last] = np.einsum("ki,ki->k", x, np.linalg.solve(own, x[..., None])[..., 0])
+        names = label[order][first:last]
+        starts = np.flatnonzero(np.diff(names, prepend=-1))
+        for a, b in zip(starts, [*starts[1:], n], strict=True):
+            if b - a == 1 or b - a > LARGEST:
+                group[first + a : first + b] = single[first + a : first + b]
+                continue
+            W: Array = S[a * d : b * d, a * d : b * d]
+            g = G[(first + a) * d : (first + b) * d]
+            own_r = e[a * d : b * d]
+            if not accepted:
+                W = np.asarray(np.linalg.inv(W))
+                own_r = W @ own_r
+            u = g.T @ own_r
+            M = g.T @ W @ g
+            unit = np.sqrt(np.maximum(np.diag(g.T @ g), np.finfo(float).tiny))
+            M = M / np.outer(unit, unit) + HELD * np.eye(d)
+            group[first + a : first + b] = (u / unit) @ np.linalg.solve(M, u / unit)
+    back = np.argsort(order, kind="stable")
+    return single[back], group[back], label
+
+
+def _common_motion(loops: BetweenBatch, J: Array, poses: Array) -> Array:
+    """Whitened derivative ``(l d, d)`` of the loops' residuals by a motion of all later ends, a left tangent about the
+    middle of their positions (the condition of what follows is better there than about the origin)."""
+    g, ends = group_of(poses), loops.ends
+    # a loop that runs back says the same of the inverse motion: the later end is the one that moves
+    moved = poses[np.max(ends, axis=1)].copy()
+    moved[:, : g.dim] -= moved[:, : g.dim].mean(axis=0) if len(moved) else 0.0
+    blocks = np.where((ends[:, 0] > ends[:, 1])[:, None, None], J[:, :, : g.dof], J[:, :, g.dof :])
+    return np.asarray((blocks @ g.adjoint(g.inverse(moved))).reshape(len(ends) * g.dof, g.dof))
+
+
+def _chunks(label: Ints, most: int) -> list[tuple[int, int]]:
+    """Pieces of a sorted label array that cut no group of at most ``LARGEST``."""
+    starts = np.flatnonzero(np.diff(label, prepend=-1))
+    ends = np.append(starts[1:], len(label))
+    out: list[tuple[int, int]] = []
+    begin = 0
+    for a, b in zip(starts.tolist(), ends.tolist(), strict=True):
+        if b - begin <= most:
+            continue
+        if a > begin:
+            out.append((begin, a))
+            begin = a
+        if b - a > LARGEST:
+            while b - begin > most:
+                out.append((begin, begin + most))
+                begin += most
+    if begin < len(label):
+        out.append((begin, len(label)))
+    return out
+
+
+def leave_one_out_test(
+    whole: BatchProblem,
+    values: gtsam.Values,
+    inliers: Mask,
+    limit: Array,
+    *,
+    probability: float = QUANTILE,
+    own_tail: bool = True,
+) -> RobustResult:
+    """Rounds of accepting and refusing by ``D²`` until nothing changes.
+
+    Parameters
+    ----------
+    whole : BatchProblem
+        Of all measurements.
+    values : gtsam.Values
+        Near a minimum of the inliers' objective.
+    inliers : (m + k,) bool
+        Believed so far.
+    limit : (m + k,)
+        Infinite for trusted edges; of observations.
+    probability : float
+        With which a right loop is kept (:func:`family_quantile`) if the stated noise is right: no limit is wider.
+    own_tail : bool
+        The limit of edges is the file's own (:func:`tail_limit`); that of ``limit`` if not.
+    """
+    network, flat = whole.network, whole.flat
+    m, d = len(network.edges), network.tangent_dim
+    w = np.linalg.eigvalsh(network.information)
+    judged = ~np.isinf(limit[:m]) & (w[:, 0] > 1e-12 * w[:, -1])
+    limit, scale, rounds = limit.copy(), 0.0, 0
+    dull = float(stats.chi2.ppf(DULL, d))
+    seen: set[bytes] = set()
+    back = False
+    single, worst = np.full(m, np.nan), np.full(m, np.nan)
+    for rounds in range(1, ROUNDS + 1):
+        problem = BatchProblem(network, inliers, flat)
+        end = descend_to_minimum(problem, values, max_iterations=STEPS)
+        values, here = end.values, problem.unpack(end.values)
+        if back:
+            break
+        seen.add(inliers.tobytes())
+        fresh = inliers.copy()
+        every = flat.squared(here)
+        fresh[m:] = every[m:] <= limit[m:]
+        inside = np.flatnonzero(judged & inliers[:m])
+        asked = inside[~(worst[inside] <= scale * dull)]
+        if len(asked):
+            single[asked], group, _ = loop_evidence(flat, inliers, asked, here, accepted=True)
+            worst[asked] = np.maximum(single[asked], group)
+        if len(inside):
+            quantile = family_quantile(probability, len(inside))
+            most, scale = tail_limit(single[inside], d, quantile)
+            if own_tail:
+                stated = float(stats.chi2.ppf(quantile, d))
+                most = min(most, stated) if len(inside) >= FEW else stated
+                limit[:m] = np.where(np.isinf(limit[:m]), np.inf, most)
+            bad = worst[inside] > np.maximum(limit[inside], WORST * worst[inside].max())
+            fresh[inside[bad]] = False
+            worst[inside[bad]] = np.nan
+        costs = every[:m]
+        partial = ~judged & np.isfinite(limit[:m])
+        fresh[:m][partial] = costs[partial] <= limit[:m][partial]
+        outside = np.flatnonzero(judged & ~inliers[:m])
+        outside = outside[np.argsort(costs[outside], kind="stable")]
+        against = np.full(m, np.inf)
+        for first, last in ((0, TESTED), (TESTED, len(outside))):
+            # the dear ones only where nothing else changes: what the accepted do not hold may lie far off
+            some = outside[first:last]
+            if len(some) and (first == 0 or (fresh == inliers).all()):
+                against[some] = loop_evidence(flat, inliers, some, here, accepted=False)[0]
+        # the group of a right loop is that of those that could be right: wrong ones may lie beside it
+        good = outside[against[outside] <= limit[outside]]
+        if len(good):
+            alone, group, _ = loop_evidence(flat, inliers, good, here, accepted=False)
+            fresh[good[np.maximum(alone, group) <= limit[good]]] = True
+        if (fresh == inliers).all() or rounds == ROUNDS:
+            break
+        back = fresh.tobytes() in seen
+        inliers = fresh
+    return RobustResult(inliers, problem, end, limit, scale=scale, rounds=rounds)
