@@ -125,7 +125,7 @@ They change more often than functions and types. Example: `from graphslam.plots 
     uses = {p.stem: p.read_text(encoding="utf-8") for p in sorted((ROOT / "notebooks").glob("*.ipynb"))}
     for room in sorted(p.parent.name for p in (ROOT / "graphslam").glob("*/__init__.py")):
         module = importlib.import_module(f"graphslam.{room}")
-        face: dict[str, str] = getattr(module, "_FACE", {})
+        face: dict[str, str] = getattr(module, "_EXPORTS", {})
         if face:
             text += f"\n## graphslam.{room}\n\n{(module.__doc__ or '').strip()}\n"
         for name, home in sorted((n, m) for m, names in face.items() for n in names.split()):

@@ -50,6 +50,8 @@ BESIDE = sorted(ROOT.glob("notebooks/studies/graphslam_studies/**/*.py"))
 
 def package_of(module: str) -> str | None:
     parts = module.split(".")
+    if module == "graphslam.__main__":  # the command line
+        return "graphslam.app"
     if parts[0] == "graphslam_frontends":
         return parts[0]
     return ".".join(parts[:2]) if parts[0] == "graphslam" and len(parts) > 1 else None

@@ -126,7 +126,7 @@ def _public_names() -> dict[Path, set[str]]:
         add(module, {name})
     for init in (ROOT / "graphslam").rglob("__init__.py"):
         for n in ast.parse(init.read_text(encoding="utf-8")).body:
-            if isinstance(n, ast.Assign) and isinstance(n.targets[0], ast.Name) and n.targets[0].id == "_FACE":
+            if isinstance(n, ast.Assign) and isinstance(n.targets[0], ast.Name) and n.targets[0].id == "_EXPORTS":
                 for module, names in ast.literal_eval(n.value).items():
                     add(".".join(init.parent.relative_to(ROOT).parts) + "." + module, set(names.split()))
     return out

@@ -9,16 +9,23 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from tqdm.auto import tqdm
 
 from graphslam.app.memory import MemoryProbe
 from graphslam.core.errors import DataError
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.poses import group_of
+from graphslam.core.progress import Bar
 from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error
 from graphslam.evaluate.map_error import match_ids
 from graphslam.join.association import MapAssociationConfig
-from graphslam.join.registry import Material, association_of, identify_landmarks, methods_for, prepare_submaps
+from graphslam.join.registry import (
+    Material,
+    association_of,
+    compile_method,
+    identify_landmarks,
+    methods_for,
+    prepare_submaps,
+)
 from graphslam.join.submap_solver import SubmapEstimate
 
 logger = logging.getLogger(__name__)
@@ -153,8 +160,8 @@ def compare_methods(
         ``nees`` and ``ci`` are taken in the chart of the map, ``nees_plain`` of the plain vector. They and the errors
         judge the map that is handed over: the polished one where there is a polish; ``nees_unpolished`` and
         ``ci_unpolished`` the method's own. ``dof`` are the scalars measured less the free ones. ``seconds`` is wall
-        time, polish included; ``nnz`` the stored entries of the information matrix (of the dense covariance for an
-        unpolished EKF).
+        time, polish included and compilation excluded; ``nnz`` the stored entries of the information matrix (of the
+        dense covariance for an unpolished EKF).
     """
     submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
     way = methods_for(submaps)
@@ -167,8 +174,9 @@ def compare_methods(
         truth = None if truth is None else _poses_only(truth)
     keys = submap_keys(submaps)
     rows = []
-    for method in tqdm(methods, desc="compare", unit="method", disable=not progress):
+    for method in Bar(methods, name="compare", unit="method", shown=progress):
         own: dict[str, Any] = {}
+        compile_method(submaps, method, polish=polish)
         if method in way.joiners:
             joined = way.joiners[method](submaps)
             if polish:

@@ -5,9 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
 
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
@@ -49,55 +46,35 @@ def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool
     particles = PRESETS[preset]
     options = {} if particles is None else {"frontend": {"filter": {"particles": particles}}}
     truth = None if log.truth is None else log.truth.trajectory
-    with DemoProgress(out / "figures" / "progress.png", truth, shown=progress) as watch:
-        return run(
-            log, frontend="segslam", seed=seed, out=out, config=options, resume=True, progress=False, observers=[watch]
-        )
+    watch = DemoProgress(out / "figures" / "progress.png", truth)
+    return run(
+        log, frontend="segslam", seed=seed, out=out, config=options, resume=True, progress=progress, observers=[watch]
+    )
 
 
 @dataclass
 class DemoProgress(Observer):
-    """One line on stderr that says where the demo is, and a picture of the segments so far.
+    """A picture of the segments so far.
 
     Parameters
     ----------
+    picture : Path
     truth : Trajectory or None
         Drawn beside the segments.
-    shown : bool
-        Show the line.
     """
 
     picture: Path
     truth: Trajectory | None = None
-    shown: bool = True
     drawn: int = field(default=0, init=False)
     """Segments of the last picture."""
-    bar: Any = field(default=None, init=False)
 
-    def __enter__(self) -> DemoProgress:
-        self.bar = tqdm(desc="SegSLAM", unit="step", disable=not self.shown, leave=False, dynamic_ncols=True)
-        self.bar.set_postfix_str("compiling (first run only, ~30 s)")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.close()
-
-    def front_end_at(self, at: SegSlamProgress) -> None:
-        """After every step of the filter."""
-        if self.bar.total is None:
-            self.bar.total = at.steps
-        self.bar.update(at.step - self.bar.n)
-        last = at.step == at.steps
-        n = at.segments
-        if n > self.drawn:
-            self.draw(at)
-            self.drawn = n
-        where = f"{at.length:.0f} m, {n} segments"
-        if self.drawn:
-            where += f"; see {self.picture}"
-        if last:
-            self.bar.set_description("segments → graph → fused map")
-        self.bar.set_postfix_str(where, refresh=last)
+    def front_end_at(self, progress: SegSlamProgress) -> None:
+        """After every step of the filter: the picture, where there is a segment more."""
+        if progress.segments > self.drawn:
+            self.draw(progress)
+            if not self.drawn:
+                logger.warning("see %s: drawn again after every segment", self.picture)
+            self.drawn = progress.segments
 
     def draw(self, at: SegSlamProgress) -> None:
         """The picture, in place of the one before."""

@@ -6,15 +6,19 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
 
 from graphslam.app.run.front_ends import front_end_names
 from graphslam.core.extras import EXTRAS
+from graphslam.core.jit import compiled_code, compiled_folder, compiled_root, unwritable
 from graphslam.io.catalog import cache_folder, data_roots
 
+DISTRIBUTION = "graphslam-submaps"
 REQUIRED = {
     "gtsam": "gtsam",
     "numpy": "numpy",
@@ -31,12 +35,12 @@ class InstallCheck:
     """One line of the examination."""
 
     name: str
-    state: Literal["ok", "missing", "absent"]
+    state: Literal["ok", "missing", "conflict", "absent"]
     detail: str
 
 
 def examine_installation() -> list[InstallCheck]:
-    """Python, packages, extras and what each buys, data roots, front ends; "absent" is an optional part."""
+    """Python, packages, extras and what each buys, front ends, folders; "absent" is an optional part."""
     found = [InstallCheck("python", "ok", f"{platform.python_version()}, {os.cpu_count()} cores, {platform.system()}")]
     for name, module in REQUIRED.items():
         problem = _import_error(f"import {module}")
@@ -49,6 +53,7 @@ def examine_installation() -> list[InstallCheck]:
         advice = f"{e.buys}: pip install 'graphslam-submaps[{extra}]' (about {e.size} MB)"
         detail = e.buys if not problem else advice if not there else f"{problem} ({e.buys})"
         found.append(InstallCheck(f"extra {extra}", "absent" if problem else "ok", detail))
+    found += [*other_distributions(), *remains(site_packages())]
     names = front_end_names()
     state: Literal["ok", "missing"] = "ok" if names else "missing"
     found.append(
@@ -60,7 +65,54 @@ def examine_installation() -> list[InstallCheck]:
     found.append(
         InstallCheck("data cache", "ok" if cache.is_dir() else "absent", f"{cache} (made by graphslam data fetch)")
     )
+    found.append(_compiled())
     return found
+
+
+def other_distributions() -> list[InstallCheck]:
+    """Installed distributions that also hold an import package ``graphslam``: which one is imported is chance."""
+    others = sorted({n for n in packages_distributions().get("graphslam", ()) if _plain(n) != DISTRIBUTION})
+    return [
+        InstallCheck(
+            "import name",
+            "conflict",
+            f"{name} {version(name)} also installs a package graphslam: pip uninstall {name}, "
+            f"then install {DISTRIBUTION} again",
+        )
+        for name in others
+    ]
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "-")
+
+
+def site_packages() -> list[Path]:
+    """Folders of installed packages on the import path."""
+    return [Path(p) for p in sys.path if Path(p).name in ("site-packages", "dist-packages")]
+
+
+def remains(folders: Sequence[Path]) -> list[InstallCheck]:
+    """Folders of the name that an uninstall left: without an ``__init__.py`` they are imported as empty packages."""
+    left = [f / name for f in folders for name in ("graphslam", "graphslam_frontends")]
+    return [
+        InstallCheck(
+            "old install", "conflict", f"{folder} is left of an install before this one; delete it: rm -r {folder}"
+        )
+        for folder in left
+        if folder.is_dir() and not (folder / "__init__.py").exists()
+    ]
+
+
+def _compiled() -> InstallCheck:
+    """Compiled code: where it is, and how much."""
+    folder, why = compiled_folder(), unwritable()
+    if why:
+        advice = "kernels are compiled at every start; make it writable, or set NUMBA_CACHE_DIR to a folder that is"
+        return InstallCheck("compiled code", "absent", f"{folder}: {why}; {advice}")
+    number, size = compiled_code()
+    clear = "set by NUMBA_CACHE_DIR" if os.environ.get("NUMBA_CACHE_DIR") else "graphslam doctor --clear-compiled"
+    return InstallCheck("compiled code", "ok", f"{compiled_root()}: {number} functions, {size / 1e6:.0f} MB ({clear})")
 
 
 def _finding(name: str, problem: str) -> InstallCheck:

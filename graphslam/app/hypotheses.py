@@ -12,8 +12,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from graphslam.app.folders.generations import check_same, read_consistently
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.files import read_options
@@ -32,6 +30,7 @@ from graphslam.core.errors import ConfigError, MissingDataError, RunFolderError
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
+from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
@@ -112,7 +111,7 @@ def minimum_entropy_loops(run: Run, made: RunMap, *, progress: bool = True) -> M
     if len(every) > MOST:
         logger.warning("solved %d of %d choices of matches and loop closures", MOST, len(every))
     alternatives = []
-    for name, chosen in tqdm(choices.items(), desc="choices", unit="graph", disable=not progress):
+    for name, chosen in Bar(choices.items(), name="choices", unit="graph", shown=progress):
         back = solve_choice(run.submaps, chosen, config, loops=loops, decided=decided, **streams())
         solution = back.finish()
         ends = [*solution.base_nodes.tolist(), int(solution.exit_nodes[-1])]
@@ -154,7 +153,7 @@ def minimum_entropy_topology(
     front: Any = make_front_end(SegSlam.name, values["frontend"])
     config, streams = _graph_options(run)
     reach = sensor_reach(values)
-    with tqdm(desc="particles", unit="step", disable=not progress) as bar:
+    with Bar(name="particles", unit="step", shown=progress) as bar:
 
         def watch(at: Any) -> None:
             bar.total = at.steps

@@ -9,9 +9,12 @@ from __future__ import annotations
 import os
 import platform
 import sys
+import time
 from importlib.metadata import PackageNotFoundError, version
 
 from threadpoolctl import threadpool_limits
+
+from graphslam.core.jit import compile_seconds
 
 
 def one_blas_thread() -> threadpool_limits:
@@ -31,6 +34,21 @@ def hold_one_thread() -> None:
     else:
         os.environ["NUMBA_NUM_THREADS"] = "1"
     threadpool_limits(limits=1)
+
+
+class Stopwatch:
+    """Time since it was made, or since some seconds before, and what of it went into compilation [s]."""
+
+    def __init__(self, before: float = 0.0) -> None:
+        self._begin, self._compiled = time.perf_counter() - before, compile_seconds()
+
+    def seconds(self) -> float:
+        """All the time."""
+        return time.perf_counter() - self._begin
+
+    def compilation(self) -> float:
+        """The part of it in which kernels were compiled."""
+        return compile_seconds() - self._compiled
 
 
 PACKAGES = ("graphslam-submaps", "gtsam", "numpy", "scipy", "numba", "matplotlib", "pandas")

@@ -23,7 +23,7 @@ from types import TracebackType
 import graphslam
 from graphslam.core.heap import trim_heap
 from graphslam.io.submap_store import read_submaps, write_submaps
-from graphslam.join.registry import Material, join_by_method
+from graphslam.join.registry import Material, compile_method, join_by_method
 
 logger = logging.getLogger(__name__)
 
@@ -107,8 +107,7 @@ def _read(folder: Path) -> Material:
 def _measure_here(folder: str, method: str, polish: bool) -> float:
     """Load, settle, reset the high-water mark, join, read the mark [MB]."""
     submaps = _read(Path(folder))
-    first = submaps[:2] if isinstance(submaps, Sequence) else submaps.part(0, min(2, len(submaps.keys)))
-    join_by_method(first, method, polish=polish)  # modules and thread pools that load on first use
+    compile_method(submaps, method, polish=polish)  # and modules and thread pools that load on first use
     gc.collect()
     trim_heap()  # or the join would reuse it unseen
     before = _status("VmRSS")

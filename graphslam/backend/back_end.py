@@ -53,6 +53,9 @@ class Observer:
     Nothing that an observer does changes the run; what it raises ends it.
     """
 
+    def stage(self, name: str) -> None:
+        """A stage of the run begins, such as ``"front end"`` (:data:`graphslam.app.run.run_bar.STAGES`)."""
+
     def front_end_at(self, progress: Any) -> None:
         """A front end that can be watched has made a step; ``progress`` is of its own kind."""
 

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
 from graphslam.backend.back_end import BackEnd, find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.streams import ImuSource
 from graphslam.core.errors import ConfigError
+from graphslam.core.progress import Bar
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
 from graphslam.evidence.grid import EvidenceGrid
@@ -354,7 +354,7 @@ def solve_hypotheses(
     options = replace(config, match_support=math.inf, loops=False)
     pieces: dict[int, DividedSubmaps] = {}
     out = []
-    for number, h in enumerate(tqdm(told, "hypotheses", disable=not progress, leave=False)):
+    for number, h in enumerate(Bar(told, "hypotheses", shown=progress)):
         back = build_back_end(h.submaps, options, **streams())
         back.solver.solve_to_optimum()
         # what is withdrawn must not come back by registration: that is the other hypothesis

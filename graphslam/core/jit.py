@@ -6,10 +6,15 @@ imported as an empty namespace package. So every kernel of the package is compil
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import logging
+import multiprocessing
 import os
+import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -17,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import platformdirs
+
+from graphslam.core.progress import say_compiling
 
 
 @contextmanager
@@ -35,29 +42,191 @@ def without_garbage_collection() -> Iterator[None]:
 
 with without_garbage_collection():
     import numba
+    from numba.core import caching, event
 
-_NAMES = 2
-"""Raise it when a class that kernels take is renamed: numba looks for the old name before it sees a changed source."""
+logger = logging.getLogger(__name__)
+
+COMPILING = "GRAPHSLAM_COMPILING"
+"""Set in the environment of processes that compile for another one."""
+MOST_BYTES = 1_000_000_000
+"""Largest size of the compiled code of all versions."""
+UNUSED_SECONDS = 30 * 86_400.0
+"""Compiled code of another version of numba or Python is deleted when it has not been used for this long."""
+
+
+class _Compilations(event.Listener):
+    """Time that this process spends compiling; bars of progress say so meanwhile."""
+
+    def __init__(self) -> None:
+        self.seconds, self._depth, self._since = 0.0, 0, 0.0
+
+    def on_start(self, event: Any) -> None:
+        self._depth += 1
+        if self._depth == 1:
+            self._since = time.perf_counter()
+            say_compiling(True)
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._since
+            say_compiling(False)
+
+
+_compilations = _Compilations()
+event.register("numba:compile", _compilations)
+
+
+def compile_seconds() -> float:
+    """Time that this process has spent compiling kernels, or waiting for another one that did [s]."""
+    return _compilations.seconds
+
+
+@contextmanager
+def compiling_elsewhere() -> Iterator[None]:
+    """While another process compiles for this one: counted as compilation."""
+    begin = time.perf_counter()
+    try:
+        yield
+    finally:
+        _compilations.seconds += time.perf_counter() - begin
+
+
+def compiled_root() -> Path:
+    """Folder of the compiled code of all versions."""
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(chosen)
+    return Path(platformdirs.user_cache_dir("graphslam", appauthor=False)) / "compiled"
 
 
 def compiled_folder() -> Path:
     """Folder of compiled code: ``NUMBA_CACHE_DIR``, or one of this numba and Python in the user's cache folder."""
-    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(chosen)
-    version = f"numba-{numba.__version__}-python-{sys.version_info.major}.{sys.version_info.minor}-{_NAMES}"
-    return Path(platformdirs.user_cache_dir("graphslam", appauthor=False)) / "compiled" / version
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return compiled_root()
+    return compiled_root() / f"numba-{numba.__version__}-python-{sys.version_info.major}.{sys.version_info.minor}"
+
+
+def compiled_code() -> tuple[int, int]:
+    """Number of compiled functions in :func:`compiled_root`, and the size of all its files [bytes]."""
+    files = list(_files(compiled_root()))
+    return sum(f.suffix == ".nbc" for _, _, f in files), sum(size for _, size, _ in files)
+
+
+def clear_compiled_code() -> None:
+    """Delete the compiled code of all versions; a process that runs keeps what it has loaded.
+
+    A folder named by ``NUMBA_CACHE_DIR`` may hold code of other packages, and stays as it is.
+    """
+    if not os.environ.get("NUMBA_CACHE_DIR"):
+        shutil.rmtree(compiled_root(), ignore_errors=True)
+
+
+def trim_compiled_code(root: Path, current: Path) -> None:
+    """Delete versions that were not used for a month, then the oldest files until the rest is small enough.
+
+    Other processes may do the same, or read what is deleted here: they compile it anew.
+    """
+    oldest = time.time() - UNUSED_SECONDS
+    with contextlib.suppress(OSError):
+        for folder in root.iterdir():
+            if folder != current and folder.is_dir() and folder.stat().st_mtime < oldest:
+                shutil.rmtree(folder, ignore_errors=True)
+    files = sorted(_files(root))
+    size = sum(s for _, s, _ in files)
+    for _, s, file in files:
+        if size <= MOST_BYTES:
+            return
+        with contextlib.suppress(OSError):
+            file.unlink()
+        size -= s
+
+
+def _files(root: Path) -> Iterator[tuple[float, int, Path]]:
+    """Time, size and path of each file below a folder."""
+    for folder, _, names in os.walk(root):
+        for file in (Path(folder, n) for n in names):
+            with contextlib.suppress(OSError):  # another process has deleted it
+                yield file.stat().st_mtime, file.stat().st_size, file
 
 
 @cache
-def keeps_compiled_code() -> bool:
-    """Whether compiled code can be kept: the folder can be made, and written to."""
+def unwritable() -> str:
+    """Why compiled code cannot be kept in :func:`compiled_folder`; empty where it can."""
     folder = compiled_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+        os.utime(folder)  # the version is in use
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+@cache
+def _warn_not_kept(why: str) -> None:
+    if multiprocessing.parent_process() is None and COMPILING not in os.environ:
+        logger.warning(
+            "compiled code cannot be kept in %s (%s): kernels are compiled again at every start, about a minute; "
+            "make the folder writable or set NUMBA_CACHE_DIR to one that is",
+            compiled_folder(),
+            why,
+        )
+
+
+@cache
+def _trim_once() -> None:
+    if not os.environ.get("NUMBA_CACHE_DIR"):
+        trim_compiled_code(compiled_root(), compiled_folder())
+
+
+class _InMemory(caching.NullCache):
+    """Compiled code that is not kept; a warning says so when something is compiled."""
+
+    def __init__(self, why: str) -> None:
+        self.why = why
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        _warn_not_kept(self.why)
+
+
+class _ChosenFolder(caching.CompileResultCacheImpl):
+    _locator_classes: list[type[object]] = [caching.UserProvidedCacheLocator]  # noqa: RUF012 - never beside the source
+
+
+class _OnDisk(caching.FunctionCache):
+    """Compiled code of a function on disk. What cannot be read is compiled again; what cannot be written is lost."""
+
+    _impl_class = _ChosenFolder
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # unpickling a damaged file may raise anything
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _warn_not_kept(error.strerror or str(error))
+        else:
+            _trim_once()
+
+
+def _cache_of(function: Callable[..., Any]) -> Any:
+    if unwritable():
+        return _InMemory(unwritable())
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(compiled_folder())  # other packages keep theirs
+    try:
+        return _OnDisk(function)
+    except RuntimeError:  # numba found no folder for it
+        return _InMemory("it cannot be written")
+    finally:
+        config.CACHE_DIR = before
 
 
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
@@ -72,10 +241,7 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """
     if function is None:
         return lambda decorated: njit(decorated, **options)
-    config: Any = numba.config
-    before = config.CACHE_DIR
-    config.CACHE_DIR = str(compiled_folder())  # read when a function is decorated; other packages keep theirs
-    try:
-        return numba.njit(cache=keeps_compiled_code(), **options)(function)
-    finally:
-        config.CACHE_DIR = before
+    made = numba.njit(**options)(function)
+    if hasattr(made, "enable_caching"):  # it is the function itself under NUMBA_DISABLE_JIT
+        made._cache = _cache_of(function)
+    return made

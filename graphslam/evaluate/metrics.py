@@ -318,11 +318,14 @@ def add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:
 
 
 def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, scans: float, cost: Array) -> None:
-    """Seconds per stage, how much faster than the recording, and whether cost per scan grows over the log."""
+    """Seconds per stage, how much faster than the recording, and whether cost per scan grows over the log.
+
+    Compilation is no part of the speed, and ``duration`` is that of the records used now, not in a run that is resumed.
+    """
     for stage, value in seconds.items():
         out.add(f"seconds_{stage}", value, "s", "lower")
-    total = seconds.get("total", 0.0)
-    if total > 0:
+    total = seconds.get("total", 0.0) - seconds.get("compilation", 0.0)
+    if total > 0 and duration > 0:
         out.add("times_real_time", duration / total, "x", "higher")
     if scans:
         out.add("frontend_ms_per_scan", 1e3 * seconds.get("frontend", 0.0) / scans, "ms", "lower")

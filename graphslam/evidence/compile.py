@@ -10,69 +10,59 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
-from graphslam.core.jit import without_garbage_collection
+from graphslam.core.jit import COMPILING, without_garbage_collection
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.formats import to_dense
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.jit_notice import COMPILING, start_compiling
+from graphslam.evidence.jit_notice import start_compiling
 from graphslam.evidence.layout import BRICK_VOXELS, UNKNOWN
 from graphslam.evidence.octomap import read_octomap, write_octomap
 
 
-def compile_kernels(*, progress: bool = True) -> None:
-    """Compile every kernel, with a line of progress on stderr.
+def compile_kernels() -> None:
+    """Compile every kernel.
 
     Compiling is the compiler's own Python, on one core: a second process takes one half, where there is one to take it.
     """
     other = start_compiling("half", subprocess.Popen) if (os.cpu_count() or 1) > 1 else None
-    with (
-        without_garbage_collection(),
-        tqdm(desc="compiling evidence kernels, once", unit="part", file=sys.stderr, disable=not progress) as bar,
-    ):
-        uses = _first_half()
-        bar.reset(total=len(uses) + 1)
-        for name, use in uses:
-            bar.set_postfix_str(name)
+    with without_garbage_collection():
+        for use in _first_half():
             use()
-            bar.update()
-        bar.set_postfix_str("files")
         if other is None or other.wait() != 0:
-            for _, use in _second_half():
+            for use in _second_half():
                 use()
-        bar.update()
 
 
-def _first_half() -> list[tuple[str, Callable[[], object]]]:
+def _first_half() -> list[Callable[[], object]]:
     """Small pieces of work: what a filter does with its maps."""
     grid = EvidenceGrid(1.0)
     other = grid.copy()
     point = np.array([[3.0, 0.0, 0.0]])
     poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1))
     return [
-        ("scans", lambda: update_grids([grid, other], poses, point)),
-        ("values", lambda: grid.values_at(point)),
-        ("casts", lambda: grid.cast(None, point, 5.0)),
-        ("points", lambda: grid.log_odds_at(point)),
-        ("boxes", lambda: (grid.box_query(-point, point), grid.bounding_box())),
-        ("sums", lambda: (grid.entropy(), grid.memory())),
+        lambda: update_grids([grid, other], poses, point),
+        lambda: grid.values_at(point),
+        lambda: grid.cast(None, point, 5.0),
+        lambda: grid.log_odds_at(point),
+        lambda: (grid.box_query(-point, point), grid.bounding_box()),
+        lambda: (grid.entropy(), grid.memory()),
     ]
 
 
-def _second_half() -> list[tuple[str, Callable[[], object]]]:
+def _second_half() -> list[Callable[[], object]]:
     """Small pieces of work: what is done with whole maps. None of it inserts a scan, which is compiled elsewhere."""
     grid = EvidenceGrid(1.0)
     values = np.full((1, BRICK_VOXELS), UNKNOWN, np.int16)
     values[0, 0] = 100
     return [
-        ("bricks", lambda: grid.write_bricks([[0, 0, 0]], values)),
-        ("merges", lambda: grid.merge(grid.copy())),
-        ("clouds", grid.occupied_cloud),
-        ("dense", lambda: to_dense(grid, dtype=np.float32)),
-        ("compaction", lambda: compact_grids([grid, grid.copy()])),
-        ("files", lambda: _through_files(grid)),
+        lambda: grid.write_bricks([[0, 0, 0]], values),
+        lambda: grid.merge(grid.copy()),
+        grid.occupied_cloud,
+        lambda: to_dense(grid, dtype=np.float32),
+        lambda: compact_grids([grid, grid.copy()]),
+        lambda: _through_files(grid),
     ]
 
 
@@ -87,7 +77,7 @@ if __name__ == "__main__":
     os.environ[COMPILING] = "1"
     if sys.argv[1:] == ["half"]:
         with without_garbage_collection():
-            for _, work in _second_half():
+            for work in _second_half():
                 work()
     else:
         compile_kernels()

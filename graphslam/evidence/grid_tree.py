@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,12 @@ class GridTree:
     """
 
     __slots__ = ("__weakref__", "_box", "dim", "locked", "model", "pool", "voxel_size")
+    _plain: ClassVar[Any]
+    """Class of copies and of empty grids: that of grids in memory, also of one that is spilled."""
+
+    def __init_subclass__(cls) -> None:
+        if GridTree in cls.__bases__:
+            cls._plain = cls
 
     def __init__(
         self, voxel_size: float, *, model: BeamModel | None = None, pool: GridPool | None = None, dim: int = 3
@@ -46,7 +52,7 @@ class GridTree:
 
         The copy of a locked grid is not locked.
         """
-        twin = _new(self.__class__)
+        twin: Self = _new(self._plain)
         twin.voxel_size = self.voxel_size
         twin.model = self.model
         twin.pool = self.pool
@@ -64,7 +70,9 @@ class GridTree:
 
     def empty(self, pool: GridPool | None = None) -> Self:
         """An empty grid of the same kind, in the same pool or another."""
-        return self.__class__(self.voxel_size, model=self.model, pool=self.pool if pool is None else pool, dim=self.dim)
+        pool = self.pool if pool is None else pool
+        made: Self = self._plain(self.voxel_size, model=self.model, pool=pool, dim=self.dim)
+        return made
 
     def release(self) -> None:
         """Forget the map now; the handle is an empty grid afterwards. Happens by itself when the last handle dies."""

@@ -13,18 +13,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from graphslam.core.jit import COMPILING, compiling_elsewhere
+from graphslam.core.progress import compiling
 from graphslam.evidence.mark_kernels import mark_grids
 
-COMPILING = "GRAPHSLAM_COMPILING"
-"""Set in the environment of processes that compile, so that they start none of their own."""
 _state = {"checked": False}
 
 
 def is_compiled(kernel: Any) -> bool:
     """Whether compiled code of a kernel lies on disk that is not older than its source; true also where nothing is
-    compiled.
+    compiled, or no compiled code can be kept.
     """
-    if not hasattr(kernel, "stats"):  # NUMBA_DISABLE_JIT
+    if not hasattr(kernel, "stats") or kernel.stats.cache_path is None:  # NUMBA_DISABLE_JIT; see graphslam.core.jit
         return True
     source = Path(inspect.getsourcefile(kernel.py_func) or "")
     found = Path(kernel.stats.cache_path).glob(f"{source.stem}.{kernel.py_func.__name__}-*.nbi")
@@ -44,7 +44,8 @@ def announce_compilation() -> None:
         return
     _state["checked"] = True
     if not is_compiled(mark_grids) and COMPILING not in os.environ:
-        start_compiling("all", subprocess.run)
+        with compiling(), compiling_elsewhere():
+            start_compiling("all", subprocess.run)
 
 
 def start_compiling(part: str, start: Any) -> Any:
@@ -57,7 +58,7 @@ def start_compiling(part: str, start: Any) -> Any:
         return start(
             [sys.executable, "-m", "graphslam.evidence.compile", part],
             env={**os.environ, COMPILING: "1", "PYTHONPATH": paths},
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=None if part == "all" else subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
     except OSError:
         return None

@@ -175,7 +175,7 @@ def log_weights(
         )
         return likelihood.exponent * likelihood.beams(found).sum(axis=1)
     if math.isinf(limit):
-        raise ConfigError("weighting by casting needs the maximum range: beams that met nothing are compared with it")
+        raise ConfigError("weighting by casting needs the maximum range: beams without a hit are compared with it")
     c = cast_grids(
         grids,
         poses,

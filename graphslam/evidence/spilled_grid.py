@@ -38,6 +38,10 @@ class SpilledGrid(EvidenceGrid):
         self._slot: CacheEntry[GridPool] | None = slot
         self._own: tuple[GridPool, RootBox] | None = None
 
+    def empty(self, pool: GridPool | None = None) -> EvidenceGrid:  # type: ignore[override]
+        """A grid like this one, that is empty and lies on no shelf."""
+        return EvidenceGrid(self.voxel_size, model=self.model, pool=self.pool if pool is None else pool, dim=self.dim)
+
     @property
     def on_shelf(self) -> bool:
         """Has nobody written to it?"""

@@ -134,9 +134,6 @@ def _remedies(lost: Sequence[str], flat: FactorArrays, waiting: int) -> list[str
         out.append(f"{landmarks[0]} is in no submap with a usable covariance: remove it or add a submap that saw it.")
     if "datum" in lost:
         fixes = sum(r.group == "gps" for r in flat.records)
-        out.append(
-            f"the GPS datum is determined by only {fixes} fixes ({waiting} waiting): "
-            "it needs two that are metres apart."
-        )
+        out.append(f"the GPS datum has only {fixes} fixes ({waiting} waiting): it needs two that are metres apart.")
     kinds = {split_name(n)[0].word for n in lost}
     return out + list(dict.fromkeys(KINDS[w].remedy for w in KINDS if w in kinds and KINDS[w].remedy))

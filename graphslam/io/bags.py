@@ -461,7 +461,7 @@ def read_bag(
         if fixes is not None:
             streams["gps"] = fixes
     if not streams:
-        raise DataError("nothing of the bag can be used", where=str(p), got=dict(counter.counts), wanted=_WANTED)
+        raise DataError("the bag has no usable messages", where=str(p), got=dict(counter.counts), wanted=_WANTED)
     if drops is not None:
         drops.counts.update(counter.counts)
     read = {k: len(rows[k].stamps) if k in rows else len(s.times) for k, s in streams.items()}

@@ -123,7 +123,8 @@ def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, mo
 def _stream(url: str, file: str, most: int, progress: bool) -> None:
     """Write what an address gives, no more than ``most`` bytes of it; every redirect must be to an allowed scheme."""
     import requests
-    from tqdm import tqdm
+
+    from graphslam.core.progress import Bar
 
     with requests.Session() as session:
         at = url
@@ -137,7 +138,7 @@ def _stream(url: str, file: str, most: int, progress: bool) -> None:
                     continue
                 answer.raise_for_status()
                 size = 0
-                with open(file, "wb") as out, tqdm(total=most, unit="B", unit_scale=True, disable=not progress) as bar:
+                with open(file, "wb") as out, Bar(total=most, unit="B", unit_scale=True, shown=progress) as bar:
                     for part in answer.iter_content(1 << 16):
                         size += len(part)
                         if size > most:

@@ -22,10 +22,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
-from tqdm.auto import tqdm
 
 from graphslam.core.errors import ConfigError, CovarianceError, DataError
 from graphslam.core.geometry import Array, rotation2
+from graphslam.core.progress import Bar
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.join.association import MapAssociationConfig, match_landmarks
 from graphslam.join.joined_map import (
@@ -223,7 +223,7 @@ def join_ekf(
     known: dict[int, int] = {}
     dense: DenseMap | None = None
     capacity = sum(3 + 2 * len(landmark_map_of(s)) for s in submaps) if not identified else _scalars(submaps)
-    for k, submap in enumerate(tqdm(submaps, desc="join", unit="submap", disable=not progress)):
+    for k, submap in enumerate(Bar(submaps, name="join", unit="submap", shown=progress)):
         with times.measure("update"):
             fused, entries = distinct_landmarks(submap, identified=identified)
             if not identified:

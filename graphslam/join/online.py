@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from tqdm.auto import tqdm
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
 from graphslam.join import kernels
 from graphslam.join.association import MapAssociationConfig, match_landmarks
@@ -124,7 +124,7 @@ def join_online(
     state = _Online(leaves[0], np.zeros(len(leaves[0].ids), dtype=np.int64), np.zeros(0))
     if on_join is not None:
         on_join(0, state.joined)
-    for k, leaf in enumerate(tqdm(leaves[1:], desc="join", unit="submap", disable=not progress), start=1):
+    for k, leaf in enumerate(Bar(leaves[1:], name="join", unit="submap", shown=progress), start=1):
         with times.measure("association"):
             match = (
                 match_by_id(state.joined, leaf)

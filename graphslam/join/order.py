@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from tqdm.auto import tqdm
 
+from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish_map
@@ -53,7 +53,7 @@ def join_sequential(
     joined = leaves[0]
     if on_join is not None:
         on_join(0, joined)
-    for k, leaf in enumerate(tqdm(leaves[1:], desc="join", unit="submap", disable=not progress), start=1):
+    for k, leaf in enumerate(Bar(leaves[1:], name="join", unit="submap", shown=progress), start=1):
         joined = join_two(joined, leaf, association, times)
         if on_join is not None:
             on_join(k, joined)

@@ -20,10 +20,10 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import ThreadpoolController
-from tqdm.auto import tqdm
 
 from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError
+from graphslam.core.progress import Bar
 from graphslam.join.association import MapAssociationConfig, match_landmarks
 from graphslam.join.eif import join_maps, match_by_id
 from graphslam.join.joined_map import JoinedMap, JoinTimes
@@ -57,7 +57,7 @@ def join_subtree(level: Sequence[JoinedMap], association: MapAssociationConfig |
     times = JoinTimes()
     with (
         _blas().limit(limits=1, user_api="blas"),
-        tqdm(total=len(level) - 1, desc="join", unit="join", disable=not progress) as bar,
+        Bar(total=len(level) - 1, name="join", unit="join", shown=progress) as bar,
     ):
         while len(level) > 1:
             above = [join_two(a, b, association, times) for a, b in zip(level[::2], level[1::2])]
@@ -127,7 +127,7 @@ def _submit(
     level: list[Any] = [
         pool.submit(join_subtree, leaves[i : i + size], association) for i in range(0, len(leaves), size)
     ]
-    with tqdm(total=2 * len(level) - 1, desc="join", unit="task", disable=not progress) as bar:
+    with Bar(total=2 * len(level) - 1, name="join", unit="task", shown=progress) as bar:
         while len(level) > 1:
             ready = [f.result() for f in level] if here else level
             bar.update(len(level) if here else len(level) // 2)

@@ -9,8 +9,8 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
-from tqdm.auto import tqdm
 
+from graphslam.core.progress import Bar
 from graphslam.join.joined_map import JoinTimes
 from graphslam.join.pose_ekf import PoseFilter
 from graphslam.join.pose_estimate import PoseEstimate, estimate_of_map, evaluate_map, optimise_poses, up_direction
@@ -67,7 +67,7 @@ def leaf_maps(problem: PoseProblem, ties: SortedFactors, times: JoinTimes, progr
     with times.measure("leaves"):
         return [
             PoseMap.leaf(problem.part(k, k + 1, ties.inside[k], ties.levels[k]))
-            for k in tqdm(range(len(problem.keys)), desc="leaves", unit="submap", disable=not progress)
+            for k in Bar(range(len(problem.keys)), name="leaves", unit="submap", shown=progress)
         ]
 
 
@@ -84,7 +84,7 @@ def join_poses_sequential(problem: PoseProblem, *, passes: int = 1, progress: bo
     ties, times = SortedFactors(problem), JoinTimes()
     leaves = leaf_maps(problem, ties, times, progress)
     joined = leaves[0]
-    for k, leaf in enumerate(tqdm(leaves[1:], desc="join", unit="submap", disable=not progress), start=1):
+    for k, leaf in enumerate(Bar(leaves[1:], name="join", unit="submap", shown=progress), start=1):
         joined = join_poses(joined, leaf, problem.take(ties.across[k], _NONE), times, passes=passes)
     return estimate_of_map(problem, joined, method="eif-sequential", times=times)
 
@@ -100,7 +100,7 @@ def join_poses_tree(problem: PoseProblem, *, passes: int = 1, progress: bool = F
     ties, times = SortedFactors(problem), JoinTimes()
     leaves = leaf_maps(problem, ties, times, progress)
     bases = problem.bases
-    with tqdm(total=len(leaves) - 1, desc="join", unit="join", disable=not progress) as bar:
+    with Bar(total=len(leaves) - 1, name="join", unit="join", shown=progress) as bar:
 
         def joined(a: int, b: int, edges: Index) -> PoseMap:
             """Submaps a … b - 1 with the edges between different ones of them."""
@@ -122,7 +122,7 @@ def join_poses_ekf(problem: PoseProblem, *, progress: bool = False) -> PoseEstim
     ties, times = SortedFactors(problem), JoinTimes()
     dense = PoseFilter(problem)
     leaves = leaf_maps(problem, ties, times, progress)
-    for k, leaf in enumerate(tqdm(leaves, desc="join", unit="submap", disable=not progress)):
+    for k, leaf in enumerate(Bar(leaves, name="join", unit="submap", shown=progress)):
         with times.measure("update"):
             dense.join(leaf, problem.take(ties.across[k], _NONE))
     return evaluate_map(
@@ -159,7 +159,7 @@ def join_poses_isam2(problem: PoseProblem, *, progress: bool = False) -> PoseEst
     graph = PoseGraph(problem.dim)
     solver = Isam2Solver(graph)
     number = 0
-    for k in tqdm(range(len(problem.keys)), desc="iSAM2", unit="submap", disable=not progress):
+    for k in Bar(range(len(problem.keys)), name="iSAM2", unit="submap", shown=progress):
         a, b = problem.bases[k], problem.bases[k + 1]
         chain = g.between(problem.start[a], problem.start[a + 1 : b + 1])
         graph.structure.append("x", g.compose(graph.pose(int(a)), chain))

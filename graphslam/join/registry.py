@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
 
-from graphslam.core.errors import ConfigError, UnknownNameError
+from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.submap import Submap
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
@@ -186,6 +187,16 @@ def join_by_method(
     shared = {"workers": workers, "executor": cluster} if method.startswith("eif-tree") else {}
     joined = JOINERS[method](submaps, association=association, progress=progress, **shared)
     return polish_join(submaps, joined) if polish else joined
+
+
+def compile_method(submaps: Material, method: str, *, polish: bool = False) -> None:
+    """Join the first submaps alone: kernels are compiled and modules loaded, and neither is timed or measured later.
+
+    What is wrong with the submaps is left to the join of all of them to report.
+    """
+    first = submaps[:3] if isinstance(submaps, Sequence) else submaps.part(0, min(3, len(submaps.keys)))
+    with contextlib.suppress(GraphSlamError):
+        join_by_method(first, method, polish=polish)
 
 
 def identify_landmarks(

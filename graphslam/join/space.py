@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from tqdm.auto import tqdm
 
 from graphslam.core.charts import chart_difference, pose_differences
 from graphslam.core.errors import CovarianceError, DataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
+from graphslam.core.progress import Bar
 from graphslam.core.se3 import quat_to_matrix, se3_compose, se3_transform, skew
 from graphslam.core.submap import LandmarkMap, Submap, turned_covariance
 from graphslam.join.joined_map import JoinResult, JoinTimes
@@ -283,7 +283,7 @@ def join_space_sequential(
     """
     problem, times = SpaceProblem.of(submaps), JoinTimes()
     first, *rest = _leaves(problem, classical)
-    for leaf in tqdm(rest, desc="joining", unit="submap", disable=not progress):
+    for leaf in Bar(rest, name="joining", unit="submap", shown=progress):
         first = _join(first, leaf, times, 1 if classical else _PASSES)
     return _finished(problem, first, times, "eif-sequential" + "-classical" * classical)
 
@@ -292,7 +292,7 @@ def join_space_tree(submaps: Sequence[Submap], *, classical: bool = False, progr
     """Join submaps in space pairwise, then the pairs, and so on (B9), as :func:`join_space_sequential`."""
     problem, times = SpaceProblem.of(submaps), JoinTimes()
     level = _leaves(problem, classical)
-    with tqdm(total=len(level) - 1, desc="joining", unit="join", disable=not progress) as bar:
+    with Bar(total=len(level) - 1, name="joining", unit="join", shown=progress) as bar:
         while len(level) > 1:
             pairs = zip(level[::2], level[1::2])
             joined = [_join(a, b, times, 1 if classical else _PASSES) for a, b in pairs]
@@ -311,7 +311,7 @@ def join_space_ekf(submaps: Sequence[Submap], *, progress: bool = False) -> Spac
     covariances = [np.linalg.inv(leaf.information.toarray()) for leaf in problem.leaves]
     poses, points = problem.leaves[0].poses, problem.leaves[0].points
     ids, P = problem.leaf_ids[0], covariances[0]
-    for k in tqdm(range(1, len(problem.leaves)), desc="joining", unit="submap", disable=not progress):
+    for k in Bar(range(1, len(problem.leaves)), name="joining", unit="submap", shown=progress):
         leaf, theirs = problem.leaves[k], problem.leaf_ids[k]
         with times.measure("update"):
             m, n = len(poses), len(points)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from tqdm import tqdm
 
 from graphslam.core.geometry import rotation2
+from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.join.joined_map import in_group_chart
@@ -52,7 +52,7 @@ def solve_submaps_isam2(
     start = time.perf_counter()
     graph = PoseGraph()
     solver = Isam2Solver(graph, relinearize_threshold=relinearize_threshold, relinearize_angle=relinearize_angle)
-    for submap in tqdm(submaps, desc="iSAM2", unit="submap", disable=not progress):
+    for submap in Bar(submaps, name="iSAM2", unit="submap", shown=progress):
         graph.add_submap(submap, covariance_scale=covariance_scale)
         solver.update()
     objective = graph.objective().total

@@ -196,4 +196,4 @@ def _drop_orphans(closer: LoopCloser) -> None:
     believed = _believed(closer)
     for n in closer.accepted:
         if not overlap_entries(closer.loops[n].gates) <= believed:
-            closer.switch_off(n, "the match by which it is in that map is not believed")
+            closer.switch_off(n, "its match in that map is rejected")

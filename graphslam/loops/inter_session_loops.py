@@ -192,7 +192,7 @@ class TwoSessions:
         self.known, self.new = known, new
         a, b = known.places, new.places
         if group_of(a.T_base_node).dim != group_of(b.T_base_node).dim:
-            raise DataError("a session in the plane and one in space cannot be tied")
+            raise DataError("a 2-D and a 3-D session cannot be aligned")
         self.offset = len(known.increments) + 1
         """Of the new session's nodes in the chain of both: the end of the known one is a node, too."""
         self.places = Places(

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
+from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
 from graphslam.evidence.views import dense_view
 from graphslam.loops.candidates import FRONT_END, TIE, LoopCandidate
@@ -96,7 +96,7 @@ class LoopMeasurer:
 
     def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
         """Loops of candidates, in their order; a front end's match or a tie is one already."""
-        return [self.one(c) for c in tqdm(candidates, "matching submaps", disable=not progress, leave=False)]
+        return [self.one(c) for c in Bar(candidates, "matching submaps", shown=progress)]
 
     def one(self, c: LoopCandidate) -> Loop:
         """The loop of one candidate, accepted by the gates or not."""

@@ -64,7 +64,7 @@ class Places:
             raise GeometryError("places differ in number", got=sizes)
         group_of(self.T_base_node)  # refuses other shapes
         if n and np.any(np.diff(self.way) < 0):
-            raise DataError("places are not in the order of the way", wanted="rising lengths")
+            raise DataError("places are not in the order of the path", wanted="rising lengths")
 
     def __len__(self) -> int:
         return len(self.node)

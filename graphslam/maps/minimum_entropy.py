@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3
+from graphslam.core.progress import Bar
 from graphslam.evidence.beams import BeamModel
 from graphslam.maps.entropy import MapEntropy, grid_placements, mean_map_entropy
 from graphslam.maps.fuse import FusedMap, fuse_pieces
@@ -114,7 +114,7 @@ def rank_by_entropy(
     work = np.zeros((len(candidates), 2), np.int64)
     best: tuple[float, int] | None = None
     best_map: FusedMap | None = None
-    with tqdm(total=count * len(way), desc="entropy of candidates", unit="map", disable=not progress) as bar:
+    with Bar(total=count * len(way), name="entropy of candidates", unit="map", shown=progress) as bar:
         for s, T in enumerate(stands):
             fused: FusedMap | None = None
             for k in way:

@@ -356,7 +356,7 @@ class _Refiner:
         found = self.result(guides.steps[~taken & guides.far(self.poses)], other)
         if not found.input_better or self.fixes is not None:  # fixes hold a path, and odometry knows none of them
             return found
-        self.tell("the odometry alone agrees better than all that was made of it: its path is taken")
+        self.tell("the odometry alone agrees better; its path is the result")
         return self.initial_result(found, odometry)
 
     def initial_result(self, found: Refinement, odometry: Array) -> Refinement:

@@ -217,5 +217,5 @@ def campus_preset(name: str = "full", **changes: Any) -> CampusConfig:
     known = {f.name for f in dataclasses.fields(CampusConfig)}
     for key in changes:
         if key not in known:
-            raise ConfigError(f"campus: unknown figure {key!r}; known: {', '.join(sorted(known))}")
+            raise ConfigError(f"campus: unknown parameter {key!r}; known: {', '.join(sorted(known))}")
     return CampusConfig(**{**PRESETS[name], **changes})

@@ -158,5 +158,5 @@ def crawler_preset(name: str = "light", **changes: Any) -> CrawlerConfig:
     known = {f.name for f in dataclasses.fields(CrawlerConfig)}
     for key in changes:
         if key not in known:
-            raise ConfigError(f"crawler: unknown figure {key!r}; known: {', '.join(sorted(known))}")
+            raise ConfigError(f"crawler: unknown parameter {key!r}; known: {', '.join(sorted(known))}")
     return CrawlerConfig(**{**PRESETS[name], **changes})

@@ -9,10 +9,10 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 from scipy.signal import lfilter
-from tqdm import tqdm
 
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.imu import GRAVITY, Imu, ImuNoise
+from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import VelocityControls
@@ -95,7 +95,7 @@ def cast_scans(
     c, n, m = config, len(scans.times), len(scans.beam_times)
     exact = np.empty((n, m))
     chunk = max(_BEAMS_AT_ONCE // m, 1)
-    with tqdm(total=n, desc="casting beams", unit="scan", disable=not progress) as bar:
+    with Bar(total=n, name="casting beams", unit="scan", shown=progress) as bar:
         for k in range(0, n, chunk):
             part = slice(k, min(k + chunk, n))
             rays = scan_rays(scans, motion, part)

@@ -147,7 +147,7 @@ class ReducedChain:
         )
         if bad >= 0:
             i, j = self.kept[self._ends[bad]]
-            raise IndeterminateError(f"nothing ties pose {i} of the chain to pose {j}", (f"x{i}", f"x{j}"))
+            raise IndeterminateError(f"no factor connects pose {i} of the chain with pose {j}", (f"x{i}", f"x{j}"))
         return JoinedLinks(poses, float(total), float(energy), blocks, g, covariance, misfit)
 
     def follow(self, joined: JoinedLinks, solved: Array) -> Array:

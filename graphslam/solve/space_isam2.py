@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from tqdm.auto import tqdm
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE3
+from graphslam.core.progress import Bar
 from graphslam.core.se3 import se3_compose, se3_transform
 from graphslam.graph.factors.space_map import gtsam_pose3, pose_of_gtsam, space_factor
 from graphslam.linear.space_maps import PlacedMap
@@ -35,7 +35,7 @@ def run_space_isam2(
     here: gtsam.Values = gtsam.Values()
     known: set[int] = set()
     updates = 0
-    for k, one in enumerate(tqdm(placed, desc="iSAM2", unit="submap", disable=not progress)):
+    for k, one in enumerate(Bar(placed, name="iSAM2", unit="submap", shown=progress)):
         graph, new = gtsam.NonlinearFactorGraph(), gtsam.Values()
         graph.push_back(space_factor(one))
         base = SE3.identity if k == 0 else pose_of_gtsam(here.atPose3(gtsam.symbol("x", k)))

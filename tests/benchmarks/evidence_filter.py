@@ -188,7 +188,7 @@ _COMPILE = """
 import time
 begin = time.perf_counter(), time.process_time()
 from graphslam.evidence.compile import compile_kernels
-compile_kernels(progress=False)
+compile_kernels()
 print(time.perf_counter() - begin[0], time.process_time() - begin[1])
 """
 _START = """

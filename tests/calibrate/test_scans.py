@@ -35,7 +35,7 @@ def test_added_scale_noise_and_turning_are_found(log) -> None:
     step = 0.5 * metres / 150.0
     heading = c.heading_metre**2 * step + c.heading_radian**2 * 0.09 + c.heading_second**2 * 0.5
     assert np.sqrt(heading) == pytest.approx(NOISE * np.sqrt(step), rel=0.35)
-    assert any("distances of the motion" in f.text for f in found.findings())
+    assert any("odometry distances" in f.text for f in found.findings())
     assert found.prediction is not None
     assert found.prediction.taken == "all"
 

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ROOMS = sorted(
     m.name
     for m in pkgutil.iter_modules(graphslam.__path__)
-    if m.ispkg and hasattr(importlib.import_module(f"graphslam.{m.name}"), "_FACE")
+    if m.ispkg and hasattr(importlib.import_module(f"graphslam.{m.name}"), "_EXPORTS")
 )
 every_room = pytest.mark.parametrize("room", ROOMS)
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from graphslam.core.jit import COMPILING
+from graphslam.core.progress import Bar
 from graphslam.evidence import compile as compiling
 from graphslam.evidence import jit_notice
 from graphslam.evidence.mark_kernels import mark_grids
@@ -35,11 +38,25 @@ def test_what_the_second_process_does_not_do_is_done_here(
     done: list[str] = []
     monkeypatch.setattr(compiling, "start_compiling", lambda part, start: other)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    monkeypatch.setattr(compiling, "_first_half", lambda: [("a", lambda: done.append("a"))])
-    monkeypatch.setattr(compiling, "_second_half", lambda: [("b", lambda: done.append("b"))])
+    monkeypatch.setattr(compiling, "_first_half", lambda: [lambda: done.append("a")])
+    monkeypatch.setattr(compiling, "_second_half", lambda: [lambda: done.append("b")])
     compiling.compile_kernels()
     assert done == here
-    assert "compiling evidence kernels, once" in capfd.readouterr().err
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("with_bar", [False, True])
+def test_a_bar_says_that_kernels_are_compiled(
+    with_bar: bool, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(jit_notice, "is_compiled", lambda kernel: False)
+    monkeypatch.setattr(jit_notice, "start_compiling", lambda part, start: None)
+    jit_notice._state["checked"] = False
+    with Bar(name="front end", total=3) if with_bar else nullcontext():
+        jit_notice.announce_compilation()
+    written = capfd.readouterr().err
+    assert "compiling (first run only, ~1 min)" in written
+    assert ("front end" in written) == with_bar
 
 
 def test_nothing_is_said_where_the_kernels_are_compiled(capfd: pytest.CaptureFixture[str]) -> None:
@@ -88,6 +105,6 @@ def test_a_machine_without_code_is_told_once_and_processes_that_compile_start_no
         "print(started)\n"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    environment |= {jit_notice.COMPILING: "1"} if compiling_already else {}
+    environment |= {COMPILING: "1"} if compiling_already else {}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout.strip() == ("[]" if compiling_already else "['all']"), done.stderr

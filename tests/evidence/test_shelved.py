@@ -127,3 +127,11 @@ def test_values_are_packed_without_loss() -> None:
     assert np.array_equal(unpacked_values(*packed_values(values)), values)
     none = values[:0]
     assert unpacked_values(*packed_values(none)).shape == none.shape
+
+
+def test_copies_of_a_spilled_grid_are_in_memory() -> None:
+    grid = spill_grid(EvidenceGrid(0.1, dim=2), SpillCache())
+    assert isinstance(grid, SpilledGrid)
+    for made in (grid.copy(), grid.empty(), grid.empty(GridPool(grid.pool.levels))):
+        assert type(made) is EvidenceGrid
+        assert (made.voxel_size, made.dim) == (grid.voxel_size, grid.dim)

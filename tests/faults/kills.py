@@ -2,7 +2,7 @@
 
 ``python -m tests.faults.kills [--kills 50] [--verb VERB …] [--seed N] [--exec SHARE]``
 
-A fifth of the kills (``--exec``) strike at random moments of a process of its own (``python -m graphslam.app.cli …``),
+A fifth of the kills (``--exec``) strike at random moments of a process of its own (``python -m graphslam …``),
 between the end of its imports and its last moment. The others strike just before the k-th operation by which the
 verb changes the file system, with k drawn from all of them: so the writing phase is covered too. After each:
 
@@ -273,7 +273,7 @@ def executed(arguments: list[str], kill_after: float | None = None) -> tuple[int
     """A verb as a user calls it; how it ended, and after how many seconds."""
     begin = time.monotonic()
     process = subprocess.Popen(
-        [sys.executable, "-m", "graphslam.app.cli", *arguments],
+        [sys.executable, "-m", "graphslam", *arguments],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
         stdout=subprocess.DEVNULL,

@@ -17,7 +17,7 @@ from graphslam.io.log_store import save_log
 
 def command(log: Path, out: Path) -> list[str]:
     options = ["--set", "frontend.particles=40", "--seed", "4", "--resume", "--json"]
-    return [sys.executable, "-m", "graphslam.app.cli", "run", str(log), "--out", str(out), *options]
+    return [sys.executable, "-m", "graphslam", "run", str(log), "--out", str(out), *options]
 
 
 def submap_bytes(folder: Path) -> dict[str, bytes]:

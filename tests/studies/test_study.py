@@ -34,7 +34,7 @@ FRAGILE = "tests.reference.small_study:FRAGILE"
 
 
 def command(*args: object) -> list[str]:
-    return [sys.executable, "-m", "graphslam.app.cli", "study", *map(str, args)]
+    return [sys.executable, "-m", "graphslam", "study", *map(str, args)]
 
 
 def environment() -> dict[str, str]:

@@ -14,13 +14,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from tqdm.auto import tqdm
 
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.poses import group_of
+from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -167,7 +167,7 @@ def run_rbpf(
         raise DataError("no steps to filter", where=steps.name, wanted="at least 1")
     filter = GridFilter(steps, config, seed, prune_every=prune_every)
     effective, resampled = np.empty(n), np.zeros(n, dtype=np.bool_)
-    for k in tqdm(range(n), desc=steps.name, unit="step", disable=not progress):
+    for k in Bar(range(n), name=steps.name, unit="step", shown=progress):
         effective[k], ancestors = filter.step(k)
         resampled[k] = ancestors is not None
     if prune_every:

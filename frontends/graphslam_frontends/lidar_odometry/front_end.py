@@ -223,7 +223,7 @@ class LidarFrontEnd(FrontEnd):
         if scans and not mapped:
             c = self.config.odometry
             raise DataError(
-                "no scan has points enough to be followed",
+                "no scan has enough points",
                 where=f"{feed.name}/{name}",
                 got=f"{scans} scans, of which the fullest has {most} points {c.min_range:g} to {c.max_range:g} m away",
                 wanted=f"at least {FEW} points, in metres",
@@ -449,9 +449,9 @@ def _bent(key: int, kept: list[FollowedScan]) -> list[Finding]:
     if worst <= BENT:
         return []
     text = (
-        f"Points of the scans have no times, and in submap {key} they move by up to {worst:.2f} m from scan to scan. "
-        "If the scans were not straightened before, they are bent by as much as a scan takes of that time, and neither "
-        "path nor covariance knows of it. Give the points their times, as a field t, time or offset_time."
+        f"point times in submap {key}: none, while points move by up to {worst:.2f} m from scan to scan — scans are "
+        "distorted unless they were deskewed before, and the covariance does not include this. Give the points their "
+        "times in a field t, time or offset_time."
     )
     return [Finding("look", "points-without-times", text)]
 

@@ -15,11 +15,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from tqdm.auto import tqdm
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of, remove_roll_pitch
+from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
 from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.config import GridFilterConfig
@@ -74,7 +74,7 @@ def run_segslam(
     if len(steps) < 2:
         raise DataError("too few steps for a segment", where=steps.name, got=len(steps), wanted="at least 2")
     run = _Run(steps, filter, config, seed, prune_every)
-    for k in tqdm(range(len(steps)), desc=steps.name, unit="step", disable=not progress):
+    for k in Bar(range(len(steps)), name=steps.name, unit="step", shown=progress):
         begin = time.perf_counter()
         run.step(k)
         run.step_seconds[k] = time.perf_counter() - begin

@@ -9,6 +9,7 @@ import errno
 import os
 import shlex
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import typer
@@ -27,9 +28,10 @@ from graphslam.app.cli import results as cli_results
 from graphslam.app.cli import run as cli_run
 from graphslam.app.cli import sessions as cli_sessions
 from graphslam.app.cli import tools as cli_tools
-from graphslam.app.cli.terminal import log_to_stderr
+from graphslam.app.cli.terminal import be_quiet, be_verbose, log_to_stderr, outlive_stderr
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.plugins import IN_STUDIES, load_plugin, plugins
+from graphslam.core.progress import printable, shown_bars
 
 
 class Interrupted(Exception):
@@ -39,19 +41,64 @@ class Interrupted(Exception):
 COMMANDS = "graphslam.commands"
 
 
-class Verbs(TyperGroup):
+def _volume() -> list[Any]:
+    """Options of every command, before and after its name. They act when they are read; no command sees them."""
+
+    def when_given(action: Callable[[], None]) -> Callable[[bool], None]:
+        return lambda given: action() if given else None
+
+    def options(
+        verbose: bool = typer.Option(
+            *(False, "--verbose", "-v"), callback=when_given(be_verbose), help="Print progress messages on stderr."
+        ),
+        quiet: bool = typer.Option(
+            *(False, "--quiet", "-q"), callback=when_given(be_quiet), help="Print the result and errors only."
+        ),
+    ) -> None: ...
+
+    made = typer.Typer(add_completion=False)
+    made.command()(options)
+    params: list[Any] = typer.main.get_command(made).params
+    for p in params:
+        p.expose_value = False
+    return params
+
+
+class Commands(TyperGroup):
+    """A group of commands that all have ``-v`` and ``-q``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.params = [*self.params, *_volume()]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        found = self.find(ctx, cmd_name)
+        if found is not None and "verbose" not in {p.name for p in found.params}:
+            found.params = [*found.params, *_volume()]
+        return found
+
+    def find(self, ctx: Any, name: str) -> Any:
+        """The command of a name, or None."""
+        return super().get_command(ctx, name)
+
+
+class AllCommands(Commands):
     """The commands, and those of plug-ins; Ctrl-C in one of them reaches :func:`main`."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), *plugins(COMMANDS)]
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        own = super().get_command(ctx, cmd_name)
-        if own is not None or cmd_name not in {*plugins(COMMANDS), *IN_STUDIES[COMMANDS]}:
+    def find(self, ctx: Any, name: str) -> Any:
+        own = super().find(ctx, name)
+        if own is not None or name not in {*plugins(COMMANDS), *IN_STUDIES[COMMANDS]}:
             return own
         lone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-        lone.command(cmd_name)(load_plugin(COMMANDS, "command", cmd_name))
+        lone.command(name)(load_plugin(COMMANDS, "command", name))
         return typer.main.get_command(lone)
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        log_to_stderr()
+        return super().main(*args, **options)
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -62,11 +109,12 @@ class Verbs(TyperGroup):
 
 app = typer.Typer(
     name="graphslam",
-    cls=Verbs,
+    cls=AllCommands,
     help="Globally consistent maps with an uncertainty you can trust.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # or else [m] in a help text is taken for markup and disappears
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
@@ -78,10 +126,9 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    verbose: bool = typer.Option(False, "--verbose", "-v", help="Print progress messages on stderr."),
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
-    log_to_stderr(verbose)
+    """Options before the name of a command."""
 
 
 cli_run.add_run_commands(app)
@@ -91,18 +138,20 @@ cli_map.add_map_command(app)
 cli_sessions.add_session_commands(app)
 cli_results.add_result_commands(app)
 cli_tools.add_tool_commands(app)
-app.add_typer(cli_data.app, name="data")
+app.add_typer(cli_data.app, name="data", cls=Commands)
 
 
 def main() -> None:
     """Entry point ``graphslam``."""
+    outlive_stderr()
     try:
         app()
     except BrokenPipeError:  # `graphslam … | head`
         sys.stderr.close()
         sys.exit(1)
     except (GraphSlamError, OSError, MemoryError, RecursionError, KeyboardInterrupt, Interrupted) as error:
-        _end_bars()
+        for bar in shown_bars():
+            bar.close()
         typer.echo(f"graphslam: {error_line(error)}", err=True)
         _drop_output()
         sys.exit(130 if isinstance(error, (KeyboardInterrupt, Interrupted)) else 1)
@@ -119,8 +168,8 @@ def error_line(error: BaseException) -> str:
     if isinstance(error, OSError):
         files = [str(f) for f in (error.filename, error.filename2) if f is not None]
         advice = _ADVICE.get(error.errno or 0, "")
-        return f"{': '.join([*files, error.strerror or str(error)])}{advice}"
-    return " ".join(str(error).split())
+        return printable(f"{': '.join([*files, error.strerror or str(error)])}{advice}")
+    return printable(" ".join(str(error).split()))
 
 
 def _go_on(arguments: list[str]) -> str:
@@ -133,13 +182,6 @@ def _go_on(arguments: list[str]) -> str:
     if verb in ("demo", "study"):
         return f"finished parts are saved; resume with: {command}"
     return "existing files are unchanged"
-
-
-def _end_bars() -> None:
-    """Leave no bar of progress on the line that is written next."""
-    if "tqdm" in sys.modules:
-        for bar in list(getattr(sys.modules["tqdm"].tqdm, "_instances", ())):
-            bar.close()
 
 
 def _drop_output() -> None:

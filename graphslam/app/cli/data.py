@@ -5,8 +5,9 @@ from __future__ import annotations
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
-from graphslam.app.cli.terminal import log_to_stderr, print_result, text_table
+from graphslam.app.cli.terminal import be_verbose, print_result, text_table
 from graphslam.core.errors import DataError, MissingDataError
+from graphslam.core.progress import Bar
 
 app = typer.Typer(
     help="Recorded data sets: list, describe, download and check them.", no_args_is_help=True, rich_markup_mode=None
@@ -93,7 +94,8 @@ def fetch_command(name: str, as_json: bool = JSON) -> None:
     """Find a data set on this machine, or download it and verify its checksums."""
     from graphslam.io.fetch import fetch_dataset as fetch_files
 
-    log_to_stderr(True)
+    if not Bar.hidden:  # --quiet
+        be_verbose()
     folder = fetch_files(name, progress=not as_json)
     print_result({"name": name, "folder": str(folder)}, str(folder), as_json=as_json)
 

@@ -51,13 +51,15 @@ def join_command(
     from graphslam.app.submap_sources import submap_source
     from graphslam.core.trajectory import Trajectory
     from graphslam.io.joined_map import write_joined
+    from graphslam.join.registry import compile_method, methods_for, prepare_submaps
     from graphslam.join.registry import join_by_method as join_by
-    from graphslam.join.registry import methods_for, prepare_submaps
 
     s = submap_source(source, submap_poses=submap_poses)
     factor = s.covariance_scale if scale is None else scale
     material = prepare_submaps(s.material, associate=associate, covariance_scale=factor)
     way = methods_for(material)
+    way.check(method)
+    compile_method(material, method, polish=polish)  # not a part of the time that is printed
     filters = method in way.joiners
     estimate = own = join_by(
         material,

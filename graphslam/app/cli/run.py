@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -149,10 +150,23 @@ def _summary(result: Any, out: Path, every: bool = False) -> str:
     dropped = result.report["records_dropped"]
     lines = metric_lines(result, every)
     lines += [f"dropped {n} {what}" for what, n in dropped.items()]
-    lines += join_note(result)
+    lines += [*time_notes(result.report, len(result.submaps)), *join_note(result)]
     lines += ["", *verdict_text(result.headline, result.verdict), ""]
     lines.append(f"written to {out}: report in {out / 'report.html'}, map in {out / 'figures' / 'map.png'}")
     return "\n".join(lines)
+
+
+def time_notes(report: Mapping[str, Any], submaps: int) -> list[str]:
+    """What the times of a run leave out: submaps of an earlier session, and compilation."""
+    resumed, compilation = report["resumed_submaps"], report["seconds"].get("compilation", 0.0)
+    lines = []
+    if resumed >= submaps:
+        lines.append(f"resumed: all {submaps} submaps were read from the run folder, none computed")
+    elif resumed:
+        lines.append(f"resumed: {resumed} of {submaps} submaps were read from the run folder and are in no time above")
+    if compilation >= 1.0:
+        lines.append(f"seconds_total includes {compilation:.0f} s of compilation (first run only)")
+    return lines
 
 
 CAUSES = frozenset(

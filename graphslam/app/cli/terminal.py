@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,11 +14,12 @@ import typer
 
 from graphslam.core.findings import Finding
 from graphslam.core.json_file import json_values
+from graphslam.core.progress import Bar, printable
 
 
 def print_result(value: Mapping[str, Any], text: str, *, as_json: bool) -> None:
     """Print ``value`` as one JSON object, or ``text``."""
-    typer.echo(json.dumps(json_values(value), allow_nan=False) if as_json else text)
+    typer.echo(json.dumps(json_values(value), allow_nan=False) if as_json else printable(text))
 
 
 def text_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
@@ -42,8 +45,52 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
-def log_to_stderr(verbose: bool) -> None:
-    """Library messages on stderr, so that stdout holds the result alone."""
-    logging.basicConfig(
-        stream=sys.stderr, level=logging.INFO if verbose else logging.WARNING, format="%(message)s", force=True
-    )
+class _Messages(logging.StreamHandler):
+    """Messages of the library, above a bar of progress and without control characters."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with Bar.external_write_mode(file=self.stream):
+            super().emit(record)
+
+
+def log_to_stderr() -> None:
+    """Library messages on stderr, so that stdout holds the result alone: warnings and errors."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[_Messages(sys.stderr)], force=True)
+    Bar.hidden = False
+
+
+def be_verbose() -> None:
+    """Progress messages as well."""
+    logging.getLogger().setLevel(logging.INFO)
+
+
+def be_quiet() -> None:
+    """Errors only, and no bar of progress."""
+    logging.getLogger().setLevel(logging.ERROR)
+    Bar.hidden = True
+
+
+class _Lost(io.FileIO):
+    """Stderr; what cannot be written is dropped."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data) or 0
+        except OSError:
+            return len(data)
+
+
+def outlive_stderr() -> None:
+    """Go on where stderr is closed, full, or a broken pipe: messages are lost then, and the result is not."""
+    if sys.stderr is None:
+        try:
+            os.fstat(2)
+        except OSError:  # closed: the next file that is opened would get its messages
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    elif sys.stderr is sys.__stderr__:
+        kept = io.BufferedWriter(_Lost(2, "w", closefd=False))
+        sys.stderr = io.TextIOWrapper(kept, sys.__stderr__.encoding, "backslashreplace", line_buffering=True)

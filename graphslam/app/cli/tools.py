@@ -119,13 +119,22 @@ def evaluate_command(
     print_result(value, text_table(rows), as_json=as_json)
 
 
-def doctor_command(as_json: bool = JSON) -> None:
+def doctor_command(
+    clear_compiled: bool = typer.Option(
+        False, "--clear-compiled", help="Delete the compiled code; it is compiled again at its next use."
+    ),
+    as_json: bool = JSON,
+) -> None:
     """Check the installation: versions, missing system libraries, and what to install."""
     from graphslam.app.doctor import examine_installation
+    from graphslam.core.jit import clear_compiled_code
 
+    if clear_compiled:
+        clear_compiled_code()
     findings = examine_installation()
     rows = [{"check": f.name, "state": f.state, "detail": f.detail} for f in findings]
     print_result({"checks": rows}, text_table(rows), as_json=as_json)
-    bad = [f for f in findings if f.state == "missing"]
-    if bad:
-        raise GraphSlamError(f"{len(bad)} required parts are missing: {', '.join(f.name for f in bad)}")
+    for state, what in (("missing", "required parts are missing"), ("conflict", "installs are in conflict")):
+        bad = [f.name for f in findings if f.state == state]
+        if bad:
+            raise GraphSlamError(f"{len(bad)} {what}: {', '.join(bad)}")

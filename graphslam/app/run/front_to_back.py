@@ -8,41 +8,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from graphslam.app.run.folder import RunFolder
-from graphslam.backend.back_end import BackEnd, Observer
+from graphslam.backend.back_end import BackEnd
 from graphslam.core.geometry import Array
-from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.spilled_grid import load_spilled, spill_grid
-from graphslam.graph.pose_graph import PoseGraph
-from graphslam.solve.solution import Solution
 from graphslam_frontends.base import FrontEnd
 
 logger = logging.getLogger(__name__)
-
-
-class ProgressBar(Observer):
-    """How much of the log is in the graph, on stderr."""
-
-    def __init__(self, log: SensorLog, shown: bool) -> None:
-        first, last = log.interval
-        self.bar = tqdm(total=round(last - first, 1), unit="s", desc=log.name, disable=not shown, leave=False)
-        self.bar.bar_format = "{l_bar}{bar}| {n:.0f}/{total:.0f} s [{elapsed}<{remaining}{postfix}]"
-        self.bar.set_postfix_str("compiling (first run only, ~30 s)")
-
-    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
-        """A step."""
-        self.bar.update(submap.interval[1] - submap.interval[0])
-        self.bar.set_postfix(submaps=len(graph.submaps), landmarks=len(graph.values.landmarks))
-
-    def solved(self, solution: Solution) -> None:
-        """The end."""
-        self.bar.close()
 
 
 @dataclass(frozen=True, slots=True)

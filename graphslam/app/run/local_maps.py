@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tqdm.auto import tqdm
-
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import make_front_end, recommended_options
@@ -15,6 +13,7 @@ from graphslam.app.run.source import load_log_source
 from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog
+from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
@@ -70,7 +69,7 @@ def local_maps(
     log = load_log_source(source)
     made = _front_end(log, frontend, options)
     submaps = []
-    with one_blas_thread(), tqdm(desc=log.name, unit="submap", disable=not progress) as bar:
+    with one_blas_thread(), Bar(name=log.name, unit="submap", shown=progress) as bar:
         for submap in made.submaps(log, seed=SeedTree(seed).child("frontend")):
             submaps.append(submap)
             bar.update()

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphslam.app.folders.generations import read_consistently
 from graphslam.app.folders.lock import lock_folder
-from graphslam.app.machine import one_blas_thread, versions
+from graphslam.app.machine import Stopwatch, one_blas_thread, versions
 from graphslam.app.run import config as cfg
 from graphslam.app.run.audit import audit_association, reference_identities
 from graphslam.app.run.calibration import (
@@ -30,11 +30,12 @@ from graphslam.app.run.choice import choose_front_end, reading_line
 from graphslam.app.run.files import read_options, removed_loops_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import check_name, make_front_end, name_of, preset_of, recommended_options
-from graphslam.app.run.front_to_back import FrontEndTiming, ProgressBar, SubmapPipeline
+from graphslam.app.run.front_to_back import FrontEndTiming, SubmapPipeline
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_metrics, write_outputs
 from graphslam.app.run.residual_consistency import check_residual_consistency
 from graphslam.app.run.run import Run
+from graphslam.app.run.run_bar import RunBar
 from graphslam.app.run.run_inputs import RunInputs, collect_inputs, read_inputs
 from graphslam.app.run.source import load_log_source
 from graphslam.app.run.stream_use import stream_use
@@ -171,16 +172,19 @@ def run(
         check_name(frontend)
     if solver not in SOLVERS:
         raise UnknownNameError("solver", solver, SOLVERS)
-    with one_blas_thread():
-        begin = time.perf_counter()
+    with one_blas_thread(), RunBar(progress) as bar:
+        begin = Stopwatch()
+        _stage([bar, *observers], "reading")
         log = load_log_source(source, reader=reader, **(reader_options or {}))
-        loading = time.perf_counter() - begin
+        loading = begin.seconds()
+        bar.log_read(log)
         name, suggested, own = _chosen(log, name, preset)
         front: str | FrontEnd | type[FrontEnd] = name if frontend is None else frontend
         if not isinstance(front, (str, type)):
             suggested = {k: v for k, v in suggested.items() if k != "frontend"}
         asked = config or {}
-        return _run(log, loading, front, solver, seed, out, suggested, own, asked, resume, progress, undo, observers)
+        watch = [bar, *observers]
+        return _run(log, begin, loading, front, solver, seed, out, suggested, own, asked, resume, undo, watch)
 
 
 def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[str, dict[str, Any], bool]:
@@ -202,6 +206,7 @@ def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[s
 
 def _run(
     log: SensorLog,
+    begin: Stopwatch,
     loading: float,
     frontend: str | FrontEnd | type[FrontEnd],
     solver: str,
@@ -211,30 +216,30 @@ def _run(
     own: bool,
     config: Mapping[str, Any],
     resume: bool,
-    progress: bool,
     undo: Sequence[int | LoopDecision] | None,
     observers: Sequence[Observer],
 ) -> Run:
-    begin = time.perf_counter() - loading
     seconds = {"load": loading}
     options = merge_options(suggested if own and uses_preset_noise(config) else without_noise(suggested), config)
     settings: cfg.RunConfig = build_config(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
     noticed = check_streams(log)
     recorded, clock = log, time.perf_counter()
+    _stage(observers, "calibration")
     log, applied, said, found = apply_calibration(log, front, settings.calibrate, config, own=own, seed=seed)
     front = configure_for_calibration(front, log, applied.given, found, config)
     settings = replace(settings, calibrate=applied)
     seconds["calibrate"] = time.perf_counter() - clock
     noticed = [*noticed, *(StreamFinding("", f) for f in said)]
     effective = effective_config(log.name, name_of(frontend), solver, seed, front.config, settings)
-    back = back_end(RecordSource(log), settings, solver, [ProgressBar(log, progress), *observers])
+    back = back_end(RecordSource(log), settings, solver, observers)
 
     def finish(folder: RunFolder | None, undone: Sequence[int | LoopDecision]) -> Run:
         tree = SeedTree(seed)
+        _stage(observers, "front end")
         work = SubmapPipeline(RecordSource(log), front, back, tree, folder, with_grids(settings))
         work.step()
-        return solve_and_evaluate(log, work, settings, effective, seconds, begin, undone, noticed, progress=progress)
+        return solve_and_evaluate(log, work, settings, effective, seconds, begin, undone, noticed)
 
     if out is None:
         return finish(None, undo or ())
@@ -242,7 +247,14 @@ def _run(
     with RunFolder.start(out, effective, resume=resume) as folder:
         if undo is None:  # what was taken out of a run stays out when it is gone on with
             undo = removed_loops_of_run(folder.path) if resume else ()
-        return write_outputs(folder.path, finish(folder, undo))
+        made = finish(folder, undo)
+        _stage(observers, "figures")
+        return write_outputs(folder.path, made)
+
+
+def _stage(observers: Sequence[Observer], name: str) -> None:
+    for o in observers:
+        o.stage(name)
 
 
 def with_digest(effective: dict[str, Any], log: SensorLog) -> dict[str, Any]:
@@ -257,11 +269,9 @@ def solve_and_evaluate(
     settings: cfg.RunConfig,
     effective: dict[str, Any],
     seconds: dict[str, float],
-    begin: float,
+    begin: Stopwatch,
     undo: Sequence[int | LoopDecision],
     noticed: Sequence[StreamFinding],
-    *,
-    progress: bool,
 ) -> Run:
     """The run of a log whose submaps are all in the graph of the back end: solved and judged.
 
@@ -288,7 +298,8 @@ def solve_and_evaluate(
     best = solve()
     while best.denied and front.draws and work.settled is None and not undo and work.draw + 1 < settings.backend.draws:
         logger.warning("overlapping submaps still contradict each other: making submaps again with another seed")
-        bars = [ProgressBar(log, progress)]
+        bars = _bars(work.back)
+        _stage(bars, "front end")
         work = work.with_next_seed(back_end(RecordSource(log), settings, effective["run"]["solver"], bars))
         work.step()
         release_memory(work)
@@ -296,6 +307,10 @@ def solve_and_evaluate(
     if work.folder is not None and work.settled is None and work.draw:
         work.folder.settle(best.draw, attempts.of_others(best.draw))
     return replace(attempts.result(), log=log)
+
+
+def _bars(back: BackEnd) -> list[Observer]:
+    return [o for o in back.observers if isinstance(o, RunBar)]
 
 
 def release_memory(work: SubmapPipeline) -> None:
@@ -317,11 +332,14 @@ def rerun_without_loops(folder: str | Path, undo: Sequence[LoopDecision], *, pro
         Show a progress bar on stderr.
     """
     root = Path(folder)
-    begin = time.perf_counter()
-    with one_blas_thread(), lock_folder(root):
+    begin = Stopwatch()
+    with one_blas_thread(), lock_folder(root), RunBar(progress) as bar:
+        bar.stage("reading")
         taken, _ = read_consistently(root, read_inputs)
-        effective, settings, back, submaps = _stored(root, taken, progress=progress)
-        seconds = {"load": time.perf_counter() - begin}
+        effective, settings, back, submaps = _stored(root, taken, [bar])
+        seconds = {"load": begin.seconds()}
+        bar.log_read(taken.log)
+        bar.stage("front end")
         for s in submaps:
             back.add(s)
         work = FrontEndTiming(0.0, len(submaps), np.zeros(0))
@@ -329,6 +347,7 @@ def rerun_without_loops(folder: str | Path, undo: Sequence[LoopDecision], *, pro
         draw, earlier = (0, []) if settled is None else (settled.draw, settled.attempts)
         attempts = _MapCandidates(earlier)
         _solved(taken, settings, submaps, back, seconds, begin, work, effective, undo, draw, attempts)
+        bar.stage("figures")
         return write_outputs(root, attempts.result())
 
 
@@ -337,7 +356,7 @@ def resolve_from_folder(folder: str | Path) -> tuple[PoseGraph, Solution]:
     root = Path(folder)
     with one_blas_thread():
         taken, _ = read_consistently(root, read_inputs)
-        _, _, back, submaps = _stored(root, taken, progress=False)
+        _, _, back, submaps = _stored(root, taken, [])
         for s in submaps:
             back.add(s)
         solution = back.finish(removed_loops_of_run(root))
@@ -345,14 +364,14 @@ def resolve_from_folder(folder: str | Path) -> tuple[PoseGraph, Solution]:
 
 
 def _stored(
-    root: Path, taken: RunInputs, *, progress: bool
+    root: Path, taken: RunInputs, observers: Sequence[Observer]
 ) -> tuple[dict[str, Any], cfg.RunConfig, BackEnd, list[Submap]]:
     """Options and submaps of a run folder, and a back end that is to have them."""
     effective = read_options(root)
     wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
     said = check_json(effective, wanted, str(root / CONFIG))["run"]
     settings: cfg.RunConfig = build_config(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
-    back = back_end(RecordSource(taken.log), settings, said["solver"], [ProgressBar(taken.log, progress)])
+    back = back_end(RecordSource(taken.log), settings, said["solver"], observers)
     return effective, settings, back, read_submaps(root, load_grid=load_spilled if with_grids(settings) else None)
 
 
@@ -455,7 +474,7 @@ def _solved(
     submaps: list[Submap],
     back: BackEnd,
     seconds: dict[str, float],
-    begin: float,
+    begin: Stopwatch,
     work: FrontEndTiming,
     effective: dict[str, Any],
     undo: Sequence[int | LoopDecision],
@@ -469,9 +488,11 @@ def _solved(
     """
 
     def made(back: BackEnd) -> _MapCandidate:
+        _stage(back.observers, "graph")
         solution = back.finish(undo)
         spent = seconds | {"frontend": work.seconds} | {f"backend_{k}": v for k, v in back.seconds.items()}
-        spent |= {"backend": sum(back.seconds.values()), "total": time.perf_counter() - begin}
+        spent |= {"backend": sum(back.seconds.values()), "compilation": begin.compilation()}
+        spent["total"] = begin.seconds()
         run = _evaluate_run(taken, settings, submaps, back, solution, spent, work, effective)
         return _MapCandidate(run, draw, back.config.looks)
 
@@ -481,7 +502,7 @@ def _solved(
         return
     looking = replace(settings, backend=replace(settings.backend, loops=True))
     logger.warning("overlapping submaps contradict each other: searching loop closures between submaps")
-    other = back_end(RecordSource(taken.log), looking, effective["run"]["solver"], ())
+    other = back_end(RecordSource(taken.log), looking, effective["run"]["solver"], _bars(back))
     for s in submaps:
         other.add(s)
     attempts.add(made(other))
@@ -533,9 +554,13 @@ def _evaluate_run(
     imu_metrics(out, back.graph, drops)
     clock, graph_path = time.perf_counter(), global_map.trajectory
     fixes = None if gps is None or solution.T_gps_world is None else (split_fixes(gps, settings.gps)[0], settings.gps)
+    if settings.refine.use:
+        _stage(back.observers, "refinement")
     refined, refining = refine_run(settings.refine, taken.scans, submaps, global_map, gps=fixes, graph=back.graph)
     seconds_refine = time.perf_counter() - clock
     trim_heap()
+    if settings.map.fuse and has_maps(submaps):
+        _stage(back.observers, "fused map")
     fused, why_not = _fused_map(submaps, global_map, settings.map, effective)
     ledger = back.graph.ledger
     if refined is not None:
@@ -559,8 +584,11 @@ def _evaluate_run(
             out.add(*row)
         seconds["map"] = fused.divide_s + fused.fuse_s + fused.move_s
         seconds["total"] += seconds["map"]
-    scans = sum(int(s.report.get("scans", 0)) for s in submaps[work.resumed :])
-    time_metrics(out, seconds, log.duration, scans, work.per_scan)
+    _stage(back.observers, "evaluation")
+    now = submaps[work.resumed :]
+    scans = sum(int(s.report.get("scans", 0)) for s in now)
+    begun = log.interval[0] if not work.resumed else submaps[work.resumed - 1].interval[1]
+    time_metrics(out, seconds, log.interval[1] - begun if now else 0.0, scans, work.per_scan)
     out.add("path_length", global_map.trajectory.length(), "m")
     residuals = {}
     reckoned = dead_reckoned_path(log, global_map.trajectory)

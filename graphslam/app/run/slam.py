@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from graphslam.app.machine import one_blas_thread
+from graphslam.app.machine import Stopwatch, one_blas_thread
 from graphslam.app.run import config as cfg
 from graphslam.app.run.calibration import can_calibrate
 from graphslam.app.run.folder import RunFolder
@@ -232,14 +232,14 @@ class Slam:
 
     def _finished(self, work: SubmapPipeline) -> Run:
         log, seconds = self._feed.log, {"load": 0.0, "calibrate": 0.0}
-        begin = time.perf_counter() - self._seconds  # time in which records were waited for is nobody's
+        begin = Stopwatch(self._seconds)  # time in which records were waited for is nobody's
         noticed = check_streams(log)
         effective = self._effective
         if self._folder is not None:
             effective = with_digest(effective, log)
             self._folder.describe(effective)
         work.step()
-        result = solve_and_evaluate(log, work, self._settings, effective, seconds, begin, (), noticed, progress=False)
+        result = solve_and_evaluate(log, work, self._settings, effective, seconds, begin, (), noticed)
         return result if self._folder is None else write_outputs(self._folder.path, result)
 
     def _closing_on_error(self) -> ExitStack:

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.run import Run
@@ -20,6 +19,7 @@ from graphslam.core.errors import DataError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
+from graphslam.core.progress import Bar
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.surface.layer import PieceId, SurfaceLayer
@@ -181,7 +181,7 @@ def read_surface(
         at = p.inside()
         owner = p.nodes_of(at)
         scans += len(at)
-        for node in tqdm(np.unique(owner).tolist(), desc="surface", unit="node", disable=not progress):
+        for node in Bar(np.unique(owner).tolist(), name="surface", unit="node", shown=progress):
             layer.read(start + node, _scans(p.scans, at[owner == node], p.path), p.node_poses[node])
             if p.node_covariances is not None:
                 covariances[start + node] = p.node_covariances[node]

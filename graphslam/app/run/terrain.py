@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.files import read_options
@@ -24,6 +23,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.npz import floats, ints
 from graphslam.core.point_clouds import PointClouds
+from graphslam.core.progress import Bar
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.spilled_grid import load_spilled
@@ -216,7 +216,7 @@ def read_terrain(
         ends = np.searchsorted(node_times, scans.times[at], side="left") - 1
         gone = [places.get(k) for k in np.maximum(ends, 0).tolist()]
         turns = _Turns(scans, at, level, height, sensor_height is None, gone)
-    for node in tqdm(nodes.tolist(), desc="terrain", unit="node", disable=not progress):
+    for node in Bar(nodes.tolist(), name="terrain", unit="node", shown=progress):
         mine = at[owner == node]
         if turns is not None:
             lines = [turns.lines(k) for k in mine.tolist()]

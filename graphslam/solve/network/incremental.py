@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from tqdm import tqdm
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
+from graphslam.core.progress import Bar
 from graphslam.graph.factors.batch import gtsam_pose, pose_array
 from graphslam.graph.network import problem_of_network
 from graphslam.graph.variables import gtsam_key
@@ -119,7 +119,7 @@ def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, pro
     graph, values, fresh = gtsam.NonlinearFactorGraph(), gtsam.Values(), set[int]()
     steps = list(insertion_order(network))
     batch = options.batch or max(1, round(len(network) / 500))
-    for count, (v, links) in enumerate(tqdm(steps, desc="iSAM2", unit="pose", disable=not progress, leave=False), 1):
+    for count, (v, links) in enumerate(Bar(steps, name="iSAM2", unit="pose", shown=progress), 1):
         if v in anchors:
             poses[v] = network.poses[v]
             graph.push_back(anchors[v])

@@ -267,9 +267,9 @@ def best_of_starts(
 
 
 def _shown(names: list[str]) -> Iterable[str]:
-    from tqdm import tqdm
+    from graphslam.core.progress import Bar
 
-    return tqdm(names, desc="starts", unit="start", leave=False)
+    return Bar(names, name="starts", unit="start")
 
 
 def _is_native(problem: LeastSquaresProblem) -> bool:

@@ -19,11 +19,11 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 from scipy import stats
-from tqdm import tqdm
 
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
+from graphslam.core.progress import Bar
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.network import network_values
 from graphslam.graph.variables import Values
@@ -132,7 +132,7 @@ def truncated_least_squares(
     limit = _limits(network, probability, scale if noise_scale is not None else min(1.0, MARGIN * scale), trusted)
     starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
     found: list[tuple[str, RobustResult]] = []
-    for name in tqdm(list(starts), desc="robust starts", unit="start", disable=not progress, leave=False):
+    for name in Bar(list(starts), name="robust starts", unit="start", shown=progress):
         if name not in starts:
             continue
         values, believed = starts[name]

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
-from tqdm import tqdm
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
+from graphslam.core.progress import Bar
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT
 from graphslam.maps.terrain.lines import Rows, lines_of_scans
 from graphslam.maps.terrain.pyramid import Pyramid
@@ -100,7 +100,7 @@ def learn_tables(
     histograms = np.zeros((2, 3, shape.bands, BINS), np.int64)
     kept: list[Drive] = []
     kept_wide: list[Drive] = []
-    for seed, target in tqdm([(s, t) for s in seeds for t in targets], desc="drives", disable=not progress):
+    for seed, target in Bar([(s, t) for s in seeds for t in targets], name="drives", shown=progress):
         street = draw_street(target, seed, teaching=True)
         drive = drive_street(street, seed, c.robot)
         lines = lines_of_scans(drive.scans, drive.believed, c.robot.height)

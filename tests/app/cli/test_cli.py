@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -12,8 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from graphslam.app.cli import app
+from graphslam.app.cli.terminal import log_to_stderr
 from graphslam.app.worlds import simulate
+from graphslam.core.progress import Bar
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.joined_map import information_of, read_joined
 from graphslam.io.log_store import save_log
@@ -22,7 +27,7 @@ from graphslam.io.tum import read_tum, write_tum
 
 def graphslam(*args: object, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own."""
-    command = [sys.executable, "-m", "graphslam.app.cli", *map(str, args)]
+    command = [sys.executable, "-m", "graphslam", *map(str, args)]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=300, check=False, env={**os.environ, **(env or {})}
     )
@@ -238,3 +243,41 @@ def test_tum_files_with_backward_time_are_refused(tmp_path):
     lines = (tmp_path / "a.tum").read_text().splitlines()
     (tmp_path / "b.tum").write_text("\n".join([lines[0], lines[2], lines[1]]))
     refused("eval", tmp_path / "a.tum", tmp_path / "b.tum", saying="b.tum")
+
+
+def test_help_has_a_short_name_everywhere():
+    for verb in ((), ("run",), ("data",), ("data", "list")):
+        short, long = (graphslam(*verb, option) for option in ("-h", "--help"))
+        assert (short.returncode, short.stdout) == (0, long.stdout)
+        assert "-v, --verbose" in short.stdout
+        assert "-q, --quiet" in short.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "level", "hidden"),
+    [
+        (("data", "list"), logging.WARNING, False),
+        (("-q", "data", "list"), logging.ERROR, True),
+        (("data", "-q", "list"), logging.ERROR, True),
+        (("data", "list", "-q"), logging.ERROR, True),
+        (("-v", "data", "list"), logging.INFO, False),
+        (("data", "list", "--json", "-v"), logging.INFO, False),
+    ],
+)
+def test_verbose_and_quiet_stand_before_and_after_the_verb(options, level, hidden):
+    try:
+        assert CliRunner().invoke(app, options).exit_code == 0
+        assert (logging.getLogger().level, Bar.hidden) == (level, hidden)
+    finally:
+        log_to_stderr()
+
+
+def test_a_quiet_run_writes_nothing_to_stderr(tmp_path):
+    log = tmp_path / "log"
+    graphslam("simulate", "landmark-field", "--preset", "quick", "--out", log)
+    end = "--frontend", "rbpf-ekf", "--set", "frontend.particles=5", "--out", tmp_path / "run", "--resume"
+    assert "1/8 reading" in graphslam("run", log, *end).stderr
+    again = graphslam("run", log, *end, "-q")
+    assert again.stderr == ""
+    assert "resumed: all" in again.stdout
+    assert "times_real_time" not in again.stdout

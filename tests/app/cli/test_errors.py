@@ -80,7 +80,7 @@ def verb(*args: str, stdout: int | None = subprocess.PIPE, file_size: int | None
         if file_size is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
 
-    command = [sys.executable, "-m", "graphslam.app.cli", *args]
+    command = [sys.executable, "-m", "graphslam", *args]
     done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, preexec_fn=limits, check=False)
     return done.returncode, done.stderr
 

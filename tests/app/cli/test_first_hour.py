@@ -83,7 +83,7 @@ def test_ctrl_c_in_a_run_is_one_line_that_says_how_to_go_on(tmp_path: Path) -> N
     log, out = tmp_path / "log", tmp_path / "run"
     CliRunner().invoke(app, ["simulate", "landmark-field", "--preset", "demo", "--out", str(log)])
     typed = ["run", str(log), "--set", "frontend.particles=150", "--out", str(out)]
-    command = [sys.executable, "-m", "graphslam.app.cli"]
+    command = [sys.executable, "-m", "graphslam"]
 
     def hear() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it

@@ -50,7 +50,7 @@ NOTHING = {
 
 @pytest.mark.parametrize("name", NOTHING)
 def test_scans_that_cannot_be_followed_are_refused(name: str) -> None:
-    with pytest.raises(DataError, match="points enough to be followed"):
+    with pytest.raises(DataError, match="no scan has enough points"):
         followed([NOTHING[name]] * 12)
 
 

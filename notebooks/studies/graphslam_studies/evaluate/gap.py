@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from tqdm.auto import tqdm
 
 from graphslam.core.errors import DataError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
+from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import Consistency, nees, vector_pose_error
 from graphslam.join.ekf import join_ekf
@@ -80,7 +80,7 @@ def _isam2_along(submaps: Sequence[Submap], *, progress: bool) -> Array:
     graph = PoseGraph()
     solver = Isam2Solver(graph)
     found = np.empty(len(submaps))
-    for k, submap in enumerate(tqdm(submaps, desc="iSAM2", unit="submap", disable=not progress)):
+    for k, submap in enumerate(Bar(submaps, name="iSAM2", unit="submap", shown=progress)):
         graph.add_submap(submap)
         solver.update()
         found[k] = graph.objective().total
@@ -192,7 +192,7 @@ def gap_by_tree(submaps: Sequence[Submap], *, classical: bool = False, progress:
     ]
     rows = []
     gaps: dict[tuple[int, int], float] = {}
-    for level, first, end in tqdm(spans, desc="tree", unit="join", disable=not progress):
+    for level, first, end in Bar(spans, name="tree", unit="join", shown=progress):
         below = submaps[first:end]
         joined = join_tree(below, classical=classical)
         best = optimise_from_join(below, joined).objective_polished

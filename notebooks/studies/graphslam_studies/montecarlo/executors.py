@@ -8,7 +8,6 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import signal
-import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -16,8 +15,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Literal
-
-from tqdm import tqdm
 
 from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError, GraphSlamError
@@ -133,7 +130,6 @@ def _check_picklable(job: Job) -> None:
 def _serve(pipe: Connection) -> None:
     """Work of a spawned process: jobs in, results out, until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides what ends
-    tqdm.set_lock(threading.RLock())  # its default is a semaphore of the system, left behind where we are terminated
     pipe.send("ready")
     while True:
         try:

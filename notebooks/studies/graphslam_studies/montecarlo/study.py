@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from tqdm import tqdm
 
 from graphslam.app.folders.generations import new_generation
 from graphslam.app.machine import hold_one_thread, one_blas_thread, versions
@@ -18,6 +17,7 @@ from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
 from graphslam.core.interrupt import watch_interrupts
 from graphslam.core.markup import html_element, html_frame, html_table, join_parts
 from graphslam.core.plugins import plugins
+from graphslam.core.progress import Bar
 from graphslam_studies.montecarlo.definition import GROUP, StudyDefinition, find_study, fingerprint, source_digest
 from graphslam_studies.montecarlo.executors import Executor, Job, execute
 from graphslam_studies.montecarlo.folder import StudyFolder
@@ -201,7 +201,7 @@ def _run(
             watch_interrupts() as interrupt,
             closing(outcomes),  # ends the workers, whatever happens here
             one_blas_thread(),
-            tqdm(total=len(wanted), desc=definition.name, disable=not progress) as bar,
+            Bar(total=len(wanted), name=definition.name, shown=progress) as bar,
         ):
             bar.update(len(wanted) - len(jobs))
             for outcome in outcomes:

@@ -11,9 +11,9 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import pandas as pd
-from tqdm import tqdm
 
 from graphslam.core.errors import ConfigError, GraphSlamError
+from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
 from graphslam_studies.montecarlo.executors import Executor, Job, execute
 
@@ -109,7 +109,7 @@ def run_trials(
     rows: dict[int, tuple[Measurement, ...]] = {}
     outcomes = execute(list(jobs.values()), executor=executor, workers=workers, address=address)
     with closing(outcomes):
-        for outcome in tqdm(outcomes, total=len(numbers), desc="trials", disable=not progress):
+        for outcome in Bar(outcomes, total=len(numbers), name="trials", shown=progress):
             error = outcome.error or check_measurements(outcome.values)
             if error is not None:
                 failure = TrialError(f"{outcome.job.name} (seed {outcome.job.seed}) failed: {error}")

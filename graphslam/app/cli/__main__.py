@@ -1,5 +1,0 @@
-"""``python -m graphslam.app.cli``."""
-
-from graphslam.app.cli import main
-
-main()

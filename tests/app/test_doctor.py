@@ -1,0 +1,72 @@
+"""What the examination of an installation finds, beside the packages (tests/app/cli/test_cli.py)."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from graphslam.app import doctor
+
+
+def test_another_distribution_with_this_import_name_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor.other_distributions() == []
+    home = tmp_path / "python_graphslam-0.0.17.dist-info"
+    home.mkdir()
+    (home / "METADATA").write_text("Metadata-Version: 2.1\nName: python-graphslam\nVersion: 0.0.17\n")
+    (home / "RECORD").write_text("graphslam/__init__.py,,\ngraphslam/graph/graph.py,,\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    (finding,) = doctor.other_distributions()
+    assert finding.state == "conflict"
+    assert "python-graphslam 0.0.17" in finding.detail
+    assert "pip uninstall python-graphslam" in finding.detail
+
+
+def test_what_an_old_install_left_is_found(tmp_path: Path) -> None:
+    assert doctor.remains(doctor.site_packages()) == []
+    (tmp_path / "graphslam" / "core" / "__pycache__").mkdir(parents=True)
+    whole = tmp_path / "graphslam_frontends"
+    whole.mkdir()
+    (whole / "__init__.py").touch()
+    (finding,) = doctor.remains([tmp_path])
+    assert finding.state == "conflict"
+    assert f"rm -r {tmp_path / 'graphslam'}" in finding.detail
+
+
+def command(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"XDG_CACHE_HOME": str(home)}
+    return subprocess.run([sys.executable, "-m", "graphslam", *arguments], capture_output=True, text=True, env=env)
+
+
+def test_compiled_code_is_shown_and_cleared(tmp_path: Path) -> None:
+    file = tmp_path / "graphslam" / "compiled" / "numba-0-python-3" / "core_1" / "f.1.nbc"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(bytes(3_000_000))
+
+    def line(*options: str) -> str:
+        done = command(tmp_path, "doctor", "--json", *options)
+        assert done.returncode == 0, done.stderr
+        (row,) = [c for c in json.loads(done.stdout)["checks"] if c["check"] == "compiled code"]
+        return row["detail"]
+
+    assert line().startswith(f"{tmp_path / 'graphslam' / 'compiled'}: 1 functions, 3 MB")
+    assert ": 0 functions, 0 MB" in line("--clear-compiled")
+    assert not file.exists()
+
+
+def test_a_conflict_is_a_line_and_exit_code_1(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture) -> None:
+    from graphslam.app import cli
+
+    found = [doctor.InstallCheck("import name", "conflict", "python-graphslam 1 …")]
+    monkeypatch.setattr(doctor, "examine_installation", lambda: found)
+    monkeypatch.setattr(sys, "argv", ["graphslam", "doctor"])
+    with pytest.raises(SystemExit) as caught:
+        cli.main()
+    assert caught.value.code == 1
+    out, err = capfd.readouterr()
+    assert "conflict" in out
+    assert err == "graphslam: 1 installs are in conflict: import name\n"
