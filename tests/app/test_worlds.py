@@ -80,7 +80,7 @@ def test_seed_layout_and_world_seed(log: SensorLog) -> None:
         ({"world": "garage", "seed": -1}, ConfigError, "seed = -1"),
         ({"world": "garage", "world_seed": 1.5}, ConfigError, "world_seed = 1.5"),
         ({"world": "garage", "preset": "fuller"}, UnknownNameError, "full"),
-        ({"world": "garage", "bems": 3}, ConfigError, "unknown figure 'bems'"),
+        ({"world": "garage", "bems": 3}, ConfigError, "unknown parameter 'bems'"),
     ],
 )
 def test_impossible_wishes_are_refused(arguments: dict, kind: type, what: str) -> None:
