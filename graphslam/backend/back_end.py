@@ -34,12 +34,18 @@ from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
+MERGE_REACH = 5.0
+"""Landmarks farther apart than this are not tested for merging by covariance [m]."""
+LOOP_OVERLAP = 8.0
+"""Maps of two places are matched if the places may be nearer than this [m] …"""
+LOOP_HEIGHT = 1.0
+"""… and not farther above each other than this [m]."""
 
 
 def find_config(c: BackEndConfig) -> FindConfig:
     """How the back end looks for loops, the front end's matches among them."""
     return FindConfig(
-        candidates=CandidateConfig(overlap=c.loop_overlap, height=c.loop_height, least_support=c.match_support),
+        candidates=CandidateConfig(overlap=LOOP_OVERLAP, height=LOOP_HEIGHT, least_support=c.match_support),
         appearance=AppearanceConfig() if c.loop_appearance else None,
         front_end=True,
         ties=OverlapConfig() if c.loop_ties else None,
@@ -204,7 +210,7 @@ class BackEnd:
         start = time.perf_counter()
         merged = 0
         if self.config.associate and len(self.graph.values.landmarks) > 1:
-            for keep, drop in mahalanobis_merges(self.graph, self.config.gate, distance=self.config.merge_reach):
+            for keep, drop in mahalanobis_merges(self.graph, self.config.gate, distance=MERGE_REACH):
                 self.graph.merge_landmarks(keep, drop)
                 merged += 1
             if merged:

@@ -73,8 +73,6 @@ class BackEndConfig:
     """At the end, a sighting that contradicts the map by this χ² (2 dof) becomes a landmark of its own; 0 = never."""
     merge_distance: float = 0.0
     """Landmarks nearer than this after the join are one [m]; 0 = never merge by distance."""
-    merge_reach: float = 5.0
-    """Landmarks farther apart than this are not tested for merging by covariance [m]."""
     merge_every: int = 20
     """Look for landmarks to merge after this many submaps, and at the end."""
     confirmed_hits: int = 1
@@ -98,10 +96,6 @@ class BackEndConfig:
     the map in which the fewest points are denied; 1 = never."""
     look_every: int = 5
     """While the run goes on, tie in IMUs and look for loops after every so many submaps, too; 0 = at the end only."""
-    loop_overlap: float = 8.0
-    """Maps of two places are matched if the places may be nearer than this [m] …"""
-    loop_height: float = 1.0
-    """… and not farther above each other than this [m]."""
     loop_ties: bool = True
     """With loops: also along submaps, where their bodies were in a map that held them."""
     loop_appearance: bool = False
@@ -113,6 +107,6 @@ class BackEndConfig:
         return self.loops is True
 
     def __post_init__(self) -> None:
-        for name in ("node_spacing", "level_sigma", "match_support", "loop_overlap", "loop_height", "look_every"):
+        for name in ("node_spacing", "level_sigma", "match_support", "look_every"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"backend.{name} must not be negative, got {getattr(self, name)}")

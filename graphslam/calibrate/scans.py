@@ -303,12 +303,6 @@ def _match_noise(e: Array, stated: Array) -> float:
     return math.exp(found.x)
 
 
-def _turning(p: ScanPairs, noise: dict[str, float]) -> float:
-    """Noise of the heading after one metre of this log [rad/√m]."""
-    grows = np.array([x.sum() for x in (p.metres, p.turned, p.seconds)]) / max(float(p.metres.sum()), 1e-9)
-    return float(np.sqrt(grows @ np.square([noise[f"heading_{k}"] for k in ("metre", "radian", "second")])))
-
-
 def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, float]]:
     columns = {"yaw_bias": p.seconds, "turn_per_metre": p.metres, "turn_scale": p.turn}
     names, notes = list(HEADING), list[Finding]()

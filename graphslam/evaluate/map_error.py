@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, ArrayLike, align_se2, se2_between, se2_compose, se2_transform, wrap_angle
+from graphslam.core.geometry import Array, ArrayLike, align_se2, se2_transform
 from graphslam.evaluate.statistics import ErrorStatistics
 
 Gauge = Literal["first-base", "rigid"]
@@ -19,7 +19,7 @@ Index = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapError:
-    """Errors of landmarks or poses.
+    """Errors of landmarks.
 
     Parameters
     ----------
@@ -30,8 +30,6 @@ class MapError:
         The transform that was applied; identity for ``first-base``.
     errors : (n,)
         Distances [m].
-    heading_errors : (n,) or None
-        Rotation angles [rad], poses only.
     unmatched : int
         Estimates without a truth.
     """
@@ -40,20 +38,12 @@ class MapError:
     gauge: Gauge
     T_truth_estimate: Array
     errors: Array
-    heading_errors: Array | None = None
     unmatched: int = 0
 
     @property
     def statistics(self) -> ErrorStatistics:
         """Of the distances [m]."""
         return ErrorStatistics.of(self.errors)
-
-    @property
-    def heading_statistics(self) -> ErrorStatistics:
-        """Of the absolute rotation angles [rad]."""
-        if self.heading_errors is None:
-            raise DataError(f"{self.quantity} have no heading")
-        return ErrorStatistics.of(np.abs(self.heading_errors))
 
     def as_row(self) -> dict[str, Any]:
         """One row of a table."""
@@ -111,26 +101,4 @@ def landmark_error(
         T_truth_estimate=T,
         errors=np.linalg.norm(moved - q[j], axis=1),
         unmatched=len(p) - len(i),
-    )
-
-
-def pose_map_error(poses: ArrayLike, truth: ArrayLike, *, gauge: Gauge = "first-base") -> MapError:
-    """Distances and rotation angles between poses ``(n, 3)`` or ``(n, 7)`` and true ones, row by row."""
-    p, q = np.asarray(poses, dtype=np.float64), np.asarray(truth, dtype=np.float64)
-    if p.shape != q.shape or p.ndim != 2 or p.shape[1] not in (3, 7):
-        raise DataError("poses and truth differ in shape", got=(p.shape, q.shape), wanted="(n, 3) or (n, 7) each")
-    dim = 2 if p.shape[1] == 3 else 3
-    T = fit_gauge(p[:, :dim], q[:, :dim], gauge)
-    if dim == 2:
-        d = se2_between(se2_compose(T, p), q)
-        angle = np.abs(wrap_angle(d[:, 2]))
-    else:
-        d = se3.se3_between(se3.se3_compose(np.broadcast_to(T, p.shape), p), q)
-        angle = np.linalg.norm(se3.so3_log(d[:, 3:]), axis=1)
-    return MapError(
-        quantity="poses",
-        gauge=gauge,
-        T_truth_estimate=T,
-        errors=np.linalg.norm(d[:, :dim], axis=1),
-        heading_errors=angle,
     )

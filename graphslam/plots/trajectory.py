@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from graphslam.evaluate.gps import GpsResiduals
-from graphslam.evaluate.trajectory_error import TrajectoryError
 from graphslam.plots import style
 
 # A pause between fixes longer than this starts a new segment: no line is drawn over it [s].
@@ -41,27 +40,6 @@ def plot_gps_residuals(
     ax.set_title(
         title if title is not None else "GPS residuals (rigid alignment, no scale; dashed: RMSE)", fontsize="medium"
     )
-    ax.set_ylim(0.0, top * (1.08 + 0.12 * len(named)))  # room for the legend
-    style.legend(ax, outside=False, loc="upper left")
-    return ax
-
-
-def plot_trajectory_error(
-    ax: Axes | None, errors: TrajectoryError | Mapping[str, TrajectoryError], *, title: str | None = None
-) -> Axes:
-    """Translation error against time (ATE or RPE)."""
-    ax = style.new_axes(ax, (7.0, 3.2))
-    top = 0.0
-    named = errors if isinstance(errors, Mapping) else {"estimate": errors}
-    for k, (label, e) in enumerate(named.items()):
-        text = f"{label}: RMSE {e.statistics.rmse:.3f} m, {e.pairs} pairs"
-        top = max(top, e.statistics.maximum)
-        ax.plot(e.times, e.translation, color=style.colour(k), lw=1.2, label=text)
-    first = next(iter(named.values()))
-    what = first.kind if first.delta is None else f"{first.kind} over {first.delta[0]:g} {first.delta[1]}"
-    ax.set_xlabel("time [s]")
-    ax.set_ylabel("translation error [m]")
-    ax.set_title(title if title is not None else f"{what}, alignment: {first.alignment}", fontsize="medium")
     ax.set_ylim(0.0, top * (1.08 + 0.12 * len(named)))  # room for the legend
     style.legend(ax, outside=False, loc="upper left")
     return ax

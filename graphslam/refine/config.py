@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam.registration.surfaces import SurfaceFitConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,12 +15,6 @@ class RefineConfig:
 
     use: bool = True
     """Refine the solved path of runs whose front end works on scans; false: the path of the graph is the result."""
-    chunk_length: float = 3.0
-    """Way over which the points of steps are searched together [m]."""
-    chunk_time: float = 10.0
-    """Longest time of such a chunk, for robots that stand still [s]."""
-    chunk_turn: float = 0.5
-    """In the plane: greatest turn within such a chunk [rad]; a scanner that looks one way soon sees other walls."""
     reach: float | None = None
     """Chunks whose centres are nearer than this may see the same surfaces [m]; None: the range that three quarters of
     the returns of the log stay below, 10 m at least and 30 m at most."""
@@ -37,13 +30,9 @@ class RefineConfig:
     """Of so many points in the log at most; more are thinned evenly."""
     most_beams: int = 3_000_000
     """Of so many beams in the log at most surfaces are made; more are thinned evenly, which bounds the memory."""
-    knot: float = 30.0
-    """Time between the knots of the yaw bias [s]."""
-    surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
-    """What counts as a surface."""
 
     def __post_init__(self) -> None:
-        for name in ("chunk_length", "chunk_time", "chunk_turn", "reach", "spacing", "turn", "knot"):
+        for name in ("reach", "spacing", "turn"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"refine: {name} = {value}; wanted > 0")

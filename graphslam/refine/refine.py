@@ -47,6 +47,7 @@ from graphslam.refine.surfaces import (
     match_surfaces,
 )
 from graphslam.registration.plane_kernels import PlanePairs
+from graphslam.registration.surfaces import SURFACE
 from graphslam_frontends.odometry.recorded import chain_odometry
 
 log = logging.getLogger(__name__)
@@ -68,6 +69,12 @@ FEWEST = 3
 """Chunks of one pass that a chunk is paired with at least; over a reach there lie so many as fit."""
 KEPT = 2
 """Surfaces are found anew in so many rounds over all passes; then the steps about a point move no more."""
+CHUNK_LENGTH = 3.0
+"""Way over which the points of steps are searched together [m] …"""
+CHUNK_TIME = 10.0
+"""… the longest time of such a chunk, for robots that stand still [s] …"""
+CHUNK_TURN = 0.5
+"""… and in the plane the greatest turn within it [rad]; a scanner that looks one way soon sees other walls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,11 +319,9 @@ class _Refiner:
     ) -> None:
         self.steps, self.start, self.config, self.tell = steps, start, config, tell
         self.group = group_of(start)
-        turn = config.chunk_turn if steps.group.dim == 2 else np.inf
-        self.raw = self.cloud = ScanReturns.of(
-            steps, chunk_length=config.chunk_length, chunk_time=config.chunk_time, chunk_turn=turn
-        )
-        self.motion = MotionModel(steps, knot=config.knot, bridge=self.cloud.bridge())
+        turn = CHUNK_TURN if steps.group.dim == 2 else np.inf
+        self.raw = self.cloud = ScanReturns.of(steps, chunk_length=CHUNK_LENGTH, chunk_time=CHUNK_TIME, chunk_turn=turn)
+        self.motion = MotionModel(steps, bridge=self.cloud.bridge())
         self.every = max(config.every, int(np.ceil(len(self.cloud.points) / config.most_points)))
         fixes = None if gps is None else FixModel(*gps, self.motion, start)
         self.fixes = fixes if fixes is not None and gps is not None and fixes.ready(gps[1].baseline, start) else None
@@ -330,7 +335,7 @@ class _Refiner:
         self.first: CacheEntry[Surfaces] | None = None
         self.length = float(steps.path_length[-1])
         self.reach = config.reach if config.reach is not None else _reach(steps)
-        self.most = max(FEWEST, round(self.reach / config.chunk_length))
+        self.most = max(FEWEST, round(self.reach / CHUNK_LENGTH))
 
     def first_states(self) -> States:
         """No lasting errors; fixes as they lie at the path."""
@@ -456,7 +461,7 @@ class _Refiner:
         trim_heap()
         if again or self.surfaces is None:
             self.surfaces = None
-            self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
+            self.surfaces = find_surfaces(self.cloud, self.poses, SURFACE)
             if self.first is None:
                 self.first = self.surfaces.put_aside()
         self.chunks = chunk_pairs(self.cloud, self.poses, self.reach, self.most, passes=passes)
@@ -549,7 +554,7 @@ class _Refiner:
 
     def agreement_along(self, poses: Array) -> float:
         """The same of the raw scans at another path, with surfaces made there."""
-        return self.agreement(self.raw, find_surfaces(self.raw, poses, self.config.surface), poses, self.noise)
+        return self.agreement(self.raw, find_surfaces(self.raw, poses, SURFACE), poses, self.noise)
 
     def result(self, refused: Index, other: AttemptComparison | None) -> Refinement:
         """Covariances at the end, and all that was found."""

@@ -69,8 +69,6 @@ class RegistrationConfig:
         Greatest distances of a pair, stage by stage [m].
     iterations : int
         At most, a stage.
-    rotation_epsilon, translation_epsilon : float
-        A stage ends when a step is smaller [rad, m].
     near : float
         A source point has a neighbour if one is nearer than this [m].
     least_points : int
@@ -79,7 +77,7 @@ class RegistrationConfig:
         A result farther from its start is refused [m, rad]: it is another place than the one asked about.
     covariance_scale : float
         Of the inverse Hessian with the noise that the pairs show; calibrated in halls, whatever the noise, the bins and
-        the number of points (docs/notes/registration.md). Three dimensions; ``covariance_scale_planar`` in two.
+        the number of points (docs/notes/registration.md). Three dimensions.
     floor_sigma, floor_turn : float
         σ added to the covariance, per axis [m, rad]: what is wrong with the map itself. The defaults are for maps whose
         scans are placed to 2 cm and 2 mrad; for 30 m of dead reckoning 5 cm and 5 mrad fit.
@@ -87,14 +85,11 @@ class RegistrationConfig:
 
     radii: tuple[float, ...] = (2.0, 0.5)
     iterations: int = 30
-    rotation_epsilon: float = 1e-4
-    translation_epsilon: float = 1e-4
     near: float = 0.25
     least_points: int = 20
     max_shift: float = 3.0
     max_turn: float = 0.5
     covariance_scale: float = 3.0
-    covariance_scale_planar: float = 5.0
     floor_sigma: float = 0.01
     floor_turn: float = 0.001
     gates: RegistrationGates = field(default_factory=RegistrationGates)

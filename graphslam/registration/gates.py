@@ -22,6 +22,11 @@ from graphslam.core.poses import group_of
 from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.register import Registration, failed_gates
 
+VAGUE_POSITION = 0.4
+"""A match is refused whose own σ is above this in some direction [m]: nothing holds it there …"""
+VAGUE_ANGLE = 0.04
+"""… or above this about some axis [rad]."""
+
 
 class MatchLimits(Protocol):
     """What the gates are set to; see :class:`MatchGates`."""
@@ -36,10 +41,6 @@ class MatchLimits(Protocol):
     def shift(self) -> float: ...
     @property
     def margin(self) -> float: ...
-    @property
-    def vague_position(self) -> float: ...
-    @property
-    def vague_angle(self) -> float: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,8 +61,6 @@ class MatchGates:
         A second mode must be worse by this share of the points.
     mode_distance : float
         … if it is farther off than this [m].
-    vague_position, vague_angle : float
-        A match is refused whose own σ is above these [m, rad] in some direction.
     """
 
     fitness: float = 0.83
@@ -70,8 +69,6 @@ class MatchGates:
     shift: float = 2.5
     margin: float = 0.1
     mode_distance: float = 1.5
-    vague_position: float = 0.4
-    vague_angle: float = 0.04
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -151,9 +148,7 @@ def failed_match_gates(
     if (moved := shift_between(at, T_prior)) > limits.shift * sigma:
         fails.append(f"shift {moved:.2f} m > {limits.shift:g} σ of {sigma:.2f} m")
     own = np.sqrt(np.diag(found.covariance))
-    if ask_vague and (
-        own[g.position].max() > limits.vague_position or np.delete(own, g.position).max() > limits.vague_angle
-    ):
+    if ask_vague and (own[g.position].max() > VAGUE_POSITION or np.delete(own, g.position).max() > VAGUE_ANGLE):
         fails.append("vague")
     if margin < limits.margin:
         fails.append(f"margin {margin:.3f} < {limits.margin:g}")

@@ -28,6 +28,13 @@ from graphslam.registration.target import Target
 
 _LEAST_NOISE = 1e-4  # clouds that are copies of each other show none
 Known = npt.NDArray[np.bool_] | Callable[[Array], npt.NDArray[np.bool_]]
+ROTATION_EPSILON = 1e-4
+"""A stage of a registration ends when a step turns by less than this [rad] …"""
+TRANSLATION_EPSILON = 1e-4
+"""… and moves by less than this [m]."""
+COVARIANCE_SCALE_PLANAR = 5.0
+"""Factor on the inverse Hessian with the noise that the pairs show, in two dimensions; calibrated in halls, whatever
+the noise, the bins and the number of points (docs/notes/registration.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -248,7 +255,7 @@ def failed_gates(result: Registration, config: RegistrationConfig) -> str:
 
 def _align(source: Target, target: Target, T: Array, config: RegistrationConfig) -> PlanarAlignment:
     """Both radii."""
-    limits = (config.iterations, config.rotation_epsilon, config.translation_epsilon)
+    limits = (config.iterations, ROTATION_EPSILON, TRANSLATION_EPSILON)
     if target.dim == 2:
         found = PlanarAlignment(T, np.zeros((3, 3)), 0.0, 0)
         for radius in config.radii:
@@ -266,8 +273,8 @@ def _align(source: Target, target: Target, T: Array, config: RegistrationConfig)
             max_correspondence_distance=radius,
             num_threads=1,
             max_iterations=config.iterations,
-            rotation_epsilon=config.rotation_epsilon,
-            translation_epsilon=config.translation_epsilon,
+            rotation_epsilon=ROTATION_EPSILON,
+            translation_epsilon=TRANSLATION_EPSILON,
         )
         matrix = np.asarray(result.T_target_source)
         if not np.all(np.isfinite(matrix)):
@@ -312,7 +319,7 @@ def _measure(
     # the noise that the pairs show: 1 where the variances of the shapes are right
     freedom = max(found.pairs - len(found.hessian), 1)
     noise = max(2.0 * found.error / freedom, _LEAST_NOISE)
-    factor = config.covariance_scale_planar if planar else config.covariance_scale
+    factor = COVARIANCE_SCALE_PLANAR if planar else config.covariance_scale
     covariance = calibrated_covariance(
         information,
         dim=dim,

@@ -39,6 +39,10 @@ class SurfaceFitConfig:
     """Least RMS extent along the middle axis [m]."""
 
 
+SURFACE = SurfaceFitConfig()
+"""Of the refinement and of scan-to-window odometry: walls, floors and ground as robots meet them."""
+
+
 def thin_places(W: Array, a: int, b: int, spacing: float, stands: Index) -> Index:
     """Rows of the points ``a:b`` that stand for themselves; enters into ``stands`` who stands for the others."""
     if a == b:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import process_time
 from typing import Any
+from unittest import mock
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -42,6 +43,7 @@ from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.plots import style
 from graphslam.plots.save import save_figure
+from graphslam_frontends.landmarks import ekf_filter
 from graphslam_studies.plots.study_time import plot_cumulative_time
 from tests.reference.gps_maps import plot_gps_maps
 
@@ -195,9 +197,11 @@ def _all_methods(log: SensorLog, judge: Judge, out: Results, seed: int, *, progr
         for name, options in (
             ("EKF, one map, nearest", {"association": "nearest"}),
             ("EKF, one map, jcbb", {"association": "jcbb"}),
-            ("EKF, one map, jcbb, all landmarks", {"association": "jcbb", "active_margin": EVERYWHERE}),
+            ("EKF, one map, jcbb, all landmarks", {"association": "jcbb"}),
         ):
-            submap, seconds = one_map(log, **options)
+            margin = EVERYWHERE if "all landmarks" in name else ekf_filter.ACTIVE_MARGIN
+            with mock.patch.object(ekf_filter, "ACTIVE_MARGIN", margin):
+                submap, seconds = one_map(log, **options)
             assert submap.trajectory is not None
             assert submap.landmarks is not None
             scans = submap.trajectory.times[-len(seconds) :]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_compose, se2_transform
-from graphslam.evaluate.map_error import landmark_error, match_ids, pose_map_error
+from graphslam.evaluate.map_error import landmark_error, match_ids
 from graphslam.evaluate.statistics import ErrorStatistics
 
 
@@ -61,19 +60,3 @@ def test_rigid_gauge_cannot_hide_a_scale_error(rng: np.random.Generator) -> None
     e = landmark_error(np.arange(50), 1.1 * truth, np.arange(50), truth, gauge="rigid")
     spread = np.sqrt(np.mean(np.sum((truth - truth.mean(0)) ** 2, axis=1)))
     assert e.statistics.rmse == pytest.approx(0.1 * spread, rel=1e-6)
-
-
-def test_pose_errors_in_two_and_three_dimensions() -> None:
-    e = pose_map_error([[0, 0, 0], [3, 4, 3.1]], [[0, 0, 0], [0, 0, -3.1]])
-    assert e.errors.tolist() == [0.0, 5.0]
-    assert e.heading_statistics.maximum == pytest.approx(2 * np.pi - 6.2)
-    T = se3.se3_exp(np.array([0.0, 0.0, 0.4, 1.0, 2.0, 3.0]))
-    poses = se3.se3_exp(np.random.default_rng(0).normal(size=(8, 6)))
-    moved = se3.se3_compose(np.broadcast_to(T, poses.shape), poses)
-    r = pose_map_error(moved, poses, gauge="rigid")
-    assert r.statistics.maximum < 1e-9
-    assert r.heading_statistics.maximum < 1e-7
-    with pytest.raises(DataError, match="differ in shape"):
-        pose_map_error(np.zeros((2, 3)), np.zeros((3, 3)))
-    with pytest.raises(DataError, match="no heading"):
-        _ = landmark_error([1], [[0.0, 0.0]], [1], [[0.0, 0.0]]).heading_statistics

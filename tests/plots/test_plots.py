@@ -18,13 +18,12 @@ from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import Consistency
 from graphslam.evaluate.gps import gps_residuals
-from graphslam.evaluate.trajectory_error import ate, rpe
 from graphslam.plots import style
 from graphslam.plots.comparison import plot_comparison
 from graphslam.plots.consistency import plot_consistency
 from graphslam.plots.map import ellipse_axes, landmark_blocks, plot_ellipses, plot_map
 from graphslam.plots.submaps import chain_poses, plot_submap_chain
-from graphslam.plots.trajectory import plot_gps_residuals, plot_trajectory_error
+from graphslam.plots.trajectory import plot_gps_residuals
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 
 
@@ -225,14 +224,6 @@ def test_gps_residual_figure_draws_no_line_over_a_pause(log) -> None:
     drawn = plot_gps_residuals(None, r).get_lines()[0].get_xydata()
     assert np.sum(np.isnan(drawn[:, 1])) == 1
     assert np.sum(~np.isnan(drawn[:, 1])) == len(r.times)
-
-
-def test_trajectory_error_figure(log, tmp_path: Path) -> None:
-    t = log.truth.trajectory
-    est = Trajectory(t.times, t.poses + 0.01 * np.sin(t.times)[:, None])
-    ax = rendered(plot_trajectory_error(None, {"a": ate(est, t, alignment="none")}), tmp_path)
-    assert "alignment: none" in ax.get_title()
-    assert "RPE over 5 m" in plot_trajectory_error(None, rpe(est, t, delta=5.0)).get_title()
 
 
 def test_comparison_bars_and_points(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import least_squares
 
+from graphslam_frontends.detectors import trees
 from graphslam_frontends.detectors.trees import TreeDetectorConfig
 
 
@@ -47,8 +48,8 @@ def detect_scan(ranges: np.ndarray, bearings: np.ndarray, config: TreeDetectorCo
         previous = clusters[-1][-1] if clusters else None
         if (
             previous is None
-            or k - previous - 1 > config.max_missing
-            or abs(ranges[k] - ranges[previous]) > config.break_distance
+            or k - previous - 1 > trees.MAX_MISSING
+            or abs(ranges[k] - ranges[previous]) > trees.BREAK_DISTANCE
         ):
             clusters.append([])
         clusters[-1].append(k)
@@ -60,26 +61,26 @@ def detect_scan(ranges: np.ndarray, bearings: np.ndarray, config: TreeDetectorCo
     for cluster in clusters:
         a, b = cluster[0], cluster[-1]
         n = b - a + 1
-        if n < config.min_beams or a == 0 or b == len(ranges) - 1:
+        if n < trees.MIN_BEAMS or a == 0 or b == len(ranges) - 1:
             continue
         distance = [abs(2 * k - a - b) for k in cluster]
         inner = [k for k, d in zip(cluster, distance) if d == min(distance)]
         middle = float(np.mean([ranges[k] for k in inner]))
         values = [ranges[k] for k in cluster]
-        if (n - 1) * step * middle >= config.max_width or max(values) - min(values) >= config.max_depth:
+        if (n - 1) * step * middle >= config.max_width or max(values) - min(values) >= trees.MAX_DEPTH:
             continue
         hidden = [
             out
             for out, mine in ((a - 1, a), (b + 1, b))
-            if ranges[out] > 0 and ranges[out] < ranges[mine] - config.occlusion
+            if ranges[out] > 0 and ranges[out] < ranges[mine] - trees.OCCLUSION
         ]
         close = [
             other
             for other in clusters
             if other is not cluster
             and (
-                np.linalg.norm(point(a) - point(other[-1])) < config.isolation
-                or np.linalg.norm(point(b) - point(other[0])) < config.isolation
+                np.linalg.norm(point(a) - point(other[-1])) < trees.ISOLATION
+                or np.linalg.norm(point(b) - point(other[0])) < trees.ISOLATION
             )
         ]
         if hidden or close:
@@ -99,9 +100,9 @@ def _measure(ranges, bearings, cluster, inner, middle, step, config) -> Trunk:
     # derivative of middle / (1 - sin g) with respect to g, by finite differences
     h = 1e-6
     slope = (middle / (1 - math.sin(g + h)) - middle / (1 - math.sin(g - h))) / (2 * h)
-    variance = (config.beam_sigma / (1 - math.sin(g))) ** 2 / len(inner) + (slope * step) ** 2 * var_g
+    variance = (trees.BEAM_SIGMA / (1 - math.sin(g))) ** 2 / len(inner) + (slope * step) ** 2 * var_g
     plain = Trunk(rho, bearing, radius, math.sqrt(variance), step / math.sqrt(24), n, False)
-    if n < config.fit_beams:
+    if n < trees.FIT_BEAMS:
         return plain
     half = math.asin(min(radius / rho, 0.99))
     used = [k for k in cluster if abs(bearings[k] - bearing) <= 0.7 * half]
@@ -113,7 +114,7 @@ def _measure(ranges, bearings, cluster, inner, middle, step, config) -> Trunk:
         model = [p[0] * math.cos(x) - math.sqrt(p[2] ** 2 - (p[0] * math.sin(x)) ** 2) for x in psi]
         return np.array(
             [e / (step / math.sqrt(12)) for e in edges]
-            + [(ranges[k] - m) / config.beam_sigma for k, m in zip(used, model)]
+            + [(ranges[k] - m) / trees.BEAM_SIGMA for k, m in zip(used, model)]
         )
 
     try:

@@ -17,6 +17,7 @@ from graphslam.refine.nodes import scans_at
 from graphslam.refine.refine import _Refiner, refine_by_scans
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import find_surfaces
+from graphslam.registration.surfaces import SURFACE
 from graphslam_studies.evaluate import segslam_judge as judge
 from graphslam_studies.refinement import QUICK_WORLDS
 from graphslam_studies.refinement_trial import FAULTS, nees_of, run_refinement_trial
@@ -227,7 +228,7 @@ def test_odometry_better_than_all_that_was_made_of_it_is_the_result(monkeypatch:
         rounds(self, distances)
         turns = np.linspace(0.0, 1.0, len(self.poses))[:, None] * np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         self.poses = SE3.compose(SE3.exp(turns), self.poses)
-        self.surfaces = find_surfaces(self.cloud, self.poses, self.config.surface)
+        self.surfaces = find_surfaces(self.cloud, self.poses, SURFACE)
 
     monkeypatch.setattr(_Refiner, "all_passes", bent)
     found = refine_by_scans(scans, start)

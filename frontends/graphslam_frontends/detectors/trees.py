@@ -17,7 +17,7 @@ for one beam E g = (4/9) δ and Var g = (1/4 - 16/81) δ². The stated covarianc
     σ²_range = σ_beam² / (k (1 - g)²) + r² cos²g / (1 - sin g)⁴ · Var g        (k = 1 or 2 middle beams)
     σ²_bearing = δ² / 24                                                       (mean of two uniform edges)
 
-which grows with range, and most for few beams. From ``fit_beams`` beams on, (ρ, β, R) is the weighted least-squares
+which grows with range, and most for few beams. From :data:`FIT_BEAMS` beams on, (ρ, β, R) is the weighted least-squares
 fit to both edges (σ = δ/√12) and to the ranges of the beams that do not graze the trunk, and the covariance is that of
 the fit; a cluster that is no circle (χ² > 9 a beam) keeps the closed form.
 
@@ -40,6 +40,22 @@ from graphslam.core.records import LandmarkObservations, LaserScans
 from graphslam_frontends.detectors import kernels
 
 Ints = npt.NDArray[np.int64]
+BREAK_DISTANCE = 1.5
+"""Neighbouring returns that differ more in range belong to different things [m]."""
+MAX_MISSING = 5
+"""More missing beams than this break a cluster."""
+MAX_DEPTH = 0.5
+"""Spread of the ranges within a trunk is below this [m]."""
+ISOLATION = 3.0
+"""Least distance from a trunk's first and last return to those of any other cluster [m]."""
+OCCLUSION = 0.3
+"""A neighbouring beam nearer by more than this hides part of the trunk: rejected [m]."""
+MIN_BEAMS = 1
+"""Fewer beams than this are no trunk. One is right for a park: requiring two loses 40 % of the trees."""
+FIT_BEAMS = 5
+"""From this many beams on a circle is fitted."""
+BEAM_SIGMA = 0.03
+"""σ of one beam's range on bark [m], for the noise of the geometry."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,22 +64,8 @@ class TreeDetectorConfig:
 
     max_range: float = 75.0
     """Returns at or beyond are ignored [m]."""
-    break_distance: float = 1.5
-    """Neighbouring returns that differ more in range belong to different things [m]."""
-    max_missing: int = 5
-    """More missing beams than this break a cluster."""
     max_width: float = 1.0
     """The least width that the beams allow, (n - 1) δ r, must be below [m]."""
-    max_depth: float = 0.5
-    """Spread of the ranges within a trunk must be below [m]."""
-    isolation: float = 3.0
-    """Least distance from a trunk's first and last return to those of any other cluster [m]."""
-    occlusion: float = 0.3
-    """A neighbouring beam nearer by more than this hides part of the trunk: rejected [m]."""
-    min_beams: int = 1
-    """Fewer beams than this are no trunk. One is right for a park: requiring two loses 40 % of the trees."""
-    fit_beams: int = 5
-    """From this many beams on a circle is fitted."""
     noise: Literal["fixed", "fit"] = "fixed"
     """Whether the sigmas are the parameters below or those of the geometry."""
     range_sigma: float = 0.08
@@ -72,29 +74,13 @@ class TreeDetectorConfig:
     """Fixed noise: part of σ_range proportional to range [m/m]."""
     bearing_sigma: float = float(np.deg2rad(0.5))
     """Fixed noise: σ_bearing [rad]."""
-    beam_sigma: float = 0.03
-    """Fit: σ of one beam's range on bark [m]."""
 
     def __post_init__(self) -> None:
-        positive = (
-            "max_range",
-            "break_distance",
-            "max_width",
-            "max_depth",
-            "range_sigma",
-            "bearing_sigma",
-            "beam_sigma",
-        )
-        for name in positive:
+        for name in ("max_range", "max_width", "range_sigma", "bearing_sigma"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"tree detector: {name} = {getattr(self, name)}; wanted > 0")
-        for name in ("isolation", "occlusion", "range_slope", "max_missing"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"tree detector: {name} = {getattr(self, name)}; wanted ≥ 0")
-        if self.min_beams < 1 or self.fit_beams < 3:
-            raise ConfigError(
-                f"tree detector: min_beams = {self.min_beams}, fit_beams = {self.fit_beams}; wanted ≥ 1 and ≥ 3"
-            )
+        if not self.range_slope >= 0:
+            raise ConfigError(f"tree detector: range_slope = {self.range_slope}; wanted ≥ 0")
         if self.noise not in ("fixed", "fit"):
             raise ConfigError(f"tree detector: noise = {self.noise!r}; known: fixed, fit")
 
@@ -171,15 +157,15 @@ def find_trunks(scans: LaserScans, config: TreeDetectorConfig | None = None) -> 
     parameters = np.array(
         [
             min(c.max_range, scans.max_range),
-            c.break_distance,
-            c.max_missing,
+            BREAK_DISTANCE,
+            MAX_MISSING,
             c.max_width,
-            c.max_depth,
-            c.isolation,
-            c.occlusion,
-            c.min_beams,
-            c.fit_beams,
-            c.beam_sigma,
+            MAX_DEPTH,
+            ISOLATION,
+            OCCLUSION,
+            MIN_BEAMS,
+            FIT_BEAMS,
+            BEAM_SIGMA,
         ]
     )
     ranges = np.ascontiguousarray(scans.ranges, dtype=np.float64)

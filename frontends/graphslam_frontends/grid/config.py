@@ -11,6 +11,11 @@ from graphslam.core.errors import ConfigError
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood
 
+CAST_EFFECTIVE_BEAMS = 4.0
+"""Independent beams that a step counts as, weighed by casting, which is far sharper than end points: a few."""
+GREATEST_EXPONENT = 1.0
+"""A beam counts as no more than this many, however few there are."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridFilterConfig:
@@ -32,17 +37,13 @@ class GridFilterConfig:
     """Probability that a voxel is occupied, given that a beam ended in it (OctoMap's). With a larger one floors outlast
     the beams that graze them, so that heights drift less; walls get thicker, and the way across them is told less
     well."""
-    miss: float = 0.4
-    """The same, given that a beam passed through it (OctoMap's)."""
-    clamp: tuple[float, float] = (0.1192, 0.971)
-    """Bounds of a voxel's probability (OctoMap's): a map may change its mind."""
     map_beams: int = 0
     """Beams of a step that go into the maps, spread over it; 0 = all there are."""
 
     likelihood: Literal["endpoint", "cast", "upright"] = "endpoint"
     """How beams are weighed. End points are flat, so that of particles all a little off the nearest still wins. Casting
     is sharp, and asks for more particles or less motion noise. ``upright``: end points of upright surfaces alone, which
-    say where the body is in the plan, and ``cast_beams`` casts, which say how high it is; end points of floors pull the
+    say where the body is in the plan, and some casts, which say how high it is; end points of floors pull the
     body down. Where no gravity is measured that is ``endpoint``."""
     weight_beams: int = 180
     """Beams of a step that are weighed, spread over it. Neighbours repeat each other, so fewer than go into the map."""
@@ -50,23 +51,11 @@ class GridFilterConfig:
     """Independent beams that a step counts as, weighed by end points: the exponent of its likelihood is this over the
     number weighed. Some tens leave about half of the particles effective; fewer teach the filter little, and many more
     have it resample at nearly every step."""
-    cast_effective_beams: float = 4.0
-    """The same, weighed by casting, which is far sharper: a few."""
-    greatest_exponent: float = 1.0
-    """A beam counts as no more than this many, however few there are."""
     floor: float = 0.05
     """End points: probability that a beam has nothing to do with the map."""
-    interpolation: Literal["trilinear", "nearest"] = "trilinear"
-    """End points: between voxels, so that poses closer to each other than a voxel are told apart; or not."""
     unknown: float = 0.3
     """End points: probability of occupancy where the map knows nothing. Below one half, so that a particle which finds
     the surfaces it knows again beats one that puts them where nothing was seen; far above, new ground is a reward."""
-    cast_sigma: float = 0.2
-    """Casting: σ of a measured range about the expected one [m], a voxel's edge."""
-    cast_clip: float = 3.0
-    """Casting: standard deviations beyond which a beam is no worse."""
-    cast_beams: int = 60
-    """Beams of a step that are cast beside the end points of upright surfaces, spread over it."""
     young: int = 12
     """A map of fewer scans than this says little yet, and what it says is not to be held against maps that know more:
     its particle takes the mean evidence of the older ones. 12 are 5 s, after which a spun scanner has seen all round
@@ -97,7 +86,6 @@ class GridFilterConfig:
         for name, least in (
             ("particles", 1),
             ("weight_beams", 1),
-            ("cast_beams", 1),
             ("threads", 1),
             ("map_beams", 0),
             ("young", 0),
@@ -108,7 +96,7 @@ class GridFilterConfig:
             raise ConfigError(f"lift = {self.lift}; wanted 0 … 1 voxels")
         if not 0.0 < self.ess_fraction <= 1.0:
             raise ConfigError(f"ess_fraction = {self.ess_fraction}; wanted in (0, 1]")
-        for name in ("voxel_size", "endpoint_effective_beams", "cast_effective_beams", "greatest_exponent"):
+        for name in ("voxel_size", "endpoint_effective_beams"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted a finite number above 0")
         walks = ("walk_scale", "position_walk", "height_walk", "heading_walk", "heading_turn", "tilt_walk")
@@ -123,21 +111,20 @@ class GridFilterConfig:
 
     def beam_model(self) -> BeamModel:
         """What a beam says of a voxel."""
-        return BeamModel(hit=self.hit, miss=self.miss, clamp=self.clamp)
+        return BeamModel(hit=self.hit)
 
     def by_end_points(self, beams: int) -> EndpointLikelihood:
         """The likelihood of a step of which the end points of so many beams are weighed."""
         return EndpointLikelihood(
             exponent=self._exponent(self.endpoint_effective_beams, beams),
             floor=self.floor,
-            interpolation=self.interpolation,
             unknown=self.unknown,
         )
 
     def by_casting(self, beams: int) -> CastLikelihood:
         """The likelihood of a step of which so many beams are cast."""
-        exponent = self._exponent(self.cast_effective_beams, beams)
-        return CastLikelihood(exponent=exponent, sigma=self.cast_sigma, clip=self.cast_clip)
+        exponent = self._exponent(CAST_EFFECTIVE_BEAMS, beams)
+        return CastLikelihood(exponent=exponent)
 
     def _exponent(self, effective: float, beams: int) -> float:
-        return min(effective / max(beams, 1), self.greatest_exponent)
+        return min(effective / max(beams, 1), GREATEST_EXPONENT)

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 Ints = npt.NDArray[np.int64]
 
 PARTS = ("predict", "weigh", "record", "resample", "update")
+CAST_BEAMS = 60
+"""Beams of a step that are cast beside the end points of upright surfaces, spread over it."""
 
 
 @dataclass(slots=True)
@@ -347,7 +349,7 @@ class GridFilter:
             rows = _some(np.flatnonzero(ends), c.weight_beams)
             out.append((rows, c.by_end_points(len(rows))))
         if c.likelihood == "cast" or self.upright is not None:
-            rows = evenly_spaced_indices(len(returns), c.weight_beams if self.upright is None else c.cast_beams)
+            rows = evenly_spaced_indices(len(returns), c.weight_beams if self.upright is None else CAST_BEAMS)
             out.append((rows, c.by_casting(len(rows))))
         return [(rows, likelihood) for rows, likelihood in out if len(rows)]
 

@@ -13,7 +13,7 @@ has exits that say so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,14 @@ from graphslam.core.poses import group_of, remove_roll_pitch
 
 _NODES = 64
 """Places along a path at which the heading may err; more change nothing that a Monte Carlo could see."""
+HEADING_START = 0.002
+"""σ of the heading at the end of a path of no length [rad]."""
+POSITION_START = 0.01
+"""σ along x and y there [m]."""
+HEIGHT_START = 0.025
+"""σ of the height there [m]."""
+HEIGHT_SCALE = 0.002
+"""Gravity is told with an error that lasts: σ of the height after a way of one metre [m/m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +90,10 @@ class ErrorPassThrough:
         return np.asarray(out)
 
 
+PASSED = ErrorPassThrough()
+"""Comes on top of what a filter leaves, where it is known how far off dead reckoning is."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterDrift:
     """Covariance at the end of a path that a filter of N particles drove.
@@ -101,30 +113,18 @@ class FilterDrift:
     """The variances of these walks are larger by this over the number of particles."""
     alone_walk: float = 0.015
     """Walk of the heading of a single particle, which corrects nothing [rad/√m]."""
-    heading_start: float = 0.002
-    """σ at no length [rad]."""
-    position_start: float = 0.01
-    """[m]"""
-    height_start: float = 0.025
-    """[m]"""
     height_walk: float = 0.021
     """[m/√m]"""
-    height_scale: float = 0.002
-    """Gravity is told with an error that lasts: σ of the height after a way of one metre [m/m]."""
     tilt: float = 0.006
     """σ of roll and pitch, whatever the length [rad]."""
-    passed: ErrorPassThrough = field(default_factory=ErrorPassThrough)
-    """What comes on top where it is known how far off dead reckoning is."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
-            if name == "passed":
-                continue
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ConfigError(f"filter drift: {name} = {value}; wanted ≥ 0")
-        if min(self.heading_start, self.position_start, self.height_start, self.tilt) <= 0:
-            raise ConfigError("filter drift: σ at no length must be > 0, or covariances are singular")
+        if self.tilt <= 0:
+            raise ConfigError("filter drift: σ of roll and pitch must be > 0, or covariances are singular")
 
     def covariance(
         self,
@@ -171,15 +171,15 @@ class FilterDrift:
         alone = particles == 1 and reckoned is None
         heading = self.alone_walk**2 if alone else more * self.heading_walk**2
         C = heading * (effect * share[:, None]).T @ effect
-        C[group.heading, group.heading] += self.heading_start**2
-        C[[x, y], [x, y]] += self.position_start**2 + more * self.position_walk**2 * length
+        C[group.heading, group.heading] += HEADING_START**2
+        C[[x, y], [x, y]] += POSITION_START**2 + more * self.position_walk**2 * length
         away = np.zeros(group.dof)
         away[[x, y]] = -there[0, :2]
         C += self.position_scale**2 * np.outer(away, away)
         if group.dim == 3:
-            C[5, 5] += self.height_start**2 + self.height_walk**2 * length + (self.height_scale * length) ** 2
+            C[5, 5] += HEIGHT_START**2 + self.height_walk**2 * length + (HEIGHT_SCALE * length) ** 2
             C[[0, 1], [0, 1]] += self.tilt**2
-        return C if reckoned is None else C + self.passed.covariance(reckoned, length, particles, tilt=told_tilt)
+        return C if reckoned is None else C + PASSED.covariance(reckoned, length, particles, tilt=told_tilt)
 
 
 def interpolate_covariances(knots: npt.NDArray[np.int64], covariances: Array, poses: Array, along: Array) -> Array:

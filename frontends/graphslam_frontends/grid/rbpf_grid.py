@@ -28,7 +28,7 @@ from graphslam_frontends.base import Watch
 from graphslam_frontends.grid.ancestry import Ancestry
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import FilterCounts, GridFilter, GridParticles
-from graphslam_frontends.grid.filter_error_model import ErrorPassThrough, interpolate_covariances
+from graphslam_frontends.grid.filter_error_model import PASSED, ErrorPassThrough, interpolate_covariances
 from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.scan_use import (
     dead_reckoning_covariance,
@@ -271,12 +271,9 @@ class RbpfGridConfig:
     """How the log becomes steps."""
     filter: GridFilterConfig = field(default_factory=GridFilterConfig)
     """Particles, motion, weights."""
-    drift: DriftModel = field(default_factory=DriftModel)
-    """Errors that all particles share, by the length of the path; its dimension is that of the log."""
-    passed: ErrorPassThrough = field(default_factory=ErrorPassThrough)
-    """What comes on top of them: the share of the errors of dead reckoning that the filter passes on."""
     drift_scale: float = 1.0
-    """Factor on the covariances of both."""
+    """Factor on the covariances of the errors that all particles share: of the drift model, and of what a filter passes
+    on of the errors of dead reckoning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,10 +299,8 @@ class RbpfGrid(StepwiseFrontEnd):
         if after is None:
             steps = self.steps(log, drops=drops)
             result = run_rbpf(steps, self.config.filter, seed.child(0))
-            drift = replace(self.config.drift, dim=steps.dim)
-            submap = rbpf_submap(
-                result, drift, drift_scale=self.config.drift_scale, steps=steps, passed=self.config.passed
-            )
+            drift = DriftModel(dim=steps.dim)
+            submap = rbpf_submap(result, drift, drift_scale=self.config.drift_scale, steps=steps, passed=PASSED)
             if len(result.particles) == 1:
                 text = "particles: 1 — no correction by scans; path and covariance are dead reckoning."
                 steps = replace(steps, findings=(*steps.findings, Finding("look", "one-particle", text)))

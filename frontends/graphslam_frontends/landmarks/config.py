@@ -95,6 +95,10 @@ class DelayedInitialisation:
             raise ConfigError(f"delayed start needs spread > 0, margin > 0 and 0 < support ≤ 1, got {self}")
 
 
+DELAYED = DelayedInitialisation()
+"""Of the particle filters."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterConfig:
     """What a particle filter over one map needs, whatever becomes of the map."""
@@ -118,14 +122,10 @@ class FilterConfig:
     """A provisional feature goes after this many scans in which it should have been seen and was not."""
     drop_scans: int = 10
     """A provisional feature goes if it is not confirmed this many scans after its birth."""
-    delayed: DelayedInitialisation = field(default_factory=DelayedInitialisation)
-    """Range-only observations: when the ranges to a beacon make a landmark."""
     max_range: float = 45.0
     """Observations beyond are not used [m]."""
     ess_fraction: float = 0.5
     """Systematic resampling when N_eff < ess_fraction · N. Never switch it off inside a submap."""
-    control_hold: float = 0.5
-    """Scans up to this long before the first control are used, with that control held backwards [s]."""
     longest_gap: float = 60.0
     """Longest time without a record of the motion that is bridged [s]
     (:mod:`graphslam_frontends.odometry.motion_gaps`)."""

@@ -36,8 +36,6 @@ class EkfFilterConfig:
     """A provisional feature goes if it is not confirmed this many scans after its birth."""
     max_range: float = 45.0
     """Observations beyond are not used [m]."""
-    control_hold: float = 0.5
-    """Scans up to this long before the first control are used, with that control held backwards [s]."""
     longest_gap: float = 60.0
     """Longest time without a record of the motion that is bridged [s]
     (:mod:`graphslam_frontends.odometry.motion_gaps`)."""
@@ -47,9 +45,6 @@ class EkfFilterConfig:
     """Observation noise in the filter; None: the log's sigmas."""
     min_hits: int = 1
     """Landmarks handed over were seen at least this often."""
-    active_margin: float = 20.0
-    """The filter works on landmarks this far beyond the sensor's range and leaves the rest for later [m]. Changes the
-    time it takes, not the result."""
     detector: TreeDetectorConfig = field(default_factory=TreeDetectorConfig)
     """Tree detector, used when the log holds raw scans instead of landmark observations."""
 
@@ -65,9 +60,8 @@ class EkfFilterConfig:
         for name in ("max_nodes", "confirm_hits", "drop_misses", "drop_scans", "min_hits"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted ≥ 1")
-        for name in ("max_range", "active_margin"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ConfigError(f"{name} = {getattr(self, name)}; wanted a finite number > 0")
+        if not (np.isfinite(self.max_range) and self.max_range > 0):
+            raise ConfigError(f"max_range = {self.max_range}; wanted a finite number > 0")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

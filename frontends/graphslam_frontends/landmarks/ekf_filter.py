@@ -37,6 +37,9 @@ _SMALL = 48
 _GENEROUS = 3.0
 _ROWS = 1024
 _ROOM = 96
+ACTIVE_MARGIN = 20.0
+"""The filter works on landmarks this far beyond the range of the sensor and leaves the rest for later [m]. It changes
+the time the filter takes, not its result."""
 
 
 class EkfMap:
@@ -114,7 +117,7 @@ class EkfMap:
         by_identity = self.config.association == "known"
         if len(self._active):
             moved = np.hypot(self._ax[0] - self._anchor[0], self._ax[1] - self._anchor[1])
-            if moved > self.config.active_margin and (self._n0 or len(self._active) > _SMALL):
+            if moved > ACTIVE_MARGIN and (self._n0 or len(self._active) > _SMALL):
                 self._choose(None)
         predict_kernel(self._ax, self._aP, 3 + 2 * len(self._active), self._aPhi, self._n0, u, Q)
         if by_identity:
@@ -301,7 +304,7 @@ class EkfMap:
         self._anchor = self._x[:2].copy()
         active = np.ones(len(slots), dtype=np.bool_)
         if len(slots) > _SMALL:
-            m = self.config.active_margin
+            m = ACTIVE_MARGIN
             dx, dy = self._x[3 + 2 * slots] - x, self._x[4 + 2 * slots] - y
             distance = np.hypot(dx, dy)
             bearing = np.abs((np.arctan2(dy, dx) - th - self.sensor[2] + np.pi) % (2 * np.pi) - np.pi)

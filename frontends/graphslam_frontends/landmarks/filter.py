@@ -8,7 +8,7 @@ import numpy.typing as npt
 from graphslam.core.gaussian import equal_tail_gate
 from graphslam.core.geometry import Array, se2_transform, wrap_angle
 from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from graphslam_frontends.landmarks.config import FilterConfig
+from graphslam_frontends.landmarks.config import DELAYED, FilterConfig
 from graphslam_frontends.landmarks.kernels import (
     CFG_LENGTH,
     IGNORED,
@@ -61,7 +61,7 @@ class ParticleSet:
         self.resamplings = 0
         self.min_ess = float(n)
         outlier = config.outlier_gate or np.inf
-        self.waiting = WaitingRanges(n, config.delayed, equal_tail_gate(outlier, 2, 1))
+        self.waiting = WaitingRanges(n, DELAYED, equal_tail_gate(outlier, 2, 1))
         margin = np.deg2rad(1.0)  # at the edge of the scan a trunk is cut off and not reported
         self._cfg = np.zeros(CFG_LENGTH)
         self._cfg[:] = (

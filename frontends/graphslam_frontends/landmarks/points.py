@@ -33,6 +33,8 @@ Ints = npt.NDArray[np.int64]
 NO_POSES, NO_POINTS = np.zeros((0, 7)), np.zeros((0, 3))
 NONE = np.zeros(0, dtype=np.int64)
 _ROUNDS = 10
+MAX_LANDMARKS = 60
+"""A submap ends with this many landmarks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,10 +43,8 @@ class PointsConfig:
 
     max_distance: float = 20.0
     """A submap ends after this many metres."""
-    max_landmarks: int = 60
-    """… or with this many landmarks."""
     max_scans: int = 100
-    """… or after this many scans."""
+    """… or after this many scans, or with :data:`MAX_LANDMARKS` landmarks."""
     min_scans: int = 5
     """It does not end before this many."""
     min_hits: int = 2
@@ -53,7 +53,7 @@ class PointsConfig:
     """A sighting farther from what all others say than this share of honest ones is left out, and counted."""
 
     def __post_init__(self) -> None:
-        if self.max_distance <= 0 or min(self.max_landmarks, self.max_scans, self.min_scans, self.min_hits) < 1:
+        if self.max_distance <= 0 or min(self.max_scans, self.min_scans, self.min_hits) < 1:
             raise ConfigError("limits of a submap in space are not positive; wanted > 0 metres and ≥ 1 of the others")
         if not 0.5 < self.gate < 1.0:
             raise ConfigError(f"gate = {self.gate}; wanted between 0.5 and 1")
@@ -117,7 +117,7 @@ class Points(FrontEnd):
                 return k, "distance"
             if n >= c.max_scans:
                 return k, "scans"
-            if sum(h >= c.min_hits for h in hits.values()) >= c.max_landmarks:
+            if sum(h >= c.min_hits for h in hits.values()) >= MAX_LANDMARKS:
                 return k, "landmarks"
         return end, "end"
 

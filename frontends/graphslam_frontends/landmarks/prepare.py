@@ -24,6 +24,8 @@ from graphslam_frontends.odometry.motion import Motion, MotionNoise, motion_stre
 from graphslam_frontends.odometry.motion_gaps import SHORTEST, MotionGap, dead_reckon_over_gaps, final_until
 
 Ints = npt.NDArray[np.int64]
+CONTROL_HOLD = 0.5
+"""Scans up to this long before the first control are used, with that control held backwards [s]."""
 
 
 class PrepareConfig(Protocol):
@@ -36,10 +38,6 @@ class PrepareConfig(Protocol):
     @property
     def max_range(self) -> float:
         """Observations beyond are not used [m]."""
-
-    @property
-    def control_hold(self) -> float:
-        """Scans up to this long before the first control are used, with that control held backwards [s]."""
 
     @property
     def longest_gap(self) -> float:
@@ -243,10 +241,10 @@ class LogPreparation:
         """The scans of a part of the stream, behind those that are there."""
         config, drops, where = self.config, self.drops, f"{self.feed.name}/{stream}"
         observations = part if isinstance(part, LandmarkObservations) else detect_trees(part, config.detector)
-        early = int(np.searchsorted(observations.times, motion.times[0] - config.control_hold, side="left"))
+        early = int(np.searchsorted(observations.times, motion.times[0] - CONTROL_HOLD, side="left"))
         late = len(observations.times)
         if last and isinstance(motion, Odometry):  # controls are held to the end; recorded odometry ends where it ends
-            late = int(np.searchsorted(observations.times, motion.times[-1] + config.control_hold, side="right"))
+            late = int(np.searchsorted(observations.times, motion.times[-1] + CONTROL_HOLD, side="right"))
             late = max(late, early)
         drops.drop(stream, "before the first control", early)
         drops.drop(stream, "after the last odometry", len(observations.times) - late)
@@ -294,7 +292,7 @@ class LogPreparation:
             SensorLog(name=self.feed.name, streams={motion_name: motion}),
             stamps,
             config.motion,
-            hold=config.control_hold,
+            hold=CONTROL_HOLD,
             limit=config.longest_gap,
             drops=count,
         )

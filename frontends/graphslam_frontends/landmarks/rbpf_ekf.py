@@ -19,7 +19,7 @@ from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.base import FrontEnd, Watch
 from graphslam_frontends.landmarks.bias_score import bias_score_test
-from graphslam_frontends.landmarks.config import RbpfEkfConfig
+from graphslam_frontends.landmarks.config import DELAYED, RbpfEkfConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.fix_points import expects_fixes, fix_points, place_fixes
 from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem, resolve_mirror_ambiguity
@@ -152,7 +152,7 @@ class RbpfEkf(FrontEnd):
         )
         smoothed = problem.smooth(particles.path[best, : last - first], particles.mean[best, association.slots])
         if not data.has_bearing.all():
-            settled = resolve_mirror_ambiguity(problem, smoothed, c.delayed)
+            settled = resolve_mirror_ambiguity(problem, smoothed, DELAYED)
             smoothed = settled.smoothed
             report |= {
                 "beacons_without_landmark": len(particles.waiting.slots),

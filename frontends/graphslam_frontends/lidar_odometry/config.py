@@ -21,23 +21,15 @@ class LidarOdometryConfig:
     """Edge of the cubes of which one point each is matched [m]."""
     most_points: int = 3000
     """Points matched of a scan at most."""
-    most_kept: int = 8000
-    """Points of a scan that enter the map at most."""
     levels: tuple[float, ...] = (2.0, 1.0, 0.5)
     """Edges of the cells, coarse to fine [m]."""
-    finest_sigma: float = 0.05
-    """σ added to the cells of the finest level [m]; coarser ones: a quarter of their edge."""
     window: float = 50.0
-    """Way behind from which cells are kept [m]."""
-    window_scans: int = 100
-    """… and scans that are kept at least."""
-    suspicious: float = 0.7
-    """Overlap beside the running median below which a scan is looked for far and wide."""
+    """Way behind from which cells are kept [m]; those of the last hundred scans are kept in any case."""
     deskew: bool = True
     """Move points of a scan to its stamp, where they have stamps of their own."""
 
     def __post_init__(self) -> None:
-        for name in ("max_range", "spacing", "finest_sigma", "window"):
+        for name in ("max_range", "spacing", "window"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"lidar odometry: {name} = {value}; wanted > 0")
@@ -45,7 +37,5 @@ class LidarOdometryConfig:
             raise ConfigError(f"lidar odometry: min_range = {self.min_range}; wanted 0 … max_range {self.max_range}")
         if not self.levels or any(not a > b for a, b in zip(self.levels, self.levels[1:])) or self.levels[-1] <= 0:
             raise ConfigError(f"lidar odometry: levels = {self.levels}; wanted edges in metres, from coarse to fine")
-        if self.most_points < 100 or self.most_kept < 100 or self.window_scans < 1:
-            raise ConfigError("lidar odometry: wanted most_points and most_kept ≥ 100, window_scans ≥ 1")
-        if not 0 < self.suspicious < 1:
-            raise ConfigError(f"lidar odometry: suspicious = {self.suspicious}; wanted between 0 and 1")
+        if self.most_points < 100:
+            raise ConfigError(f"lidar odometry: most_points = {self.most_points}; wanted ≥ 100")

@@ -60,6 +60,8 @@ LEVEL = 1e-6
 """Odometry is that of wheels if heights and tilts change by no more while the first scans are made [m, quaternion]."""
 REHEARSED = 60
 """Scans at the start that are followed thrice at most, until it is known what an IMU does not know."""
+MOST_SCANS = 100
+"""A submap holds no more scans, however slowly the sensor moves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,9 +71,7 @@ class LidarSubmapConfig:
     length: float = 3.0
     """Way of a submap [m] …"""
     scans: int = 5
-    """… which holds no fewer scans …"""
-    most_scans: int = 100
-    """… and no more."""
+    """… which holds no fewer scans than this."""
     voxel_size: float = 0.2
     """Edge of a voxel of the grid [m]."""
     cloud_cell: float = 0.1
@@ -82,23 +82,19 @@ class LidarSubmapConfig:
     """Points of a scan in grid and cloud at most."""
     hit: float = 0.7
     """Probability that a voxel is occupied, given that a beam ended in it."""
-    miss: float = 0.4
-    """The same, given that a beam passed through it."""
-    clamp: tuple[float, float] = (0.1192, 0.971)
-    """Bounds of a voxel's probability."""
 
     def __post_init__(self) -> None:
         for name in ("length", "voxel_size", "cloud_cell", "reach"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"submap: {name} = {value}; wanted > 0")
-        if not 1 <= self.scans <= self.most_scans or self.points < 1:
-            raise ConfigError("submap: wanted 1 ≤ scans ≤ most_scans and points ≥ 1")
+        if not 1 <= self.scans <= MOST_SCANS or self.points < 1:
+            raise ConfigError(f"submap: wanted 1 ≤ scans ≤ {MOST_SCANS} and points ≥ 1")
         self.beam_model()
 
     def beam_model(self) -> BeamModel:
         """What a beam says of a voxel."""
-        return BeamModel(hit=self.hit, miss=self.miss, clamp=self.clamp)
+        return BeamModel(hit=self.hit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,7 +202,7 @@ class LidarFrontEnd(FrontEnd):
             kept.append(seen[-1])
             n = len(kept) - 1
             full = odometry.way - way >= config.length and n >= config.scans
-            if k == scans - 1 or full or n >= config.most_scans:
+            if k == scans - 1 or full or n >= MOST_SCANS:
                 bent = [] if told else [*_bent(key, kept), *_uneven(key, kept)]
                 told = told or bool(bent)
                 if n and key >= first:

@@ -97,6 +97,14 @@ LONG_SWEEP = 10.0
 """Points are no older than so many times the motion that they are moved by."""
 GIVEN_UP = 10
 """Scans lost in a row after which a new map begins."""
+MOST_KEPT = 8000
+"""Points of a scan that enter the map at most."""
+FINEST_SIGMA = 0.05
+"""σ added to the cells of the finest level [m]; coarser ones: a quarter of their edge."""
+WINDOW_SCANS = 100
+"""Cells of so many scans are kept at least, however far the sensor has moved since."""
+SUSPICIOUS = 0.7
+"""Share of the running median of the overlap below which a scan is looked for far and wide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +213,7 @@ class LidarOdometry:
         self.config, self.inertial, self.reckoned = config, inertial, reckoned
         last = len(config.levels) - 1
         self.levels = [
-            CellMap(LevelConfig(size, config.finest_sigma if k == last else 0.25 * size, k == last))
+            CellMap(LevelConfig(size, FINEST_SIGMA if k == last else 0.25 * size, k == last))
             for k, size in enumerate(config.levels)
         ]
         self.pose = np.array([0.0, 0, 0, 0, 0, 0, 1])
@@ -270,7 +278,7 @@ class LidarOdometry:
                 led = ahead is None and (self.lost > 0 or self.reckoned.better)
         predicted = ahead if ahead is not None else bridge if led and bridge is not None else even
         rows = first_rows_by_cube(np.ascontiguousarray(cloud), c.spacing, (c.min_range, c.max_range))
-        kept = rows[evenly_spaced_rows(len(rows), c.most_kept)]
+        kept = rows[evenly_spaced_rows(len(rows), MOST_KEPT)]
         raw = self._raw(cloud[kept], None if ages is None or not c.deskew else ages[kept], time)
         dt = time - self.time if np.isfinite(self.time) else 0.0
         self._since(raw, time)
@@ -320,7 +328,7 @@ class LidarOdometry:
         self.ways.append(self.way)
         if self.scan % 20 == 19:
             old = int(np.searchsorted(self.ways, self.way - c.window)) - 1
-            since = min(old, self.scan - c.window_scans)
+            since = min(old, self.scan - WINDOW_SCANS)
             if since > 0:
                 for level in self.levels:
                     level.keep_since(since)
@@ -474,7 +482,7 @@ class LidarOdometry:
             _, start = max(tried, key=lambda x: x[0])
         pose, points, fit = self._finish(raw, chosen, start, time)
         state = "matched"
-        few_of_it = len(self.overlaps) >= 3 and fit.overlap < self.config.suspicious * np.median(self.overlaps)
+        few_of_it = len(self.overlaps) >= 3 and fit.overlap < SUSPICIOUS * np.median(self.overlaps)
         if few_of_it or self._late(time):
             searched = True
             found = self._search(points, few, (predicted, self.anchor), self.wide_rotations, 6, self.levels)
@@ -483,7 +491,7 @@ class LidarOdometry:
                 start = best
                 pose, points, fit = self._finish(raw, chosen, start, time)
                 state = "found again"
-            if few_of_it and fit.overlap < self.config.suspicious * np.median(self.overlaps):
+            if few_of_it and fit.overlap < SUSPICIOUS * np.median(self.overlaps):
                 # after scans that were lost, what overlaps little is not new but elsewhere
                 fits = (
                     not self.lost and fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW

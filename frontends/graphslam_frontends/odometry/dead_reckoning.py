@@ -41,6 +41,17 @@ from graphslam_frontends.odometry.gaps import Gaps, find_gaps
 __all__ = ["DeadReckoningNoise", "DriftModel", "imu_wheel_increments", "integrate_imu_and_wheels"]
 
 _STEEPEST = float(np.deg2rad(80.0))  # heading means nothing on a wall
+FILTER_TIME = 5.0
+"""Time constant of the complementary filter, where the unit gives no attitude [s]."""
+GAP_SPEED = 0.5
+"""σ of the speed in a gap of the wheels, constant in it [m/s]; at least, for speeds of the log that are spread more
+widely about the last one before the gap say more."""
+GAP_RATE = 0.3
+"""σ of the yaw rate in a gap of the IMU, constant in it [rad/s], where wheels do not tell the turn."""
+GAP_TILT = 0.1
+"""σ of roll and pitch in a gap of the IMU [rad]."""
+FLOOR_ANGLE = 1e-5
+"""σ of the angles that every increment has at least [rad]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,24 +68,13 @@ class DeadReckoningNoise:
     """The same upwards [m/√m]."""
     attitude_bias: float = float(np.deg2rad(0.1))
     """Part that lasts of the σ of the unit's own roll and pitch [rad]; the rest of it fades."""
-    filter_time: float = 5.0
-    """Time constant of the complementary filter, where the unit gives no attitude [s]."""
-    gap_speed: float = 0.5
-    """σ of the speed in a gap of the wheels, constant in it [m/s]; at least, for speeds of the log that are spread more
-    widely about the last one before the gap say more."""
-    gap_rate: float = 0.3
-    """σ of the yaw rate in a gap of the IMU, constant in it [rad/s], where wheels do not tell the turn."""
-    gap_tilt: float = 0.1
-    """σ of roll and pitch in a gap of the IMU [rad]."""
     floor_position: float = 1e-4
     """σ that every increment has at least [m]."""
-    floor_angle: float = 1e-5
-    """[rad]"""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            positive = name in ("filter_time", "floor_position", "floor_angle")
+            positive = name == "floor_position"
             if not (np.isfinite(value) and (value > 0 if positive else value >= 0)):
                 raise ConfigError(f"dead reckoning: {name} = {value}; wanted {'> 0' if positive else '≥ 0'}")
 
@@ -155,7 +155,7 @@ def integrate_imu_and_wheels(
             wanted="a ground vehicle; is T_base_imu right?",
         )
     rates = _interpolate(knots, imu.times, to_base)
-    gap_rate = noise.gap_rate
+    gap_rate = GAP_RATE
     told = _turn_of_wheels(imu.times, to_base[:, 2], wheels, imu_gaps) if len(imu_gaps.begin) else None
     if told is not None:
         inside = imu_gaps.length_at(knots) > 0
@@ -168,22 +168,22 @@ def integrate_imu_and_wheels(
     held = np.append(np.diff(wheels.times), 0.0)[active]
     held = np.where(held > 0, held, fine.h)
     in_wheels, in_imu = wheel_gaps.length_at(middle), imu_gaps.length_at(middle)
-    gap_speed = np.full(len(speed), noise.gap_speed)
+    gap_speed = np.full(len(speed), GAP_SPEED)
     for k in np.flatnonzero(in_wheels):
-        gap_speed[k] = max(noise.gap_speed, float(np.sqrt(np.mean((wheels.speed - speed[k]) ** 2))))
+        gap_speed[k] = max(GAP_SPEED, float(np.sqrt(np.mean((wheels.speed - speed[k]) ** 2))))
     fine.rates = np.column_stack(
         [
             imu.noise.gyro**2 * np.sum(fine.g**2, axis=1) + gap_rate**2 * in_imu,
             np.where(speed != 0.0, noise.wheel**2 * held, 0.0) + gap_speed**2 * in_wheels,
-            noise.lateral**2 * np.abs(speed) + (noise.gap_tilt * speed) ** 2 * in_imu,
-            noise.vertical**2 * np.abs(speed) + (noise.gap_tilt * speed) ** 2 * in_imu,
+            noise.lateral**2 * np.abs(speed) + (GAP_TILT * speed) ** 2 * in_imu,
+            noise.vertical**2 * np.abs(speed) + (GAP_TILT * speed) ** 2 * in_imu,
         ]
     )
     at = np.searchsorted(knots, t)
     F, Q = _transitions(fine, at, lasting)
     path = Trajectory(knots, fine.poses)
     poses = fine.poses[at]
-    floor = np.repeat([noise.floor_angle, noise.floor_position], 3)
+    floor = np.repeat([FLOOR_ANGLE, noise.floor_position], 3)
     increments = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(t), 1))
     increments[1:] = se3.se3_between(poses[:-1], poses[1:])
     covariances = np.tile(np.diag(floor**2), (len(t), 1, 1))
@@ -281,13 +281,13 @@ def _up(
         )
     seen = seen / length
     # the filter needs a start as good as it is later: it first runs backwards over its own time
-    m = int(np.searchsorted(imu.times, imu.times[0] + 3.0 * noise.filter_time, side="right"))
+    m = int(np.searchsorted(imu.times, imu.times[0] + 3.0 * FILTER_TIME, side="right"))
     back, up = np.empty((m, 3)), np.empty_like(seen)
-    complementary_kernel(-imu.times[:m][::-1], -rate[:m][::-1], seen[:m][::-1], noise.filter_time, seen[m - 1], back)
-    complementary_kernel(imu.times, rate, seen, noise.filter_time, back[-1], up)
+    complementary_kernel(-imu.times[:m][::-1], -rate[:m][::-1], seen[:m][::-1], FILTER_TIME, seen[m - 1], back)
+    complementary_kernel(imu.times, rate, seen, FILTER_TIME, back[-1], up)
     # errors of the filter: white rates gathered over its time, white forces averaged over it; an accelerometer
     # that is off lasts; what the bias of the gyro does is in the transition
-    T = noise.filter_time
+    T = FILTER_TIME
     fading = n.gyro**2 * T / 2.0 + (n.accelerometer / GRAVITY) ** 2 / (2.0 * T) + (noise.wheel / (GRAVITY * T)) ** 2
     return up, DeadReckoningErrorModel(
         **common,

@@ -34,6 +34,8 @@ from graphslam_frontends.odometry.steps import Steps
 
 _log = logging.getLogger(__name__)
 _MOST_STEPS = 1_000_000
+CLOUD_RANGE = 60.0
+"""Range of lidars whose records are clouds and do not state theirs [m]."""
 
 
 def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropCounter | None = None) -> Steps:
@@ -157,7 +159,7 @@ def _beam_sources(
             name,
             min_range=config.min_range,
             range_sigma=config.range_sigma,
-            cloud_range=config.cloud_range,
+            cloud_range=CLOUD_RANGE,
             drops=drops,
         )
         if source.dim != motion.dim:

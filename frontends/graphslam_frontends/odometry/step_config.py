@@ -26,8 +26,6 @@ class StepConfig:
     """Beams kept of a step, spread evenly over it."""
     range_sigma: float = 0.03
     """σ of a range, for sensors that do not state theirs [m]."""
-    cloud_range: float = 60.0
-    """Range of lidars whose records are clouds and do not state theirs [m]."""
     silent: Literal["free", "unknown"] = "free"
     """What a beam says that came back with no range at all: that nothing is there as far as it reaches, or nothing. Old
     laser scanners lose beams on glass and dark walls; taken for free space they wipe rooms out of a map."""
@@ -54,8 +52,6 @@ class StepConfig:
     odometry_tilt_sigma: float = 0.0
     """σ of roll and pitch of recorded odometry in space that saw gravity (lidar or visual with inertial): its poses
     then tell them, the first being level [rad]; 0: it saw none. ``yaw_bias`` leaves them alone, as gravity would."""
-    odometry_tilt_time: float = 10.0
-    """Time over which errors of these stay alike [s]."""
     level_floors: bool = False
     """The floors driven on are level on the whole, as in buildings: what gravity's roll and pitch show in the median
     over the way is an error that lasts, and is taken out. Heights then drift by a third of what they did, or less."""
@@ -66,7 +62,7 @@ class StepConfig:
 
     def __post_init__(self) -> None:
         positive = {"period": self.period, "max_range": self.max_range}
-        for name in ("range_sigma", "cloud_range", "longest_record", "odometry_tilt_time"):
+        for name in ("range_sigma", "longest_record"):
             positive[name] = getattr(self, name)
         for name, value in positive.items():
             if value is not None and not (np.isfinite(value) and value > 0):

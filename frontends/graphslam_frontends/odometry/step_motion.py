@@ -23,6 +23,9 @@ from graphslam_frontends.odometry.motion import steering_odometry, velocity_odom
 from graphslam_frontends.odometry.recorded import RecordedErrors, add_yaw_bias, bridge_gap, chain_odometry, cut_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
+TILT_TIME = 10.0
+"""Time over which errors of the roll and pitch of recorded odometry stay alike [s]."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepMotion:
@@ -178,7 +181,7 @@ def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig)
             motion,
             tilt=roll_pitch_of(upright.interpolate(times)),
             tilt_sigma=config.odometry_tilt_sigma,
-            tilt_time=config.odometry_tilt_time,
+            tilt_time=TILT_TIME,
         )
 
     return MotionSource((name,), whole.dim, float(whole.times[0]), float(whole.times[-1]), solve)

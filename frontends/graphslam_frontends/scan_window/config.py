@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam.registration.surfaces import SurfaceFitConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,26 +28,14 @@ class ScanWindowConfig:
     """Greatest distance of a point from its surface in each iteration [m]."""
     spent: float = 1.7
     """σ of a residual in multiples of the spread of the residuals: steps share surfaces, whose errors last."""
-    normal_sigma: float = 0.03
-    """σ of the normal of a surface [rad]: what surfaces hold must be clearly more than it would pretend to."""
     least_points: int = 20
     """A scan with fewer points on surfaces is lost: it corrects nothing."""
-    least_overlap: float = 0.1
-    """… and one of whose points a smaller share lies on surfaces."""
-    most_spread: float = 0.15
-    """… and one whose residuals are spread wider than this [m]."""
-    surprise: float = 40.0
-    """… and one whose correction is this far from what the motion allows (χ² of up to six degrees of freedom)."""
-    surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
-    """What counts as a surface."""
 
     def __post_init__(self) -> None:
-        for name in ("seconds", "spent", "normal_sigma", "most_spread", "surprise"):
+        for name in ("seconds", "spent"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"window: {name} = {value}; wanted > 0")
-        if not 0.0 <= self.least_overlap <= 1.0:
-            raise ConfigError(f"window: least_overlap = {self.least_overlap}; wanted 0 … 1")
         if not self.distances or not all(np.isfinite(d) and d > 0 for d in self.distances):
             raise ConfigError(f"window: distances = {self.distances}; wanted at least one, all > 0 m")
         for name, least in (("most_steps", 2), ("points", 6), ("least_points", 6)):

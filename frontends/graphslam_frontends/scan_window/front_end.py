@@ -50,10 +50,6 @@ class WindowSubmapConfig:
     voxels would be in one of them here and in the other there."""
     hit: float = 0.7
     """Probability that a voxel is occupied, given that a beam ended in it."""
-    miss: float = 0.4
-    """The same, given that a beam passed through it."""
-    clamp: tuple[float, float] = (0.1192, 0.971)
-    """Bounds of a voxel's probability."""
 
     def __post_init__(self) -> None:
         for name in ("length", "voxel_size"):
@@ -68,7 +64,7 @@ class WindowSubmapConfig:
 
     def beam_model(self) -> BeamModel:
         """What a beam says of a voxel."""
-        return BeamModel(hit=self.hit, miss=self.miss, clamp=self.clamp)
+        return BeamModel(hit=self.hit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

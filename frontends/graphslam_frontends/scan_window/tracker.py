@@ -30,7 +30,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.registration.plane_kernels import PlanePairs, no_noise_correction, plane_blocks, plane_residuals
-from graphslam.registration.surfaces import fit_places, rotations, thin_places
+from graphslam.registration.surfaces import SURFACE, fit_places, rotations, thin_places
 from graphslam_frontends.grid.motion import with_roll_pitch
 from graphslam_frontends.grid.weights import evenly_spaced_indices
 from graphslam_frontends.odometry.bias_sigmas import bias_sigmas
@@ -47,6 +47,14 @@ CLEARLY = 4.0
 """How many times what noise of the normals would say of a direction surfaces must say of it."""
 TOLD = 1e-5
 """σ of what gravity says beside its fading and its constant error [rad]."""
+NORMAL_SIGMA = 0.03
+"""σ of the normal of a surface [rad]: what surfaces hold must be clearly more than it would pretend to."""
+LEAST_OVERLAP = 0.1
+"""A scan of whose points a smaller share lies on surfaces is lost: it corrects nothing."""
+MOST_SPREAD = 0.15
+"""… and one whose residuals are spread wider than this [m]."""
+SURPRISE = 40.0
+"""… and one whose correction is this far from what the motion allows (χ² of up to six degrees of freedom)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +264,7 @@ class ScanToWindowOdometry:
             facing = np.einsum("kij,kj,ki->k", self.R[slot], self.normals[q], towards[near] @ R.T) > 0
             near, q, slot = near[facing], q[facing], slot[facing]
             overlap = len(near) / len(p)
-            if len(near) < c.least_points or overlap < c.least_overlap:
+            if len(near) < c.least_points or overlap < LEAST_OVERLAP:
                 return ScanMatch(len(near), overlap, np.nan, 0.0, "overlap")
             n = len(near)
             pairs = PlanePairs(source[near], q, np.full(n, self.NOW), slot)
@@ -270,14 +278,14 @@ class ScanToWindowOdometry:
             # what is measured: Jᵀ Λ r, of as many directions as surfaces hold, each of unit noise
             every = full_rank_information(points[p][near], information)
             seen = np.stack([L, every])
-            M = observable_directions(L, every, c.normal_sigma, self._unheld(lately + seen))
+            M = observable_directions(L, every, NORMAL_SIGMA, self._unheld(lately + seen))
             H = np.zeros((len(M), self.x))
             H[:, :w] = M @ L @ g.adjoint(g.exp(-d[:w]))  # from the axes of the pose before corrections
             y = M @ (L @ d[:w] - b)
             gain = self._gain(H, M @ G, slots, 1.0)
             d = gain[0] @ y
         surprise = float(y @ np.linalg.solve(gain[2], y))
-        lost = "spread" if scatter > c.most_spread else "surprise" if surprise > c.surprise else ""
+        lost = "spread" if scatter > MOST_SPREAD else "surprise" if surprise > SURPRISE else ""
         self._lately, self._seen_at = (1.0 - self.config.spacing / self.lay) * lately + seen, pose
         if not lost:
             self._correct(gain, y)
@@ -285,7 +293,7 @@ class ScanToWindowOdometry:
 
     def _unheld(self, seen: Array) -> Array:
         """Directions ``(w, m)`` that nothing has held lately, this scan included: along a corridor, say."""
-        values, V = direction_strengths(seen[0], seen[1], self.config.normal_sigma)
+        values, V = direction_strengths(seen[0], seen[1], NORMAL_SIGMA)
         return V[:, values <= CLEARLY]
 
     def _seen(self, pose: Array) -> Array:
@@ -355,14 +363,14 @@ class ScanToWindowOdometry:
         rows = np.concatenate([slot * self.rows + np.arange(n) for slot, n, _ in lot])
         stands = np.arange(len(rows))
         self.lots.append(lot)
-        self.places.append(rows[thin_places(self._world(rows)[0], 0, len(rows), self.config.surface.spacing, stands)])
+        self.places.append(rows[thin_places(self._world(rows)[0], 0, len(rows), SURFACE.spacing, stands)])
         self.flat.append(np.zeros(0, np.int64))
         c = max(len(self.lots) - 2, 0)  # the first lot of all at once: better a poor window than none
         around = self.places[max(c - 1, 0) : c + 2]
         own, near = self.places[c], np.concatenate(around)
         begin = len(around[0]) if c else 0
         W, O = self._world(near)
-        normals, _, flat = fit_places(W, O, begin + np.arange(len(own)), np.arange(len(near)), self.config.surface)
+        normals, _, flat = fit_places(W, O, begin + np.arange(len(own)), np.arange(len(near)), SURFACE)
         self.normals[own] = np.einsum("kji,kj->ki", self.R[own // self.rows], normals)
         self.flat[c] = own[flat]
         self._plant()

@@ -10,6 +10,9 @@ from typing import Any, Literal
 from graphslam.core.errors import ConfigError
 from graphslam.registration.config import RegistrationConfig
 
+MAX_YAW = 0.8
+"""Greatest half width of a search in heading [rad], however long the way was."""
+
 
 def _check(config: Any, part: str, *, positive: tuple[str, ...] = (), unit: tuple[str, ...] = ()) -> None:
     """Refuse numbers that are NaN or negative, ``positive`` ones that are 0, and ``unit`` ones above 1."""
@@ -34,13 +37,6 @@ class SegmentationConfig:
     """Look-ahead window W [s]; the filter runs this far behind."""
     tolerance: float = 0.6
     """A look-ahead beam is predicted if its cast range is within this [m]."""
-    score_sigma: float = 0.3
-    """σ of the ranges in the score's log-likelihood [m]."""
-    score_beams: int = 600
-    """Beams of a window that are cast, at most (evenly thinned)."""
-    score_particles: int = 8
-    """Particles in whose maps they are cast, at most, by weight: where the whole filter decides its mean score counts,
-    and particles differ by less than 0.03 in it."""
     excluded: float = 5.0
     """The score says nothing in the first seconds of a segment, and does not count for its maximum [s]."""
     every: float = 2.0
@@ -51,15 +47,6 @@ class SegmentationConfig:
     """… and [m]: both must be reached."""
     max_length: float = 60.0
     """A segment ends after this length of new ground at the latest [m]."""
-    known_score: float = 0.8
-    """Where the map predicts the window this well …"""
-    known_radius: float = 2.0
-    """… and its own path passed this near [m] …"""
-    known_gap: float = 20.0
-    """… so long ago [s], the body drives where it has been: it localises there, gathers no drift, and the way is not
-    counted for ``max_length``; a map that ended there would be drawn a second time beside the first. A score of 1 =
-    every metre counts. In a simulated building three quarters of the scores on new ground are below 0.78, and of those
-    on the way back above 0.84."""
     max_seconds: float = math.inf
     """… or after this time [s], except where less than the minimum length was driven."""
     period: float = 0.0
@@ -80,14 +67,11 @@ class SegmentationConfig:
             positive=(
                 "window",
                 "tolerance",
-                "score_sigma",
-                "score_beams",
-                "score_particles",
                 "every",
                 "max_length",
                 "max_seconds",
             ),
-            unit=("score", "relative_score", "known_score"),
+            unit=("score", "relative_score"),
         )
         if self.min_length > self.max_length or self.min_seconds > self.max_seconds:
             raise ConfigError(f"segmentation: the minimum size is above the maximum, got {self}")
@@ -151,26 +135,15 @@ class CandidateSearch:
     yaw: float = 0.1
     """Half width in heading [rad] …"""
     yaw_per_metre: float = 2.5e-3
-    """… plus this for each metre driven since."""
-    max_yaw: float = 0.8
-    """… but no more [rad]."""
+    """… plus this for each metre driven since, and no more than :data:`MAX_YAW`."""
     starts: int = 6
     """Distinct modes handed to the registration."""
-    least_score: float = 0.7
-    """A place that explains less of the points than this in the search is not registered: what registration accepted
-    later scored 0.85 to 0.97, and places that the robot had not been at 0.54 to 0.63, with a few to 0.84."""
-    score_margin: float = 0.15
-    """… and none that scores so much less than the best."""
     source_radius: float = 15.0
     """Points of the look-ahead window beyond this are left out [m]."""
     source_points: int = 300
     """Points of the look-ahead window, at most."""
-    cloud_level: int = 1
-    """Cells of 2**level voxels, in which a map's occupied voxels are gathered for matching."""
     most_searches: int = 12
     """Searches at one time, of all particles together, at most."""
-    same_start: float = 1.0
-    """Particles that ask for the same map from places closer than about this share one search [m]."""
 
     def __post_init__(self) -> None:
         _check(
@@ -184,14 +157,12 @@ class CandidateSearch:
                 "source_radius",
                 "source_points",
                 "most_searches",
-                "same_start",
             ),
-            unit=("least_score", "score_margin"),
         )
 
     def yaw_width(self, length: float) -> float:
         """Half width in heading after a path of a length [m]."""
-        return min(self.yaw + self.yaw_per_metre * length, self.max_yaw)
+        return min(self.yaw + self.yaw_per_metre * length, MAX_YAW)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,21 +184,6 @@ class ChoiceConfig:
     margin: float = 0.1
     """A second mode must be worse by this share of the points: in simulated mines right matches were better than any
     other by 0.10 and more, wrong ones by 0.03 to 0.09 …"""
-    vague_position: float = 0.4
-    """A match is not taken whose own σ is above this in some direction [m]: nothing there holds it …"""
-    vague_angle: float = 0.04
-    """… or above this about some axis [rad]."""
-    rivals: float = 0.15
-    """In the maps that other particles made of the same steps only modes are tried that in the first were worse by no
-    more than this; less than ``margin`` would hide second modes."""
-    mode_distance: float = 1.5
-    """… if it is farther off than this [m]."""
-    fitness_sigma: float = 0.15
-    """Weight of the fitness: ``exp(-½ ((1 - fitness) / this)²)``."""
-    error_sigma: float = 0.4
-    """Weight of the range error of localisation [m], in the same way."""
-    spread_sigma: float = 0.3
-    """Weight of the spread of localisation [m], in the same way."""
     null_weight: float = 0.01
     """Weight of no match at all, which is always in the draw."""
     position_sigma: float = 0.1
@@ -241,44 +197,11 @@ class ChoiceConfig:
         _check(
             self,
             "choice",
-            positive=(
-                "every", "shift", "vague_position", "vague_angle", "fitness_sigma", "error_sigma", "spread_sigma",
-                "null_weight", "position_sigma",
-                "angle_sigma",
-            ),
-            unit=("fitness", "fitness_upright", "margin", "rivals"),
-        )  # fmt: skip
-        if self.rivals < self.margin:
-            raise ConfigError(f"choice.rivals = {self.rivals}; wanted at least the margin, {self.margin}")
+            positive=("every", "shift", "null_weight", "position_sigma", "angle_sigma"),
+            unit=("fitness", "fitness_upright", "margin"),
+        )
         if self.method not in ("registration", "localisation", "both"):
             raise ConfigError(f"choice.method = {self.method!r}; known: registration, localisation, both")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocalisationConfig:
-    """The throw-away particle filter that tries a match (eq. 19)."""
-
-    particles: int = 100
-    """Poses drawn around the start."""
-    rounds: int = 4
-    """Times they are weighed and resampled; the likelihood is spent in equal parts."""
-    position: float = 0.4
-    """σ of the draw in position [m]."""
-    angle: float = 0.05
-    """σ of the draw in heading [rad]; roll and pitch stay where gravity put them."""
-    effective_beams: float = 60.0
-    """Beams of the window count for so many independent ones."""
-    cast_sigma: float = 0.2
-    """σ of the ranges in the error [m]."""
-    clip: float = 3.0
-    """Range errors are no larger than this many σ."""
-
-    def __post_init__(self) -> None:
-        _check(
-            self,
-            "localisation",
-            positive=("particles", "rounds", "position", "angle", "effective_beams", "cast_sigma", "clip"),
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -289,11 +212,9 @@ class HandoverConfig:
     """Factor on the drift model in the exit covariance."""
     matched_only: bool = False
     """The paper's moment matching instead of particles plus drift: to be measured, not to be used."""
-    minimum_support: float = 0.05
-    """Matches that took a smaller share of the particles' weight are not handed over."""
 
     def __post_init__(self) -> None:
-        _check(self, "handover", positive=("drift_scale",), unit=("minimum_support",))
+        _check(self, "handover", positive=("drift_scale",))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -310,8 +231,6 @@ class SegSlamConfig:
     """How it is registered, with the gates of fitness, degeneracy and tilt."""
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
     """Which matches are believed."""
-    localisation: LocalisationConfig = field(default_factory=LocalisationConfig)
-    """The throw-away filter."""
     handover: HandoverConfig = field(default_factory=HandoverConfig)
     """What is handed over."""
     inside: Literal["filter", "scan-window"] = "filter"

@@ -19,10 +19,33 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
 from graphslam.evidence.queries import cast_grids
 from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from graphslam_frontends.segslam.config import LocalisationConfig
 from graphslam_frontends.segslam.segmentation import LookAheadWindow
 
 _SHRINK = 0.95  # of the cloud about its mean before it is blurred to its old size (Liu & West 2001)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalisationConfig:
+    """The throw-away particle filter that tries a match (eq. 19)."""
+
+    particles: int = 100
+    """Poses drawn around the start."""
+    rounds: int = 4
+    """Times they are weighed and resampled; the likelihood is spent in equal parts."""
+    position: float = 0.4
+    """σ of the draw in position [m]."""
+    angle: float = 0.05
+    """σ of the draw in heading [rad]; roll and pitch stay where gravity put them."""
+    effective_beams: float = 60.0
+    """Beams of the window count for so many independent ones."""
+    cast_sigma: float = 0.2
+    """σ of the ranges in the error [m]."""
+    clip: float = 3.0
+    """Range errors are no larger than this many σ."""
+
+
+LOCALISATION = LocalisationConfig()
+"""Tries the matches of SegSLAM."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +79,7 @@ def localise_in_map(
     window: LookAheadWindow,
     max_range: float,
     rng: np.random.Generator,
-    config: LocalisationConfig,
+    config: LocalisationConfig = LOCALISATION,
     *,
     threads: int = 1,
 ) -> ScanLocalisation:

@@ -27,6 +27,14 @@ from graphslam_frontends.segslam.segmap import MATCH, SegmentEntry
 
 NULL = -1
 """The draw's answer for no match."""
+MODE_DISTANCE = 1.5
+"""Modes of a match farther apart than this are two [m]."""
+FITNESS_SIGMA = 0.15
+"""Weight of the fitness of a match: ``exp(-½ ((1 - fitness) / this)²)``."""
+ERROR_SIGMA = 0.4
+"""Weight of the range error of localisation [m], in the same way."""
+SPREAD_SIGMA = 0.3
+"""Weight of the spread of localisation [m], in the same way."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +163,7 @@ def match_posterior(
         Whose gates are asked; default the standard ones.
     """
     rules = RegistrationConfig() if registration is None else registration
-    margins = proposal_margins(proposals, config.mode_distance)
+    margins = proposal_margins(proposals, MODE_DISTANCE)
     why, weights = [], np.zeros(len(proposals))
     for k, p in enumerate(proposals):
         fails = _fails(p, float(margins[k]), config, rules)
@@ -197,8 +205,8 @@ def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfi
 def _log_weight(p: Proposal, c: ChoiceConfig) -> float:
     total = -0.5 * (p.shift / p.sigma) ** 2  # p(‖τ_m‖²)
     if c.method != "localisation":
-        total += -0.5 * ((1.0 - p.fitness) / c.fitness_sigma) ** 2  # p(err_ICP | T_m), eq. 18
+        total += -0.5 * ((1.0 - p.fitness) / FITNESS_SIGMA) ** 2  # p(err_ICP | T_m), eq. 18
     if c.method != "registration" and p.localisation is not None:
-        total += -0.5 * p.localisation.error / c.error_sigma**2  # p(err_X), eq. 19
-        total += -0.5 * (p.localisation.spread / c.spread_sigma) ** 2  # p(|Σ_X|)
+        total += -0.5 * p.localisation.error / ERROR_SIGMA**2  # p(err_X), eq. 19
+        total += -0.5 * (p.localisation.spread / SPREAD_SIGMA) ** 2  # p(|Σ_X|)
     return total

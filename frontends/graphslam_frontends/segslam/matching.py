@@ -39,6 +39,18 @@ KEPT_BYTES = 200_000_000
 """What is kept of search fields, and of clouds that others are registered to, takes so much memory each [bytes]."""
 POINT_BYTES = 1250
 """Of one point of such a cloud, with its covariance and its places in two trees."""
+LEAST_SCORE = 0.7
+"""A place that explains less of the points than this in the search is not registered: what registration accepted later
+scored 0.85 to 0.97, and places that the robot had not been at 0.54 to 0.63, with a few to 0.84 …"""
+SCORE_MARGIN = 0.15
+"""… and none that scores so much less than the best."""
+CLOUD_LEVEL = 1
+"""The occupied voxels of a map are gathered for matching in cells of 2**level voxels."""
+SAME_START = 1.0
+"""Particles that ask for the same map from places closer than about this share one search [m]."""
+RIVALS = 0.15
+"""In the maps that other particles made of the same steps only modes are tried that in the first were worse by no more
+than this share of the points. Less than ``choice.margin`` would hide second modes: then the margin counts."""
 
 
 class RecentCache(dict[K, V]):
@@ -244,7 +256,7 @@ class Matcher:
         for c in asked:
             for segment, T, sigma, way in zip(c.segments.tolist(), c.T_map_body, c.sigma, c.travelled):
                 m = int(self.segmap.table.map[segment])
-                key = (m, *np.rint(T[:2] / s.same_start).astype(int).tolist(), round(float(heading_of(T)) / 0.1))
+                key = (m, *np.rint(T[:2] / SAME_START).astype(int).tolist(), round(float(heading_of(T)) / 0.1))
                 if key in done or len(done) >= s.most_searches:
                     continue
                 target = self._target(m, segment)
@@ -265,7 +277,11 @@ class Matcher:
                 registrations += len(starts)
                 if first:
                     top = found[0].best_fitness if found else 0.0
-                    near = [r.T_target_source for r in found if r.best_fitness >= top - self.config.choice.rivals]
+                    near = [
+                        r.T_target_source
+                        for r in found
+                        if r.best_fitness >= top - max(RIVALS, self.config.choice.margin)
+                    ]
                     alike.append((T, radius, near))
                 results[m] = distinct_registrations(results.get(m, []) + found)
         return results, searches, registrations
@@ -281,7 +297,7 @@ class Matcher:
         """The map's cloud, None if there is too little of it."""
 
         def made() -> Target | None:
-            points = self.segmap.map_of(segment)[0].binned_cloud(self.config.search.cloud_level).points
+            points = self.segmap.map_of(segment)[0].binned_cloud(CLOUD_LEVEL).points
             return Target(points) if len(points) >= self.config.registration.least_points else None
 
         return self._targets.of(m, made)
@@ -302,7 +318,7 @@ class Matcher:
         steps = [*[s.grid] * self.segmap.group.dim, s.yaw_step]
         found = correlative_search(source, fine, T, half, steps, s.starts, coarse=coarse)
         best = max((p.score for p in found), default=0.0)
-        return [p.T for p in found if p.score >= max(s.least_score, best - s.score_margin)]
+        return [p.T for p in found if p.score >= max(LEAST_SCORE, best - SCORE_MARGIN)]
 
     def forget(self) -> None:
         """Drop what belongs to maps that are gone."""
@@ -323,7 +339,7 @@ class Matcher:
                 if self.config.choice.method != "registration" and r.accepted:
                     local = localise_in_map(
                         self.segmap.map_of(segment)[0], r.T_target_source, ahead.window, self.max_range,
-                        seed.child(len(out)).generator(), self.config.localisation, threads=self.threads,
+                        seed.child(len(out)).generator(), threads=self.threads,
                     )  # fmt: skip
                 out.append(
                     Proposal(

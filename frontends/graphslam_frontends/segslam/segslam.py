@@ -31,6 +31,7 @@ from graphslam_frontends.segslam.progress import SegSlamProgress
 from graphslam_frontends.segslam.result import Boundary, ScoreLine, SegSlamResult
 from graphslam_frontends.segslam.segmap import MATCH, NEW, SAME, SegMap, SegmentEntry
 from graphslam_frontends.segslam.segmentation import (
+    KNOWN_SCORE,
     SegmentDecision,
     Segmenter,
     predictive_score,
@@ -39,6 +40,17 @@ from graphslam_frontends.segslam.segmentation import (
 from graphslam_frontends.segslam.window import LookAheadScan, gather_look_ahead
 
 Ints = npt.NDArray[np.int64]
+SCORE_SIGMA = 0.3
+"""σ of the ranges in the log-likelihood of the predictive score [m]."""
+SCORE_BEAMS = 600
+"""Beams of a look-ahead window that are cast for the predictive score, at most (evenly thinned)."""
+SCORE_PARTICLES = 8
+"""Particles in whose maps they are cast, at most, by weight: where the whole filter decides, its mean score counts, and
+particles differ by less than 0.03 in it."""
+KNOWN_RADIUS = 2.0
+"""A place is known where the path of the map itself passed this near [m] …"""
+KNOWN_GAP = 20.0
+"""… at least so long ago [s]."""
 
 
 def run_segslam(
@@ -192,10 +204,10 @@ class _Run:
             ahead, p = self._look(k), f.particles
             # half a window at the end of the log would be scored against maxima of whole ones
             if ahead.full:
-                rows, weights = representative_particles(p.weights, c.score_particles if together else n)
+                rows, weights = representative_particles(p.weights, SCORE_PARTICLES if together else n)
                 score = predictive_score(
-                    [p.grids[i] for i in rows], p.poses[rows], ahead.window.thinned(c.score_beams),
-                    self.steps.max_range, weights=weights, tolerance=c.tolerance, sigma=c.score_sigma,
+                    [p.grids[i] for i in rows], p.poses[rows], ahead.window.thinned(SCORE_BEAMS),
+                    self.steps.max_range, weights=weights, tolerance=c.tolerance, sigma=SCORE_SIGMA,
                     threads=f.config.threads,
                 )  # fmt: skip
                 share, shares[rows] = score.share, score.shares
@@ -218,16 +230,16 @@ class _Run:
         return ends, why
 
     def _decision(self, i: int, k: int, now: float, score: float, particle: int) -> SegmentDecision:
-        again = score >= self.config.segmentation.known_score and self._been_here(k, particle)
+        again = score >= KNOWN_SCORE and self._been_here(k, particle)
         length, turned = float(self.path_length[k]), float(self.turned[k])
         return self.segmenters[i].decide(now, length, turned, score, again=again)
 
     def _been_here(self, k: int, particle: int) -> bool:
         """Did the path of the map that a particle works in pass here, long enough ago?"""
-        f, segmap, c = self.filter, self.segmap, self.config.segmentation
+        f, segmap = self.filter, self.segmap
         entry, start, T = segmap.entries[particle], int(segmap.start[particle]), f.particles.poses[particle]
         assert entry is not None
-        old = int(np.searchsorted(self.steps.times, self.steps.times[k] - c.known_gap, side="right")) - 1
+        old = int(np.searchsorted(self.steps.times, self.steps.times[k] - KNOWN_GAP, side="right")) - 1
         own = f.ancestry.recent(k - start)[: max(old - start, 0), particle] if old > start else T[None][:0]
         paths, frames = [own], [T]
         source, link = (-1 if entry.kind == NEW else entry.source), segmap.links[particle]
@@ -238,7 +250,7 @@ class _Run:
             if path is not None:
                 paths.append(path)
                 frames.append(T)
-        return any(bool(near_pose(path, at, c.known_radius).any()) for path, at in zip(paths, frames))
+        return any(bool(near_pose(path, at, KNOWN_RADIUS).any()) for path, at in zip(paths, frames))
 
     def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> MatchAttempt | None:
         """Try to enter older maps: every so often, and wherever a segment ends."""

@@ -33,6 +33,8 @@ Ints = npt.NDArray[np.int64]
 
 KNOTS = 9
 """Places along a segment at which the drift model is asked; between them its covariance is interpolated."""
+MINIMUM_SUPPORT = 0.05
+"""Matches that a smaller share of the weight of the particles holds are not handed over."""
 
 
 class Drift(Protocol):
@@ -285,7 +287,7 @@ def _matches(
         index = np.array([i for i, _ in entries])
         weight = share[index]
         support = min(float(weight.sum()), 1.0)
-        if support < config.minimum_support:
+        if support < MINIMUM_SUPPORT:
             continue
         # the chain's own match speaks for its group, else the heaviest
         lead = int(np.argmax(index == s.index)) if s.index in index else int(np.argmax(weight))

@@ -8,7 +8,7 @@ from typing import Any
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.choice import kind_preset
-from graphslam.core.config import build_config, merge_options
+from graphslam.core.config import build_config, merge_options, without_removed
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.plugins import load_plugin, plugins, unknown
@@ -79,6 +79,18 @@ def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str,
     if not made.incremental() and type(made).submaps is FrontEnd.submaps:
         raise ConfigError(f"front end {name!r} is none: {kind.__name__} has neither submaps nor follow")
     return made
+
+
+def current_options(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of a run folder in the names of today, without options that were removed since."""
+    out = without_removed(cfg.RunConfig, stored)
+    run = out.get("run")
+    if isinstance(run, Mapping) and isinstance(name := run.get("frontend"), str):
+        name = RENAMED.get(name, name)
+        out["run"] = {**run, "frontend": name}
+        if isinstance(out.get("frontend"), Mapping) and name in front_end_names():
+            out["frontend"] = without_removed(_kind(name)[1], out["frontend"], "frontend")
+    return out
 
 
 def recommended_options(log: SensorLog, frontend: str, preset: str | None = None) -> dict[str, Any]:

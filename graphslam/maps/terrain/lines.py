@@ -16,7 +16,6 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array
-from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.terrain.line_kernels import BandCells, DetectorSettings, observe_lines, sort_into_columns
@@ -173,14 +172,6 @@ def lines_of_clouds(points: Array, origin: Array, foot: float, *, columns: int =
     there = np.arange(beams) < filled[:, None]
     lines[there] = p[order[there]]
     return ScanLines(lines, np.broadcast_to(origin, (columns, 3)), np.full(columns, float(foot)))
-
-
-def lines_of_turns(clouds: PointClouds, path: Trajectory, height: float, **options: int) -> Iterator[ScanLines]:
-    """Lines of every scan of a spinning scanner, posed at the stamp of each scan; see :func:`lines_of_clouds`."""
-    for k, t in enumerate(clouds.times):
-        T = path.interpolate(np.array([t]))[0]
-        points = se3.se3_transform(T[None], np.asarray(clouds.cloud(k), dtype=np.float64))
-        yield lines_of_clouds(points, T[:3], float(T[2]) - height, **options)
 
 
 def observe_terrain(

@@ -6,7 +6,6 @@ added to another. So no amount of evidence from far away can outvote a single lo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -314,13 +313,3 @@ def _difference(a: Array, k: int, axis: int) -> Array:
         b, o = np.moveaxis(a, axis, 0), np.moveaxis(out, axis, 0)
         o[k:-k] = b[2 * k :] - b[: -2 * k]
     return out
-
-
-def pyramid_of(
-    lines: Iterable[ScanLines], box: Box, tables: TerrainWeights, vehicle: Vehicle, sensor: LineSensor
-) -> Pyramid:
-    """A pyramid of some lines."""
-    p = Pyramid(box, tables, vehicle, sensor)
-    for part in lines:
-        p.insert(part)
-    return p

@@ -110,10 +110,6 @@ class LineSensor:
         """Range [m] within which so many beams meet a riser of this height: ``b / (k δ)``."""
         return height / (beams * self.beam_step)
 
-    def depth_seen(self, length: float, distance: float) -> float:
-        """How deep [m] one sees into a hole of this length from this distance: ``L H / r``."""
-        return length * self.height / distance
-
     def speed_bound(self, vehicle: Vehicle, depth: float | None = None) -> float:
         """Highest speed [m/s] from which the vehicle stops before a fall.
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.run import loops as app_loops
+from graphslam.backend import back_end
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig
 from graphslam.core import se3
@@ -18,7 +19,13 @@ from graphslam.loops.ledger import LoopDecision, ledger_of_events
 from tests.app.run.test_loops import there_and_back
 
 C = np.diag([0.01, 0.01, 0.01, 0.05, 0.05, 0.03]) ** 2
-CONFIG = BackEndConfig(loops=True, loop_overlap=0.1, loop_height=0.1)
+CONFIG = BackEndConfig(loops=True)
+
+
+@pytest.fixture(autouse=True)
+def no_pairs_by_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("LOOP_OVERLAP", "LOOP_HEIGHT"):
+        monkeypatch.setattr(back_end, name, 0.1)
 
 
 @pytest.fixture(scope="module")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 import graphslam as gs
-from graphslam.core.errors import FormatError
+from graphslam.core.config import dump_toml, merge_options
+from graphslam.core.errors import FormatError, RunFolderError
 
 
 def test_ledger_and_events_come_back(tmp_path: Path) -> None:
@@ -42,3 +44,19 @@ def test_a_time_that_was_not_measured_is_left_out(tmp_path: Path) -> None:
     seconds = gs.open_run(tmp_path / "run").report["seconds"]
     assert row["key"].removeprefix("seconds_") not in seconds
     assert len(seconds) == sum(r["key"].startswith("seconds_") for r in rows) - 1
+
+
+def test_folders_from_before_an_option_was_removed_are_read_and_resumed(tmp_path: Path) -> None:
+    log, out = gs.simulate("landmark-field", preset="quick", laps=0.3), tmp_path / "run"
+    first = gs.run(log, out=out, progress=False)
+    file = out / "config.toml"
+    old = tomllib.loads(file.read_text())
+    old["frontend"] |= {"control_hold": 0.5, "delayed": {"min_ranges": 5, "support": 0.9}}
+    old["backend"] |= {"merge_reach": 5.0}
+    old["refine"] |= {"surface": {"radius": 0.8}}
+    file.write_text(dump_toml(old))
+    assert repr(gs.open_run(out)) == repr(first)
+    assert repr(gs.run(log, out=out, resume=True, progress=False)) == repr(first)
+    file.write_text(dump_toml(merge_options(old, {"backend": {"merge_reach": 6.0}})))
+    with pytest.raises(RunFolderError, match=r"cannot resume, backend\.merge_reach = 6\.0: this option was removed"):
+        gs.run(log, out=out, resume=True, progress=False)

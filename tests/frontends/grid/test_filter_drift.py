@@ -7,7 +7,8 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.poses import SE2, SE3, Group, remove_roll_pitch
-from graphslam_frontends.grid.filter_error_model import ErrorPassThrough, FilterDrift, interpolate_covariances
+from graphslam_frontends.grid import filter_error_model
+from graphslam_frontends.grid.filter_error_model import PASSED, ErrorPassThrough, FilterDrift, interpolate_covariances
 
 MODEL = FilterDrift(heading_walk=0.01, position_walk=0.03, position_scale=0.01, few=5.0, alone_walk=0.03)
 
@@ -45,7 +46,7 @@ def test_covariance_is_that_of_many_drives(group: Group, particles: int) -> None
         driven = np.repeat(u[k][None], m, axis=0)
         driven[:, group.position] *= wheels
         T = group.compose(group.compose(T, group.exp(driven)), group.exp(noise))
-    T[:, 2] += 0.0 if group.dim == 2 else MODEL.height_scale * 40.0 * rng.standard_normal(m)
+    T[:, 2] += 0.0 if group.dim == 2 else filter_error_model.HEIGHT_SCALE * 40.0 * rng.standard_normal(m)
     e = group.log(group.between(np.broadcast_to(true[-1], T.shape), T))
     drawn = e.T @ e / m
     C = MODEL.covariance(true, particles)
@@ -86,7 +87,7 @@ def test_a_single_step_by_hand(group: Group) -> None:
     path[1, 0] = 2.0
     C = MODEL.covariance(path, 20, gravity=False)
     y, walk = group.position.start + 1, MODEL.heading_walk**2 * (1.0 + MODEL.few / 20) * 2.0
-    assert C[group.heading, group.heading] == pytest.approx(MODEL.heading_start**2 + walk)
+    assert C[group.heading, group.heading] == pytest.approx(filter_error_model.HEADING_START**2 + walk)
     assert C[group.heading, y] == pytest.approx(0.5 * walk * 2.0)
 
 
@@ -137,7 +138,7 @@ def test_a_single_particle_passes_everything_on_and_more_never_less_than_nothing
     for tilt in (None, 0.005):
         more = MODEL.covariance(path, 20, reckoned=O, told_tilt=tilt) - MODEL.covariance(path, 20)
         assert np.linalg.eigvalsh(more).min() > -1e-12  # the fitted constants are a floor
-        assert more == pytest.approx(MODEL.passed.covariance(O, 40.0, 20, tilt=tilt), rel=1e-3, abs=1e-12)
+        assert more == pytest.approx(PASSED.covariance(O, 40.0, 20, tilt=tilt), rel=1e-3, abs=1e-12)
 
 
 def test_impossible_shares_are_refused() -> None:

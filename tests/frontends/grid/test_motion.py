@@ -53,13 +53,13 @@ def test_the_path_of_a_step_is_that_of_its_position_and_its_turn_that_about_the_
 
 def test_models_are_those_of_the_configuration() -> None:
     """Whatever is set is handed on: nothing falls back on a default of its own."""
-    c = GridFilterConfig(hit=0.8, miss=0.3, clamp=(0.05, 0.99), floor=0.11, unknown=0.2, interpolation="nearest",
-                         cast_sigma=0.3, cast_clip=2.0, cast_effective_beams=3.0, greatest_exponent=0.5)  # fmt: skip
+    c = GridFilterConfig(hit=0.8, floor=0.11, unknown=0.2, endpoint_effective_beams=60.0)
     model = c.beam_model()
-    assert (model.hit, model.miss, model.clamp) == (0.8, 0.3, (0.05, 0.99))
+    assert (model.hit, model.miss, model.clamp) == (0.8, 0.4, (0.1192, 0.971))
     end, cast = c.by_end_points(120), c.by_casting(30)
-    assert (end.exponent, end.floor, end.unknown, end.interpolation) == (0.5, 0.11, 0.2, "nearest")
-    assert (cast.exponent, cast.sigma, cast.clip) == (0.1, 0.3, 2.0)
+    assert (end.exponent, end.floor, end.unknown, end.interpolation) == (0.5, 0.11, 0.2, "trilinear")
+    assert c.by_end_points(30).exponent == 1.0
+    assert (cast.exponent, cast.sigma, cast.clip) == (4.0 / 30, 0.2, 3.0)
     GridFilterConfig(particles=1, weight_beams=1, threads=1, map_beams=0, young=0, lift=1.0, ess_fraction=1.0)
     GridFilterConfig(lift=0.0, walk_scale=0.0, motion_scale=0.0)
 
@@ -129,7 +129,7 @@ def test_errors_of_gravity_keep_their_spread_and_forget_in_time(time: float, rng
     [
         {"particles": 0}, {"threads": 0}, {"ess_fraction": 0.0}, {"voxel_size": float("nan")}, {"heading_walk": -1.0},
         {"ess_fraction": 1.01}, {"lift": 1.01}, {"lift": -0.01}, {"map_beams": -1}, {"young": -1}, {"walk_scale": -1.0},
-        {"motion_scale": float("inf")}, {"greatest_exponent": 0.0}, {"tilt_walk": float("nan")},
+        {"motion_scale": float("inf")}, {"tilt_walk": float("nan")},
         {"likelihood": "guess"}, {"endpoint_effective_beams": 0.0}, {"hit": 0.4}, {"floor": 0.0}, {"weight_beams": 0},
     ],
 )  # fmt: skip

@@ -21,6 +21,7 @@ from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_error_model import ErrorPassThrough
 from graphslam_frontends.grid.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
+from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance
 from graphslam_frontends.odometry.steps import Steps
 from tests.frontends.grid_world import ring, true_end
@@ -178,13 +179,11 @@ def planar_log(seed: int) -> SensorLog:
 
 def test_front_end_gives_one_submap_and_nothing_after_it() -> None:
     log, drops = planar_log(0), DropCounter()
-    front = make_front_end(
-        "rbpf-grid", {"filter": {"particles": 6, "voxel_size": 0.1}, "drift": {"heading_scale": 0.01}}
-    )
+    front = make_front_end("rbpf-grid", {"filter": {"particles": 6, "voxel_size": 0.1}, "drift_scale": 1.5})
     assert isinstance(front, FrontEnd)
     (submap,) = front.submaps(log, seed=SeedTree(1), drops=drops)
     assert submap.dim == 2
-    assert submap.exit_covariance[2, 2] > (0.01 * 15.0) ** 2
+    assert submap.exit_covariance[2, 2] > 1.5 * DriftModel(dim=2).covariance(15.0)[2, 2]
     assert submap.report["particles"] == 6
     assert submap.uses == {"laser", "odometry"}
     assert submap.trajectory is not None

@@ -74,8 +74,9 @@ def test_what_is_up_is_seen_from_a_tilted_body() -> None:
         assert se3.quat_rotate(q, seen) == pytest.approx([0.0, 0.0, 1.0], abs=1e-12)
 
 
-def test_both_kinds_of_beams_are_added(steps: Steps) -> None:
-    config = GridFilterConfig(particles=4, likelihood="upright", weight_beams=40, cast_beams=25, young=3)
+def test_both_kinds_of_beams_are_added(steps: Steps, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("graphslam_frontends.grid.filter.CAST_BEAMS", 25)
+    config = GridFilterConfig(particles=4, likelihood="upright", weight_beams=40, young=3)
     filter = GridFilter(steps, config, SeedTree(1))
     for k in range(8):
         filter.step(k)
@@ -109,7 +110,7 @@ def test_without_gravity_and_in_the_plane_end_points_of_all_are_weighed() -> Non
 
 
 def test_impossible_settings_are_named() -> None:
-    with pytest.raises(ConfigError, match="cast_beams"):
-        GridFilterConfig(cast_beams=0)
+    with pytest.raises(ConfigError, match="weight_beams"):
+        GridFilterConfig(weight_beams=0)
     with pytest.raises(ConfigError, match="upright"):
         GridFilterConfig(likelihood="lying")  # type: ignore[arg-type]

@@ -87,7 +87,7 @@ def test_weights_equal_the_slow_twin(dim: int) -> None:
 
 
 def test_exponents_follow_the_number_of_beams() -> None:
-    config = GridFilterConfig(endpoint_effective_beams=60.0, cast_effective_beams=4.0)
+    config = GridFilterConfig(endpoint_effective_beams=60.0)
     end, cast = config.by_end_points(240), config.by_casting(240)
     assert isinstance(end, EndpointLikelihood)
     assert isinstance(cast, CastLikelihood)

@@ -45,8 +45,13 @@ def drive(seed, *, scans=160, laps=1.4, landmarks=30, clutter=0.0, ranges_only=0
     return log, x, world
 
 
+@pytest.fixture(autouse=True)
+def small_margin(monkeypatch):
+    monkeypatch.setattr("graphslam_frontends.landmarks.ekf_filter.ACTIVE_MARGIN", 4.0)
+
+
 def ekf(**config):
-    return EkfMap(EkfFilterConfig(max_range=10.0, active_margin=4.0, **config), SENSOR, FOV, np.inf)
+    return EkfMap(EkfFilterConfig(max_range=10.0, **config), SENSOR, FOV, np.inf)
 
 
 @pytest.fixture
@@ -222,7 +227,6 @@ def test_bad_motion_is_named_at_once():
         {"max_nodes": 0},
         {"min_hits": 0},
         {"max_range": np.inf},
-        {"active_margin": 0.0},
         {"outlier_gate": -1.0},
     ],
 )

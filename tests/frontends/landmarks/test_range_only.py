@@ -172,11 +172,10 @@ def test_every_range_is_spent_once():
     np.testing.assert_allclose(p.cov[0, 0], fit[2:5], rtol=0.1)
 
 
-def test_paths_that_explain_the_ranges_gain_weight():
+def test_paths_that_explain_the_ranges_gain_weight(monkeypatch):
     """Two particles, one of which drifted: the ranges that make the landmark say so."""
-    config = RbpfEkfConfig(
-        particles=2, association="known", ess_fraction=1e-6, delayed=DelayedInitialisation(support=0.4)
-    )
+    config = RbpfEkfConfig(particles=2, association="known", ess_fraction=1e-6)
+    monkeypatch.setattr("graphslam_frontends.landmarks.filter.DELAYED", DelayedInitialisation(support=0.4))
     p = ParticleSet(config, np.zeros(3), (-np.pi, np.pi), 100.0, np.random.default_rng(0))
     anchors, rng = bend(40), np.random.default_rng(3)
     before, started = np.zeros(2), False

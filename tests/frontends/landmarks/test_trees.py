@@ -9,6 +9,7 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.records import LaserScans
+from graphslam_frontends.detectors import trees
 from graphslam_frontends.detectors.trees import (
     TreeDetectorConfig,
     Trunks,
@@ -45,26 +46,30 @@ def park(rng: np.random.Generator, n: int) -> np.ndarray:
     return out
 
 
-def test_equals_the_slow_twin_on_crowded_scenes(rng: np.random.Generator) -> None:
-    scans = scans_of(park(rng, 150))
-    for config in (TreeDetectorConfig(), TreeDetectorConfig(isolation=0.5, max_missing=1, min_beams=2, fit_beams=4)):
-        fast = find_trunks(scans, config)
-        slow = [(k, t) for k, r in enumerate(scans.ranges) for t in detect_scan(r, BEARINGS, config)]
-        assert len(slow) > 100
-        np.testing.assert_array_equal(fast.scan, [k for k, _ in slow])
-        np.testing.assert_array_equal(fast.beams, [t.beams for _, t in slow])
-        # At the very gate of the circle fit the two optimisers may part; they must not do so often.
-        same = fast.fitted == np.array([t.fitted for _, t in slow])
-        assert same.mean() > 0.99
-        for name, value, tolerance in (
-            ("ranges", [t.range for _, t in slow], 1e-6),
-            ("bearings", [t.bearing for _, t in slow], 1e-7),
-            ("radii", [t.radius for _, t in slow], 1e-6),
-        ):
-            np.testing.assert_allclose(getattr(fast, name)[same], np.array(value)[same], atol=tolerance)
-        sigmas = np.array([[t.sigma_range, t.sigma_bearing] for _, t in slow])
-        np.testing.assert_allclose(fast.sigmas[same], sigmas[same], rtol=2e-3)
-        assert (fast.fitted & same).sum() > 10
+@pytest.mark.parametrize("others", [{}, {"ISOLATION": 0.5, "MAX_MISSING": 1, "MIN_BEAMS": 2, "FIT_BEAMS": 4}])
+def test_equals_the_slow_twin_on_crowded_scenes(
+    rng: np.random.Generator, others: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans, config = scans_of(park(rng, 150)), TreeDetectorConfig()
+    for name, value in others.items():
+        monkeypatch.setattr(trees, name, value)
+    fast = find_trunks(scans, config)
+    slow = [(k, t) for k, r in enumerate(scans.ranges) for t in detect_scan(r, BEARINGS, config)]
+    assert len(slow) > 100
+    np.testing.assert_array_equal(fast.scan, [k for k, _ in slow])
+    np.testing.assert_array_equal(fast.beams, [t.beams for _, t in slow])
+    # At the very gate of the circle fit the two optimisers may part; they must not do so often.
+    same = fast.fitted == np.array([t.fitted for _, t in slow])
+    assert same.mean() > 0.99
+    for name, value, tolerance in (
+        ("ranges", [t.range for _, t in slow], 1e-6),
+        ("bearings", [t.bearing for _, t in slow], 1e-7),
+        ("radii", [t.radius for _, t in slow], 1e-6),
+    ):
+        np.testing.assert_allclose(getattr(fast, name)[same], np.array(value)[same], atol=tolerance)
+    sigmas = np.array([[t.sigma_range, t.sigma_bearing] for _, t in slow])
+    np.testing.assert_allclose(fast.sigmas[same], sigmas[same], rtol=2e-3)
+    assert (fast.fitted & same).sum() > 10
 
 
 def test_half_chord_moments_are_those_of_uniform_edges(rng: np.random.Generator) -> None:
@@ -98,10 +103,15 @@ def normalised(found: Trunks, truth: np.ndarray) -> np.ndarray:
     ],
 )
 def test_stated_covariance_is_that_of_the_errors(
-    rng: np.random.Generator, half_angle: tuple[float, float], distance: tuple[float, float], beams: tuple[int, int]
+    rng: np.random.Generator,
+    half_angle: tuple[float, float],
+    distance: tuple[float, float],
+    beams: tuple[int, int],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Two-sided, by number of beams: one (closed form), a few (closed form), many (circle fit)."""
-    config = TreeDetectorConfig(beam_sigma=0.03, max_width=2.0, max_depth=2.0)
+    monkeypatch.setattr(trees, "MAX_DEPTH", 2.0)
+    config = TreeDetectorConfig(max_width=2.0)
     scans, truth, _ = one_trunk_scans(rng, BEARINGS, n=6000, distance=distance, half_angle=half_angle, sigma=0.03)
     found = find_trunks(scans_of(scans), config)
     keep = (found.beams >= beams[0]) & (found.beams <= beams[1])
@@ -113,11 +123,12 @@ def test_stated_covariance_is_that_of_the_errors(
     assert np.all(np.abs((e**2).mean(0) - 1.0) < 4 * np.sqrt(2 / n)), (e**2).mean(0)
 
 
-def test_trunk_radius_and_fit_beat_the_closed_form(rng: np.random.Generator) -> None:
+def test_trunk_radius_and_fit_beat_the_closed_form(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     scans, truth, radii = one_trunk_scans(rng, BEARINGS, n=3000, distance=(2.0, 8.0), radius=(0.1, 0.4), sigma=0.03)
     error = {}
     for fit_beams in (5, 400):
-        found = find_trunks(scans_of(scans), TreeDetectorConfig(fit_beams=fit_beams))
+        monkeypatch.setattr(trees, "FIT_BEAMS", fit_beams)
+        found = find_trunks(scans_of(scans), TreeDetectorConfig())
         many = found.beams >= 5
         assert found.fitted[many].mean() > (0.95 if fit_beams == 5 else -1)
         assert not found.fitted[~many].any()
@@ -186,7 +197,14 @@ def test_float32_and_uneven_beams() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"noise": "guess"}, {"max_range": 0.0}, {"isolation": -1.0}, {"min_beams": 0}, {"beam_sigma": float("nan")}]
+    "bad",
+    [
+        {"noise": "guess"},
+        {"max_range": 0.0},
+        {"range_slope": -1.0},
+        {"max_width": 0.0},
+        {"bearing_sigma": float("nan")},
+    ],
 )
 def test_impossible_configuration_is_refused(bad: dict) -> None:
     with pytest.raises(ConfigError, match="tree detector"):

@@ -234,7 +234,6 @@ def test_impossible_figures_are_refused():
     for wrong in (
         {"max_range": -1.0},
         {"levels": (0.5, 1.0)},
-        {"suspicious": 1.5},
         {"most_points": 3},
         {"min_range": 90.0},
     ):

@@ -221,7 +221,7 @@ def test_refusals() -> None:
         integrate_imu_and_wheels(weightless, d.wheels, TIMES)
     with pytest.raises(DataError, match="no such interval"):
         integrate_imu_and_wheels(d.imu, d.wheels, TIMES).between(5, 101)
-    for bad in ({"filter_time": 0.0}, {"wheel": -1.0}, {"wheel_scale": np.nan}):
+    for bad in ({"floor_position": 0.0}, {"wheel": -1.0}, {"wheel_scale": np.nan}):
         with pytest.raises(ConfigError):
             DeadReckoningNoise(**bad)
 

@@ -15,6 +15,7 @@ from graphslam.app.worlds import mesh_world
 from graphslam.sim.crawler import crawler_motion
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import yaw_bias_for
+from graphslam_frontends.grid import filter_error_model
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.motion import motion_covariance, walk_tilt_errors
@@ -67,7 +68,7 @@ def test_a_map_is_young_until_a_spun_scanner_has_seen_all_round() -> None:
 
 def test_odds_of_a_voxel_are_those_of_octomap() -> None:
     """Hornung et al. (2013): log-odds clamped at -2 and 3.5, 0.85 for a hit and -0.4 for a miss."""
-    c = GridFilterConfig()
+    c = GridFilterConfig().beam_model()
     odds = np.log(np.array([*c.clamp, c.hit, c.miss]) / (1.0 - np.array([*c.clamp, c.hit, c.miss])))
     np.testing.assert_allclose(odds, [-2.0, 3.5, 0.85, -0.4], atol=0.02)
 
@@ -80,15 +81,16 @@ def test_beams_have_nothing_to_do_with_the_map_as_often_as_amcl_assumes() -> Non
 def test_cast_ranges_are_as_unsure_as_the_voxel_they_end_in() -> None:
     c = GridFilterConfig(likelihood="cast")
     # uniform over a voxel that is met under any angle: σ between edge / √12 and the diagonal
-    assert c.voxel_size / np.sqrt(3) < c.cast_sigma < c.voxel_size * np.sqrt(3)
+    assert c.voxel_size / np.sqrt(3) < c.by_casting(60).sigma < c.voxel_size * np.sqrt(3)
 
 
 def test_a_cast_beam_is_no_worse_where_it_rather_has_nothing_to_do_with_the_map() -> None:
     """A share of the beams has nothing to do with the map and may be of any length; the others are normal about the
     expected range. Both densities are equal at this many standard deviations."""
     c = GridFilterConfig(likelihood="cast")
-    stray, normal = c.floor / CrawlerConfig().max_range, (1.0 - c.floor) / (c.cast_sigma * np.sqrt(2.0 * np.pi))
-    assert 0.75 < c.cast_clip / np.sqrt(2.0 * np.log(normal / stray)) < 1.33
+    cast = c.by_casting(60)
+    stray, normal = c.floor / CrawlerConfig().max_range, (1.0 - c.floor) / (cast.sigma * np.sqrt(2.0 * np.pi))
+    assert 0.75 < cast.clip / np.sqrt(2.0 * np.log(normal / stray)) < 1.33
 
 
 # --- what is left at the end of a segment -------------------------------------------------------------------------
@@ -154,7 +156,7 @@ def test_what_lasts_is_what_the_sensors_have() -> None:
     """Wheels that are off by a factor, and gravity told with an error that stays."""
     crawler, model = CrawlerConfig(), FilterDrift()
     assert 0.75 < model.position_scale / crawler.wheel_scale < 1.5
-    assert 0.75 < model.height_scale / crawler.attitude_bias < 1.5
+    assert 0.75 < filter_error_model.HEIGHT_SCALE / crawler.attitude_bias < 1.5
 
 
 def test_variances_at_no_length_only_keep_short_segments_regular() -> None:
@@ -164,7 +166,7 @@ def test_variances_at_no_length_only_keep_short_segments_regular() -> None:
     start, end = (np.diag(model.covariance(path[:n], 40)) for n in (1, 9))
     assert np.all(np.sqrt((start / end)[[2, 3, 5]]) < [0.25, 0.4, 0.6])
     assert np.all(np.sqrt((start / end)[[2, 3, 5]]) > [0.05, 0.1, 0.2])
-    assert start[[3, 5]] == pytest.approx([model.position_start**2, model.height_start**2])
+    assert start[[3, 5]] == pytest.approx([filter_error_model.POSITION_START**2, filter_error_model.HEIGHT_START**2])
 
 
 @pytest.mark.parametrize("part", [HEADING, PLANE, HEIGHT])

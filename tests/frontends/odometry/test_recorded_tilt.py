@@ -32,10 +32,10 @@ def rolling() -> SensorLog:
 def test_a_yaw_bias_turns_the_heading_and_leaves_roll_and_pitch() -> None:
     log = rolling()
     true = roll_pitch_of(chain_odometry(log["odometry"]).poses)
-    config = StepConfig(period=None, yaw_bias=0.02, odometry_tilt_sigma=0.004, odometry_tilt_time=7.0)
+    config = StepConfig(period=None, yaw_bias=0.02, odometry_tilt_sigma=0.004)
     steps = make_steps(log, config)
     assert steps.tilt is not None
-    assert (steps.tilt_sigma, steps.tilt_time) == (0.004, 7.0)
+    assert (steps.tilt_sigma, steps.tilt_time) == (0.004, 10.0)
     np.testing.assert_allclose(steps.tilt, true, atol=1e-9)
     assert np.abs(true).max() > 0.25
     # the motion itself has the bias: its own chain is off in heading by the bias, and leans wrongly

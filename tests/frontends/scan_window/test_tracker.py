@@ -284,7 +284,6 @@ def test_numbers_that_cannot_be_are_refused() -> None:
     for bad in (
         {"seconds": 0.0},
         {"spent": np.nan},
-        {"least_overlap": 1.5},
         {"distances": ()},
         {"points": 3},
         {"lay": 30.0},

@@ -16,8 +16,8 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.likelihood import EndpointLikelihood, log_weights
 from graphslam.registration.config import RegistrationConfig, RegistrationGates
 from graphslam.registration.register import Registration
-from graphslam_frontends.segslam.config import ChoiceConfig, LocalisationConfig
-from graphslam_frontends.segslam.localisation import ScanLocalisation, localise_in_map, range_error
+from graphslam_frontends.segslam.config import ChoiceConfig
+from graphslam_frontends.segslam.localisation import LocalisationConfig, ScanLocalisation, localise_in_map, range_error
 from graphslam_frontends.segslam.match_posterior import (
     NULL,
     Proposal,

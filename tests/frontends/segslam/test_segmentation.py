@@ -11,6 +11,7 @@ from graphslam.core import se3
 from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam_frontends.segslam import segmentation
 from graphslam_frontends.segslam.config import SegmentationConfig, SegSlamConfig
 from graphslam_frontends.segslam.segmentation import (
     Segmenter,
@@ -167,15 +168,15 @@ def test_without_drops_segments_have_their_maximum_size() -> None:
     assert _run(SegmentationConfig(max_seconds=30.0), {20.0: 0.1}, speed=0.01) == []
 
 
-def test_ground_that_the_map_foretells_does_not_count_for_the_maximum_size() -> None:
+def test_ground_that_the_map_foretells_does_not_count_for_the_maximum_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """A corridor of 12 s out and 12 s back, 1 m/s: the way back is known, so the segment goes on into the next."""
     config = SegmentationConfig(max_length=20.0, relative_score=0.0)
     there = {0.0: 0.7, 14.0: 0.9, 26.0: 0.7}
     # 12 m out; the decisions at 14 … 24 s look back on known ground; 8 m more are driven by 32 s
     assert _run(config, there, 34.0) == [(32.0, "max-length")]
-    assert _run(SegmentationConfig(max_length=20.0, relative_score=0.0, known_score=1.0), there, 34.0) == [
-        (20.0, "max-length")
-    ]
+    with monkeypatch.context() as patch:
+        patch.setattr(segmentation, "KNOWN_SCORE", 2.0)  # no ground is known
+        assert _run(config, there, 34.0) == [(20.0, "max-length")]
     s = Segmenter(config, 0.0, 5.0)
     assert s.decide(2.0, 7.0, score=0.95).new_ground == pytest.approx(2.0)  # too early for a score to say anything
     assert s.decide(6.0, 11.0, score=0.95, again=True).new_ground == pytest.approx(2.0)
@@ -246,8 +247,8 @@ def test_configurations_are_checked_and_built_from_tables() -> None:
         {"winnowing": {"gap": NAN}},
         {"choice": {"null_weight": 0.0}},
         {"choice": {"method": "vote"}},
-        {"localisation": {"particles": 0}},
-        {"handover": {"minimum_support": 2.0}},
+        {"localisation": {"particles": 99}},
+        {"handover": {"drift_scale": 0.0}},
         {"search": {"grids": 1.0}},
         {"lock_after": -1},
     ):

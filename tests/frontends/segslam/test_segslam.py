@@ -13,6 +13,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.random import SeedTree
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.odometry.steps import Steps
+from graphslam_frontends.segslam import segmentation, segslam
 from graphslam_frontends.segslam.config import (
     CandidateSearch,
     ChoiceConfig,
@@ -128,19 +129,22 @@ def test_one_particle_without_matches_is_dead_reckoning() -> None:
     np.testing.assert_allclose(r.final_pose, _dead_reckoning(steps), atol=1e-9)
 
 
-def test_ground_driven_again_does_not_fill_a_segment() -> None:
+def test_ground_driven_again_does_not_fill_a_segment(monkeypatch: pytest.MonkeyPatch) -> None:
     """One and a half rounds of 37 m without matches: 60 m of way, but 37 m of ground."""
 
-    def cuts(**more: float) -> list[str]:
-        segmentation = SegmentationConfig(
-            window=2.0, max_length=45.0, score=0.0, relative_score=1e-6, excluded=3.0, known_gap=10.0, **more
-        )
-        config = replace(CONFIG, segmentation=segmentation, winnowing=SegmentCandidateConfig(gap=1e6))
+    monkeypatch.setattr(segslam, "KNOWN_GAP", 10.0)
+
+    def cuts(known_score: float, known_radius: float = 2.0) -> list[str]:
+        for module in (segslam, segmentation):
+            monkeypatch.setattr(module, "KNOWN_SCORE", known_score)
+        monkeypatch.setattr(segslam, "KNOWN_RADIUS", known_radius)
+        cut = SegmentationConfig(window=2.0, max_length=45.0, score=0.0, relative_score=1e-6, excluded=3.0)
+        config = replace(CONFIG, segmentation=cut, winnowing=SegmentCandidateConfig(gap=1e6))
         r = run_segslam(world(0, 2, 0.002), GridFilterConfig(particles=10), config, SeedTree(0))
         return [b.why for b in r.boundaries]
 
     assert cuts(known_score=0.6) == ["end-of-log"]
-    assert cuts(known_score=1.0) == ["max-length", "end-of-log"]
+    assert cuts(known_score=2.0) == ["max-length", "end-of-log"]
     assert cuts(known_score=0.6, known_radius=0.0) == ["max-length", "end-of-log"]  # its path never passed so near
 
 

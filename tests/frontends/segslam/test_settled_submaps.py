@@ -108,7 +108,7 @@ def test_the_exit_covariance_is_particles_about_the_chosen_one_plus_drift() -> N
     np.testing.assert_allclose(P[1], 2 * D + np.diag([w @ (0.5 * ahead) ** 2, 0, 0]), atol=1e-12)
 
 
-def test_matches_go_along_with_their_support() -> None:
+def test_matches_go_along_with_their_support(monkeypatch: pytest.MonkeyPatch) -> None:
     m = loop()
     last = submaps_of_segments(m, common_ancestor_chain(m, 16), drift)[-1]
     (match,) = last.matches  # all three lead to the first submap of the chain
@@ -128,7 +128,9 @@ def test_matches_go_along_with_their_support() -> None:
     (match,) = other.matches
     assert match.support == pytest.approx(0.9)
     np.testing.assert_allclose(match.T_target_here, [0.5, 0.0, 0.0], atol=1e-12)
-    assert submaps_of_segments(m, [0, 4, 8, 12, 19], drift, HandoverConfig(minimum_support=0.95))[-1].matches == ()
+    with monkeypatch.context() as patch:
+        patch.setattr("graphslam_frontends.segslam.submaps.MINIMUM_SUPPORT", 0.95)
+        assert submaps_of_segments(m, [0, 4, 8, 12, 19], drift)[-1].matches == ()
     # with another particle's first segment in the chain, the same place
     (match,) = submaps_of_segments(m, [2, 4, 8, 12, 16], drift)[-1].matches
     np.testing.assert_allclose(match.T_target_here, [0.5, 0.0, 0.0], atol=1e-12)
