@@ -17,7 +17,7 @@ from nbclient.exceptions import CellExecutionError
 import graphslam
 import graphslam_studies
 from graphslam.core.errors import UnknownNameError
-from graphslam.io.notebook import NotebookStop, load_or_stop
+from graphslam_studies.notebook import NotebookStop, load_or_stop
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -90,7 +90,7 @@ def test_a_notebook_imports_no_internal_module(path: Path) -> None:
 
 def test_internal_imports_are_found() -> None:
     for line in (
-        "from graphslam.plots.scans import plot_scan",
+        "from graphslam_studies.plots.scans import plot_scan",
         "import graphslam.app.verbs",
         "from graphslam import io",
     ):

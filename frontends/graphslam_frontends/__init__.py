@@ -7,7 +7,6 @@ _EXPORTS = {
     "detectors.trees": "TreeDetectorConfig detect_trees",
     "grid.config": "GridFilterConfig",
     "grid.filter": "GridFilter",
-    "grid.rbpf_grid": "run_rbpf",
     "segslam.segslam": "run_segslam",
     "segslam.config": "HandoverConfig",
     "segslam.front_end": "submaps_of_best_particle",

@@ -24,10 +24,10 @@ INSTALL_STUDIES = "pip install ./notebooks/studies in a clone of the repository"
 
 IN_STUDIES: dict[str, tuple[str, ...]] = {
     "graphslam.commands": ("study", "terrain-tables"),
-    "graphslam.frontends": ("ekf-slam", "rbpf-slam"),
+    "graphslam.frontends": ("ekf-slam", "rbpf-grid", "rbpf-slam"),
     "graphslam.readers": (
         *("kitti-gps", "lidar-pack", "mrclam", "plaza", "slsjf-local-maps", "slsjf-network"),
-        *("slsjf-observations", "smartloc", "tuc", "ufastslam-detections"),
+        *("slsjf-observations", "smartloc", "tuc", "ufastslam-detections", "victoria-park"),
     ),
     "graphslam.verbs": ("find_study", "open_study", "study"),
     "graphslam.worlds": ("building", "mine", "point-field"),

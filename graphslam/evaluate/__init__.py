@@ -4,7 +4,6 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "consistency": "Consistency",
-    "submap_consistency": "submap_nees submaps_consistency",
     "association": "match_observations",
     "gps": "gps_residuals move_to_gps_frame",
     "gps_repeatability": "fix_segments revisit_disagreement segment_table",

@@ -4,7 +4,6 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "cards": "find_card",
-    "notebook": "load_or_stop",
     "catalog": "load_recording",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -89,15 +89,6 @@ def _submap_store(look: SourceProbe) -> ReaderMatch | None:
     return ReaderMatch("submaps of graphslam") if found else None
 
 
-def _victoria_park(look: SourceProbe) -> ReaderMatch | None:
-    laser = look.named("laser.txt")
-    if laser is None or parse_numbers(look.head(laser)[:60].decode("latin-1").rpartition("\t")[0]) is None:
-        return None
-    if look.path.is_file() or look.named("drs.txt") is None:
-        return ReaderMatch("LASER.txt of the ACFR", "the folder with DRS.txt, speed and steering, in it")
-    return ReaderMatch("laser, speed and steering of the ACFR in the text form of Victoria Park (LASER.txt, DRS.txt)")
-
-
 def euroc_tables(look: SourceProbe) -> dict[str, Path]:
     """Tables of a EuRoC recording by what their header says: ``imu``, ``leica``, ``vicon``, ``truth``."""
     out: dict[str, Path] = {}
@@ -246,12 +237,6 @@ BUILT_IN: dict[str, Reader] = {
         "submaps of graphslam: a run, or a folder with index.json",
         f"{_IO}.submap_store:read_submaps",
         _submap_store,
-    ),
-    "victoria-park": Reader(
-        "laser, speed and steering of a car as text of the ACFR: LASER.txt, DRS.txt, perhaps GPS.txt",
-        f"{_IO}.victoria_park:read_victoria_park",
-        _victoria_park,
-        preset="victoria-park",
     ),
     "euroc": Reader(
         "EuRoC (ASL) without cameras: data.csv of imu0, perhaps of leica0 or vicon0, and ground truth",

@@ -23,7 +23,7 @@ from graphslam.app.run.pipeline import run
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import simulate
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.evaluate.submap_consistency import submap_nees
+from graphslam_studies.evaluate.submap_consistency import submap_nees
 
 
 def trial(world: str, seed: int) -> tuple[pd.DataFrame, dict[str, float]]:

@@ -27,8 +27,8 @@ from graphslam.core.se3 import (
 )
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.rbpf_grid import run_rbpf
 from graphslam_frontends.odometry.steps import Steps
+from graphslam_studies.frontends.rbpf_grid import run_rbpf
 from tests.benchmarks.evidence_scenes import SPIN_RATE, tunnel
 
 PER_STEP = 15

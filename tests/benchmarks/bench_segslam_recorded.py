@@ -30,7 +30,6 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.io.catalog import load_recording
 from graphslam.plots.evidence import plot_heights, plot_section
 from graphslam.plots.save import save_figure
-from graphslam_frontends.grid.rbpf_grid import run_rbpf
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.steps import Steps
@@ -38,6 +37,7 @@ from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
 from graphslam_studies.evaluate.relations import consecutive_pairs, covered_part, random_pairs, relation_error
+from graphslam_studies.frontends.rbpf_grid import run_rbpf
 
 NAMES = (
     "radish-intel", "radish-fr079", "radish-mit-csail", "lidar3d-hku1", "lidar3d-balm-hall", "lidar3d-hku-mb",

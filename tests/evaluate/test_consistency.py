@@ -23,8 +23,8 @@ from graphslam.evaluate.consistency import (
     pose_error,
     vector_pose_error,
 )
-from graphslam.evaluate.submap_consistency import submap_nees, submaps_consistency, true_submap
 from graphslam.sim.landmark_field import PRESETS, simulate_landmark_field
+from graphslam_studies.evaluate.submap_consistency import submap_nees, submaps_consistency, true_submap
 from tests.reference.batch_slam import batch_submap
 
 GAUGE = "first base fixed"

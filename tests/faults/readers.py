@@ -65,7 +65,6 @@ from graphslam.io.mesh_file import read_mesh, write_mesh
 from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, read_tum_log, write_tum
-from graphslam.io.victoria_park import read_victoria_park
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
 from graphslam_frontends.odometry.bias_sigmas import LEAST
@@ -76,6 +75,7 @@ from graphslam_studies.io.plaza import read_plaza
 from graphslam_studies.io.slsjf import read_slsjf_local_maps
 from graphslam_studies.io.smartloc import read_smartloc
 from graphslam_studies.io.tuc import read_tuc
+from graphslam_studies.io.victoria_park import read_victoria_park
 from graphslam_studies.io.victoria_park_published import (
     read_slsjf_network,
     read_slsjf_observations,

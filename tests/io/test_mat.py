@@ -14,7 +14,7 @@ import scipy.io
 
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.reading import size_limit
-from graphslam.io.mat import read_mat
+from graphslam_studies.io.mat import read_mat
 
 HEAD = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H2s", 0x0100, b"IM")
 

@@ -13,7 +13,7 @@ import scipy.io
 from graphslam.core.errors import ConfigError, DataError, FormatError, GraphSlamError, MissingDataError
 from graphslam.core.geometry import align_se2, se2_transform
 from graphslam.core.log import DropCounter, SensorLog
-from graphslam.io.victoria_park import BEARINGS, LASER_POSITION, read_victoria_park
+from graphslam_studies.io.victoria_park import BEARINGS, LASER_POSITION, read_victoria_park
 from tests.reference.dead_reckoning import integrate
 
 SCANS, CONTROLS, FIXES = 60, 500, 40

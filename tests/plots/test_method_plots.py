@@ -15,8 +15,8 @@ import graphslam as gs
 from graphslam.app.run.local_maps import first_particles, local_maps
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.evaluate.submap_consistency import true_submap
 from graphslam.join.registry import join_by_method
+from graphslam_studies.evaluate.submap_consistency import true_submap
 from graphslam_studies.plots.gap import FLOOR, plot_convergence, plot_gap_along, plot_tree_gap
 from graphslam_studies.plots.method_maps import plot_method_maps
 from graphslam_studies.plots.particles import (

@@ -20,11 +20,11 @@ from graphslam.core.records import LandmarkObservations, LaserScans
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import gps_residuals
-from graphslam.plots.gps import plot_gps_vectors
-from graphslam.plots.reports import plot_report, plot_submap_chi2
-from graphslam.plots.scans import observed_points, plot_scan, scan_points
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
+from graphslam_studies.plots.gps import plot_gps_vectors
 from graphslam_studies.plots.local_map import plot_correlation, plot_local_map
+from graphslam_studies.plots.reports import plot_report, plot_submap_chi2
+from graphslam_studies.plots.scans import observed_points, plot_scan, scan_points
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,7 @@ from graphslam.app.run.pipeline import run
 from graphslam.app.worlds import simulate
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.consistency import nees, pose_error
-from graphslam.evaluate.submap_consistency import submap_nees
+from graphslam_studies.evaluate.submap_consistency import submap_nees
 from graphslam_studies.evaluate.tables import summarise
 from graphslam_studies.montecarlo.trials import Measurement, trial_seed
 

@@ -10,9 +10,9 @@ from matplotlib.collections import LineCollection
 from graphslam.core.errors import DataError
 from graphslam.core.random import SeedTree
 from graphslam_frontends.grid.config import GridFilterConfig
-from graphslam_frontends.grid.rbpf_grid import RbpfResult, run_rbpf
 from graphslam_frontends.segslam.config import SegmentationConfig, SegSlamConfig
 from graphslam_frontends.segslam.segslam import run_segslam
+from graphslam_studies.frontends.rbpf_grid import RbpfResult, run_rbpf
 from graphslam_studies.plots.particles import plot_ancestry, plot_effective, plot_pasts
 from tests.frontends.grid_world import ring
 

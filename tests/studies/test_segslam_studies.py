@@ -16,11 +16,11 @@ from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2, SE3, heading_of, remove_roll_pitch
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.grid.filter_error_model import FilterDrift
-from graphslam_frontends.grid.rbpf_grid import RbpfGridConfig, RbpfResult
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_studies import segslam_trial
 from graphslam_studies.evaluate import segslam_judge as judge
+from graphslam_studies.frontends.rbpf_grid import RbpfGridConfig, RbpfResult
 from graphslam_studies.montecarlo.definition import StudyDefinition, find_study, fingerprint
 from graphslam_studies.segslam_building import STUDY as BUILDING
 from graphslam_studies.segslam_garage import STUDY as GARAGE

@@ -11,7 +11,7 @@ import scipy.io
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.log import DropCounter
-from graphslam.io.victoria_park import LASER_POSITION, read_victoria_park
+from graphslam_studies.io.victoria_park import LASER_POSITION, read_victoria_park
 from graphslam_studies.io.victoria_park_published import (
     SLSJF_LANDMARK_OFFSET,
     read_slsjf_network,

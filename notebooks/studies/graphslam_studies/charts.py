@@ -41,12 +41,12 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations, Odometry, Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.optimise import optimise_from_join
 from graphslam.join.registry import JOINERS, methods_for
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
+from graphslam_studies.evaluate.submap_consistency import submap_nees
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam_studies.sim.point_field import PRESETS, PointFieldConfig, simulate_point_field

@@ -20,9 +20,9 @@ from graphslam.core.log import Truth
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees, nees, pose_error, vector_pose_error
-from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam.join.joined_map import JoinedMapView, landmark_scalars
 from graphslam.join.submap_solver import SubmapEstimate
+from graphslam_studies.evaluate.submap_consistency import submap_nees
 from graphslam_studies.frontends.snapshot import Snapshot
 from graphslam_studies.montecarlo.trials import Measurement
 

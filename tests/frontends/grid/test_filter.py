@@ -13,8 +13,8 @@ from graphslam.core.random import SeedTree
 from graphslam.evidence.memory import measure_memory
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import GridFilter
-from graphslam_frontends.grid.rbpf_grid import run_rbpf
 from graphslam_frontends.odometry.steps import Steps
+from graphslam_studies.frontends.rbpf_grid import run_rbpf
 from tests.frontends.grid_world import ring
 
 CONFIG = GridFilterConfig(particles=8, voxel_size=0.2, heading_walk=0.02)

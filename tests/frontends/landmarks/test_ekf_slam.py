@@ -14,12 +14,12 @@ from graphslam.core.geometry import tangent_to_vector_covariance
 from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.association import pair_agreement
-from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.landmarks.config import StoppingConfig
 from graphslam_frontends.landmarks.ekf import Ekf
 from graphslam_frontends.landmarks.ekf_config import EkfConfig
 from graphslam_studies.charts import ChartConfig, draw_log
+from graphslam_studies.evaluate.submap_consistency import submaps_consistency
 from graphslam_studies.frontends.ekf_slam import EkfSlam, EkfSlamConfig, ekf_snapshots
 from graphslam_studies.frontends.snapshot import Snapshot
 

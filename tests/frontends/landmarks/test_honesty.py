@@ -12,11 +12,11 @@ from graphslam.core.gaussian import Gaussian
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.metrics import Metrics, flag_counts, front_end_metrics
-from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
 from graphslam_frontends.landmarks.moment_consistency import consistency_flag, pool_gaussians, variance_bounds
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 from graphslam_frontends.odometry.motion import MotionNoise
+from graphslam_studies.evaluate.submap_consistency import submaps_consistency
 
 
 def test_pool_is_unbiased_for_estimates_of_one_posterior():

@@ -13,8 +13,8 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.se3 import se3_inverse, se3_transform, so3_exp
-from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam_frontends.landmarks.points import Points, PointsConfig
+from graphslam_studies.evaluate.submap_consistency import submap_nees
 
 
 def flight(seed: int, **changes: float) -> SensorLog:

@@ -15,7 +15,6 @@ from graphslam.core.geometry import se2_compose
 from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
-from graphslam.evaluate.submap_consistency import submap_nees
 from graphslam_frontends.landmarks.config import DelayedInitialisation, RbpfEkfConfig, StoppingConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem, resolve_mirror_ambiguity
@@ -35,6 +34,7 @@ from graphslam_frontends.landmarks.range_only_kernels import (
 )
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 from graphslam_frontends.odometry.motion import MotionNoise
+from graphslam_studies.evaluate.submap_consistency import submap_nees
 from graphslam_studies.frontends.rbpf_slam import RbpfSlamConfig, rbpf_snapshots
 from tests.reference import trilateration as slow
 

@@ -12,12 +12,12 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import wrap_angle
 from graphslam.core.log import DropCounter
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.submap_consistency import submaps_consistency
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, StoppingConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 from graphslam_frontends.landmarks.stopping import StoppingRule
 from graphslam_frontends.landmarks.summarise import common_features, gaussian_of_particles, winning_association
+from graphslam_studies.evaluate.submap_consistency import submaps_consistency
 
 
 def particle_set(n=4, observations=6, **config):

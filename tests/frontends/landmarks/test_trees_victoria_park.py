@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.records import LandmarkObservations, LaserScans
-from graphslam.io.victoria_park import read_victoria_park
 from graphslam_frontends.detectors.trees import TreeDetectorConfig, detect_trees, find_trunks
+from graphslam_studies.io.victoria_park import read_victoria_park
 from graphslam_studies.io.victoria_park_published import read_ufastslam_detections
 from tests.reference.trees import detect_scan
 

@@ -23,8 +23,8 @@ from graphslam.core.reading import integer_mask
 from graphslam.core.records import LandmarkObservations, VelocityControls
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED, usable_records
-from graphslam.io.mat import read_mat
 from graphslam.io.text_records import find_text_file, read_table
+from graphslam_studies.io.mat import read_mat
 
 RANGE_SIGMA = 1.5
 """Stated σ of a range [m]; the recording states none."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from graphslam.io.reader import Reader
-from graphslam.io.recognise import first_rows
+from graphslam.io.recognise import first_rows, parse_numbers
 from graphslam.io.source_probe import ReaderMatch, SourceProbe, plain_name
 
 
@@ -31,6 +31,15 @@ def _slsjf_network(look: SourceProbe) -> ReaderMatch | None:
 def _ufastslam(look: SourceProbe) -> ReaderMatch | None:
     found = look.named("ufastslam_observationdistance.txt")
     return ReaderMatch("detections of trees as UFastSLAM publishes them") if found and look.path.is_dir() else None
+
+
+def _victoria_park(look: SourceProbe) -> ReaderMatch | None:
+    laser = look.named("laser.txt")
+    if laser is None or parse_numbers(look.head(laser)[:60].decode("latin-1").rpartition("\t")[0]) is None:
+        return None
+    if look.path.is_file() or look.named("drs.txt") is None:
+        return ReaderMatch("LASER.txt of the ACFR", "the folder with DRS.txt, speed and steering, in it")
+    return ReaderMatch("laser, speed and steering of the ACFR in the text form of Victoria Park (LASER.txt, DRS.txt)")
 
 
 def _mrclam(look: SourceProbe) -> ReaderMatch | None:
@@ -124,4 +133,10 @@ KITTI_GPS = Reader("KITTI positions of GTSAM: Time,X,Y,Z", f"{_IO}.kitti_gps:rea
 LIDAR_PACK = Reader("packed clouds: xyz_i16_planar.npy", f"{_IO}.lidar_pack:read_lidar_pack", _lidar_pack)
 SLSJF_OBSERVATIONS = Reader(
     "observations and identities of 2D I-SLSJF", f"{_IO}.victoria_park_published:read_slsjf_observations", _never
+)
+VICTORIA_PARK = Reader(
+    "laser, speed and steering of a car as text of the ACFR: LASER.txt, DRS.txt, perhaps GPS.txt",
+    f"{_IO}.victoria_park:read_victoria_park",
+    _victoria_park,
+    preset="victoria-park",
 )

@@ -18,7 +18,7 @@ from graphslam.core.errors import CovarianceError, FormatError, MissingDataError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.reading import integer_mask
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.io.mat import read_mat
+from graphslam_studies.io.mat import read_mat
 
 _NAME = re.compile(r"localmap_(\d+)\.mat")
 

@@ -4,7 +4,7 @@
 * 2D I-SLSJF (Huang, Wang, Dissanayake, IEEE T-RO 24(5), 2008): range, bearing and identity, and the same as a
   network of relative poses and Cartesian observations with covariances.
 
-Bearings are turned to straight ahead, and stamps to the clock of :mod:`graphslam.io.victoria_park`.
+Bearings are turned to straight ahead, and stamps to the clock of :mod:`graphslam_studies.io.victoria_park`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.reading import integer_mask
 from graphslam.core.records import LandmarkObservations
 from graphslam.io.clock import MAX_DROPPED, usable_records
-from graphslam.io.mat import read_mat
-from graphslam.io.victoria_park import LASER_POSITION, mat_seconds, read_numbers
+from graphslam_studies.io.mat import read_mat
+from graphslam_studies.io.victoria_park import LASER_POSITION, mat_seconds, read_numbers
 
 SLSJF_LANDMARK_OFFSET = 1_000_000
 """Added to feature ids in :func:`read_slsjf_network`, whose poses and landmarks share one space of ids."""

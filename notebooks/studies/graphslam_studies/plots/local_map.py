@@ -9,9 +9,9 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import tangent_to_vector_covariance
 from graphslam.core.log import Truth
 from graphslam.core.submap import Submap
-from graphslam.evaluate.submap_consistency import true_submap
 from graphslam.plots import style
 from graphslam.plots.map import landmark_blocks, plot_ellipses
+from graphslam_studies.evaluate.submap_consistency import true_submap
 
 
 def plot_local_map(

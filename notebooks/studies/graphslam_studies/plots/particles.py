@@ -15,12 +15,12 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.log import Truth
 from graphslam.core.submap import Submap
-from graphslam.evaluate.submap_consistency import true_submap
 from graphslam.plots import style
 from graphslam.plots.map import landmark_blocks, plot_ellipses
-from graphslam_frontends.grid.rbpf_grid import RbpfResult
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.segslam.result import SegSlamResult
+from graphslam_studies.evaluate.submap_consistency import true_submap
+from graphslam_studies.frontends.rbpf_grid import RbpfResult
 from graphslam_studies.plots.exit_points import draw_exits
 
 _COLOURS = (style.ESTIMATE, style.VERMILION, style.PURPLE, style.ORANGE, style.SKY)

@@ -31,7 +31,7 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.reading import read_text
 from graphslam.core.records import AckermannGeometry, Gps, LaserScans, SteeringControls
 from graphslam.io.clock import usable_records
-from graphslam.io.mat import read_mat
+from graphslam_studies.io.mat import read_mat
 
 LASER_POSITION = (3.78, 0.50)
 """Laser in the base frame [m]."""
