@@ -80,12 +80,3 @@ def enu_to_geodetic(enu: ArrayLike, latitude: float, longitude: float, height: f
         p = np.concatenate([p, np.zeros((*p.shape[:-1], 1))], -1)
     origin = geodetic_to_ecef([latitude, longitude, height])
     return ecef_to_geodetic(origin + p @ tangent_axes(latitude, longitude))
-
-
-def geodetic_to_enu(geodetic: ArrayLike, latitude: float, longitude: float, height: float = 0.0) -> Array:
-    """Inverse of :func:`enu_to_geodetic`: east, north, up [m] ``(..., 3)``."""
-    g = np.asarray(geodetic, dtype=np.float64)
-    check_geodetic(g[..., 0], g[..., 1])
-    check_geodetic(latitude, longitude)
-    origin = geodetic_to_ecef([latitude, longitude, height])
-    return np.asarray((geodetic_to_ecef(g) - origin) @ tangent_axes(latitude, longitude).T)

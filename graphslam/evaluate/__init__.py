@@ -6,7 +6,7 @@ _EXPORTS = {
     "consistency": "Consistency",
     "association": "match_observations",
     "gps": "gps_residuals move_to_gps_frame",
-    "gps_repeatability": "fix_segments revisit_disagreement segment_table",
+    "gps_repeatability": "fix_segments",
     "dead_reckoning_baseline": "dead_reckoned_path",
     "trajectory_error": "ate fit_alignment",
 }

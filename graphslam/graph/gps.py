@@ -18,7 +18,6 @@ from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_to_matrix, skew
-from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.gps import AntennaRecord, BiasPriorRecord, GpsRecord, antenna_terms
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.noise import RobustKernel, whitener
@@ -134,27 +133,6 @@ class AttachedFix:
     covariance: Array
     point: int | None = None
     """Row of the point of the path that it measures, where its submap has one."""
-
-
-def antenna_in_base(trajectory: Trajectory, times: Array, lever: Array) -> tuple[Array, Array]:
-    """Antenna in the base frame, and its covariance from the submap's own trajectory.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        ``T_start_body(t)``; covariances in the right tangent, none = the arm is taken as exact.
-    times : (q,)
-    lever : (dim,)
-        Antenna in the body frame [m].
-
-    Returns
-    -------
-    arm : (q, dim)
-    covariance : (q, dim, dim)
-        See :func:`lever_arm`.
-    """
-    covariances = None if trajectory.covariances is None else trajectory.interpolate_covariance(times)
-    return lever_arm(trajectory.interpolate(times), covariances, lever)
 
 
 def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ _EXPORTS = {
     "alternatives": "Alternative rank_alternatives",
     "minimum_entropy": "MapHypothesis",
     "terrain.lines": "lines_of_scans",
-    "terrain.plan": "CostConfig cost_map plan_vehicle_path",
+    "terrain.plan": "CostConfig cost_map",
     "terrain.pyramid": "Pyramid",
     "terrain.tables": "TerrainWeights fixed_tables read_tables",
     "terrain.vehicle": "CELLS LineSensor Vehicle",

@@ -3,18 +3,18 @@
 from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
-    "comparison": "comparison_figure plot_comparison",
+    "comparison": "comparison_figure",
     "consistency": "plot_consistency",
-    "evidence": "plot_heights plot_section plot_sharing",
+    "evidence": "plot_heights plot_section",
     "fused_map": "plot_cut plot_storey",
     "map": "plot_ellipses plot_map",
     "paths": "plot_paths",
     "refined": "plot_before_after",
-    "segments": "plot_entropies plot_samples plot_scores plot_segments sample_paths",
+    "segments": "plot_segments",
     "style": "NAMES use_palette",
     "submaps": "plot_submap_chain",
     "surface": "plot_surface",
-    "terrain": "plot_bands plot_terrain",
+    "terrain": "plot_terrain",
     "trajectory": "plot_gps_residuals",
     "residual_consistency": "plot_innovations plot_loop_matrix",
 }

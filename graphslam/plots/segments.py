@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +14,10 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.plots import style
-from graphslam_frontends.segslam.sampling import OPEN, MapSample, nearest_step
-from graphslam_frontends.segslam.segmap import KINDS, MATCH, SegMap
 
 Path = Trajectory | npt.ArrayLike
 
-_REASON_STYLES = ("-", "--", ":", "-.")
+REASON_STYLES = ("-", "--", ":", "-.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,69 +32,6 @@ class DrawnMatch:
 
     here: Array
     there: Array
-
-
-def plot_scores(
-    ax: Axes | None,
-    lengths: npt.ArrayLike,
-    scores: npt.ArrayLike,
-    *,
-    boundaries: Sequence[tuple[float, str]] = (),
-    threshold: float | None = None,
-    relative: float | None = None,
-    title: str | None = None,
-) -> Axes:
-    """Predictive score along the path, with the boundaries of segments and why they are there (SegSLAM Fig. 6).
-
-    Parameters
-    ----------
-    lengths, scores : (n,)
-        Metres driven; share of the look-ahead beams that the maps predict, NaN where there is none.
-    boundaries : sequence of (length, reason)
-    threshold : float, optional
-        Score below which a segment ends.
-    relative : float, optional
-        … or below this share of the running maximum of its segment, which is drawn.
-
-    Raises
-    ------
-    DataError
-        Lengths and scores differ in number, or fall.
-    """
-    s, y = np.asarray(lengths, dtype=np.float64), np.asarray(scores, dtype=np.float64)
-    if s.shape != y.shape or s.ndim != 1 or np.any(np.diff(s) < 0):
-        raise DataError("scores do not belong to the path", got=f"{y.shape} on {s.shape}", wanted="one each, in order")
-    ax = style.new_axes(ax, (8.0, 3.2))
-    ax.plot(s, y, color=style.ESTIMATE, lw=1.1, marker="o", ms=2.2, label="predictive score", zorder=3)
-    at = sorted(boundaries)
-    reasons = sorted({why for _, why in at})
-    for length, why in at:
-        k = reasons.index(why)
-        ax.axvline(length, color=style.colour(k + 1), ls=_REASON_STYLES[k % len(_REASON_STYLES)], lw=1.0, zorder=2)
-    for k, why in enumerate(reasons):
-        n = sum(w == why for _, w in at)
-        ax.plot([], [], color=style.colour(k + 1), ls=_REASON_STYLES[k % len(_REASON_STYLES)], lw=1.0,
-                label=f"segment ends: {why} ({n})")  # fmt: skip
-    if threshold:
-        ax.axhline(threshold, color=style.GREY, lw=0.8, label=f"threshold {threshold:g}")
-    if relative:
-        ax.plot(s, relative * running_maximum(s, y, [length for length, _ in at]), color=style.GREY, lw=0.8, ls="--",
-                drawstyle="steps-post", label=f"{relative:g} × running maximum")  # fmt: skip
-    ax.set_ylim(0.0, 1.0)
-    ax.set_xlabel("path [m]")
-    ax.set_ylabel("share of beams predicted")
-    _finish(ax, title)
-    return ax
-
-
-def running_maximum(lengths: Array, scores: Array, boundaries: Sequence[float]) -> Array:
-    """Maximum of the scores so far since the last boundary before or at each length ``(n,)``; NaN before the first."""
-    segment = np.searchsorted(np.sort(np.asarray(boundaries, dtype=np.float64)), lengths, side="left")
-    out = np.full(len(scores), np.nan)
-    for k in np.unique(segment):
-        rows = np.flatnonzero(segment == k)
-        out[rows] = np.fmax.accumulate(scores[rows])
-    return out
 
 
 def plot_segments(
@@ -131,11 +65,11 @@ def plot_segments(
     """
     if not paths:
         raise DataError("no segment to draw")
-    i, j = _plane(plane)
-    rows = [_positions(p, max(i, j)) for p in paths]
+    i, j = plan_axes(plane)
+    rows = [plan_positions(p, max(i, j)) for p in paths]
     ax = style.new_axes(ax)
     if truth is not None:
-        t = _positions(truth, max(i, j))
+        t = plan_positions(truth, max(i, j))
         ax.plot(t[:, i], t[:, j], color=style.TRUTH, lw=0.8, ls="--", label="truth", zorder=1)
     for k, p in enumerate(rows):
         ax.plot(p[:, i], p[:, j], color=style.colour(k), lw=1.6, zorder=2)
@@ -148,163 +82,30 @@ def plot_segments(
         ax.plot([here[i], there[i]], [here[j], there[j]], color=style.BLACK, lw=1.2, marker="o", ms=5.0, mfc="none",
                 label=f"matches ({len(ties)})" if k == 0 else None, zorder=5)  # fmt: skip
     style.metric_axes(ax, *plane)
-    _finish(ax, title)
+    finish_plan(ax, title)
     return ax
 
 
-def sample_paths(
-    segmap: SegMap, sample: MapSample, *, frame: Literal["root", "first"] = "root"
-) -> tuple[list[Array], list[DrawnMatch], list[str]]:
-    """Paths of the closed segments of a map sample, in the order of time, for :func:`plot_segments`; the matches
-    between them; and their labels.
-
-    Parameters
-    ----------
-    frame : {"root", "first"}
-        In the frame of the sample's root, or of its first segment in time.
-
-    Returns
-    -------
-    paths : list of (n, dim)
-    ties : list of DrawnMatch
-        Of segments that entered a map which the sample holds.
-    labels : list of str
-        Number in time, with "m" where an older map was entered.
-    """
-    g, t = segmap.group, segmap.table
-    if frame not in ("root", "first"):
-        raise ConfigError(f"frame {frame!r} of a map sample; known: root, first")
-    poses = sample.poses
-    if frame == "first":
-        first = g.inverse(poses[int(sample.in_time[0])])
-        poses = g.compose(np.broadcast_to(first, poses.shape), poses)
-    place = {int(i): k for k, i in enumerate(sample.segments.tolist()) if i != OPEN}
-    paths: list[Array] = []
-    ties: list[DrawnMatch] = []
-    labels: list[str] = []
-    for k in sample.in_time.tolist():
-        i = int(sample.segments[k])
-        if i == OPEN:
-            continue
-        s = segmap[i]
-        paths.append(_placed(poses[k], s.path))
-        labels.append(f"{len(labels)}{'m' if s.kind == KINDS[MATCH] else ''}")
-        if s.kind != KINDS[MATCH] or s.source not in place:
-            continue
-        source = segmap[s.source]
-        seen = g.compose(g.inverse(t.link[i]), s.T_entry)  # the body in the frame of the entered segment
-        at = poses[place[s.source]]
-        nearest = source.path[nearest_step(segmap, s.source, seen) - source.interval[0]]
-        ties.append(DrawnMatch(paths[-1][0], _placed(at, nearest[None])[0]))
-    return paths, ties, labels
-
-
-def plot_samples(
-    ax: Axes | None,
-    trajectories: Sequence[Path],
-    *,
-    best: int | None = None,
-    truth: Path | None = None,
-    plane: str = "xy",
-    what: str = "map sample",
-    title: str | None = None,
-) -> Axes:
-    """Map samples over each other: where they agree, the map is sure.
-
-    Parameters
-    ----------
-    trajectories : sequence of Trajectory or (n, dim)
-        Of the samples, in one frame.
-    best : int, optional
-        The one to set off, as that of least entropy.
-    truth : Trajectory or (n, dim), optional
-    plane : {"xy", "xz", "yz"}
-    what : str
-        Name of one of them, in the legend.
-    """
-    if not trajectories:
-        raise DataError("no sample to draw")
-    i, j = _plane(plane)
-    ax = style.new_axes(ax)
-    n = len(trajectories)
-    for k, path in enumerate(trajectories):
-        p = _positions(path, max(i, j))
-        if k != best:
-            ax.plot(p[:, i], p[:, j], color=style.SKY, lw=0.7, alpha=max(0.12, min(1.0, 4.0 / n)), zorder=2)
-    ax.plot([], [], color=style.SKY, lw=1.2, label=f"{n} {what}{'s' if n != 1 else ''}")
-    if best is not None:
-        p = _positions(trajectories[best], max(i, j))
-        ax.plot(p[:, i], p[:, j], color=style.ESTIMATE, lw=1.5, label="the best of them", zorder=3)
-    if truth is not None:
-        t = _positions(truth, max(i, j))
-        ax.plot(t[:, i], t[:, j], color=style.TRUTH, lw=0.9, ls="--", label="truth", zorder=4)
-    style.metric_axes(ax, *plane)
-    _finish(ax, title)
-    return ax
-
-
-def plot_entropies(
-    ax: Axes | None,
-    entropies: Mapping[str, npt.ArrayLike],
-    *,
-    bins: int = 20,
-    unit: str = "nat m³",
-    title: str | None = None,
-) -> Axes:
-    """Histograms of the entropy of map samples, a method each; lower is a clearer map (SegSLAM eq. 20–22).
-
-    Parameters
-    ----------
-    entropies : mapping of label to (n,)
-        A single value is drawn as a line.
-    bins : int
-        Of all histograms together, so that areas compare.
-
-    Raises
-    ------
-    DataError
-        Nothing to draw, or a value that is not finite.
-    """
-    values = {k: np.atleast_1d(np.asarray(v, dtype=np.float64)) for k, v in entropies.items()}
-    if not values or any(len(v) == 0 or not np.all(np.isfinite(v)) for v in values.values()):
-        raise DataError("no entropies to draw", wanted="finite numbers for each label")
-    ax = style.new_axes(ax, (7.0, 3.2))
-    everything = np.concatenate(list(values.values()))
-    low, high = float(everything.min()), float(everything.max())
-    edges = np.linspace(low, high, bins + 1).tolist() if high > low else [low - 0.5, low + 0.5]
-    for k, (label, v) in enumerate(values.items()):
-        if len(v) == 1:
-            ax.axvline(v[0], color=style.colour(k), lw=1.6, ls="--", label=f"{label}: {v[0]:,.0f}")
-            continue
-        ax.hist(v, edges, histtype="stepfilled", alpha=0.35, color=style.colour(k), zorder=2)
-        ax.hist(v, edges, histtype="step", color=style.colour(k), lw=1.2, zorder=3,
-                label=f"{label}: least {v.min():,.0f}, median {np.median(v):,.0f} of {len(v)}")  # fmt: skip
-    ax.set_xlabel(f"entropy of the map [{unit}]")
-    ax.set_ylabel("samples")
-    _finish(ax, title)
-    return ax
-
-
-def _placed(T: Array, poses: Array) -> Array:
+def placed_segments(T: Array, poses: Array) -> Array:
     """Positions ``(n, dim)`` of poses moved into another frame."""
     g = group_of(T)
     return g.compose(np.broadcast_to(T, poses.shape), poses)[:, : g.dim]
 
 
-def _positions(path: Path, column: int) -> Array:
+def plan_positions(path: Path, column: int) -> Array:
     p = path.positions if isinstance(path, Trajectory) else np.asarray(path, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] <= column or not len(p):
         raise DataError("a path cannot be drawn in this plane", got=p.shape, wanted=f"(n ≥ 1, ≥ {column + 1})")
     return p
 
 
-def _plane(plane: str) -> tuple[int, int]:
+def plan_axes(plane: str) -> tuple[int, int]:
     if plane not in ("xy", "xz", "yz"):
         raise ConfigError(f"plane {plane!r}; known: xy, xz, yz")
     return "xyz".index(plane[0]), "xyz".index(plane[1])
 
 
-def _finish(ax: Axes, title: str | None) -> None:
+def finish_plan(ax: Axes, title: str | None) -> None:
     if title:
         ax.set_title(title, fontsize="medium")
     style.legend(ax)

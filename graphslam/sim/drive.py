@@ -259,24 +259,3 @@ def drive_motion(world: World, config: DriveConfig = DriveConfig(), caster: RayC
     if caster is not None:
         way = roll_by_floor(way, caster, config.track)
     return RouteMotion(smooth_route(way, config.wheelbase), world.speed, config)
-
-
-def drive_through_world(
-    world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None
-) -> Trajectory:
-    """Drive through a world: ``T_world_base(t)``, the base on the floor between the wheels.
-
-    Straight lines and arcs over the waypoints, smoothed over the wheelbase; from rest to rest, more slowly where the
-    way turns sharply. Pitch follows the way; roll follows the floor where a ray caster shows it.
-
-    Parameters
-    ----------
-    caster : RayCaster, optional
-        Of the world's mesh.
-
-    Returns
-    -------
-    Trajectory
-        In the frame of the world, ``config.rate`` poses a second.
-    """
-    return drive_motion(world, config, caster).trajectory()

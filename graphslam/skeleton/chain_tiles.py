@@ -12,7 +12,7 @@ same worker or by another one, at any moment, and nothing changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from graphslam.core.atomic import read_json, sweep_parts, write_json
 from graphslam.core.cluster import task_runner
-from graphslam.core.errors import ConfigError, DataError, FormatError, SolverError
+from graphslam.core.errors import DataError, FormatError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import segment_kernels as kernels
@@ -103,25 +103,6 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
     between = store_arrays(out, {name: np.concatenate([t[name] for t in ties]) for name in ties[0]})
     write_json(out / _INDEX, {"format": FORMAT, "ties": between, "tiles": tiles})
     return out
-
-
-def cut_chain(graph: ChainGraph, size: int) -> Iterator[ChainPiece]:
-    """A chain in memory, cut for :func:`chain_to_disk` into pieces of ``size`` links."""
-    if size < 1:
-        raise ConfigError(f"tiles of {size} links; wanted 1 or more")
-    last = graph.ends.max(axis=1) if len(graph.ends) else np.empty(0, np.int64)
-    for a in range(0, graph.poses - 1, size):
-        b = min(a + size, graph.poses - 1)
-        own = (last > a) & (last <= b)
-        yield ChainPiece(
-            graph.rotation[a:b],
-            graph.translation[a:b],
-            graph.covariance[a:b] if len(graph.covariance) > 1 else graph.covariance,
-            graph.ends[own],
-            graph.loop_rotation[own],
-            graph.loop_translation[own],
-            graph.loop_covariance[own] if len(graph.loop_covariance) > 1 else graph.loop_covariance,
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,9 @@ import graphslam
 from graphslam.app.cli import app
 from graphslam.app.export import export, geographic_map, parse_datum
 from graphslam.core.errors import ConfigError, GeometryError, UnknownNameError
-from graphslam.core.geodesy import geodetic_to_enu
 from graphslam.core.geometry import se2_transform
 from graphslam.io.geographic import KML_NAMESPACE, GeographicMap, write_geojson, write_kml
+from tests.reference.local_tangent import geodetic_to_enu
 
 DATUM = (-33.88, 151.19)
 NS = {"k": KML_NAMESPACE}

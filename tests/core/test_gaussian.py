@@ -19,10 +19,10 @@ from graphslam.core.gaussian import (
     ellipse_rings,
     equal_tail_gate,
     first_no_covariance,
-    information_matrices,
     largest_sigmas,
     moment_match,
 )
+from graphslam_studies.evaluate.information import information_matrices
 
 
 def random_covariance(rng: np.random.Generator, n: int) -> np.ndarray:

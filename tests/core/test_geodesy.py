@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import GeometryError
-from graphslam.core.geodesy import ecef_to_geodetic, enu_to_geodetic, geodetic_to_ecef, geodetic_to_enu
+from graphslam.core.geodesy import ecef_to_geodetic, enu_to_geodetic, geodetic_to_ecef
 from tests.reference.geodesy import iterate_geodetic
+from tests.reference.local_tangent import geodetic_to_enu
 
 
 def test_closed_form_equals_iteration(rng):

@@ -9,7 +9,8 @@ from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals, gps_residuals
-from graphslam.evaluate.gps_repeatability import fix_segments, revisit_disagreement, segment_table
+from graphslam.evaluate.gps_repeatability import fix_segments
+from graphslam_studies.evaluate.gps_repeatability import revisit_disagreement, segment_table
 
 
 def residuals(times: list[float], points: list[list[float]], errors: list[list[float]]) -> GpsResiduals:

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from graphslam.core.errors import DataError
-from graphslam.evaluate.intervals import grouped_mean_interval, mean_interval, ratio_of_means, share_interval
+from graphslam_studies.evaluate.intervals import grouped_mean_interval, mean_interval, ratio_of_means, share_interval
 
 
 def test_students_interval_covers_as_often_as_it_says() -> None:

@@ -10,13 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.core.errors import DataError
-from graphslam.evaluate.association import (
-    AssociationErrors,
-    association_errors,
-    majority_identity,
-    match_observations,
-    pair_agreement,
-)
+from graphslam.evaluate.association import match_observations, pair_agreement
+from graphslam_studies.evaluate.association import AssociationErrors, association_errors, majority_identity
 
 labels = st.lists(st.integers(-1, 4), min_size=2, max_size=14)
 

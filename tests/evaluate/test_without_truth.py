@@ -7,18 +7,20 @@ import pytest
 from scipy import stats
 
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import se2_compose, se2_compose_covariance, se2_exp, se2_transform
+from graphslam.core.geometry import se2_compose, se2_exp, se2_transform
 from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import GpsInnovations, _arm_covariance, gps_innovations
 from graphslam.evaluate.residual_consistency import class_consistency, correlated_dof, two_sided_bounds
-from graphslam.graph.gps import GpsConfig, antenna_in_base
+from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 from graphslam.solve.registry import make_solver
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf, RbpfEkfConfig
+from tests.reference.antenna import antenna_in_base
+from tests.reference.compose_covariance import se2_compose_covariance
 from tests.reference.graph_chain import make_chain
 from tests.reference.hat_matrix import class_figures, numeric_jacobian
 

@@ -16,10 +16,10 @@ from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.graph_loops import GROUP, GraphLoops, chain_of_graph, places_of_graph
 from graphslam.loops.ledger import LoopLedger
 from graphslam.loops.loops import LoopCloser
-from graphslam.loops.places import loop_places
 from graphslam.solve.batch import BatchSolver
 from tests.reference.loop_chain import STEP, chain_of, loop_of, right_loops, square_poses
 from tests.reference.loop_network import LoopNetwork
+from tests.reference.loop_places import loop_places
 
 
 def submaps_of(poses: Array, rng: np.random.Generator, length: int = 12) -> list[Submap]:

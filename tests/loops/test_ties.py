@@ -15,8 +15,9 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.overlap_constraints import OverlapConfig, overlap_candidates
-from graphslam.loops.places import Places, loop_places
+from graphslam.loops.places import Places
 from graphslam.solve.batch import BatchSolver
+from tests.reference.loop_places import loop_places
 
 OUT = 20
 """Poses on the way into a dead end, a metre apart; the way out is as long."""

@@ -16,7 +16,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.terrain.line_kernels import ABOVE, OVERHANG, STEP, SUPPORT, DetectorSettings
 from graphslam.maps.terrain.lines import DetectorConfig, ScanLines, lines_of_clouds, lines_of_scans, observe_terrain
-from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, plan_vehicle_path, save_cost_map
+from graphslam.maps.terrain.plan import CostConfig, cost_map, occupancy_values, save_cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass
 from graphslam.maps.terrain.tables import (
     BINS,
@@ -29,6 +29,7 @@ from graphslam.maps.terrain.tables import (
 )
 from graphslam.maps.terrain.vehicle import CELLS, LineSensor, Vehicle
 from graphslam_studies.maps.learning import fit_calibration, fit_weights, ratios_of
+from graphslam_studies.maps.plan import plan_vehicle_path
 from graphslam_studies.sim.street import StreetRobot, draw_street, drive_street
 from tests.reference.map_server import read_map_server
 from tests.reference.plain_terrain import plain_rows

@@ -8,7 +8,8 @@ import pytest
 
 from graphslam.core.errors import ConfigError
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.plots.evidence import grid_section, plot_heights, plot_section, plot_sharing
+from graphslam.plots.evidence import grid_section, plot_heights, plot_section
+from graphslam_studies.plots.evidence import plot_sharing
 
 
 def room() -> EvidenceGrid:

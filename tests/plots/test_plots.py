@@ -19,12 +19,12 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import Consistency
 from graphslam.evaluate.gps import gps_residuals
 from graphslam.plots import style
-from graphslam.plots.comparison import plot_comparison
 from graphslam.plots.consistency import plot_consistency
 from graphslam.plots.map import ellipse_axes, landmark_blocks, plot_ellipses, plot_map
 from graphslam.plots.submaps import chain_poses, plot_submap_chain
 from graphslam.plots.trajectory import plot_gps_residuals
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
+from graphslam_studies.plots.comparison import plot_comparison
 
 
 @pytest.fixture(autouse=True)

@@ -8,18 +8,11 @@ import pytest
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_compose
-from graphslam.plots.segments import (
-    DrawnMatch,
-    plot_entropies,
-    plot_samples,
-    plot_scores,
-    plot_segments,
-    running_maximum,
-    sample_paths,
-)
+from graphslam.plots.segments import DrawnMatch, plot_segments
 from graphslam_frontends.segslam.paths import concatenate_segments
 from graphslam_frontends.segslam.sampling import grow_sample, root_of_segment
 from graphslam_frontends.segslam.segmap import SegMap, SegmentEntry
+from graphslam_studies.plots.segments import plot_entropies, plot_samples, plot_scores, running_maximum, sample_paths
 from tests.reference.segmap_twin import flat_grid, match_entry, small_segmap, straight
 
 

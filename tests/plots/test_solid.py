@@ -9,10 +9,10 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.maps.terrain.pyramid import TerrainMap
 from graphslam.plots.surface import plot_surface
-from graphslam.plots.terrain import plot_bands
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.world import World
 from graphslam_studies.plots.solid import ViewDirection, plot_cloud, plot_solid
+from graphslam_studies.plots.terrain import plot_bands
 
 
 def boxes() -> World:

@@ -10,8 +10,9 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.se3 import quat_rotate, se3_between, so3_log
 from graphslam.sim.crawler_sensors import roll_pitch_angles
-from graphslam.sim.drive import DriveConfig, RouteMotion, drive_motion, drive_through_world
+from graphslam.sim.drive import DriveConfig, RouteMotion, drive_motion
 from graphslam.sim.raycast import RayCaster
+from tests.reference.drive_path import drive_through_world
 from tests.reference.plain_mesh import hall, quad
 
 

@@ -19,8 +19,9 @@ from graphslam.app.cli import app
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.skeleton import chain_tiles as tiles
 from graphslam.skeleton.chain_graph import ChainGraph, relax_chain
-from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, cut_chain, relax_tiles, tasks_of
+from graphslam.skeleton.chain_tiles import ChainPiece, chain_to_disk, relax_tiles, tasks_of
 from graphslam.skeleton.landmark_kernels import Poses
+from tests.reference.chain_pieces import cut_chain
 from tests.skeleton.test_chain_graph import drawn
 
 # inside tiles, between them, at their borders, crossed, twice, and into the same pose from both sides

@@ -12,10 +12,10 @@ from matplotlib.colors import to_rgba
 
 from graphslam.core.errors import DataError
 from graphslam.plots import style
-from graphslam.plots.segments import sample_paths
 from graphslam_frontends.segslam.sampling import grow_sample, root_of_segment
 from graphslam_frontends.segslam.segmap import SegMap, SegmentEntry
 from graphslam_studies.plots.segmap import plot_expansion, plot_score_map, plot_segmap
+from graphslam_studies.plots.segments import sample_paths
 from tests.reference.segmap_twin import flat_grid, match_entry, small_segmap, straight
 
 

@@ -10,7 +10,7 @@ from matplotlib.collections import EllipseCollection
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.submap import Submap
-from graphslam_frontends.segslam.covariance import ExitNees
+from graphslam_studies.evaluate.exit_nees import ExitNees
 from graphslam_studies.plots.segment_exits import plot_exit_nees, plot_segment_exit
 
 

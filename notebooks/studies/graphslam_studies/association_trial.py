@@ -22,12 +22,13 @@ from graphslam.core.geometry import Array, se2_between, se2_inverse, se2_transfo
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.evaluate.association import AssociationErrors, association_errors, majority_identity, pair_agreement
+from graphslam.evaluate.association import pair_agreement
 from graphslam.evaluate.consistency import nees, vector_pose_error
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential
+from graphslam_studies.evaluate.association import AssociationErrors, association_errors, majority_identity
 from graphslam_studies.evaluate.submap_consistency import submap_nees
 from graphslam_studies.montecarlo.trials import Measurement
 

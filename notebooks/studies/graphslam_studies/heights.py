@@ -29,8 +29,8 @@ import pandas as pd
 from graphslam.app.machine import one_blas_thread
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.intervals import grouped_mean_interval, mean_interval
 from graphslam_studies import segslam_report as tables
+from graphslam_studies.evaluate.intervals import grouped_mean_interval, mean_interval
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam_studies.refinement_trial import RefinementTrial, RefinementTrialConfig, drawn_garage

@@ -14,7 +14,7 @@ import pandas as pd
 from graphslam.core.gaussian import chi2_mean_bounds, chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.intervals import grouped_mean_interval, mean_interval, ratio_of_means, share_interval
+from graphslam_studies.evaluate.intervals import grouped_mean_interval, mean_interval, ratio_of_means, share_interval
 from graphslam_studies.montecarlo.worlds_study import whole
 from graphslam_studies.segslam_trial import family_of
 

@@ -38,10 +38,11 @@ from scipy.ndimage import binary_closing, distance_transform_edt
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.maps.terrain.lines import ScanLines, lines_of_scans
-from graphslam.maps.terrain.plan import CostConfig, CostMap, PlannedPath, cost_map, plan_vehicle_path
+from graphslam.maps.terrain.plan import CostConfig, CostMap, cost_map
 from graphslam.maps.terrain.pyramid import Pyramid, TerrainClass, TerrainMap
 from graphslam.maps.terrain.tables import read_tables
 from graphslam.maps.terrain.vehicle import CELLS, Vehicle
+from graphslam_studies.maps.plan import PlannedPath, plan_vehicle_path
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy
 from graphslam_studies.sim.street import (

@@ -29,7 +29,7 @@ from graphslam.app.run.run import Run
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
-from graphslam.evaluate.intervals import share_interval
+from graphslam_studies.evaluate.intervals import share_interval
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam_studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.core.geometry import (
-    se2_between,
-    se2_compose,
-    se2_compose_covariance,
-    se2_exp,
-    se2_log,
-)
+from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.records import AckermannGeometry, Gps, Odometry, SteeringControls, VelocityControls
 from graphslam_frontends.odometry.motion import (
@@ -22,6 +16,7 @@ from graphslam_frontends.odometry.motion import (
     steering_odometry,
     velocity_odometry,
 )
+from tests.reference.compose_covariance import se2_compose_covariance
 from tests.reference.dead_reckoning import drive_arcs, drive_arcs_covariance
 
 T = np.arange(0.0, 2.0, 0.05)

@@ -23,7 +23,8 @@ from graphslam.core.poses import (
     pose_scatter,
     remove_roll_pitch,
 )
-from graphslam_frontends.segslam.covariance import exit_covariance, exit_nees
+from graphslam_frontends.segslam.covariance import exit_covariance
+from graphslam_studies.evaluate.exit_nees import exit_nees
 
 GROUPS = [SE2, SE3]
 

@@ -13,7 +13,7 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_compose, se2_inverse
 from graphslam.core.poses import frame_between, remove_roll_pitch
-from graphslam_frontends.segslam.paths import concatenate_segments, find_seams
+from graphslam_frontends.segslam.paths import concatenate_segments
 from graphslam_frontends.segslam.sampling import (
     OPEN,
     _draw,
@@ -25,6 +25,7 @@ from graphslam_frontends.segslam.sampling import (
     segment_probabilities,
 )
 from graphslam_frontends.segslam.segmap import SAME, SegMap, SegmentEntry
+from tests.reference.seams import find_seams
 from tests.reference.segmap_twin import all_samples, flat_grid, match_entry, small_segmap, straight
 
 ZERO = np.zeros(3)

@@ -12,11 +12,12 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsRecord, gps_residual
-from graphslam.graph.gps import GpsConfig, antenna_in_base
+from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key
 from graphslam.solve.batch import BatchSolver
+from tests.reference.antenna import antenna_in_base
 from tests.reference.graph_chain import make_chain, make_gps
 
 DATUM = np.array([120.0, -40.0, 2.3])

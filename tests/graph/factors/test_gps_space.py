@@ -13,11 +13,12 @@ from graphslam.core.se3 import quat_multiply, so3_exp
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.gps import GpsRecord, gps_predicted_in_space, level_datum_pose
-from graphslam.graph.gps import GpsConfig, antenna_in_base
+from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
+from tests.reference.antenna import antenna_in_base
 from tests.reference.space_chain import DenseChain, dense_chain
 
 DATUM = np.array([120.0, -40.0, 310.0, 2.3])

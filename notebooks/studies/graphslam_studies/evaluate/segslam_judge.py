@@ -21,7 +21,6 @@ from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.motion import move_poses, with_roll_pitch
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.config import HandoverConfig
-from graphslam_frontends.segslam.covariance import ExitNees, exit_nees
 from graphslam_frontends.segslam.paths import concatenate_segments
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.sampling import draw_weights, grow_sample, nearest_step, root_of_segment
@@ -33,6 +32,7 @@ from graphslam_frontends.segslam.submaps import (
     drift_by_path,
     submaps_of_segments,
 )
+from graphslam_studies.evaluate.exit_nees import ExitNees, exit_nees
 
 Ints = npt.NDArray[np.int64]
 

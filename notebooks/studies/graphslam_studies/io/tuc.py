@@ -15,12 +15,12 @@ import numpy as np
 
 from graphslam.association.consistent_set import OdometryChain
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
-from graphslam.core.gaussian import information_matrices
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_exp, se2_inverse
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
 from graphslam.core.reading import finite_mask, read_text
 from graphslam.io.text_records import find_text_file
+from graphslam_studies.evaluate.information import information_matrices
 
 INPUT, TRUTH = "Lecture_Hall_Input.txt", "Lecture_Hall_GT.txt"
 PLACE_SIGMA = 1.0

@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, FormatError
-from graphslam.core.gaussian import information_matrices
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
 from graphslam.core.reading import integer_mask
 from graphslam.core.records import LandmarkObservations
 from graphslam.io.clock import MAX_DROPPED, usable_records
+from graphslam_studies.evaluate.information import information_matrices
 from graphslam_studies.io.mat import read_mat
 from graphslam_studies.io.victoria_park import LASER_POSITION, mat_seconds, read_numbers
 

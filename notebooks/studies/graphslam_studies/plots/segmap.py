@@ -14,9 +14,9 @@ from matplotlib.ticker import MaxNLocator
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.plots import style
-from graphslam.plots.segments import sample_paths
 from graphslam_frontends.segslam.sampling import OPEN, MapSample
 from graphslam_frontends.segslam.segmap import KINDS, MATCH, SegMap
+from graphslam_studies.plots.segments import sample_paths
 
 Place = tuple[float, float]
 

@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.plots import style
 from graphslam.plots.paths import position_covariances
-from graphslam_frontends.segslam.covariance import ExitNees
+from graphslam_studies.evaluate.exit_nees import ExitNees
 from graphslam_studies.plots.exit_points import draw_exits
 
 _COLOURS = (style.ESTIMATE, style.PURPLE, style.GREEN)
