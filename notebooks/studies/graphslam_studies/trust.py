@@ -35,13 +35,8 @@ from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, wh
 from graphslam_studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log
 
 WORDS = ("consistent", "over-confident", "pessimistic", "undecided")
-SAID = {
-    "Covariances are consistent": 0,
-    "Covariances are too small": 1,
-    "Covariances are larger": 2,
-    "Whether the covariances": 3,
-}
-"""How the line ``trust`` of a verdict begins."""
+NOT_TESTED = "not tested"
+"""What the verdict prints for an undecided word where no measurement could have shown an error."""
 WRONG = 1.5
 """NEES/n from which on a map must not be called consistent or pessimistic."""
 WORLDS_DRAWN = range(500, 560)
@@ -111,10 +106,11 @@ def honesty(error: Array, covariance: Array) -> dict[str, float]:
     }
 
 
-def said(found: Run) -> int:
-    """The word of a run, as a number into :data:`WORDS`."""
+def covariance_verdict(found: Run) -> int:
+    """The verdict on the covariances of a run, as a number into :data:`WORDS`."""
     (line,) = [f.text for f in found.verdict if f.code == "trust"]
-    return next(word for begin, word in SAID.items() if line.startswith(begin))
+    word = line.removeprefix("covariances: ").partition(" — ")[0]
+    return WORDS.index("undecided" if word == NOT_TESTED else word)
 
 
 def run_trial(w: TrustWorld, seed: int) -> Iterator[Measurement]:
@@ -123,7 +119,7 @@ def run_trial(w: TrustWorld, seed: int) -> Iterator[Measurement]:
     found = map_world(w, log, seed)
     for quantity, value in scored(found, log).items():
         yield Measurement("run", quantity, value)
-    yield Measurement("run", "word", float(said(found)))
+    yield Measurement("run", "word", float(covariance_verdict(found)))
     yield Measurement("run", "clean", float(w.clean))
 
 
