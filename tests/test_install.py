@@ -112,7 +112,9 @@ def test_install_run_uninstall_and_editable_install(built: tuple[Path, Path], en
     made = run(command, "run", "log", "--frontend", "ekf", "--out", "run", "--json", "-q", cwd=parent, compiled=False)
     assert json.loads(made)["report"]["converged"]
     assert (parent / "run" / "report.html").stat().st_size > 0
-    kernel = "from graphslam.graph.normal_kernels import arc_terms; arc_terms(0.1)"
+    kernel = (
+        "from graphslam.graph.normal_kernels import inverse_left_jacobian_kernel; inverse_left_jacobian_kernel(0.1)"
+    )
     run("-c", kernel, cwd=parent, python=python)
 
     run(*pip, "uninstall", "--yes", "graphslam-submaps", cwd=parent, python=python)

@@ -17,7 +17,7 @@ from nbclient.exceptions import CellExecutionError
 import graphslam
 import graphslam_studies
 from graphslam.core.errors import UnknownNameError
-from graphslam_studies.notebook import NotebookStop, load_or_stop
+from graphslam_studies.io.notebook import NotebookStop, load_or_stop
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -95,7 +95,11 @@ def test_internal_imports_are_found() -> None:
         "from graphslam import io",
     ):
         assert any(internal(*found) for found in imported(line)), line
-    for line in ("import graphslam as gs", "from graphslam.plots import plot_scan", "from graphslam import simulate"):
+    for line in (
+        "import graphslam as gs",
+        "from graphslam_studies.plots import plot_scan",
+        "from graphslam import simulate",
+    ):
         assert not any(internal(*found) for found in imported(line)), line
 
 

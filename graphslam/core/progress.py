@@ -58,8 +58,11 @@ class Bar(tqdm):
             self.disable = True
 
     def display(self, *args: Any, **options: Any) -> Any:
-        """Write the line; a stderr that was lost ends the bar alone."""
+        """Write the line, not before ``delay``; a stderr that was lost ends the bar alone."""
+        if self._time() < getattr(self, "start_t", 0.0) + self.delay:
+            return False
         try:
+            self.last_print_t = self._time()  # tqdm removes only lines that it knows of
             return super().display(*args, **options)
         except (OSError, ValueError):
             self.disable = True

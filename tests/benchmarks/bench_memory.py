@@ -38,7 +38,7 @@ from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 STAGES: list[tuple[Any, str, str]] = [
     (pipeline, "load_log_source", "log opened"),
     (front_to_back.SubmapPipeline, "step", "front end, back end"),
-    (pipeline, "at_rest", "scans for the refinement"),
+    (pipeline, "release_memory", "scans for the refinement"),
     (BackEnd, "finish", "loops, solved"),
     (refining, "refine", "refinement"),
     (refining, "refined_submaps", "submaps drawn anew"),

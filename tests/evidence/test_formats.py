@@ -265,7 +265,7 @@ SCRIPT = """
 import sys
 import numpy as np
 from pathlib import Path
-from graphslam.evidence.compact import compact
+from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.formats import load_npz, to_dense
 from graphslam.evidence.octomap import read_octomap, write_octomap
 from graphslam.evidence.pool import GridPool
@@ -273,7 +273,7 @@ from tests.reference.evidence_maps import cube, grid_of_map
 folder = Path(sys.argv[1])
 voxels = cube((0, 0, 0), 16, 7) | cube((16, 0, 0), 16, 7) | {(-30, 5, 8): -4, (63, -64, 0): 5}
 grid = grid_of_map(voxels, levels=2)
-freed = compact(grid)
+freed = compact_grids(grid)
 grid.save(folder / "map.npz")
 for suffix in (".bt", ".ot"):
     write_octomap(grid, folder / f"map{suffix}")

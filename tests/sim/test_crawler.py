@@ -363,7 +363,7 @@ def test_presets_and_what_the_log_says(noisy: SensorLog) -> None:
         ({"mount": (0, 0, 0, 0, 0, 0, 2)}, "mount"),
         ({"imu_mount": "up"}, "imu_mount"),
         ({"gyro": "much"}, "gyro = much"),
-        ({"gyros": 1.0}, "unknown figure 'gyros'"),
+        ({"gyros": 1.0}, "unknown parameter 'gyros'"),
     ],
 )
 def test_impossible_figures_are_refused(changes: dict[str, Any], what: str) -> None:

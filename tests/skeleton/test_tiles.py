@@ -92,7 +92,7 @@ import sys
 from pathlib import Path
 from graphslam_studies.sim.laps import LapsConfig, draw_laps
 from graphslam.skeleton import tile_store
-from graphslam.skeleton.tiles import to_disk
+from graphslam.skeleton.tiles import write_tiled_problem
 
 folder, stop = Path(sys.argv[1]), int(sys.argv[2])
 real, written = tile_store.atomic_open, []
@@ -107,7 +107,7 @@ def counted(path, *rest):
     return real(path, *rest)
 
 tile_store.atomic_open = counted
-to_disk(draw_laps(LapsConfig(poses=96, laps=4, begin=3, reach=5), seed=3).problem(), folder, 20)
+write_tiled_problem(draw_laps(LapsConfig(poses=96, laps=4, begin=3, reach=5), seed=3).problem(), folder, 20)
 """
 
 

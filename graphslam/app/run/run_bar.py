@@ -31,7 +31,10 @@ class RunBar(Observer):
 
     def __init__(self, shown: bool) -> None:
         layout = "{desc}  {percentage:3.0f} %|{bar:20}| {elapsed}{postfix}"
-        self._bar = Bar(name=next(iter(STAGES)), total=sum(STAGES.values()), shown=shown, bar_format=layout)
+        delay = 0.5 if sys.stderr is not None and sys.stderr.isatty() else 5.0  # [s] an early error is the only line
+        self._bar = Bar(
+            name=next(iter(STAGES)), total=sum(STAGES.values()), shown=shown, bar_format=layout, delay=delay
+        )
         self._stage, self._first, self._duration = "", 0.0, 0.0
         self._ended = threading.Event()
 

@@ -50,11 +50,17 @@ def in_the_data() -> None:
     [
         (
             too_deep,
-            "graphslam: something is nested too deeply to be followed; look for a damaged file among those given",
+            "graphslam: an input file is nested too deeply; check the input files for a damaged one",
         ),
         (too_much, "graphslam: not enough memory; .* Unable to allocate 7.28 PiB .*"),
-        (no_room, "graphslam: run/map.npz: No space left on device; make room and run the same command again: .*"),
-        (no_files_left, "graphslam: run/map.npz: Too many open files; the limit on open files is too low .*"),
+        (
+            no_room,
+            "graphslam: run/map.npz: No space left on device; free disk space and run the same command again: .*",
+        ),
+        (
+            no_files_left,
+            "graphslam: run/map.npz: Too many open files; increase the limit of open files \\(ulimit -n\\)",
+        ),
         (forbidden, "graphslam: run/map.npz: Permission denied"),
         (a_folder, "graphslam: /: Is a directory"),
         (in_the_data, "graphslam: a.json: not JSON at all"),
@@ -90,7 +96,7 @@ def test_a_full_file_system_behind_the_output_is_one_line() -> None:
         code, err = verb("data", "list", stdout=full.fileno())
     assert (code, err) == (
         1,
-        "graphslam: No space left on device; make room and run the same command again: what is finished is kept\n",
+        "graphslam: No space left on device; free disk space and run the same command again: finished parts are saved\n",
     )
 
 

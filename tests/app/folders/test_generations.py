@@ -109,14 +109,14 @@ def test_without_links_files_are_plain(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_ids_of_two_states_are_told(tmp_path: Path) -> None:
     check_same((tmp_path / "run.json", "a"), (tmp_path / "map.npz", "a"), (tmp_path / "older.npz", None))
-    with pytest.raises(FormatError, match=r"map\.npz: is not of one state with run\.json.* b; wanted a"):
+    with pytest.raises(FormatError, match=r"map\.npz: does not belong to the same state as run\.json.* b; wanted a"):
         check_same((tmp_path / "run.json", "a"), (tmp_path / "map.npz", "b"))
 
 
 def test_one_writer_at_a_time(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom graphslam.app.folders.lock import locked\n"
-        "with locked(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(100)"
+        "import sys, time\nfrom graphslam.app.folders.lock import lock_folder\n"
+        "with lock_folder(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(100)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None

@@ -105,7 +105,7 @@ def test_files_of_two_states_are_told_apart(folder: Path, log: SensorLog, tmp_pa
     for name in ("map.npz", "association.npz", "gps_all.npz", "fixes.npz", "events.jsonl"):
         mixed = Path(shutil.copytree(folder, tmp_path / name))  # links followed: plain files
         shutil.copy(tmp_path / "other" / name, mixed / name)
-        with pytest.raises(FormatError, match=rf"{name}: is not of one state with run\.json"):
+        with pytest.raises(FormatError, match=rf"{name}: does not belong to the same state as run\.json"):
             gs.open_run(mixed)
     cut = Path(shutil.copytree(folder, tmp_path / "cut"))
     store = RunFolder(cut).submaps
@@ -146,7 +146,7 @@ def test_a_run_is_not_gone_on_with_on_another_log(copy: Path, log: SensorLog) ->
     before = snapshot(copy, ("*", "figures/*", "submaps/*"))
     other = gs.simulate("landmark-field", preset="quick", seed=4, gps_rate=1.0, gps_sigma=0.3)
     assert other.name == log.name
-    with pytest.raises(RunFolderError, match=r"cannot resume, the log is another one: run\.log\.\S+ was '\d+ records"):
+    with pytest.raises(RunFolderError, match=r"cannot resume, another log is given: run\.log\.\S+ was '\d+ records"):
         go_on(other, copy)
     end = log.interval[1]
     grown, part = log, log.slice(0.0, 0.8 * end)

@@ -70,7 +70,7 @@ def test_a_wrong_encoder_is_found_and_named_with_its_size(degrees: float) -> Non
     assert line.level == "bad"
     assert "panning" in line.text
     assert ("too much" if degrees > 0 else "too little") in line.text
-    told = float(line.text.partition("reads ")[2].partition("°")[0])
+    told = float(line.text.partition("encoder of panning: ")[2].partition(" ±")[0])
     assert told == pytest.approx(abs(degrees), abs=0.35)
 
 

@@ -246,7 +246,7 @@ def test_a_submap_that_used_it_refuses_it(rng):
     for k, s in enumerate(made.submaps):
         g.add_submap(replace(s, uses=frozenset({"laser", "imu"} if k == 1 else {"laser"})), spacing=3.0)
     before = (len(g.records), len(g.ledger), g.values.layout())
-    with pytest.raises(EvidenceReusedError, match=r"spend stream 'imu' .* a second time: submap 1"):
+    with pytest.raises(EvidenceReusedError, match=r"use stream 'imu' .* a second time: submap 1"):
         g.add_imu(made.imu)
     assert (len(g.records), len(g.ledger), g.values.layout()) == before
     assert not g.imu.used
@@ -261,7 +261,7 @@ def test_and_the_other_way_round(rng):
         g.add_between(0, 2, SE3.identity, np.eye(6), streams=["imu"], interval=(0.0, 1.0))
     node = g.start_session(SE3.identity)
     again = replace(made.submaps[0], key=7, uses=frozenset({"imu"}))
-    with pytest.raises(EvidenceReusedError, match="submap 7 would spend stream 'imu'"):
+    with pytest.raises(EvidenceReusedError, match="submap 7 would use stream 'imu'"):
         g.add_submap(again)
     assert node == len(g.values.poses) - 1
     table = g.ledger.table()
