@@ -84,7 +84,8 @@ class Bar(tqdm):
 def shown_bars() -> list[Bar]:
     """Bars that are on the terminal now, the first one first."""
     with Bar.get_lock():
-        return [b for b in sorted(getattr(Bar, "_instances", ()), key=lambda b: abs(b.pos)) if not b.disable]
+        bars = [b for b in getattr(Bar, "_instances", ()) if isinstance(b, Bar) and not b.disable]  # tqdm's own apart
+        return sorted(bars, key=lambda b: abs(b.pos))
 
 
 def say_compiling(now: bool) -> None:

@@ -141,7 +141,7 @@ def test_terrain_is_made_alone(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["map", str(tmp_path / "none"), "--terrain", "--grid"])
     assert done.exit_code != 0
     assert isinstance(done.exception, ConfigError)
-    assert "alone" in str(done.exception)
+    assert "only the terrain" in str(done.exception)
 
 
 def test_a_surface_is_coloured_by_what_was_written(
