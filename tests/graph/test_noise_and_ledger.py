@@ -162,6 +162,6 @@ def test_what_was_only_a_start_leaves_its_streams_to_be_spent() -> None:
     ]
     assert {e.kind for e in start.entries()} == {"start"}
     start.spend(-1, "scan-pairs", ["laser", "wheels"], (0.0, 10.0))
-    with pytest.raises(EvidenceReusedError, match="scan-pairs spent it"):
+    with pytest.raises(EvidenceReusedError, match="scan-pairs used it"):
         start.spend(4, "late", ["laser"], (9.0, 11.0))
     assert ledger.conflict("laser", (5.0, 6.0)).factor == "submap 0"  # the first ledger is as it was
