@@ -179,7 +179,7 @@ def pooled_nonlinearity(reports: Sequence[Mapping[str, Any]]) -> float:
     return sum(v * n for v, n in said) / sum(n for _, n in said) if said else 0.0
 
 
-def tests_of_json(value: Any) -> list[ConsistencyTest]:
+def consistency_tests_of_json(value: Any) -> list[ConsistencyTest]:
     """Rows as a report holds them; what is none of ours is left out."""
     out = []
     for row in value if isinstance(value, list) else []:
@@ -190,6 +190,6 @@ def tests_of_json(value: Any) -> list[ConsistencyTest]:
     return out
 
 
-def tests_as_json(rows: Iterable[ConsistencyTest]) -> list[dict[str, Any]]:
+def consistency_tests_as_json(rows: Iterable[ConsistencyTest]) -> list[dict[str, Any]]:
     """The same as JSON objects."""
     return [asdict(r) for r in rows]

@@ -16,11 +16,11 @@ from graphslam.evaluate.covariance_assessment import (
     ConsistencyTest,
     assess_covariances,
     chi_square_ratio_test,
+    consistency_tests_as_json,
+    consistency_tests_of_json,
     largest_score_test,
     pooled_nonlinearity,
     short_window_tests,
-    tests_as_json,
-    tests_of_json,
 )
 from graphslam.evaluate.residual_consistency import LASTING, class_consistency
 from graphslam.evaluate.whiteness import residual_whiteness
@@ -193,14 +193,14 @@ def test_errors_that_last_for_a_window_are_found(rng):
 
 
 def test_the_line_says_what_it_rests_on_and_survives_the_file():
-    rows = json.loads(json.dumps(tests_as_json(HONEST)))
-    assert tests_of_json(rows) == HONEST
-    assert tests_of_json([{"name": "x"}, 3, None]) == tests_of_json(None) == []
+    rows = json.loads(json.dumps(consistency_tests_as_json(HONEST)))
+    assert consistency_tests_of_json(rows) == HONEST
+    assert consistency_tests_of_json([{"name": "x"}, 3, None]) == consistency_tests_of_json(None) == []
     lines = {f.code: f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": rows}, {}))}
     assert lines["trust"].level == "good"
     assert "without ground truth" in lines["trust"].text
     assert "errors match" not in " ".join(f.text for f in lines.values())
-    alone = tests_as_json(chi_square_ratio_test("map", "map", 1.0, 8.0))
+    alone = consistency_tests_as_json(chi_square_ratio_test("map", "map", 1.0, 8.0))
     (line,) = [
         f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": alone}, {})) if f.code == "trust"
     ]

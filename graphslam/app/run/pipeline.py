@@ -56,7 +56,7 @@ from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.bias_test import bias_test_findings
-from graphslam.evaluate.covariance_assessment import pooled_nonlinearity, tests_as_json
+from graphslam.evaluate.covariance_assessment import consistency_tests_as_json, pooled_nonlinearity
 from graphslam.evaluate.dead_reckoning_baseline import dead_reckoned_path
 from graphslam.evaluate.landmark_checks import sighting_findings
 from graphslam.evaluate.metrics import (
@@ -642,7 +642,7 @@ def _evaluate_run(
         "objective": solution.objective,
         "converged": solution.converged,
         "graph": graph_metrics(back.graph, checks.classes),
-        "evidence": tests_as_json(checks.evidence(submaps, refined=refined is not None)),
+        "evidence": consistency_tests_as_json(checks.evidence(submaps, refined=refined is not None)),
         "nonlinearity": pooled_nonlinearity([s.report for s in submaps]) if refined is None else 0.0,
     }
     if truth is not None:

@@ -23,7 +23,7 @@ from graphslam.evaluate.covariance_assessment import (
     ConsistencyTest,
     CovarianceAssessment,
     assess_covariances,
-    tests_of_json,
+    consistency_tests_of_json,
 )
 from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
@@ -371,7 +371,7 @@ def covariance_assessment(figures: RunMetrics) -> CovarianceAssessment | None:
     """Are the covariances consistent, by the tests that need no ground truth? None in folders without their results."""
     if figures.report.get("evidence") is None:
         return None
-    rows = tests_of_json(figures.report.get("evidence"))
+    rows = consistency_tests_of_json(figures.report.get("evidence"))
     fixes = any(r.of == "fixes" for r in rows) or any(c.get("class") == "gps" for c in class_rows(figures))
     bend: Any = figures.report.get("nonlinearity")
     return assess_covariances(rows, fixes=fixes, nonlinearity=float(bend) if is_finite_number(bend) else 0.0)

@@ -29,7 +29,7 @@ from graphslam.app.run.summary import (
 )
 from graphslam.app.run.verdict import RunMetrics, findings_from_metrics, findings_from_run
 from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst_level
-from graphslam.evaluate.covariance_assessment import chi_square_ratio_test, tests_as_json
+from graphslam.evaluate.covariance_assessment import chi_square_ratio_test, consistency_tests_as_json
 from tests.reference.page import Page
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -108,7 +108,7 @@ def figures(
         m |= {"loops_value": loops, "loops_dof": 400.0}
     report: dict[str, Any] = {} if converged is None else {"converged": converged}
     if own is not None:
-        report["evidence"] = tests_as_json(chi_square_ratio_test("χ²", "map", own, 300.0 if own else 2.0))
+        report["evidence"] = consistency_tests_as_json(chi_square_ratio_test("χ²", "map", own, 300.0 if own else 2.0))
     return RunMetrics(report, m)
 
 

@@ -318,7 +318,7 @@ def test_a_run_has_its_map_upright_and_its_graph_counts_the_readings(logs):
     truth = log_up(logs[0].truth.trajectory.interpolate(run.map.trajectory.times))
     assert np.linalg.norm(log_up(run.map.trajectory.poses) - truth, axis=1).mean() < 0.01
     spent = next(f["text"] for f in run.report["verdict"]["lines"] if f["code"] == "refine-evidence")
-    assert "spends clouds, imu once" in spent
+    assert "clouds, imu — each used once" in spent
 
 
 def log_up(poses):
