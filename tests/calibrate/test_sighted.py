@@ -111,7 +111,7 @@ def test_wrong_identities_are_trimmed(log, found) -> None:
 
 def test_too_few_sightings_are_refused_with_a_count(log) -> None:
     short = log.slice(0.0, 1.5)
-    with pytest.raises(DataError, match="sightings"):
+    with pytest.raises(DataError, match="observations of landmarks"):
         calibrate_sightings(SightingLog.of(short, "landmarks", short["landmarks"].take(slice(0, 2))), QUICK)
 
 
@@ -197,7 +197,7 @@ def test_a_scale_that_runs_away_is_held_and_the_noise_is_found(data_dir):
     assert abs(wild.constants[CONSTANTS.index("distance_scale")]) > RAN_AWAY * 0.2
     found = calibrate_sightings(seen, dataclasses.replace(QUICK, clock=False))
     assert "distance_scale" not in {e.name for e in found.estimates}
-    assert any("distance_scale cannot be told" in f.text for f in found.findings())
+    assert any("distance_scale: not observable" in f.text for f in found.findings())
     assert found.corrections.distance_scale == 1.0
     assert 0.01 < found.noise["range_sigma"] < 0.1
     assert int(found.data.split()[3]) > 900  # sightings: nearly none is trimmed

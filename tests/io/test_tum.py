@@ -72,8 +72,8 @@ def test_comments_blank_lines_and_rounded_quaternions(tmp_path: Path) -> None:
         ("inf 0 0 0 0 0 0 1", "not finite"),
         ("2.0 0 0 0 0 0 0 0", "no unit quaternion"),
         ("2.0 0 0 0 0 0 0 1.2", "no unit quaternion"),
-        ("1.0 0 0 0 0 0 0 1", "time does not increase"),
-        ("0.5 0 0 0 0 0 0 1", "time does not increase"),
+        ("1.0 0 0 0 0 0 0 1", "stamps do not increase"),
+        ("0.5 0 0 0 0 0 0 1", "stamps do not increase"),
         ("2.0,0,0,0,0,0,0,1", "wrong number of columns"),
     ],
 )
