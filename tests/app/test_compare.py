@@ -111,7 +111,7 @@ def test_nees_is_eq_18(rng: np.random.Generator) -> None:
     nobody = MapTruth(
         keys=np.array([99]), exit_poses=np.zeros((1, 3)), landmark_ids=np.array([-7]), landmarks=np.zeros((1, 2))
     )
-    with pytest.raises(DataError, match="has a truth"):
+    with pytest.raises(DataError, match="has ground truth"):
         map_nees(best, keys, nobody)
 
 
