@@ -266,7 +266,7 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
     found = two.find(InterSessionConfig())
     shift = np.array([-9.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])  # the first drive goes straight on
     wrong = replace(found, loops=tuple(replace(x, T_ij=se3.se3_compose(shift, x.T_ij)) for x in found.loops))
-    for ties, named in ((wrong, r"b: \d+ ties to a agree .* looks alike"), (found, "")):
+    for ties, named in ((wrong, r"b: \d+ loop closures with a agree .* looks alike"), (found, "")):
         graph = PoseGraph(3)
         solver = make_solver("batch", graph)
         add_session(graph, known)
