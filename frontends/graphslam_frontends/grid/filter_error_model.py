@@ -32,7 +32,7 @@ POSITION_START = 0.01
 HEIGHT_START = 0.025
 """σ of the height there [m]."""
 HEIGHT_SCALE = 0.002
-"""Gravity is told with an error that lasts: σ of the height after a way of one metre [m/m]."""
+"""Time-correlated error of roll and pitch: σ of the height after a path of one metre [m/m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
