@@ -68,6 +68,11 @@ class Bar(tqdm):
             self.disable = True
             return False
 
+    def clear(self, *args: Any, **options: Any) -> None:
+        """Remove the line for a message above it; nothing where no line is written yet."""
+        if self._time() >= getattr(self, "start_t", 0.0) + self.delay:
+            super().clear(*args, **options)
+
     def close(self) -> None:
         """Remove the line."""
         try:

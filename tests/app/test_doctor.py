@@ -19,6 +19,9 @@ def test_another_distribution_with_this_import_name_is_found(tmp_path: Path, mon
     home.mkdir()
     (home / "METADATA").write_text("Metadata-Version: 2.1\nName: python-graphslam\nVersion: 0.0.17\n")
     (home / "RECORD").write_text("graphslam/__init__.py,,\ngraphslam/graph/graph.py,,\n")
+    for file in (tmp_path / "graphslam/__init__.py", tmp_path / "graphslam/graph/graph.py"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()  # importlib_metadata, where something imports it, leaves missing files out
     monkeypatch.syspath_prepend(tmp_path)
     (finding,) = doctor.other_distributions()
     assert finding.state == "conflict"

@@ -294,6 +294,10 @@ def test_rings_lie_at_the_quantile_and_run_counter_clockwise(rng):
 def test_largest_sigmas_are_those_of_the_longest_axes(rng):
     P = random_covariances(rng, 6, 3)
     np.testing.assert_allclose(largest_sigmas(P), np.sqrt(np.linalg.eigvalsh(P)[:, -1]), rtol=1e-9)
+    assert largest_sigmas(np.zeros((0, 3, 3))).shape == (0,)
     assert first_no_covariance(P) is None
+    uneven = np.diag([1e-4, 1e-2, 1e6])[None]
+    uneven[0, 0, 1] = 1e-3  # rounding of the largest entry, though not of the second
+    assert first_no_covariance(uneven) is None
     P[2] = -P[2]
     assert first_no_covariance(P) == 2

@@ -63,8 +63,10 @@ class RunBar(Observer):
         self._first, self._duration = log.interval[0], max(log.duration, 1e-9)
 
     def front_end_at(self, progress: Any) -> None:
-        """A step of a front end that counts them."""
-        self._move(progress.step / progress.steps, f"{progress.length:.0f} m, {progress.segments} segments")
+        """A step of a front end that counts them; the progress of another front end moves nothing."""
+        steps = getattr(progress, "steps", 0)
+        if steps:
+            self._move(progress.step / steps, f"{progress.length:.0f} m, {progress.segments} segments")
 
     def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
         """A submap: how far the front end is in the log."""

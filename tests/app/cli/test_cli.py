@@ -276,7 +276,7 @@ def test_a_quiet_run_writes_nothing_to_stderr(tmp_path):
     log = tmp_path / "log"
     graphslam("simulate", "landmark-field", "--preset", "quick", "--out", log)
     end = "--frontend", "rbpf-ekf", "--set", "frontend.particles=5", "--out", tmp_path / "run", "--resume"
-    assert "1/8 reading" in graphslam("run", log, *end).stderr
+    assert graphslam("run", log, *end).stderr.startswith("read: ")
     again = graphslam("run", log, *end, "-q")
     assert again.stderr == ""
     assert "resumed: all" in again.stdout

@@ -132,7 +132,7 @@ def test_points_drawn_are_those_of_the_files(folder: Path, page: str, tmp_path: 
     low, high = stats.chi2.ppf([0.025, 0.975], 3) / 3.0
     outside = np.sum((nees < low) | (nees > high))
     assert len(found["t"]["NEES/dof of the path"]["dots"]) == outside
-    assert f"{low:.3g} to {high:.3g}" in found["t"]["NEES/dof of the path"]["said"]
+    assert f"[{low:.3g}, {high:.3g}]" in found["t"]["NEES/dof of the path"]["said"]
     for k, name in enumerate(list(found["t"])[1:4]):
         assert len(found["t"][name]["dots"]) == np.sum(np.abs(errors[:, k]) > 2.0 * sigmas[:, k])
 
