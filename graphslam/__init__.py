@@ -43,7 +43,7 @@ _TYPES = {
     "Imu": "graphslam.core.imu",
     "Submap": "graphslam.core.submap",
     "Trajectory": "graphslam.core.trajectory",
-    "PoseGraph": "graphslam.graph.pose_graph",
+    "FactorGraph": "graphslam.graph.factor_graph",
     "Run": "graphslam.app.run.run",
     "Slam": "graphslam.app.run.slam",
     "Collapse": "graphslam.skeleton.collapse",

@@ -10,6 +10,7 @@ from graphslam import maps as maps
 from graphslam import plots as plots
 from graphslam import sim as sim
 from graphslam.skeleton.collapse import Collapse as Collapse
+from graphslam.graph.factor_graph import FactorGraph as FactorGraph
 from graphslam.core.records import Gps as Gps
 from graphslam.core.imu import Imu as Imu
 from graphslam.core.records import LandmarkObservations as LandmarkObservations
@@ -17,7 +18,6 @@ from graphslam.core.records import LaserScans as LaserScans
 from graphslam.core.records import Odometry as Odometry
 from graphslam.core.point_clouds import PointClouds as PointClouds
 from graphslam.core.records import PointObservations as PointObservations
-from graphslam.graph.pose_graph import PoseGraph as PoseGraph
 from graphslam.core.range_scans import RangeScans as RangeScans
 from graphslam.app.run.run import Run as Run
 from graphslam.core.log import SensorLog as SensorLog

@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.submap_node import SubmapNode
 from graphslam.loops.ledger import LoopDecision
 from graphslam.solve.solution import Solution
@@ -50,7 +50,7 @@ class LiveView(Observer):
             self.stream.save(str(file))
         self.stream.log("map", self.rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
-    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+    def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
         """What it holds, and where everything is now."""
         self.stream.set_time("submap", sequence=len(graph.submaps))
         self.stream.set_time("seconds", duration=submap.interval[1])
@@ -59,7 +59,7 @@ class LiveView(Observer):
             self.stream.log(f"map/submap-{submap.key}/points", self.rr.Points3D(points))
         self._places(graph.submaps, np.asarray(graph.values.poses), np.asarray(graph.values.landmarks))
 
-    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
         """A line from base to base, green where it was believed; and why."""
         nodes = {s.key: s.node for s in graph.submaps}
         ends = graph.values.poses[[nodes[decision.submap_i], nodes[decision.submap_j]], : graph.dim]

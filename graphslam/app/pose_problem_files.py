@@ -12,8 +12,8 @@ from graphslam.backend.sessions import IntraSessionLoop, loops_of_network
 from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import read_g2o
 from graphslam.join.pose_problem import PoseProblem
 from graphslam.loops.graph_loops import GROUP
@@ -39,7 +39,7 @@ def load_pose_problem(root: Path, files: Path, submaps: list[Submap]) -> PosePro
     stated: dict[str, Any] = read_options(root).get("backend", {})
     config: BackEndConfig = build_config(BackEndConfig, {k: v for k, v in stated.items() if v is not None}, "backend")
     network = read_g2o(files / "graph.g2o")
-    graph = PoseGraph(submaps[0].dim)
+    graph = FactorGraph(submaps[0].dim)
     for s in submaps:
         graph.add_submap(
             s,
@@ -65,7 +65,7 @@ def load_pose_problem(root: Path, files: Path, submaps: list[Submap]) -> PosePro
     return PoseProblem.of_graph(graph)
 
 
-def _tie(graph: PoseGraph, tie: IntraSessionLoop, kernel: RobustKernel) -> None:
+def _tie(graph: FactorGraph, tie: IntraSessionLoop, kernel: RobustKernel) -> None:
     graph.add_between(
         tie.i, tie.j, tie.T_ij, tie.covariance, streams=["match"], interval=(0.0, 0.0), evidence="shared-scan",
         robust=kernel,

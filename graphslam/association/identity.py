@@ -7,7 +7,7 @@ With the submap's residual r, its information Ω and the covariance of the resid
 
     T_i = (Ω r)_iᵀ [(Ω S Ω)_ii]⁻¹ (Ω r)_i      ~ χ² with 2 degrees of freedom if nothing is wrong
 
-A sighting that fails is split off into a landmark of its own (:meth:`PoseGraph.split_landmark`): nothing is thrown
+A sighting that fails is split off into a landmark of its own (:meth:`FactorGraph.split_landmark`): nothing is thrown
 away, the submap keeps all its information about itself, and the event log says so.
 """
 

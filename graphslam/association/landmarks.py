@@ -25,7 +25,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.submap import Submap
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 
 Ids = npt.NDArray[np.int64]
 
@@ -44,7 +44,7 @@ class AssociationConfig:
     starts : int
         Seeds of the search.
     covariance_scale : float
-        Factor on the submap's covariance, the same as in :meth:`PoseGraph.add_submap`.
+        Factor on the submap's covariance, the same as in :meth:`FactorGraph.add_submap`.
     max_distance : float
         No candidate further than this from its prediction [m], however uncertain the pose.
     """
@@ -91,12 +91,12 @@ class CompatiblePairings:
         return mahalanobis2(self.innovation, _blocks(self.covariance))
 
 
-def associate_landmarks(graph: PoseGraph, submap: Submap, config: AssociationConfig | None = None) -> Ids:
+def associate_landmarks(graph: FactorGraph, submap: Submap, config: AssociationConfig | None = None) -> Ids:
     """Graph ids of the landmarks of a submap that starts at the graph's last node.
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         Its values and covariance are used as they stand: update the solver first.
     submap : Submap
         Entries whose id is not -1 keep it.
@@ -124,7 +124,7 @@ def associate_landmarks(graph: PoseGraph, submap: Submap, config: AssociationCon
 
 
 def find_pairings(
-    graph: PoseGraph,
+    graph: FactorGraph,
     submap: Submap,
     entries: npt.NDArray[np.intp],
     config: AssociationConfig,

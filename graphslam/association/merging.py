@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 
 
-def euclidean_merges(graph: PoseGraph, distance: float = 0.7, *, within_submap: bool = True) -> list[tuple[int, int]]:
+def euclidean_merges(graph: FactorGraph, distance: float = 0.7, *, within_submap: bool = True) -> list[tuple[int, int]]:
     """Landmarks closer than ``distance`` [m], as (keep, drop).
 
     Parameters
@@ -26,7 +26,7 @@ def euclidean_merges(graph: PoseGraph, distance: float = 0.7, *, within_submap: 
     Returns
     -------
     list of (int, int)
-        Ready for :meth:`PoseGraph.merge_landmarks` in this order. Closest pairs first; the one seen more often (then
+        Ready for :meth:`FactorGraph.merge_landmarks` in this order. Closest pairs first; the one seen more often (then
         the older) is kept. A landmark that already moved into another is compared from where it went, so a row of
         near ones does not collapse into one: every dropped landmark lies within ``distance`` of the one that is kept.
     """
@@ -37,7 +37,7 @@ def euclidean_merges(graph: PoseGraph, distance: float = 0.7, *, within_submap: 
     return _resolve(graph, pairs[np.argsort(gaps, kind="stable")], within_submap=within_submap, limit=distance)
 
 
-def mahalanobis_merges(graph: PoseGraph, gate: float = 11.8, *, distance: float = 5.0) -> list[tuple[int, int]]:
+def mahalanobis_merges(graph: FactorGraph, gate: float = 11.8, *, distance: float = 5.0) -> list[tuple[int, int]]:
     """Landmarks of different submaps that the joint covariance cannot tell apart, as (keep, drop).
 
     ``d² = δᵀ (P_ii + P_jj - P_ij - P_ji)⁻¹ δ < gate`` with the graph's joint covariance, closest in d² first.
@@ -66,12 +66,12 @@ def mahalanobis_merges(graph: PoseGraph, gate: float = 11.8, *, distance: float 
     return _resolve(graph, pairs[order[d2[order] < gate]], within_submap=False, limit=distance)
 
 
-def _share(graph: PoseGraph, i: int, j: int) -> bool:
+def _share(graph: FactorGraph, i: int, j: int) -> bool:
     """Does one submap hold both?"""
     return bool(graph.sightings(i) & graph.sightings(j))
 
 
-def _resolve(graph: PoseGraph, pairs: Array, *, within_submap: bool, limit: float) -> list[tuple[int, int]]:
+def _resolve(graph: FactorGraph, pairs: Array, *, within_submap: bool, limit: float) -> list[tuple[int, int]]:
     """Turn pairs of rows into merges, each landmark dropped at most once and never kept after."""
     ids, points = graph.values.landmark_ids, graph.values.landmarks
     seen = {int(i): set(graph.sightings(int(i))) for i in ids[np.unique(pairs)]}

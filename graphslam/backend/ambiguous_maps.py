@@ -15,7 +15,7 @@ import numpy as np
 from graphslam.backend.streams import repreintegrate_until_converged
 from graphslam.core.geometry import Array
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.loops import LoopCloser
 from graphslam.solve.registry import Solver
 
@@ -70,7 +70,7 @@ class AmbiguousMaps:
         }
 
 
-def ambiguous_maps(graph: PoseGraph, solver: Solver, closer: LoopCloser) -> AmbiguousMaps | None:
+def ambiguous_maps(graph: FactorGraph, solver: Solver, closer: LoopCloser) -> AmbiguousMaps | None:
     """The graph with either side of what could not be decided; None where all could be, or it bears neither side.
 
     The graph is left as it was, at its optimum.

@@ -21,9 +21,9 @@ from graphslam.backend.streams import GpsSource, ImuSource, repreintegrate_until
 from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, LoopSearch
@@ -65,10 +65,10 @@ class Observer:
     def front_end_at(self, progress: Any) -> None:
         """A front end that can be watched has made a step; ``progress`` is of its own kind."""
 
-    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+    def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
         """A submap is in the graph, and the graph is solved with it."""
 
-    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
         """A loop was believed or not, and why."""
 
     def solved(self, solution: Solution) -> None:
@@ -87,7 +87,7 @@ class BackEnd:
 
     config: BackEndConfig
     solver_name: str
-    graph: PoseGraph = field(default_factory=PoseGraph)
+    graph: FactorGraph = field(default_factory=FactorGraph)
     """Of two dimensions until a submap of three comes first."""
     seconds: dict[str, float] = field(default_factory=lambda: {"associate": 0.0, "solve": 0.0, "merge": 0.0})
     per_submap_s: list[float] = field(default_factory=list)
@@ -104,7 +104,7 @@ class BackEnd:
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
         self._waiting: list[tuple[Gps, GpsOptions]] = []
-        self._later: list[Callable[[PoseGraph], object]] = []  # until the first submap says which dimension it is
+        self._later: list[Callable[[FactorGraph], object]] = []  # until the first submap says which dimension it is
         self._loops: LoopSearch | None = None
         self._noted = 0  # decisions on loops that are among the events
         kind = self.config.match_robust
@@ -161,7 +161,7 @@ class BackEnd:
     def append(self, submap: Submap) -> float:
         """Associate and add without solving; returns the time at which it was associated [s]."""
         if submap.dim != self.graph.dim and not self.graph.submaps:
-            self.graph = PoseGraph(submap.dim)
+            self.graph = FactorGraph(submap.dim)
             self.solver = make_solver(self.solver_name, self.graph)
         c = self.config
         ids = None

@@ -25,10 +25,10 @@ from scipy import linalg, optimize
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsBatch, GpsRecord
 from graphslam.graph.gps import FixErrors
 from graphslam.graph.noise import whitener
-from graphslam.graph.pose_graph import PoseGraph
 
 logger = logging.getLogger(__name__)
 GATE = 8.0
@@ -50,7 +50,7 @@ LOOSE = 1e3
 """σ of each number of the datum, of which fixes tell nothing here."""
 
 
-def fit_fix_errors(graph: PoseGraph) -> FixErrors | None:
+def fit_fix_errors(graph: FactorGraph) -> FixErrors | None:
     """Fit the errors of the fixes of a graph at its optimum, and put what was found into it.
 
     The graph is to be solved anew then. None: nothing was changed.
@@ -85,11 +85,11 @@ def fit_fix_errors(graph: PoseGraph) -> FixErrors | None:
     return errors
 
 
-def _batch(graph: PoseGraph, fixes: list[GpsRecord]) -> GpsBatch:
+def _batch(graph: FactorGraph, fixes: list[GpsRecord]) -> GpsBatch:
     return GpsBatch(fixes, graph.flat().layout)
 
 
-def _distances(graph: PoseGraph, fixes: list[GpsRecord]) -> Array:
+def _distances(graph: FactorGraph, fixes: list[GpsRecord]) -> Array:
     """Residuals in units of the σ of the fix, by coordinate."""
     return np.asarray(np.sqrt(_batch(graph, fixes).squared(graph.values)))
 
@@ -117,7 +117,7 @@ class _Innovations:
     span: float
 
     @classmethod
-    def of(cls, graph: PoseGraph, fixes: list[GpsRecord]) -> _Innovations:
+    def of(cls, graph: FactorGraph, fixes: list[GpsRecord]) -> _Innovations:
         """At the graph's values: one Gauss–Newton step from there to the optimum without fixes."""
         flat, values, d = graph.flat(), graph.values, graph.dim
         w = np.array([0.0 if isinstance(r, GpsRecord) else 1.0 for r in flat.records])
@@ -219,7 +219,7 @@ def spread_fixes(n: int, most: int) -> npt.NDArray[np.intp]:
     return np.asarray(np.unique((first[:, None] + EVERY * np.arange(TOGETHER)).ravel()), dtype=np.intp)
 
 
-def _put(graph: PoseGraph, fixes: list[GpsRecord], errors: FixErrors) -> None:
+def _put(graph: FactorGraph, fixes: list[GpsRecord], errors: FixErrors) -> None:
     """A bias for every fix, each following from the one before; whiteners of the white part."""
     before, previous = None, 0.0
     for r in fixes:

@@ -17,10 +17,10 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.ledger import EXCLUSIVE, Ledger
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.moving import moving_points, without_moving
 from graphslam.maps.refined import base_frames, refined_map, refined_submaps
@@ -86,7 +86,7 @@ def refine_run(
     m: GlobalMap,
     *,
     gps: tuple[Gps, GpsConfig] | None = None,
-    graph: PoseGraph | None = None,
+    graph: FactorGraph | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[RefinedRun | None, list[Finding]]:
     """Refine the solved map of a run, and say what was found.
@@ -99,7 +99,7 @@ def refine_run(
         Solved.
     gps : (Gps, GpsConfig), optional
         Fixes that are in the graph, and their options; the refined path uses them, too.
-    graph : PoseGraph, optional
+    graph : FactorGraph, optional
         The graph of the map; its loop closures are compared with the refined path.
 
     Returns
@@ -161,7 +161,7 @@ def _static_submaps(submaps: list[Submap], bases: Array) -> tuple[list[Submap], 
     return without_moving(submaps, moving), [Finding("", "moving", text)] if gone else []
 
 
-def wrong_loops(graph: PoseGraph, m: GlobalMap) -> list[tuple[int, int, float, float]]:
+def wrong_loops(graph: FactorGraph, m: GlobalMap) -> list[tuple[int, int, float, float]]:
     """Loops and matches of a graph that a refined map contradicts by more than scans could bridge.
 
     Returns

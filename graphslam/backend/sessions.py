@@ -16,9 +16,9 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
 from graphslam.loops.graph_loops import GraphRelativePoses
 from graphslam.loops.inter_session_loops import (
@@ -86,7 +86,7 @@ class DenseSession:
         return np.stack(out)
 
 
-def loops_of_graph(graph: PoseGraph) -> list[IntraSessionLoop]:
+def loops_of_graph(graph: FactorGraph) -> list[IntraSessionLoop]:
     """Factors of the graph of a run beside its chain."""
     rows = [r for r in graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
     return [IntraSessionLoop(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
@@ -113,7 +113,7 @@ def _inverse(information: Array) -> Array:
     return 0.5 * (P + P.T)
 
 
-def add_session(graph: PoseGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
+def add_session(graph: FactorGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
     """Add the chain of a session and its own ties to a graph; where it hangs is another matter.
 
     Parameters
@@ -177,7 +177,7 @@ class ConnectedSession:
 
 
 def connect_session(
-    graph: PoseGraph,
+    graph: FactorGraph,
     solver: Solver,
     known: DenseSession,
     known_node: int,
@@ -240,7 +240,7 @@ def connect_session(
 
 
 def connect_by_gps(
-    graph: PoseGraph,
+    graph: FactorGraph,
     solver: Solver,
     known: DenseSession,
     known_node: int,
@@ -276,14 +276,14 @@ def connect_by_gps(
     return ConnectedSession(node, known, None, list(factors.values()), dropped)
 
 
-def _add(graph: PoseGraph, x: Loop, known: DenseSession, new: DenseSession) -> int:
+def _add(graph: FactorGraph, x: Loop, known: DenseSession, new: DenseSession) -> int:
     return graph.add_between(
         x.i, x.j, x.T_ij, x.covariance, streams=[f"{known.name}/scan", f"{new.name}/scan"], evidence="shared-scan",
         robust=RobustKernel("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
     )  # fmt: skip
 
 
-def _winnow(graph: PoseGraph, solver: Solver, factors: dict[int, Loop]) -> int:
+def _winnow(graph: FactorGraph, solver: Solver, factors: dict[int, Loop]) -> int:
     """Take out, worst first, ties that the solved graph contradicts; how many."""
     g = graph.values.group
     limit, taken = float(stats.chi2.ppf(0.9999, g.dof)), 0
@@ -305,7 +305,7 @@ def _winnow(graph: PoseGraph, solver: Solver, factors: dict[int, Loop]) -> int:
 
 
 def _near(
-    graph: PoseGraph, two: TwoSessions, known_node: int, node: int, tied: Sequence[Loop], progress: bool
+    graph: FactorGraph, two: TwoSessions, known_node: int, node: int, tied: Sequence[Loop], progress: bool
 ) -> tuple[list[Loop], int]:
     """More ties, where places of the two sessions are near each other by now, and how many were tried.
 

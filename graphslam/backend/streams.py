@@ -14,8 +14,8 @@ from graphslam.core.log import SensorLog
 from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.evaluate.gps_repeatability import fix_segments
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.ledger import EXCLUSIVE
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import Solver
 
 logger = logging.getLogger(__name__)
@@ -133,7 +133,7 @@ class ImuSource:
         """Those of the log by name, as far as they have come."""
         return imus_of(self.feed)
 
-    def look(self, graph: PoseGraph) -> None:
+    def look(self, graph: FactorGraph) -> None:
         """Hold the axes of every IMU against the path, once, as soon as there is enough of it.
 
         Those the front end uses, too: a path that is made with wrong axes contradicts the forces.
@@ -147,7 +147,7 @@ class ImuSource:
                 self._looked.add(name)
                 graph.check_imu(imu, stream=name, axes=self.config.axes)
 
-    def attach(self, graph: PoseGraph, *, more: bool = False) -> int:
+    def attach(self, graph: FactorGraph, *, more: bool = False) -> int:
         """Give the graph the IMUs that are to be used; returns the number of new factors.
 
         Parameters
@@ -170,7 +170,7 @@ class ImuSource:
             self._given.add(name)
         return made
 
-    def _wanted(self, graph: PoseGraph) -> list[str]:
+    def _wanted(self, graph: FactorGraph) -> list[str]:
         if self.config.use == "none":
             return []
         if self.config.use != "auto":
@@ -179,7 +179,7 @@ class ImuSource:
         return [name for name in self.imus if name in self._given or name not in spent]
 
 
-def repreintegrate_until_converged(graph: PoseGraph, solver: Solver) -> None:
+def repreintegrate_until_converged(graph: FactorGraph, solver: Solver) -> None:
     """Solve, preintegrate anew about the biases found, and solve again, until nothing moves."""
     solver.solve_to_optimum()
     for _ in range(RECENTRED):

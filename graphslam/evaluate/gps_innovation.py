@@ -21,10 +21,10 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.evaluate.gps_repeatability import fix_segments
 from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bounds
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord, antenna_terms
 from graphslam.graph.factors.sensor_biases import sensor_biases_at
 from graphslam.graph.gps import FixErrors, arm_jacobian, datum_columns, lever_arm
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from graphslam.graph.submap_node import SubmapNode
 
@@ -134,7 +134,7 @@ def _six(value: float) -> float:
 
 
 def gps_innovations(
-    graph: PoseGraph,
+    graph: FactorGraph,
     gps: Gps,
     *,
     sigma: float | None = None,
@@ -146,7 +146,7 @@ def gps_innovations(
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         At its optimum, with GPS of its own: without it there is no datum to predict from.
     gps : Gps
         The withheld fixes.
@@ -255,7 +255,7 @@ class _Inner:
     left: Array
 
 
-def _inner(graph: PoseGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inner:
+def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inner:
     """Points of a path given exit, landmarks, and those of its points that the graph solves for."""
     inner, values, lay = s.inner_points, graph.values, graph.flat().layout
     assert inner is not None
@@ -298,7 +298,7 @@ def _inner(graph: PoseGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inner
     return _Inner(fixes, path.positions[points] + off, columns, turned @ gain @ J, 0.5 * (left + left.T))
 
 
-def _arms(graph: PoseGraph, gps: Gps) -> tuple[Ints, Array, Array, list[_Inner]]:
+def _arms(graph: FactorGraph, gps: Gps) -> tuple[Ints, Array, Array, list[_Inner]]:
     """Node of every fix (-1: none), antenna in its frame, joint covariance of these points ``(dim n, dim n)``.
 
     Fixes of one stretch of path, from a node to the next, share what the path has lost since the node. Those at points
@@ -363,7 +363,7 @@ def _arm_covariance(T: Array, P: Array | None, lever: Array) -> Array:
     return np.asarray(np.einsum("aij,ajbk,bmk->aibm", G, joint, G, optimize=True).reshape(d * q, d * q))
 
 
-def _used_biases(graph: PoseGraph) -> tuple[Array, Ints]:
+def _used_biases(graph: FactorGraph) -> tuple[Array, Ints]:
     """Times of the used fixes that have a bias, in order, and the numbers of the biases."""
     used = sorted((r.time, r.bias) for r in graph.records.values() if isinstance(r, GpsRecord) and r.bias is not None)
     return np.array([t for t, _ in used]), np.array([b for _, b in used], dtype=np.int64)
@@ -382,7 +382,7 @@ def _bridged(times: Array, known: Array, errors: FixErrors) -> tuple[Array, Arra
     return np.asarray(gain), 0.5 * (left + left.T)
 
 
-def _biases(graph: PoseGraph, times: Array, bias_sigma: float | None, gap: float) -> Ints:
+def _biases(graph: FactorGraph, times: Array, bias_sigma: float | None, gap: float) -> Ints:
     """Bias of every fix: one of the graph's, a new one (numbered on from the graph's), or -1."""
     used = sorted((r.time, r.bias) for r in graph.records.values() if isinstance(r, GpsRecord) and r.bias is not None)
     if bias_sigma is None:

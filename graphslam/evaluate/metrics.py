@@ -28,7 +28,7 @@ from graphslam.evaluate.gps import GpsResiduals, gps_residuals
 from graphslam.evaluate.map_error import landmark_error, match_ids
 from graphslam.evaluate.residual_consistency import class_consistency, two_sided_bounds
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
@@ -336,7 +336,7 @@ def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, sc
         )
 
 
-def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
+def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
     """Biases as they are at the end, factors, and what was left out; also into the events and the counts."""
     said: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
     for stream in graph.imu.used:
@@ -358,7 +358,7 @@ def imu_metrics(out: Metrics, graph: PoseGraph, drops: DropCounter) -> None:
     _contradiction(graph)
 
 
-def _contradiction(graph: PoseGraph) -> None:
+def _contradiction(graph: FactorGraph) -> None:
     """Say so if the χ² of the ways is larger than it is by chance once in two thousand runs."""
     ways = class_consistency(graph).get("imu") if graph.imu.used else None
     if ways is None or not np.isfinite(ways.ratio):

@@ -20,11 +20,11 @@ from graphslam.core.geometry import Array
 from graphslam.evaluate.consistency import Verdict
 from graphslam.evaluate.whiteness import Whiteness, residual_whiteness
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import UniformBatch
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import GpsBatch
 from graphslam.graph.noise import robust_terms
-from graphslam.graph.pose_graph import PoseGraph
 
 LASTING = "correlated: over-confident"
 """Verdict on residuals that are alike from one to the next, whatever their size."""
@@ -135,12 +135,12 @@ class ClassConsistency:
         }
 
 
-def class_consistency(graph: PoseGraph, *, confidence: float = 0.95) -> dict[str, ClassConsistency]:
+def class_consistency(graph: FactorGraph, *, confidence: float = 0.95) -> dict[str, ClassConsistency]:
     """χ² and effective degrees of freedom of every class of factors, at the graph's present values.
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         At its optimum: elsewhere residuals are larger than the leverages say.
 
     Returns
@@ -180,7 +180,7 @@ def class_consistency(graph: PoseGraph, *, confidence: float = 0.95) -> dict[str
     return out
 
 
-def _series(graph: PoseGraph, covariance: JointCovariance) -> dict[str, Whiteness]:
+def _series(graph: FactorGraph, covariance: JointCovariance) -> dict[str, Whiteness]:
     """Whiteness of every class whose factors have an order of time: fixes and readings, and chains of increments."""
     values = graph.values
     found: dict[str, list[tuple[float, Array, Array, Array]]] = {}

@@ -149,7 +149,7 @@ class ValueSource(Protocol):
 
 
 class FactorGraphState:
-    """The passive part of a :class:`~graphslam.graph.pose_graph.PoseGraph`.
+    """The passive part of a :class:`~graphslam.graph.factor_graph.FactorGraph`.
 
     Parameters
     ----------
@@ -391,7 +391,7 @@ class FactorGraphState:
 
     def _repr_html_(self) -> str:
         said = f" {len(self.values.poses)} nodes, {len(self.values.landmarks)} landmarks, {len(self.records)} factors"
-        return join_parts([html_element("b", "PoseGraph"), said, Markup(self.objective()._repr_html_())])
+        return join_parts([html_element("b", "FactorGraph"), said, Markup(self.objective()._repr_html_())])
 
     # ---------------------------------------------------------------- inside
 

@@ -228,7 +228,7 @@ class GpsFixes:
         self.fitted: FixErrors | None = None
 
     def add(self, gps: Gps, stream: str, config: GpsConfig | None) -> list[int]:
-        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_gps`."""
+        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.add_gps`."""
         g = self.graph
         if gps.positions.shape[1] != g.dim:
             raise GeometryError(

@@ -55,7 +55,7 @@ class ImuUnits:
         self.used: dict[str, ImuUse] = {}
 
     def add(self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False) -> list[int]:
-        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_imu`."""
+        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.add_imu`."""
         if self.graph.dim != 3:
             raise GeometryError("an IMU says little of poses in the plane", where=stream, wanted="a graph in space")
         known = self.used.get(stream)
@@ -88,7 +88,7 @@ class ImuUnits:
         return ids
 
     def check(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
-        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.check_imu`."""
+        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.check_imu`."""
         if axes == "ignore":
             return ""
         try:
@@ -109,7 +109,7 @@ class ImuUnits:
         return words
 
     def recentre(self, *, limit: float = RECENTRE) -> int:
-        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.recentre_imu`."""
+        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.recentre_imu`."""
         changed = 0
         for stream, use in self.used.items():
             old = [r for r in self.graph.records.values() if isinstance(r, ImuRecord) and r.stream == stream]
@@ -124,7 +124,7 @@ class ImuUnits:
         return changed
 
     def states(self, stream: str = "imu") -> ImuStates:
-        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.imu_states`."""
+        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.imu_states`."""
         return ImuStates.of(self.graph.records.values(), stream)
 
     def detach(self, s: SubmapNode) -> None:

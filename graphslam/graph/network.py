@@ -19,7 +19,7 @@ from graphslam.graph.variables import KINDS, Values, VariableLayout
 from graphslam.linear.symmetric_factor import elimination_order
 
 if TYPE_CHECKING:
-    from graphslam.graph.pose_graph import PoseGraph
+    from graphslam.graph.factor_graph import FactorGraph
 
 
 def network_values(network: PoseNetwork, poses: Array, landmarks: Array | None = None) -> Values:
@@ -82,7 +82,7 @@ def network_of(flat: FactorArrays, values: Values) -> PoseNetwork:
     )
 
 
-def to_network(graph: PoseGraph) -> PoseNetwork:
+def to_network(graph: FactorGraph) -> PoseNetwork:
     """Nodes, landmarks, and everything that a network can hold.
 
     A landmark submap becomes one edge between its nodes and one observation per entry, each with its own marginal

@@ -149,7 +149,7 @@ class PendingMeasurements:
     # ---------------------------------------------------------------- taking readings
 
     def add_compass(self, compass: Compass, stream: str, config: CompassConfig | None) -> list[int]:
-        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_compass`."""
+        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.add_compass`."""
         cfg = config or CompassConfig()
         kept = _thinned(compass.times, cfg.every)
         source = len(self.compasses)
@@ -162,7 +162,7 @@ class PendingMeasurements:
     def add_beacons(
         self, ranges: LandmarkObservations, stream: str, config: BeaconConfig | None, lever: Array | None
     ) -> list[int]:
-        """See :meth:`~graphslam.graph.pose_graph.PoseGraph.add_beacons`."""
+        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.add_beacons`."""
         cfg = config or BeaconConfig()
         if ranges.ids is None or np.any(ranges.ids < 0):
             raise DataError("distances to beacons need to say which beacon", where=stream, wanted="known identities")

@@ -149,14 +149,14 @@ def join_poses_isam2(problem: PoseProblem, *, progress: bool = False) -> PoseEst
     PoseEstimate
         As iSAM2 leaves it, above the optimum by its linearisation gap; ``iterations`` are the updates.
     """
+    from graphslam.graph.factor_graph import FactorGraph
     from graphslam.graph.factor_graph_state import BetweenBlock  # gtsam takes a second to load
-    from graphslam.graph.pose_graph import PoseGraph
     from graphslam.solve.isam2 import Isam2Solver
 
     load_kernels()
     start = time.perf_counter()
     ties, g = SortedFactors(problem), problem.group
-    graph = PoseGraph(problem.dim)
+    graph = FactorGraph(problem.dim)
     solver = Isam2Solver(graph)
     number = 0
     for k in Bar(range(len(problem.keys)), name="iSAM2", unit="submap", shown=progress):

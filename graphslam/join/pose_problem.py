@@ -29,11 +29,11 @@ from graphslam.core.npz import floats, ints
 from graphslam.core.poses import SE2, SE3, Group, compose_increments
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, attitude_terms
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord, between_terms
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.noise import robust_terms, whiteners
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import KINDS, Values, VariableLayout
 
 Index = npt.NDArray[np.int64]
@@ -288,7 +288,7 @@ class PoseProblem(RelativePoseFactors):
         )  # fmt: skip
 
     @classmethod
-    def of_graph(cls, graph: PoseGraph) -> PoseProblem:
+    def of_graph(cls, graph: FactorGraph) -> PoseProblem:
         """The relative poses and levelled bases of a graph of dense submaps, with the weights of their kernels."""
         chain = graph.submaps
         if not chain:
@@ -328,7 +328,7 @@ class PoseProblem(RelativePoseFactors):
         if not submaps:
             raise DataError("there are no submaps", got=0, wanted="at least one")
         check_dense(submaps)
-        graph = PoseGraph(submaps[0].dim)
+        graph = FactorGraph(submaps[0].dim)
         for s in submaps:
             graph.add_submap(s, covariance_scale=covariance_scale)
             for m in s.matches:

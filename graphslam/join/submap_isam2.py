@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from graphslam.core.geometry import rotation2
 from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.join.joined_map import in_group_chart
 from graphslam.join.submap_blocks import check_identified, landmark_map_of
 from graphslam.join.submap_solver import SubmapEstimate
@@ -50,7 +50,7 @@ def solve_submaps_isam2(
     """
     check_identified(submaps)
     start = time.perf_counter()
-    graph = PoseGraph()
+    graph = FactorGraph()
     solver = Isam2Solver(graph, relinearize_threshold=relinearize_threshold, relinearize_angle=relinearize_angle)
     for submap in Bar(submaps, name="iSAM2", unit="submap", shown=progress):
         graph.add_submap(submap, covariance_scale=covariance_scale)
@@ -86,7 +86,7 @@ def _first_seen(submaps: Sequence[Submap], landmark_ids: npt.NDArray[np.int64]) 
     return np.array([first[i] for i in landmark_ids.tolist()], dtype=np.int64)
 
 
-def _vector_information(graph: PoseGraph) -> sp.csc_matrix:
+def _vector_information(graph: FactorGraph) -> sp.csc_matrix:
     """Gauss–Newton matrix with poses as (x, y, θ) vectors: ``Gᵀ A G``, ``G = blkdiag(R(θ)ᵀ, 1)`` per pose."""
     values = graph.values
     A = graph.flat().evaluate(values, dense=False).A

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.submap import Submap
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import (
     FRONT_END,
@@ -58,7 +58,7 @@ class FindConfig:
 
 
 def find_loops(
-    graph: PoseGraph,
+    graph: FactorGraph,
     solver: GraphSolver,
     submaps: Sequence[Submap],
     config: FindConfig | None = None,
@@ -69,7 +69,7 @@ def find_loops(
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         Of one chain of dense submaps, solved.
     solver : GraphSolver
         Of that graph.
@@ -117,7 +117,7 @@ class LoopSearch:
 
     def look(
         self,
-        graph: PoseGraph,
+        graph: FactorGraph,
         solver: GraphSolver,
         submaps: Sequence[Submap],
         *,

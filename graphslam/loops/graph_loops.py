@@ -8,10 +8,10 @@ import numpy as np
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints, Places, places_at_nodes
@@ -26,7 +26,7 @@ class GraphSolver(Protocol):
     def solve_to_optimum(self) -> None: ...
 
 
-def places_of_graph(graph: PoseGraph) -> Places:
+def places_of_graph(graph: FactorGraph) -> Places:
     """Bases and inner nodes of all submaps of a graph of one chain; place k is node k."""
     if not graph.submaps:
         raise DataError("a graph without submaps has no places")
@@ -41,7 +41,7 @@ def places_of_graph(graph: PoseGraph) -> Places:
     return places_at_nodes([s.T_base_node for s in graph.submaps], [s.times for s in graph.submaps])
 
 
-def chain_of_graph(graph: PoseGraph) -> tuple[Array, Array]:
+def chain_of_graph(graph: FactorGraph) -> tuple[Array, Array]:
     """Increments ``(n, 7|3)`` from node to node and their covariances ``(n, d, d)``, as the submaps stated them.
 
     The factor of a levelled exit gave up its relative roll and pitch to an attitude, which a chain by itself has not.
@@ -63,13 +63,13 @@ class GraphLoops:
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         Of one chain of dense submaps; may hold GPS and attitudes too.
     solver : GraphSolver
         Of that graph.
     """
 
-    def __init__(self, graph: PoseGraph, solver: GraphSolver) -> None:
+    def __init__(self, graph: FactorGraph, solver: GraphSolver) -> None:
         self.graph, self.solver = graph, solver
         self.places = places_of_graph(graph)
 

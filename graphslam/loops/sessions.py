@@ -1,6 +1,6 @@
 """Maps of several robots, or of several days, brought into one frame by the landmarks they share: start values only.
 
-What follows is one least-squares problem over all chains (:meth:`PoseGraph.start_session`); here it is decided where
+What follows is one least-squares problem over all chains (:meth:`FactorGraph.start_session`); here it is decided where
 another chain begins, and which of its landmarks are which. With identities that mean the same everywhere (barcodes,
 survey numbers) a rigid fit to the common landmarks does both. Without, the two constellations are matched: every pair
 of landmarks of one map is laid on every pair of the other that is as long, and the motion that brings most landmarks

@@ -15,8 +15,8 @@ from scipy import stats
 
 from graphslam.core.errors import DataError
 from graphslam.evidence.beams import BeamModel
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.maps.entropy import MapEntropy
 from graphslam.maps.fuse import FusedMap
 from graphslam.maps.minimum_entropy import MapHypothesis, rank_by_entropy
@@ -44,14 +44,14 @@ class Alternative:
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         At its solution.
     facts : mapping of str
         Further facts, JSON-serialisable.
     """
 
     name: str
-    graph: PoseGraph
+    graph: FactorGraph
     solution: Solution
     candidate: MapHypothesis
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -203,7 +203,7 @@ def rank_alternatives(
     return RankedAlternatives(tuple(order), best, scale)
 
 
-def chi2_of(graph: PoseGraph) -> float:
+def chi2_of(graph: FactorGraph) -> float:
     """χ² of a graph where it is, with matches and loops as if they had no kernel."""
     score = graph.objective()
     blocks = graph.flat().factor_blocks(graph.values)

@@ -9,8 +9,8 @@ import numpy as np
 
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.graph.covariance import JointCovariance
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.network import network_of
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import DescentLimits, Optimum, descend_to_minimum
 from graphslam.solve.solution import Solution, make_solution
@@ -39,13 +39,13 @@ class BatchSolver:
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         Read at every call; its values are written back.
     """
 
     name = "batch"
 
-    def __init__(self, graph: PoseGraph, config: LevenbergConfig | None = None) -> None:
+    def __init__(self, graph: FactorGraph, config: LevenbergConfig | None = None) -> None:
         self.graph = graph
         self.config = config or LevenbergConfig()
         self.seconds = 0.0
@@ -157,7 +157,7 @@ def optimise_problem(problem: SparseProblem, values: Values, config: LevenbergCo
 
 
 def optimise_graph(
-    graph: PoseGraph, config: LevenbergConfig | None = None, problem: SparseProblem | None = None
+    graph: FactorGraph, config: LevenbergConfig | None = None, problem: SparseProblem | None = None
 ) -> Optimum:
     """Optimum of a graph from its present values; the graph is not changed.
 
@@ -173,13 +173,13 @@ def optimise_graph(
         raise
 
 
-def linearisation_gap(graph: PoseGraph) -> float:
+def linearisation_gap(graph: FactorGraph) -> float:
     """Objective at the graph's values less the batch optimum reached from there."""
     optimum = optimise_graph(graph)
     return optimum.objective_initial - optimum.objective
 
 
-def state_of(graph: PoseGraph) -> Optimum:
+def state_of(graph: FactorGraph) -> Optimum:
     """The present values seen as an (unconverged) optimum: objective, and the decrease still promised."""
     problem = SparseProblem(graph.flat())
     objective, decrement = problem.objective(graph.values), 0.0

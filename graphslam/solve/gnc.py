@@ -21,9 +21,9 @@ from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import FactorRecord, batch_of
 from graphslam.graph.noise import NO_KERNEL
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver, LevenbergConfig, optimise_problem
 from graphslam.solve.solution import Solution
 from graphslam.solve.sparse import SparseProblem
@@ -65,7 +65,7 @@ class GncSolver(BatchSolver):
 
     name = "gnc"
 
-    def __init__(self, graph: PoseGraph, config: LevenbergConfig | None = None, gnc: GncConfig | None = None) -> None:
+    def __init__(self, graph: FactorGraph, config: LevenbergConfig | None = None, gnc: GncConfig | None = None) -> None:
         super().__init__(graph, config)
         self.gnc = gnc or GncConfig()
         self._searched = -1  # revision of the graph in which outliers were looked for last
@@ -96,7 +96,7 @@ class GncSolver(BatchSolver):
 
 
 def find_outliers(
-    graph: PoseGraph, config: GncConfig | None = None, solver: LevenbergConfig | None = None
+    graph: FactorGraph, config: GncConfig | None = None, solver: LevenbergConfig | None = None
 ) -> list[tuple[FactorRecord, float, float]]:
     """Doubtful factors whose final weight is less than a half, with their χ² at the end and its limit.
 

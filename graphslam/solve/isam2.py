@@ -27,10 +27,10 @@ from graphslam.core.errors import ConfigError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import FactorRecord, gtsam_factor, pose_array
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.gtsam_values import from_gtsam, insert_values, value_of
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values, gtsam_key, split_name, thresholds
 from graphslam.solve.batch import linearisation_gap, optimise_graph, state_of
 from graphslam.solve.solution import Solution, make_solution
@@ -51,11 +51,11 @@ class FactorRejectedError(SolverError):
 
 
 class Isam2Solver:
-    """iSAM2 over a :class:`PoseGraph`.
+    """iSAM2 over a :class:`FactorGraph`.
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         Read at every update; its values are written back.
     relinearize_threshold : float
         A position that moved by more than this [m] since it was linearised is linearised again.
@@ -72,7 +72,7 @@ class Isam2Solver:
 
     def __init__(
         self,
-        graph: PoseGraph,
+        graph: FactorGraph,
         *,
         relinearize_threshold: float = 0.1,
         relinearize_angle: float = 0.01,

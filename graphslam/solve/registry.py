@@ -1,4 +1,4 @@
-"""Solvers by name. A solver is a class over a :class:`~graphslam.graph.pose_graph.PoseGraph` with a few verbs."""
+"""Solvers by name. A solver is a class over a :class:`~graphslam.graph.factor_graph.FactorGraph` with a few verbs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 from graphslam.core.errors import UnknownNameError
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.solve.batch import BatchSolver, PcgSolver
 from graphslam.solve.gnc import GncSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -16,7 +16,7 @@ from graphslam.solve.solution import Solution
 class Solver(Protocol):
     """What every solver offers; it reads the graph at each call and writes its values back."""
 
-    graph: PoseGraph
+    graph: FactorGraph
 
     def update(self) -> None:
         """Take in what changed in the graph."""
@@ -48,7 +48,7 @@ SOLVERS: dict[str, type] = {
 }
 
 
-def make_solver(name: str, graph: PoseGraph, **options: Any) -> Solver:
+def make_solver(name: str, graph: FactorGraph, **options: Any) -> Solver:
     """A registered solver over ``graph``."""
     if name not in SOLVERS:
         raise UnknownNameError("solver", name, SOLVERS)

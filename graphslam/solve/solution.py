@@ -18,11 +18,11 @@ from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factor_graph import FactorGraph, SubmapNode
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.sensor_biases import bias_variable_names, sensor_biases_at
 from graphslam.graph.network import network_of
-from graphslam.graph.pose_graph import PoseGraph, SubmapNode
 from graphslam.graph.score import GraphScore, score_graph
 from graphslam.graph.variables import Values, vector_form
 from graphslam.solve.descent import Optimum
@@ -296,7 +296,7 @@ CONVERGED = 1e-8
 
 
 def make_solution(
-    solver: str, graph: PoseGraph, optimum: Optimum, *, iterations: int, gap: float | None, seconds: float
+    solver: str, graph: FactorGraph, optimum: Optimum, *, iterations: int, gap: float | None, seconds: float
 ) -> Solution:
     """A :class:`Solution` of the graph's present state from where an optimiser stands."""
     flat = graph.flat()

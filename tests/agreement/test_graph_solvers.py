@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_between
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import solve_submaps
@@ -22,9 +22,9 @@ from tests.reference.graph_chain import make_chain, make_gps
 from tests.reference.gtsam_optimum import optimise_with_gtsam
 
 
-def build(rng, *, gps: bool, robust: RobustKernel, update=lambda g: None) -> PoseGraph:
+def build(rng, *, gps: bool, robust: RobustKernel, update=lambda g: None) -> FactorGraph:
     chain = make_chain(rng, m=14, landmarks=20, laps=1.6)
-    g = PoseGraph()
+    g = FactorGraph()
     if gps:
         fixes = make_gps(chain, rng, np.array([30.0, -10.0, 2.0]), step=2.0)
         g.add_gps(fixes, config=GpsConfig(robust=robust, bias_sigma=1.0, segment_gap=1.9))
@@ -46,7 +46,7 @@ def test_isam2_batch_and_gtsam_agree(rng, gps, robust):
     seed = rng.integers(1 << 30)
     solvers: dict[int, Isam2Solver] = {}
 
-    def step(g: PoseGraph) -> None:
+    def step(g: FactorGraph) -> None:
         solvers.setdefault(id(g), Isam2Solver(g)).update()
 
     g = build(np.random.default_rng(seed), gps=gps, robust=robust, update=step)
@@ -113,7 +113,7 @@ def test_two_hundred_published_maps_reach_the_known_optimum(data_dir):
     assert a.objective_polished == pytest.approx(3643.43, abs=0.01)
     assert a.objective == pytest.approx(3643.43, rel=1e-3)  # iSAM2 before the polish: its gap is small here
     assert a.converged
-    g = PoseGraph()
+    g = FactorGraph()
     for s in submaps:
         g.add_submap(s)
     solver = BatchSolver(g)

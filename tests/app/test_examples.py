@@ -13,7 +13,7 @@ import pytest
 
 import graphslam as gs
 
-TYPES = {"Collapse", "PoseGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory"}
+TYPES = {"Collapse", "FactorGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory"}
 NAMES = sorted(n for n in gs.__all__ if n not in ("__version__", "plots"))
 
 

@@ -32,8 +32,8 @@ from graphslam.evaluate.consistency import Consistency
 from graphslam.evaluate.metrics import FigureTable
 from graphslam.evaluate.residual_consistency import ClassConsistency
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.ledger import Ledger
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.score import ClassScore, GraphScore
 from graphslam.io.cards import list_cards
 from graphslam.join.submap_solver import SubmapEstimate
@@ -82,8 +82,8 @@ def metrics() -> pd.DataFrame:
     return pd.DataFrame([{"key": "k", "value": 1.0, "unit": "m", "direction": "none"}])
 
 
-def graph() -> PoseGraph:
-    g = PoseGraph()
+def graph() -> FactorGraph:
+    g = FactorGraph()
     g.add_submap(submap())
     return g
 
@@ -152,7 +152,7 @@ def a_merge(_: Path) -> MergedMap:
     )
 
 
-def a_graph(_: Path) -> PoseGraph:
+def a_graph(_: Path) -> FactorGraph:
     return graph()  # the names of its classes of factors are those of the code
 
 

@@ -9,7 +9,7 @@ import pytest
 import graphslam as gs
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.core.records import Stream
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.solve.registry import make_solver
 
 VERBS = {
@@ -22,7 +22,7 @@ STREAMS = {
     *("Gps", "Imu", "LandmarkObservations", "LaserScans", "Odometry", "PointClouds", "PointObservations", "RangeScans"),
     *("SteeringControls", "VelocityControls"),
 }
-TYPES = {"Collapse", "PoseGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory"}
+TYPES = {"Collapse", "FactorGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory"}
 
 
 def test_tab_completion_offers_these_and_no_more() -> None:
@@ -35,8 +35,8 @@ def test_tab_completion_offers_these_and_no_more() -> None:
 def test_help_teaches(name: str) -> None:
     """A first sentence, what goes in, and a short example."""
     said = inspect.getdoc(getattr(gs, name)) or ""
-    if name == "PoseGraph":  # in its module
-        said += inspect.getmodule(gs.PoseGraph).__doc__ or ""  # type: ignore[union-attr]
+    if name == "FactorGraph":  # in its module
+        said += inspect.getmodule(gs.FactorGraph).__doc__ or ""  # type: ignore[union-attr]
     assert said.split("\n")[0].rstrip().endswith((".", ":"))
     assert "Examples\n--------" in said
     if name in VERBS:
@@ -55,7 +55,7 @@ def test_what_is_listed_can_be_used() -> None:
     assert {"segslam", "rbpf-ekf"} <= set(gs.front_ends())
     assert all(make_front_end(name, {}).name == name for name in ("segslam", "rbpf-grid"))
     for name in gs.solvers():
-        assert make_solver(name, PoseGraph(2)).graph.dim == 2
+        assert make_solver(name, FactorGraph(2)).graph.dim == 2
     submaps = gs.local_maps(gs.simulate("landmark-field", preset="quick"), options={"particles": 10})[:3]
     for name in gs.joiners():
         assert gs.join_submaps(submaps, name).states > 0

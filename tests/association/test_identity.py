@@ -11,14 +11,14 @@ from graphslam.association.identity import find_association_outliers, identity_s
 from graphslam.backend.back_end import BackEnd
 from graphslam.backend.config import BackEndConfig
 from graphslam.core.errors import DataError
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import make_chain
 
 
 def solved(submaps):
-    g = PoseGraph()
+    g = FactorGraph()
     for s in submaps:
         g.add_submap(s)
     BatchSolver(g).solve_to_optimum()

@@ -10,7 +10,7 @@ from graphslam.association.landmarks import AssociationConfig, CompatiblePairing
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.submap_model import predict_submap
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import anonymous, dense_submap, make_chain
@@ -21,7 +21,7 @@ JC, NN = AssociationConfig(), AssociationConfig(method="nearest-neighbour")
 @pytest.mark.parametrize("config", [JC, NN], ids=["jc", "nn"])
 def test_whole_chain_is_identified(rng, config):
     chain = make_chain(rng, m=16, landmarks=25, laps=2.0)
-    g = PoseGraph()
+    g = FactorGraph()
     solver = BatchSolver(g)
     name: dict[int, int] = {}  # ours -> true
     wrong = split = 0
@@ -37,9 +37,9 @@ def test_whole_chain_is_identified(rng, config):
     assert split <= 2
 
 
-def drifted_graph(rng, shift: np.ndarray, points: np.ndarray) -> tuple[PoseGraph, Submap]:
+def drifted_graph(rng, shift: np.ndarray, points: np.ndarray) -> tuple[FactorGraph, Submap]:
     """A map of ``points``, then a long uncertain leg that comes back to its start, off by ``shift``."""
-    g = PoseGraph()
+    g = FactorGraph()
     n = len(points)
     P = 0.02**2 * np.eye(3 + 2 * n)
     first = LandmarkMap(ids=np.arange(n), exit_pose=np.array([5.0, 0, 0]), positions=points, covariance=P)
@@ -66,7 +66,7 @@ def test_gate_covers_what_it_should(rng):
     d2, n2 = [], []
     for _ in range(150):
         chain = make_chain(rng, m=3, landmarks=6, reach=60.0, sigma=0.02)
-        g = PoseGraph()
+        g = FactorGraph()
         for s in chain.submaps[:2]:
             g.add_submap(s)
         BatchSolver(g).update()
@@ -156,7 +156,7 @@ def test_search_is_its_slow_twin(rng, persistent):
 
 def test_nothing_is_matched_where_nothing_is(rng):
     chain = make_chain(rng, m=2, landmarks=10, reach=50.0)
-    g = PoseGraph()
+    g = FactorGraph()
     assert np.all(associate_landmarks(g, anonymous(chain.submaps[0])) == -1)  # an empty graph
     g.add_submap(chain.submaps[0])
     s = anonymous(chain.submaps[1])
@@ -172,7 +172,7 @@ def test_nothing_is_matched_where_nothing_is(rng):
 
 def test_known_ids_stay_and_are_not_given_again(rng):
     chain = make_chain(rng, m=2, landmarks=10, reach=50.0)
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_submap(chain.submaps[0])
     ids = np.full(10, -1)
     ids[3] = 7  # the front end is (wrongly) sure of this one
@@ -190,10 +190,10 @@ def test_bad_options_are_refused(options):
 # ------------------------------------------------------------------ merging
 
 
-def split_graph(rng) -> tuple[PoseGraph, dict[int, int]]:
+def split_graph(rng) -> tuple[FactorGraph, dict[int, int]]:
     """Two laps whose second lap knows nothing of the first: every landmark is there twice."""
     chain = make_chain(rng, m=16, landmarks=20, laps=2.0, sigma=0.02)
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps:
         g.add_submap(s, landmark_ids=s.landmarks.ids + (100 if s.key >= 8 else 0))
     BatchSolver(g).update()
@@ -214,7 +214,7 @@ def test_mahalanobis_merge_finds_the_twins_and_no_others(rng):
 def test_only_the_euclidean_merge_repairs_a_duplicate_inside_a_submap(rng):
     points = np.array([[2.0, 0.0], [2.3, 0.1], [6.0, 1.0]])
     lm = LandmarkMap(ids=np.full(3, -1), exit_pose=np.array([4.0, 0, 0]), positions=points, covariance=1e-2 * np.eye(9))
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_submap(Submap.from_landmarks(0, lm))
     assert mahalanobis_merges(g) == []
     assert euclidean_merges(g, within_submap=False) == []
@@ -229,7 +229,7 @@ def test_only_the_euclidean_merge_repairs_a_duplicate_inside_a_submap(rng):
 def test_a_row_of_near_ones_does_not_collapse(rng):
     points = np.stack([np.arange(6) * 0.5, np.zeros(6)], -1)
     lm = LandmarkMap(ids=np.full(6, -1), exit_pose=np.zeros(3), positions=points, covariance=1e-2 * np.eye(15))
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_submap(Submap.from_landmarks(0, lm))
     merges = euclidean_merges(g, 0.7)
     assert 2 <= len(merges) <= 4
@@ -240,7 +240,7 @@ def test_a_row_of_near_ones_does_not_collapse(rng):
 
 def test_merging_prefers_the_one_seen_more_often(rng):
     chain = make_chain(rng, m=3, landmarks=5, reach=60.0, noise=0.0)
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps:
         ids = s.landmarks.ids + (50 if s.key == 0 else 0)
         g.add_submap(s, landmark_ids=ids)

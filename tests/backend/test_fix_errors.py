@@ -11,10 +11,10 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import gps_innovations
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies.trust_worlds import lasting
 
@@ -23,7 +23,7 @@ STEP = np.array([0.06, 0.04, np.deg2rad(0.15)])
 CAUCHY = RobustKernel("cauchy", 2.385)
 
 
-def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tuple[PoseGraph, np.ndarray, Gps]:
+def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tuple[FactorGraph, np.ndarray, Gps]:
     """Dead reckoning with a fix each second whose σ is stated as 1 m: graph, true nodes, fixes."""
     n = len(errors)
     rate = 0.05 * lasting(rng, n, 1.0, 20.0, 1)[:, 0]
@@ -37,7 +37,7 @@ def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tu
         times=times, positions=se2_transform(np.array([30.0, 5.0, 0.4]), inside) + errors, sigma=np.ones(n),
         lever=np.zeros(2),
     )  # fmt: skip
-    graph, P = PoseGraph(), np.diag(STEP**2)
+    graph, P = FactorGraph(), np.diag(STEP**2)
     for k in range(n):
         path = Trajectory(np.array([k, k + 1.0]), np.stack([np.zeros(3), steps[k]]), np.stack([1e-9 * np.eye(3), P]))
         graph.add_submap(
@@ -46,14 +46,14 @@ def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tu
     return graph, true, fixes
 
 
-def solved(graph: PoseGraph, fixes: Gps, robust: RobustKernel = CAUCHY) -> PoseGraph:
+def solved(graph: FactorGraph, fixes: Gps, robust: RobustKernel = CAUCHY) -> FactorGraph:
     graph.add_gps(fixes, config=GpsConfig(robust=robust))
     graph.finish_gps()
     BatchSolver(graph).solve_to_optimum()
     return graph
 
 
-def node_nees(graph: PoseGraph, true: np.ndarray) -> float:
+def node_nees(graph: FactorGraph, true: np.ndarray) -> float:
     """Mean NEES/2 of the positions of the nodes in the frame of the fixes."""
     lay, cov = graph.flat().layout, graph.covariance()
     D = graph.values.datum.copy()

@@ -13,7 +13,7 @@ from graphslam.app.run.config import RunConfig
 from graphslam.backend.back_end import Observer
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.ledger import LoopDecision
 from graphslam.solve.solution import Solution
 from tests.app.run.test_pipeline_space import Ring, ring
@@ -28,10 +28,10 @@ class Listener(Observer):
     def front_end_at(self, progress: Any) -> None:
         self.told.append(("step", progress))
 
-    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+    def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
         self.told.append(("submap", (submap.key, len(graph.submaps))))
 
-    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
         self.told.append(("loop", decision.loop))
 
     def solved(self, solution: Solution) -> None:

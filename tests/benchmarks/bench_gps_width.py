@@ -20,10 +20,10 @@ import numpy as np
 
 from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Gps
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -61,7 +61,7 @@ def spoilt(gps: Gps, rng: np.random.Generator, jump: float) -> Gps:
 def error(chain: DenseChain, gps: Gps, kernel: RobustKernel) -> float:
     """Mean squared error at the ends of the submaps [m²]."""
     dim = group_of(chain.poses).dim
-    g = PoseGraph(dim)
+    g = FactorGraph(dim)
     g.add_gps(gps, config=GpsConfig(robust=kernel))
     for s in chain.submaps:
         g.add_submap(s, spacing=4.0)

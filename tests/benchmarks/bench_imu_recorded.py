@@ -23,11 +23,11 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.residual_consistency import class_consistency
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.euroc import read_euroc
 from graphslam.solve.batch import BatchSolver
 from tests.conftest import data_root
@@ -58,7 +58,7 @@ def turned_on(start: np.ndarray, imu: Imu, at: np.ndarray, bias: np.ndarray) -> 
 
 def flown(
     imu: Imu, at: np.ndarray, points: np.ndarray, body: np.ndarray, heading: float, sigma: float
-) -> PoseGraph | None:
+) -> FactorGraph | None:
     """The graph of a flight at its optimum; None where it has none.
 
     Parameters
@@ -72,7 +72,7 @@ def flown(
     """
     path = np.concatenate([se3.quat_rotate(se3.so3_exp([0.0, 0.0, heading]), points - points[0]), body], axis=1)
     path[:, :3] -= se3.quat_rotate(body, np.tile(PRISM, (len(body), 1)))
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     frame = np.append(path[0, :3], [0.0, 0.0, 0.0, 1.0])  # the first base is level, the others stand as the body does
     for k in range(len(at) - 1):
         local = SE3.between(np.stack([frame, frame]), path[k : k + 2])
@@ -187,7 +187,7 @@ def carried(root: Path, drift: float, seed: int = 0) -> str:
     seen = SE3.compose(moves, SE3.exp(step * rng.standard_normal((len(moves), 6))))
     Q, out = np.diag(step**2), []
     for use in (False, True):
-        g = PoseGraph(3)
+        g = FactorGraph(3)
         for k in range(0, len(seen) - 20, 20):
             path, P = [SE3.identity], [1e-12 * np.eye(6)]
             for m in seen[k : k + 20]:

@@ -1,7 +1,7 @@
 """What an update of the incremental solver costs, beside bare GTSAM: ``python -m tests.benchmarks.bench_incremental``.
 
 An open chain in space with a fix of GPS on every tenth node, and loops back to nodes that were there long ago. Ours is
-a :class:`PoseGraph` with the solver ``isam2``; bare GTSAM is an ``ISAM2`` object with native factors that are made
+a :class:`FactorGraph` with the solver ``isam2``; bare GTSAM is an ``ISAM2`` object with native factors that are made
 outside the time measured. Medians of single updates by the clock on the wall: reading the CPU time of a process costs
 more than an update on some machines, and a median leaves out the updates in which something else ran. ``--quick`` for a
 short chain.
@@ -19,8 +19,8 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_pose
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.isam2 import Isam2Solver
 
 STEP = np.array([0.0, 0.0, 0.01, 1.0, 0.0, 0.0])
@@ -43,10 +43,10 @@ def problem(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     return poses, measured, fixes, loops
 
 
-def ours(n: int, data: tuple[np.ndarray, ...], close: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, PoseGraph]:
+def ours(n: int, data: tuple[np.ndarray, ...], close: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, FactorGraph]:
     """Seconds of every update, of every call of ``add_submap``, of every loop."""
     poses, measured, fixes, loops = data
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     solver = Isam2Solver(graph)
     times = np.arange(n + 1, dtype=np.float64)
     gps = Gps(times=times[EVERY::EVERY], positions=fixes, sigma=np.full(len(fixes), FIX), lever=np.zeros(3))

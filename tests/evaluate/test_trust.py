@@ -24,8 +24,8 @@ from graphslam.evaluate.covariance_assessment import (
 )
 from graphslam.evaluate.residual_consistency import LASTING, class_consistency
 from graphslam.evaluate.whiteness import residual_whiteness
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.registry import make_solver
 from tests.reference.graph_chain import make_chain
 
@@ -74,7 +74,7 @@ def test_pauses_are_not_bridged_and_few_residuals_tell_nothing(rng):
     assert w.pairs == 58
 
 
-def solved(rng, errors) -> PoseGraph:
+def solved(rng, errors) -> FactorGraph:
     """A chain with a fix each second, whose errors [m] have the size of their σ."""
     chain = make_chain(rng, m=8, landmarks=12)
     times = np.arange(0.5, 80.0, 0.5)
@@ -85,7 +85,7 @@ def solved(rng, errors) -> PoseGraph:
         c, s = np.cos(chain.poses[k, 2]), np.sin(chain.poses[k, 2])
         where.append(chain.poses[k, :2] + np.array([[c, -s], [s, c]]) @ T[:2])
     fixes = np.array(where) + errors(len(times))
-    graph = PoseGraph()
+    graph = FactorGraph()
     graph.add_gps(
         Gps(times=times, positions=fixes, sigma=np.ones(len(times)), lever=np.zeros(2)), config=GpsConfig(baseline=5.0)
     )

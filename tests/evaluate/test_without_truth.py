@@ -13,9 +13,9 @@ from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import GpsInnovations, _arm_covariance, gps_innovations
 from graphslam.evaluate.residual_consistency import class_consistency, correlated_dof, two_sided_bounds
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 from graphslam.solve.registry import make_solver
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf, RbpfEkfConfig
@@ -36,11 +36,11 @@ def fixes_of(chain, rng, times, *, sigma=0.3, lever=(0.5, 0.2)) -> Gps:
     return Gps(times=times, positions=z, sigma=np.full(len(times), sigma), lever=np.array(lever))
 
 
-def solved_graph(rng, *, robust=NO_KERNEL, bias_sigma=None, m=6) -> tuple[PoseGraph, Gps]:
+def solved_graph(rng, *, robust=NO_KERNEL, bias_sigma=None, m=6) -> tuple[FactorGraph, Gps]:
     """A small solved graph with every second fix in it, and the others."""
     chain = make_chain(rng, m=m, landmarks=12)
     gps = fixes_of(chain, rng, np.arange(0.5, 10.0 * m, 1.5))
-    graph = PoseGraph()
+    graph = FactorGraph()
     config = GpsConfig(robust=robust, baseline=5.0, bias_sigma=bias_sigma, segment_gap=4.0)
     graph.add_gps(gps.take(slice(0, None, 2)), config=config)
     for s in chain.submaps:
@@ -187,12 +187,12 @@ def test_correlated_squares_have_the_two_moments_that_the_bounds_use(rng):
     assert (verdict, low < 1 < high) == ("consistent", True)
 
 
-def small_run(seed: int, scale: float, robust: RobustKernel) -> tuple[PoseGraph, Gps]:
+def small_run(seed: int, scale: float, robust: RobustKernel) -> tuple[FactorGraph, Gps]:
     """A simulated loop through the front end and the graph; the estimators are told the noise of scale 1."""
     c = landmark_field_preset("quick", gps_rate=1.0, gps_sigma=0.5, laps=1.6, noise_scale=scale, gps_lever=(1.0, 0.3))
     log = simulate_landmark_field(c, seed)
     front = RbpfEkf(RbpfEkfConfig(association="known", particles=10, max_range=20.0))
-    gps, graph = log["gps"], PoseGraph()
+    gps, graph = log["gps"], FactorGraph()
     used = np.arange(len(gps.times)) % 2 == 0
     graph.add_gps(gps.take(used), config=GpsConfig(robust=robust))
     for s in front.submaps(log, seed=SeedTree(seed)):
@@ -257,14 +257,14 @@ def test_what_cannot_be_predicted_is_refused_or_counted(rng):
     assert (got.unpredicted, len(got.times)) == (1, len(withheld.times))
     with pytest.raises(DataError, match="no withheld fix"):
         gps_innovations(graph, late.take(slice(-1, None)))
-    bare = PoseGraph()
+    bare = FactorGraph()
     for s in make_chain(rng, m=3, landmarks=8).submaps:
         bare.add_submap(s)
     with pytest.raises(DataError, match="datum"):
         gps_innovations(bare, withheld)
     alone = class_consistency(bare)
     assert alone["submap"].dof == pytest.approx(alone["submap"].rows - bare.flat().layout.size)
-    chain = PoseGraph()
+    chain = FactorGraph()
     chain.add_submap(make_chain(rng, m=1, landmarks=4).submaps[0])
     row = class_consistency(chain)["submap"].as_row()
     assert row["verdict"] == "no redundancy"

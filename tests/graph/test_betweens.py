@@ -11,9 +11,9 @@ import pytest
 
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, EvidenceReusedError, GeometryError
 from graphslam.core.poses import SE2, SE3
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.network import network_values, problem_of_network
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.gnc import GncSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -30,7 +30,7 @@ def arrays(rng, dim, n=300):
 
 
 def in_one_call(net, P, **more):
-    graph = PoseGraph(net.dim)
+    graph = FactorGraph(net.dim)
     ids = graph.add_betweens(
         net.edges, net.measurements, P, poses=net.poses[1:], streams=["odometry"], interval=(0, 9), **more
     )
@@ -39,7 +39,7 @@ def in_one_call(net, P, **more):
 
 
 def one_by_one(net, P):
-    graph = PoseGraph(net.dim)
+    graph = FactorGraph(net.dim)
     for T in net.poses[1:]:
         graph.structure.append("x", T)
     for (i, j), T, C in zip(net.edges.tolist(), net.measurements, P):
@@ -107,7 +107,7 @@ def test_a_wrong_one_is_named_and_taken_out(rng):
     loops = np.flatnonzero(np.abs(np.diff(net.edges, axis=1)[:, 0]) > 1)
     T = net.measurements.copy()
     T[loops[0], :2] += 3.0
-    graph = PoseGraph(2)
+    graph = FactorGraph(2)
     odometry = np.setdiff1d(np.arange(len(T)), loops)
     P = np.linalg.inv(net.information)
     graph.add_betweens(
@@ -167,7 +167,7 @@ def test_a_network_and_a_graph_are_one_problem(rng):
 MILLION = r"""
 import json, re, time
 import numpy as np
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 n = 100_000
 m = 1_000_000
 
@@ -182,7 +182,7 @@ ends = np.stack([i, (i + rng.integers(1, n, m)) % (n + 1)], 1)
 ends[ends[:, 0] == ends[:, 1], 1] += 1
 T = np.zeros((m, 3))
 P = np.tile(np.diag([0.1, 0.1, 0.01]), (m, 1, 1))
-graph = PoseGraph()
+graph = FactorGraph()
 begin, before = time.process_time(), most()
 graph.add_betweens(ends, T, P, poses=np.zeros((n, 3)), evidence="shared-scan")
 spent = time.process_time() - begin

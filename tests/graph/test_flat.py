@@ -9,20 +9,20 @@ import pytest
 
 from graphslam.core.geometry import se2_between, se2_log
 from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
 
 
-def rich_graph(rng) -> PoseGraph:
+def rich_graph(rng) -> FactorGraph:
     """Every class of factor, both ends of the fixed base, kernels, a repeated id, values away from the optimum."""
     chain = make_chain(rng, m=6, landmarks=10)
-    g = PoseGraph()
+    g = FactorGraph()
     gps = make_gps(chain, rng, np.array([5.0, -3.0, 1.1]), step=2.0)
     g.add_gps(gps, config=GpsConfig(robust=RobustKernel("cauchy", 1.0), bias_sigma=0.5, segment_gap=9.0, baseline=15.0))
     for s in chain.submaps:
@@ -39,7 +39,7 @@ def rich_graph(rng) -> PoseGraph:
     return g
 
 
-def slow_residuals(g: PoseGraph, values) -> list[np.ndarray]:
+def slow_residuals(g: FactorGraph, values) -> list[np.ndarray]:
     """Whitened residual of every record, one by one, no kernel."""
     out, row = [], g.flat().layout.row_of
     for r in g.records.values():
@@ -65,7 +65,7 @@ def test_graph_has_every_kind(rng):
     assert any(len(set(i.landmark_ids.tolist())) < len(i.landmark_ids) for i in _submaps(g))
 
 
-def _submaps(g: PoseGraph) -> list[SubmapRecord]:
+def _submaps(g: FactorGraph) -> list[SubmapRecord]:
     return [r for r in g.records.values() if isinstance(r, SubmapRecord)]
 
 
@@ -113,7 +113,7 @@ def test_dense_and_sparse_agree(rng):
 def test_vector_and_tangent_blocks_share_one_model(rng, chart):
     """The kernel's block of one submap is Jᵀ Λ J of the published model, away from the optimum too."""
     chain = make_chain(rng, m=2)
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps:
         g.add_submap(replace(s, landmarks=replace(s.landmarks, chart=chart)))
     g.set_values(g.values.retract(0.4 * rng.standard_normal(g.flat().layout.size)))
@@ -132,7 +132,7 @@ def test_vector_and_tangent_blocks_share_one_model(rng, chart):
 
 
 def test_empty_and_landmark_free_graphs():
-    g = PoseGraph()
+    g = FactorGraph()
     assert g.flat().evaluate(g.values).objective == 0.0
     g.add_submap(dense_submap(0, np.array([1.0, 0, 0]), np.eye(3)))
     np.testing.assert_allclose(g.covariance().marginal("x1"), np.eye(3))

@@ -14,10 +14,10 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.inner_nodes import cut_submap, inner_rows
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.space_chain import STEP_SIGMA, dense_chain
@@ -125,7 +125,7 @@ def test_rows_are_spread_over_the_way():
 def test_an_open_chain_is_the_same_graph(rng, dim):
     """Without a loop, nodes inside change neither the bases nor what is known of them."""
     chain = dense_chain(rng, dim, m=3)
-    whole, cut = PoseGraph(dim), PoseGraph(dim)
+    whole, cut = FactorGraph(dim), FactorGraph(dim)
     for s in chain.submaps:
         whole.add_submap(s)
         cut.add_submap(s, spacing=3.0)
@@ -159,7 +159,7 @@ def test_loops_bend_a_cut_submap(rng, dim):
     T = group.between(chain.poses[0], chain.poses[2])
     error, solutions = {}, {}
     for spacing in (None, 3.0):
-        g = PoseGraph(dim)
+        g = FactorGraph(dim)
         solver = Isam2Solver(g)
         for s in bent:
             g.add_submap(s, spacing=spacing)
@@ -187,7 +187,7 @@ def test_loops_bend_a_cut_submap(rng, dim):
 def closed_ring(rng, dim, steps):
     """Two dense submaps around, cut every 3 m, closed by a loop of 1 cm and 10 mrad, solved; chain and graph."""
     group, chain = GROUP[dim], dense_chain(rng, dim, m=2, steps=steps)
-    g = PoseGraph(dim)
+    g = FactorGraph(dim)
     for s in chain.submaps:
         g.add_submap(s, spacing=3.0)
     e = group.exp(1e-2 * rng.standard_normal(group.dof))
@@ -232,7 +232,7 @@ def test_nodes_of_a_loop_graph_by_monte_carlo(rng, dim):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_match_hangs_on_the_nearest_inner_node(rng, dim):
     group, chain = GROUP[dim], dense_chain(rng, dim, m=4, noise=0.0)
-    g = PoseGraph(dim)
+    g = FactorGraph(dim)
     for s in chain.submaps:
         g.add_submap(s, spacing=3.0)
     target = g.submap(1)
@@ -260,7 +260,7 @@ def test_a_match_hangs_on_the_nearest_inner_node(rng, dim):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_fixes_hang_on_the_node_nearest_in_time(rng, dim):
     chain = dense_chain(rng, dim, m=3)
-    g = PoseGraph(dim)
+    g = FactorGraph(dim)
     times = np.arange(0.2, 30.0, 0.7)
     points = np.array([_at(chain, t, dim) for t in times]) + 0.05 * rng.standard_normal((len(times), dim))
     g.add_gps(
@@ -290,7 +290,7 @@ def _at(chain, t, dim):
 def test_local_poses_both_ways_compose_to_the_path(rng, dim):
     """A body before its node and after it: pose exact, covariance that of the steps between."""
     group, chain = GROUP[dim], dense_chain(rng, dim, m=1)
-    g = PoseGraph(dim)
+    g = FactorGraph(dim)
     g.add_submap(chain.submaps[0], spacing=3.0)
     s = g.submaps[0]
     path, k = s.trajectory, 2
@@ -310,7 +310,7 @@ def test_local_poses_both_ways_compose_to_the_path(rng, dim):
 
 def test_a_chain_comes_and_goes_as_one(rng):
     chain = dense_chain(rng, 3, m=3)
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     for s in chain.submaps[:2]:
         g.add_submap(s, spacing=3.0)
     before = len(g.values.poses), len(g.records), len(g.ledger)

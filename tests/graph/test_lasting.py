@@ -12,10 +12,10 @@ from graphslam.core.errors import DataError
 from graphslam.core.path_points import PathPoints
 from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_value
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.solve.registry import make_solver
@@ -48,9 +48,9 @@ def with_errors(rng, s: Submap, *, points: int = 0) -> Submap:
 
 
 @pytest.fixture
-def graph(rng) -> PoseGraph:
+def graph(rng) -> FactorGraph:
     chain = make_chain(rng, m=5, landmarks=8)
-    g = PoseGraph()
+    g = FactorGraph()
     gps = make_gps(chain, rng, np.array([5.0, -3.0, 1.1]), step=2.0)
     submaps = [with_errors(rng, s, points=2) for s in chain.submaps]
     times = np.concatenate([s.landmarks.path.times for s in submaps])
@@ -123,7 +123,7 @@ def _zeros(delta, names, row):
 @pytest.mark.parametrize("solver", ["batch", "lm", "isam2"])
 def test_solvers_come_to_one_optimum(rng, solver):
     chain = make_chain(rng, m=6, landmarks=8)
-    g = PoseGraph()
+    g = FactorGraph()
     s = make_solver(solver, g)
     made = np.random.default_rng(4)
     for submap in chain.submaps:
@@ -132,7 +132,7 @@ def test_solvers_come_to_one_optimum(rng, solver):
     s.solve_to_optimum()
     solution = s.solution()
     found, P = g.lasting_errors()
-    twin = PoseGraph()
+    twin = FactorGraph()
     made = np.random.default_rng(4)
     for submap in chain.submaps:
         twin.add_submap(with_errors(made, submap))
@@ -149,7 +149,7 @@ def test_solvers_come_to_one_optimum(rng, solver):
 
 def test_a_submap_that_is_removed_takes_its_word_along(rng):
     chain = make_chain(rng, m=4, landmarks=8)
-    g = PoseGraph()
+    g = FactorGraph()
     ids = [g.add_submap(with_errors(rng, s)) for s in chain.submaps]
     words = lambda: sum(r.group == "lasting" for r in g.records.values())  # noqa: E731
     assert words() == 1 + len(ids)
@@ -183,7 +183,7 @@ def test_a_store_keeps_them(rng, tmp_path):
 
 
 def test_records_of_submaps_keep_their_own_part(rng):
-    g = PoseGraph()
+    g = FactorGraph()
     s = with_errors(rng, make_chain(rng, m=2, landmarks=6).submaps[0])
     g.add_submap(s)
     r = next(r for r in g.records.values() if isinstance(r, SubmapRecord))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_between, se2_log
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.network import to_network
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import dense_submap, make_chain
 
@@ -16,7 +16,7 @@ C = np.diag([1e-2, 2e-2, 1e-3])
 
 def test_vertices_edges_and_observations(rng):
     chain = make_chain(rng, m=5, landmarks=10, noise=0.0)
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps:
         g.add_submap(s, landmark_ids=s.landmarks.ids)
     g.add_between(0, 4, se2_between(chain.poses[0], chain.poses[4]), C, evidence="shared-scan")
@@ -32,7 +32,7 @@ def test_vertices_edges_and_observations(rng):
 
 
 def test_a_chain_of_dense_submaps_survives_as_it_is(rng):
-    g = PoseGraph()
+    g = FactorGraph()
     for k in range(4):
         g.add_submap(dense_submap(k, rng.normal(size=3), C))
     BatchSolver(g).update()

@@ -15,9 +15,9 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.evaluate.gps_innovation import gps_innovations
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.landmark_submap import PathRecord
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -55,8 +55,8 @@ def submaps_of(log: SensorLog, front_end: str = "rbpf-ekf") -> list[Submap]:
     return list(make_front_end(front_end, options).submaps(log, seed=SeedTree(3)))
 
 
-def solved(submaps, gps, *, solver=BatchSolver, **config) -> PoseGraph:
-    graph = PoseGraph()
+def solved(submaps, gps, *, solver=BatchSolver, **config) -> FactorGraph:
+    graph = FactorGraph()
     graph.add_gps(gps, config=GpsConfig(baseline=5.0, **config))
     made = solver(graph)
     for s in submaps:

@@ -1,4 +1,4 @@
-"""PoseGraph: adding, refusing, removing, merging, scoring, diagnosing."""
+"""FactorGraph: adding, refusing, removing, merging, scoring, diagnosing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphslam.core.errors import (
 )
 from graphslam.core.geometry import se2_between
 from graphslam.core.submap import Match
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import anonymous, dense_submap, make_chain, make_gps
 
@@ -32,13 +32,13 @@ def chain(rng):
 
 @pytest.fixture
 def graph(chain):
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps:
         g.add_submap(s)
     return g
 
 
-def state(g: PoseGraph):
+def state(g: FactorGraph):
     return (
         len(g.records),
         len(g.ledger),
@@ -54,11 +54,11 @@ def same(a, b) -> bool:
 
 def test_dimension_four_is_refused():
     with pytest.raises(ConfigError, match="two or in three"):
-        PoseGraph(dim=4)
+        FactorGraph(dim=4)
 
 
 def test_new_landmarks_get_fresh_ids_and_start_where_they_were_seen(chain):
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_submap(anonymous(chain.submaps[0]))
     n = len(chain.submaps[0].landmarks)
     np.testing.assert_array_equal(g.landmark_ids_of(0), np.arange(n))
@@ -97,7 +97,7 @@ def test_a_refused_submap_changes_nothing(graph, chain, what):
 def test_covariance_scale_divides_the_objective(chain):
     totals = []
     for scale in (1.0, 5.0):
-        g = PoseGraph()
+        g = FactorGraph()
         for s in chain.submaps:
             g.add_submap(s, covariance_scale=scale)
         BatchSolver(g).update()
@@ -158,7 +158,7 @@ def test_removal_restores_the_graph(graph, chain):
 
 
 def test_removing_the_last_submap_takes_its_node_landmarks_and_fixes(rng, chain):
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_gps(make_gps(chain, rng, np.array([0.0, 0.0, 1.0])))
     for s in chain.submaps[:6]:
         g.add_submap(s)
@@ -173,7 +173,7 @@ def test_removing_the_last_submap_takes_its_node_landmarks_and_fixes(rng, chain)
 
 
 def test_removing_all_fixes_removes_the_datum(rng, chain):
-    g = PoseGraph()
+    g = FactorGraph()
     ids = g.add_gps(make_gps(chain, rng, np.array([0.0, 0.0, 1.0]), step=5.0))
     for s in chain.submaps:
         g.add_submap(s)
@@ -187,7 +187,7 @@ def test_removing_all_fixes_removes_the_datum(rng, chain):
 
 def test_merge_re_keys_and_equals_given_ids(chain):
     """Merging two ids after the fact is the same problem as having known it from the start."""
-    known, split = PoseGraph(), PoseGraph()
+    known, split = FactorGraph(), FactorGraph()
     twin = None
     for s in chain.submaps:
         known.add_submap(s)
@@ -226,7 +226,7 @@ def test_a_sound_graph_is_found_sound(graph):
 
 
 def test_a_broken_chain_is_named(rng):
-    g = PoseGraph()
+    g = FactorGraph()
     for k in range(5):
         g.add_submap(dense_submap(k, np.array([5.0, 0, 0.1]), C))
     g.remove(g.submaps[2].factor_id)
@@ -244,7 +244,7 @@ def test_a_broken_chain_is_named(rng):
 def test_one_common_landmark_leaves_a_rotation_free(rng, shared, ok):
     """Structure alone would call this connected; the numbers do not."""
     chain = make_chain(rng, m=4, landmarks=12, reach=100.0)
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps:
         ids = s.landmarks.ids.copy()
         if s.key >= 2:
@@ -262,7 +262,7 @@ def test_one_common_landmark_leaves_a_rotation_free(rng, shared, ok):
 
 
 def test_datum_with_one_place_is_named(rng, chain):
-    g = PoseGraph()
+    g = FactorGraph()
     ids = g.add_gps(make_gps(chain, rng, np.array([0.0, 0.0, 1.0]), step=5.0))
     for s in chain.submaps:
         g.add_submap(s)

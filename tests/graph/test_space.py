@@ -13,6 +13,7 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose, pose_array
 from graphslam.graph.factors.between import BetweenRecord
@@ -21,7 +22,6 @@ from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import to_network
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms, whitener
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values, gtsam_key, key_name
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.solve.batch import BatchSolver
@@ -37,7 +37,7 @@ def random_poses(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def loop_graph(chain: DenseChain, rng: np.random.Generator, robust: RobustKernel = NO_KERNEL, update=lambda g: None):
-    g = PoseGraph(dim=3)
+    g = FactorGraph(dim=3)
     for s in chain.submaps:
         g.add_submap(s)
         update(g)
@@ -94,7 +94,7 @@ def test_a_pose_tangent_is_gtsams_rotation_first(rng):
     np.testing.assert_allclose(
         gtsam.Marginals(factors, values).marginalCovariance(gtsam_key("x1")), C, rtol=1e-9, atol=1e-15
     )
-    g = PoseGraph(dim=3)
+    g = FactorGraph(dim=3)
     g.add_submap(Submap(key=0, interval=(0, 1), exit_pose=T, exit_covariance=C))
     np.testing.assert_allclose(g.covariance().marginal("x1"), C, rtol=1e-9, atol=1e-15)
     # and position and rotation are not alike: 1 m of σ_x is 10 mrad of roll here
@@ -233,7 +233,7 @@ def test_cross_covariances_dense_and_sparse(rng):
 
 def test_match_joins_the_bases(rng):
     chain = dense_chain(rng, m=4)
-    g = PoseGraph(dim=3)
+    g = FactorGraph(dim=3)
     for s in chain.submaps:
         g.add_submap(s)
     T = SE3.between(chain.poses[0], chain.poses[3])
@@ -247,7 +247,7 @@ def test_match_joins_the_bases(rng):
 
 def test_removing_gives_back_what_was_before(rng):
     chain = dense_chain(rng, m=6)
-    g = PoseGraph(dim=3)
+    g = FactorGraph(dim=3)
     solver = Isam2Solver(g)
     for s in chain.submaps[:5]:
         g.add_submap(s)
@@ -270,7 +270,7 @@ def test_removing_gives_back_what_was_before(rng):
 
 def test_another_session_is_tied_by_a_between_factor(rng):
     chain = dense_chain(rng, m=5)
-    g = PoseGraph(dim=3)
+    g = FactorGraph(dim=3)
     for s in chain.submaps[:3]:
         g.add_submap(s)
     start = g.start_session(SE3.compose(chain.poses[3], SE3.exp([0, 0, 0.2, 1.0, 0, 0])))
@@ -284,7 +284,7 @@ def test_another_session_is_tied_by_a_between_factor(rng):
 
 
 def test_what_a_graph_in_space_refuses(rng):
-    g = PoseGraph(dim=3)
+    g = FactorGraph(dim=3)
     with pytest.raises(GeometryError, match="wrong dimension"):
         g.add_submap(Submap(key=0, interval=(0, 1), exit_pose=np.zeros(3), exit_covariance=np.eye(3)))
     lm = LandmarkMap(ids=[3], exit_pose=SE3.identity, positions=np.ones((1, 3)), covariance=np.eye(9))

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from graphslam.core.geometry import se2_compose, se2_exp
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import whitener
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_residual
 from graphslam.graph.variables import gtsam_key, key_name, vector_form
 from tests.reference.graph_chain import correlated_covariance, dense_submap, end_only_submap, make_chain
@@ -72,7 +72,7 @@ def test_without_landmarks_it_is_a_between_factor(rng):
     base = np.array([1.0, 2.0, -0.9])
     systems = []
     for make in (end_only_submap, dense_submap):
-        g = PoseGraph()
+        g = FactorGraph()
         g.add_submap(make(0, base, P))
         g.add_submap(make(1, exit_pose, P))
         systems.append([gtsam_factor(r, g.origin).linearize(to_gtsam(g.values)) for r in g.records.values()])
@@ -83,7 +83,7 @@ def test_without_landmarks_it_is_a_between_factor(rng):
 def test_linearised_factor_gives_back_mean_and_covariance(rng):
     chain = make_chain(rng, m=1)
     s = chain.submaps[0]
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_submap(s)
     np.testing.assert_allclose(g.values.poses[1], s.landmarks.exit_pose, atol=1e-12)
     np.testing.assert_allclose(g.values.landmarks, s.landmarks.positions, atol=1e-12)

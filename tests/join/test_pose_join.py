@@ -17,8 +17,8 @@ from graphslam.core.geometry import Array
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.evaluate.consistency import joint_nees, pose_error
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.network_file import read_network
 from graphslam.join.pose_ekf import MOST
 from graphslam.join.pose_estimate import PoseEstimate, optimise_poses
@@ -168,7 +168,7 @@ def test_submaps_are_joined_by_their_exits_and_matches(dim: int) -> None:
     found = join_by_method(submaps, "eif-tree", polish=True)
     assert isinstance(found, PoseEstimate)
     assert found.states == problem.group.dof * 10
-    graph = PoseGraph(dim)
+    graph = FactorGraph(dim)
     for s in submaps:
         graph.add_submap(s)
         for m in s.matches:
@@ -185,7 +185,7 @@ def test_submaps_are_joined_by_their_exits_and_matches(dim: int) -> None:
 def test_a_tie_counts_with_the_weight_that_its_kernel_gives_it() -> None:
     """The weighted optimum is that of the graph with its kernels, a wrong loop among them."""
     submaps, problem = dense_submaps()
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     for s in submaps:
         graph.add_submap(s)
     far = problem.group.exp(np.array([0, 0, 1.0, 3, 3, 0]))
@@ -215,7 +215,7 @@ def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
         (lambda: join_by_method(problem, "eif-tree", associate="joint"), ConfigError, "no landmarks to be associated"),
         (lambda: join_by_method(problem, "eif-tree", workers=2), ConfigError, "one process"),
         (lambda: join_by_method(problem, "eif-tree", covariance_scale=2.0), ConfigError, "scale 1"),
-        (lambda: PoseProblem.of_graph(PoseGraph(3)), DataError, "no submaps"),
+        (lambda: PoseProblem.of_graph(FactorGraph(3)), DataError, "no submaps"),
         (lambda: two_sessions(submaps), DataError, "one chain"),
     ]
     for call, kind, said in refused:
@@ -230,7 +230,7 @@ def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
 
 
 def two_sessions(submaps: list[Submap]) -> PoseProblem:
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     for s in submaps[:3]:
         graph.add_submap(replace(s, matches=()))
     graph.start_session(graph.values.poses[0])

@@ -10,14 +10,14 @@ from scipy import stats
 
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import rotation2, se2_between, se2_log, wrap_angle
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import make_chain, make_gps
 
 
-def solve(chain, **scale) -> PoseGraph:
-    g = PoseGraph()
+def solve(chain, **scale) -> FactorGraph:
+    g = FactorGraph()
     for s in chain.submaps:
         g.add_submap(s, **scale)
     BatchSolver(g).update()
@@ -54,7 +54,7 @@ def test_order_of_factors_does_not_matter(rng):
     T, C = se2_between(chain.poses[1], chain.poses[4]), np.diag([1e-3, 1e-3, 1e-4])
     results = []
     for late in (False, True):
-        g = PoseGraph()
+        g = FactorGraph()
         if not late:
             g.add_gps(gps, config=GpsConfig(baseline=10.0))
         for s in chain.submaps:
@@ -77,7 +77,7 @@ def test_moving_the_gps_frame_moves_the_datum_alone(rng):
     moved = replace(gps, positions=gps.positions @ R.T + [1000.0, -5000.0])
     graphs = []
     for stream in (gps, moved):
-        g = PoseGraph()
+        g = FactorGraph()
         g.add_gps(stream)
         for s in chain.submaps:
             g.add_submap(s)
@@ -93,7 +93,7 @@ def test_a_repeated_landmark_is_its_fusion(rng):
     from graphslam.join.submap_blocks import fuse_repeated
 
     chain = make_chain(rng, m=6, landmarks=12, laps=1.2)
-    twice, fused = PoseGraph(), PoseGraph()
+    twice, fused = FactorGraph(), FactorGraph()
     for s in chain.submaps:
         ids = s.landmarks.ids.copy()
         if s.key == 2:

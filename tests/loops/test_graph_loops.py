@@ -10,9 +10,9 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.graph_loops import GROUP, GraphLoops, chain_of_graph, places_of_graph
 from graphslam.loops.ledger import LoopLedger
 from graphslam.loops.loops import LoopCloser
@@ -45,7 +45,7 @@ def submaps_of(poses: Array, rng: np.random.Generator, length: int = 12) -> list
 
 
 def graph_of(submaps: list[Submap]) -> GraphLoops:
-    graph = PoseGraph(submaps[0].dim)
+    graph = FactorGraph(submaps[0].dim)
     for s in submaps:
         graph.add_submap(s, spacing=3.0)
     return GraphLoops(graph, BatchSolver(graph))
@@ -109,9 +109,9 @@ def test_places_of_a_graph_are_those_of_its_submaps() -> None:
 
 def test_what_is_no_chain_is_refused() -> None:
     with pytest.raises(DataError):
-        places_of_graph(PoseGraph(3))
+        places_of_graph(FactorGraph(3))
     submaps = submaps_of(square_poses(2, nodes=37), np.random.default_rng(0))
-    graph = PoseGraph(2)
+    graph = FactorGraph(2)
     for s in submaps[:2]:
         graph.add_submap(s, spacing=3.0)
     graph.start_session(np.array([3.0, 1.0, 0.0]))
@@ -123,7 +123,7 @@ def test_what_is_no_chain_is_refused() -> None:
 def test_the_chain_of_levelled_submaps_is_what_they_stated() -> None:
     """A levelled exit gave its relative roll and pitch to an attitude: the chain by itself still has them."""
     submaps = submaps_of(square_poses(3, nodes=37), np.random.default_rng(1))
-    plain, level = PoseGraph(3), PoseGraph(3)
+    plain, level = FactorGraph(3), FactorGraph(3)
     for s in submaps:
         plain.add_submap(s, spacing=3.0)
         level.add_submap(s, spacing=3.0, level_sigma=0.006)

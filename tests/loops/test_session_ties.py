@@ -10,7 +10,7 @@ import pytest
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.graph_loops import GraphRelativePoses
 from graphslam.loops.inter_session_loops import InterSessionConfig, SessionMap, TwoSessions, session_start
@@ -141,7 +141,7 @@ def test_what_cannot_be_placed_is_refused(two: TwoSessions, drives: tuple) -> No
 def test_nodes_are_those_of_a_graph(dim: int) -> None:
     """What a graph knows of pairs of nodes is what its whole covariance says; the first node is held."""
     chain = dense_chain(np.random.default_rng(2), dim)
-    graph = PoseGraph(dim)
+    graph = FactorGraph(dim)
     for s in chain.submaps:
         graph.add_submap(s, spacing=3.0)
     d, n = graph.values.group.dof, len(graph.values.poses)

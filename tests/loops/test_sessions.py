@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.errors import DataError, GeometryError, IndeterminateError
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse, se2_transform
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.sessions import align_by_constellation, align_by_identity
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.registry import make_solver
@@ -68,7 +68,7 @@ def test_a_symmetric_constellation_is_refused(rng):
 
 def two_sessions(chain, cut, start):
     """The same chain with a break: the second part begins at a free base."""
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps[:cut]:
         g.add_submap(s)
     node = g.start_session(start)
@@ -92,7 +92,7 @@ def test_a_free_base_is_found_from_common_landmarks(rng, solver):
     P = solution.node_covariances()[node]
     assert error @ np.linalg.solve(P, error) < 16.3  # χ²_3 at 99.9 %
     # the break costs three scalars of information and nothing else
-    whole = PoseGraph()
+    whole = FactorGraph()
     for x in chain.submaps:
         whole.add_submap(x)
     BatchSolver(whole).solve_to_optimum()
@@ -105,7 +105,7 @@ def test_a_free_base_is_found_from_common_landmarks(rng, solver):
 
 def test_chains_without_common_landmarks_are_named(rng):
     chain = make_chain(rng, m=4, landmarks=20)
-    g = PoseGraph()
+    g = FactorGraph()
     for s in chain.submaps[:2]:
         g.add_submap(s)
     node = g.start_session(chain.poses[2])
@@ -116,7 +116,7 @@ def test_chains_without_common_landmarks_are_named(rng):
 
 
 def test_impossible_sessions_are_refused(rng):
-    g = PoseGraph()
+    g = FactorGraph()
     with pytest.raises(DataError, match="first session"):
         g.start_session([0, 0, 0])
     g.add_submap(make_chain(rng, m=1, landmarks=10).submaps[0])

@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Match, Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.overlap_constraints import OverlapConfig, overlap_candidates
 from graphslam.loops.places import Places
@@ -125,8 +125,8 @@ def test_ties_come_and_go_with_their_match(right: bool) -> None:
         T[1] += 9.0  # the chain knows the place to a decimetre or two
     drives[1] = entered(drives[1], 10, T, [10, 11])
 
-    def solved(config: FindConfig) -> tuple[PoseGraph, list[str]]:
-        graph = PoseGraph(3)
+    def solved(config: FindConfig) -> tuple[FactorGraph, list[str]]:
+        graph = FactorGraph(3)
         for s in drives:
             graph.add_submap(s, spacing=3.0)
         solver = BatchSolver(graph)

@@ -6,13 +6,13 @@ import gtsam
 import numpy as np
 
 from graphslam.core.errors import SolverError
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import Values
 
 
-def optimise_with_gtsam(graph: PoseGraph, *, max_iterations: int = 100) -> tuple[Values, float]:
+def optimise_with_gtsam(graph: FactorGraph, *, max_iterations: int = 100) -> tuple[Values, float]:
     """The same optimum by GTSAM's own Levenberg–Marquardt, as an independent check (ten times slower).
 
     Returns

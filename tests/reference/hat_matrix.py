@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.core.geometry import se2_between, se2_log
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.sensor_biases import SensorBiasRecord, sensor_biases_at
 from graphslam.graph.noise import robust_terms
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.submap_model import submap_residual
 from graphslam.graph.variables import Values
 
@@ -49,7 +49,7 @@ def numeric_jacobian(f, values: Values, step: float = 1e-6) -> np.ndarray:
     return np.array(out).T
 
 
-def class_figures(graph: PoseGraph) -> dict[str, tuple[float, float, float]]:
+def class_figures(graph: FactorGraph) -> dict[str, tuple[float, float, float]]:
     """(leverage, expected χ², χ²) of every class; the covariance of the residuals is formed whole."""
     records = list(graph.records.values())
     v = graph.values

@@ -13,9 +13,9 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.se3 import align_se3, quat_rotate, quat_to_matrix, so3_exp
 from graphslam.evaluate.residual_consistency import class_consistency
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from tests.reference.imu_ring import STEP, Ring, ring, true_pose
 
@@ -35,9 +35,11 @@ class Trial:
     chi2: dict[str, tuple[float, float]]
 
 
-def solved(made: Ring, rng: np.random.Generator, imu: ImuConfig | None, gps: bool, spacing: float | None) -> PoseGraph:
+def solved(
+    made: Ring, rng: np.random.Generator, imu: ImuConfig | None, gps: bool, spacing: float | None
+) -> FactorGraph:
     """The graph of a ring, with what it is to have, at its optimum."""
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     for s in made.submaps:
         g.add_submap(s, spacing=spacing)
     # the first base is level within LEAN: how it was levelled is all that is known of it before
@@ -58,7 +60,7 @@ def solved(made: Ring, rng: np.random.Generator, imu: ImuConfig | None, gps: boo
     return g
 
 
-def true_nodes(g: PoseGraph, made: Ring) -> np.ndarray:
+def true_nodes(g: FactorGraph, made: Ring) -> np.ndarray:
     """Truth of every node ``(m + 1, 7)``: the body, seen back from where its path has it on the node."""
     out = np.zeros_like(g.values.poses)
     for s in g.submaps:

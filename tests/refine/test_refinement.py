@@ -11,7 +11,7 @@ from graphslam.backend.refining import refinement_findings, wrong_loops
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.nodes import scans_at
 from graphslam.refine.refine import _Refiner, refine_by_scans
@@ -109,7 +109,7 @@ def test_wrong_loops_and_faults_of_the_robot_do_no_harm():
 def test_loops_that_the_refined_path_contradicts_are_named(drives):
     *_, found = drives[0]
     nodes = found.poses[::40]
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     graph.structure.append("x", nodes[1])
     for T in nodes[2:]:
         graph.structure.append("x", T)

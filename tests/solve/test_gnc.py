@@ -10,15 +10,15 @@ from graphslam.core.poses import SE2, SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.gnc import GncConfig, GncSolver, find_outliers
 from graphslam.solve.registry import SOLVERS, make_solver
 
 SIGMA = {2: np.array([0.05, 0.05, 0.01]), 3: np.array([0.002, 0.002, 0.01, 0.05, 0.05, 0.05])}
 
 
-def spoilt(rng: np.random.Generator, dim: int, wild: int, wrong: int) -> tuple[PoseGraph, np.ndarray, set[int]]:
+def spoilt(rng: np.random.Generator, dim: int, wild: int, wrong: int) -> tuple[FactorGraph, np.ndarray, set[int]]:
     """Two rounds with right matches between them, fixes, and among both some that are far off: their factor ids."""
     G, n = (SE2 if dim == 2 else SE3), 40
     step = np.array([3.0, 0.0, np.pi / 10]) if dim == 2 else np.array([0, 0, np.pi / 10, 3.0, 0, 0.05])
@@ -26,7 +26,7 @@ def spoilt(rng: np.random.Generator, dim: int, wild: int, wrong: int) -> tuple[P
     for _ in range(n):
         truth.append(G.compose(truth[-1], G.exp(step)))
     poses, P = np.array(truth), np.diag(SIGMA[dim] ** 2)
-    graph = PoseGraph(dim)
+    graph = FactorGraph(dim)
     t = np.arange(n) + 0.5
     fixes = poses[:-1, :dim] + 0.3 * rng.standard_normal((n, dim))
     far = rng.choice(n, wild, replace=False)

@@ -12,9 +12,9 @@ import graphslam.solve.isam2 as module
 from graphslam.core.errors import ConfigError, IndeterminateError, SolverError, UnknownNameError
 from graphslam.core.geometry import se2_between
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver, optimise_graph, state_of
 from graphslam.solve.isam2 import FactorRejectedError, Isam2Solver
 from graphslam.solve.registry import SOLVERS, make_solver
@@ -23,8 +23,8 @@ from tests.reference.graph_chain import dense_submap, make_chain, make_gps
 C = np.diag([1e-2, 1e-2, 1e-3])
 
 
-def grown(chain, upto=None, **options) -> tuple[PoseGraph, Isam2Solver]:
-    g = PoseGraph()
+def grown(chain, upto=None, **options) -> tuple[FactorGraph, Isam2Solver]:
+    g = FactorGraph()
     solver = Isam2Solver(g, **options)
     for s in chain.submaps[:upto]:
         g.add_submap(s)
@@ -40,7 +40,7 @@ def assert_as_before(now: tuple, before: tuple) -> None:
         np.testing.assert_allclose(now[k], before[k], atol=5e-3)
 
 
-def snapshot(g: PoseGraph, solver: Isam2Solver):
+def snapshot(g: FactorGraph, solver: Isam2Solver):
     estimate = solver._isam.calculateEstimate()
     return (
         g.values.poses.copy(),
@@ -59,7 +59,7 @@ def absurd_submap(key: int, metres: float = 1e157) -> Submap:
 def test_registry():
     assert set(SOLVERS) >= {"isam2", "batch"}
     for name in SOLVERS:
-        g = PoseGraph()
+        g = FactorGraph()
         solver = make_solver(name, g)
         g.add_submap(dense_submap(0, np.array([1.0, 2.0, 0.3]), C))
         solver.update()
@@ -68,9 +68,9 @@ def test_registry():
         assert solver.gap() == pytest.approx(0.0, abs=1e-12)
         np.testing.assert_allclose(solver.covariance().marginal("x1"), C, rtol=1e-9)
     with pytest.raises(UnknownNameError, match="batch, gnc, isam2, lm, pcg"):
-        make_solver("magic", PoseGraph())
+        make_solver("magic", FactorGraph())
     with pytest.raises(ConfigError, match="positive thresholds"):
-        Isam2Solver(PoseGraph(), relinearize_threshold=0.0)
+        Isam2Solver(FactorGraph(), relinearize_threshold=0.0)
 
 
 def test_lazy_isam2_reports_its_gap_and_gets_to_the_optimum_on_demand(rng):
@@ -195,7 +195,7 @@ def test_an_underconstrained_graph_is_an_error_that_names(rng):
 
 def test_removal_and_merging_follow_the_graph(rng):
     chain = make_chain(rng, m=12, landmarks=20, laps=2.0)
-    g = PoseGraph()
+    g = FactorGraph()
     solver = Isam2Solver(g)
     gps = make_gps(chain, rng, np.array([3.0, 4.0, 0.7]), step=2.5)
     ids = g.add_gps(gps, config=GpsConfig(robust=RobustKernel("cauchy", 1.0), baseline=10.0))
@@ -215,7 +215,7 @@ def test_removal_and_merging_follow_the_graph(rng):
     assert solver.rebuilds == 1
     assert set(solver._known) == set(g.values.layout().names())
     solver.solve_to_optimum()
-    other = PoseGraph()
+    other = FactorGraph()
     other.add_gps(gps.take(np.arange(len(gps.times)) != 7), config=GpsConfig(robust=RobustKernel("cauchy", 1.0)))
     for s in chain.submaps:
         other.add_submap(s)
@@ -238,7 +238,7 @@ def test_an_update_without_news_does_nothing(rng):
 
 def test_batch_solver_says_when_the_graph_moved_on(rng):
     chain = make_chain(rng, m=8, landmarks=20)
-    g = PoseGraph()
+    g = FactorGraph()
     solver = BatchSolver(g)
     for s in chain.submaps[:7]:
         g.add_submap(s)

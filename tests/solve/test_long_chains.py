@@ -12,7 +12,7 @@ import graphslam.solve.network.multistart as multistart
 from graphslam.app.solve_file import solution_json
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import SE2, SE3, group_of
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.solve.batch import optimise_graph
 from graphslam.solve.descent import descend_to_minimum, limits_of
 from graphslam.solve.isam2 import Isam2Solver
@@ -20,9 +20,9 @@ from graphslam.solve.network.solve import solve_network
 from tests.reference.graph_chain import dense_submap
 
 
-def chain(n: int, dim: int, covariance: np.ndarray, every: int) -> tuple[PoseGraph, Isam2Solver]:
+def chain(n: int, dim: int, covariance: np.ndarray, every: int) -> tuple[FactorGraph, Isam2Solver]:
     """One metre forward and 0.01 rad to the left, ``n`` times, with an update after every few."""
-    graph = PoseGraph(dim)
+    graph = FactorGraph(dim)
     solver = Isam2Solver(graph)
     step = np.array([1.0, 0.0, 0.01]) if dim == 2 else SE3.exp(np.array([0.0, 0.0, 0.01, 1.0, 0.0, 0.0]))
     for k in range(n):
@@ -33,7 +33,7 @@ def chain(n: int, dim: int, covariance: np.ndarray, every: int) -> tuple[PoseGra
     return graph, solver
 
 
-def same_as_batch(graph: PoseGraph, solver: Isam2Solver) -> None:
+def same_as_batch(graph: FactorGraph, solver: Isam2Solver) -> None:
     assert not [e for e in graph.events if e["event"] == "removed"]
     assert set(solver._held) == set(graph.records)
     own = graph.values.poses.copy()
@@ -124,7 +124,7 @@ def test_no_gap_is_told_where_no_optimum_is_known(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("dim", [2, 3])
 def test_noise_from_a_ten_thousandth_to_one_in_one_chain(rng: np.random.Generator, dim: int) -> None:
     """Factors 10⁸ apart in information, and a loop over most of them: nothing is removed, one optimum."""
-    graph = PoseGraph(dim)
+    graph = FactorGraph(dim)
     solver, G = Isam2Solver(graph), SE2 if dim == 2 else SE3
     step = np.array([1.0, 0.0, 0.01]) if dim == 2 else SE3.exp(np.array([0.0, 0.0, 0.01, 1.0, 0.0, 0.0]))
     for k in range(2000):

@@ -8,7 +8,7 @@ import pytest
 from graphslam.core.errors import MissingDataError, SolverError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log
 from graphslam.graph.covariance import JointCovariance
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.variables import gtsam_key, key_name
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
@@ -19,7 +19,7 @@ DATUM = np.array([100.0, 20.0, -1.0])
 @pytest.fixture
 def solved(rng):
     chain = make_chain(rng, m=8, landmarks=20)
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_gps(make_gps(chain, rng, DATUM, step=3.0))
     for s in chain.submaps:
         g.add_submap(s)
@@ -118,7 +118,7 @@ def test_a_solution_outlives_the_graph(solved):
 
 
 def test_no_trajectory_is_said():
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_submap(dense_submap(0, np.array([1.0, 0, 0]), np.eye(3)))
     solver = BatchSolver(g)
     solver.update()

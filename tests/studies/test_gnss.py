@@ -12,11 +12,11 @@ from scipy.stats import chi2
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, GeometryError
 from graphslam.core.gnss import SPEED_OF_LIGHT, Pseudoranges, TangentPlane
 from graphslam.core.poses import SE3
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.gtsam_values import to_gtsam
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam_studies.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
@@ -32,10 +32,12 @@ TRUE = PseudorangeConfig(density_scale=10.0, bias_sigma=5.0)
 """What the simulation draws from."""
 
 
-def street(seed: int = 1, config: SatelliteConfig = SHORT, *, level: bool = True, lever=(0.3, -0.2, 1.5)) -> PoseGraph:
+def street(
+    seed: int = 1, config: SatelliteConfig = SHORT, *, level: bool = True, lever=(0.3, -0.2, 1.5)
+) -> FactorGraph:
     """A short drive before it is solved, moved away from where it starts."""
     log = simulate_satellites(seed, config)
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     nodes = add_odometer(graph, log["odometry"])
     if level:
         for n in nodes[::3].tolist():
@@ -137,7 +139,7 @@ def test_the_turn_of_the_earth_is_not_left_out():
         def satellites(self, sent):
             return self.from_ecef(sent)
 
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     nodes = add_odometer(graph, log["odometry"])
     for n in nodes[::5].tolist():
         graph.add_attitude(n, DOWN, 0.02, evidence="prior")
@@ -161,8 +163,8 @@ def test_a_receiver_alone_on_its_antenna():
 def test_what_cannot_be_used_is_refused_and_changes_nothing():
     log = simulate_satellites(1, SHORT)
     with pytest.raises(GeometryError, match="in space"):
-        add_odometer(PoseGraph(2), log["odometry"])
-    graph = PoseGraph(3)
+        add_odometer(FactorGraph(2), log["odometry"])
+    graph = FactorGraph(3)
     nodes = add_odometer(graph, log["odometry"])
     with pytest.raises(DataError, match="empty graph"):
         add_odometer(graph, log["odometry"], stream="another")
@@ -183,7 +185,7 @@ def test_what_cannot_be_used_is_refused_and_changes_nothing():
 
 def test_the_stream_stays_spent_whichever_factor_goes():
     log = simulate_satellites(1, SHORT)
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     nodes = add_odometer(graph, log["odometry"])
     ids = add_pseudoranges(graph, log["pseudoranges"], PLANE, nodes)
     for fid in (0, 1, ids[0], ids[-1]):
@@ -225,7 +227,7 @@ def test_fixes_and_pseudoranges_share_their_frame(rng):
 
 def test_epochs_without_a_node_are_counted():
     log = simulate_satellites(1, SHORT)
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     nodes = add_odometer(graph, log["odometry"])
     at = np.where(np.arange(len(nodes)) < 3, -1, nodes)
     add_pseudoranges(graph, log["pseudoranges"], PLANE, at)

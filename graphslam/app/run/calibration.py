@@ -24,7 +24,7 @@ from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations, SteeringControls
 from graphslam.evaluate.residual_consistency import two_sided_bounds
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, SensorBiasConfig
 from graphslam_frontends.landmarks.prepare import landmark_stream
@@ -230,7 +230,7 @@ def explain_disagreement(
     return out
 
 
-def bias_table(graph: PoseGraph) -> list[dict[str, Any]]:
+def bias_table(graph: FactorGraph) -> list[dict[str, Any]]:
     """Constant errors that were estimated with the map: name, value, σ, and σ beforehand, a row each."""
     out = []
     for robot, event in enumerate(e for e in graph.events if e["event"] == "lasting"):

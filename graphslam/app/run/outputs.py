@@ -46,8 +46,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import FigureTable, is_time
 from graphslam.evaluate.residual_consistency import ClassConsistency
 from graphslam.evidence.spilled_grid import load_spilled
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.network import to_network
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
@@ -369,7 +369,7 @@ def _two_maps(root: Path, dim: int) -> tuple[Trajectory, Trajectory] | None:
     return None if first is None or second is None else (first, second)
 
 
-def graph_metrics(graph: PoseGraph, classes: Mapping[str, ClassConsistency]) -> dict[str, Any]:
+def graph_metrics(graph: FactorGraph, classes: Mapping[str, ClassConsistency]) -> dict[str, Any]:
     """JSON-serialisable figures of a graph at its optimum.
 
     Parameters

@@ -84,7 +84,7 @@ from graphslam.evaluate.refined import (
 from graphslam.evaluate.stream_checks import StreamFinding, check_streams
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.evidence.spilled_grid import load_spilled
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.io.log_digest import log_digest
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import LoopDecision
@@ -351,7 +351,7 @@ def rerun_without_loops(folder: str | Path, undo: Sequence[LoopDecision], *, pro
         return write_outputs(root, attempts.result())
 
 
-def resolve_from_folder(folder: str | Path) -> tuple[PoseGraph, Solution]:
+def resolve_from_folder(folder: str | Path) -> tuple[FactorGraph, Solution]:
     """Graph and solution of a finished run, from what its folder holds, without the loops that were undone."""
     root = Path(folder)
     with one_blas_thread():

@@ -30,7 +30,7 @@ from graphslam.evaluate.intervals import two_sided_width
 from graphslam.evaluate.loop_consistency import LoopConsistency, find_landmark_loops, loop_consistency
 from graphslam.evaluate.metrics import Metrics
 from graphslam.evaluate.residual_consistency import ClassConsistency, class_consistency
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 
 OF_THE_MAP = ("submap", "lasting", "dense-submap", "match", "loop", "tie")
 """Classes of factors whose χ² covers motion and sightings."""
@@ -119,7 +119,7 @@ class ResidualConsistency:
 
 def check_residual_consistency(
     out: Metrics,
-    graph: PoseGraph,
+    graph: FactorGraph,
     submaps: Sequence[Submap],
     path: Trajectory,
     poses: Array,
@@ -130,7 +130,7 @@ def check_residual_consistency(
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         At its optimum.
     submaps : sequence of Submap
         Identified.
@@ -180,7 +180,7 @@ def check_residual_consistency(
     return ResidualConsistency(classes, innovations, loops, fixes)
 
 
-def _innovations(graph: PoseGraph, gps: Gps | None, settings: RunConfig) -> GpsInnovations | None:
+def _innovations(graph: FactorGraph, gps: Gps | None, settings: RunConfig) -> GpsInnovations | None:
     if gps is None or graph.values.datum is None:
         return None
     c = settings.gps

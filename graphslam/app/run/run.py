@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from graphslam.app.run.residual_consistency import ResidualConsistency
     from graphslam.app.run.run_inputs import RunInputs
     from graphslam.backend.refining import RefinedRun
-    from graphslam.graph.pose_graph import PoseGraph
+    from graphslam.graph.factor_graph import FactorGraph
     from graphslam.maps.run_map import RunMap
     from graphslam.solve.solution import Solution
 
@@ -95,7 +95,7 @@ class Run:
         Ends of the submaps and landmarks.
     truth_path, dead_reckoning : Trajectory or None
         In the frame of the first base.
-    solution, graph : Solution, PoseGraph or None
+    solution, graph : Solution, FactorGraph or None
         The solver's own view. Of a run that :func:`graphslam.open_run` read they are solved again, once, when they are
         first asked for; None where its folder does not hold what that needs.
     checks : ResidualConsistency or None
@@ -136,7 +136,7 @@ class Run:
     truth_path: Trajectory | None = None
     dead_reckoning: Trajectory | None = None
     solution: Solution | None = _Part()  # type: ignore[assignment]
-    graph: PoseGraph | None = _Part()  # type: ignore[assignment]
+    graph: FactorGraph | None = _Part()  # type: ignore[assignment]
     checks: ResidualConsistency | None = None
     fused: RunMap | None = _Part()  # type: ignore[assignment]
     graph_path: Trajectory | None = None

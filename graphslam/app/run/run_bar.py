@@ -11,7 +11,7 @@ from graphslam.backend.back_end import Observer
 from graphslam.core.log import SensorLog
 from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 
 STAGES = {
     "reading": 2.0, "calibration": 8.0, "front end": 50.0, "graph": 5.0, "refinement": 18.0, "fused map": 6.0,
@@ -68,7 +68,7 @@ class RunBar(Observer):
         if steps:
             self._move(progress.step / steps, f"{progress.length:.0f} m, {progress.segments} segments")
 
-    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+    def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
         """A submap: how far the front end is in the log."""
         if self._stage != "front end":
             return

@@ -12,8 +12,8 @@ from graphslam.app.run.config import RunConfig
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Compass, Gps
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord
-from graphslam.graph.pose_graph import PoseGraph
 
 Role = Literal["input", "gps", "imu", "compass", "beacons", "unused"]
 
@@ -53,13 +53,13 @@ class StreamUse:
 
 
 def stream_use(
-    log: SensorLog, graph: PoseGraph, settings: RunConfig, dropped: Mapping[str, int], streams_used: frozenset[str]
+    log: SensorLog, graph: FactorGraph, settings: RunConfig, dropped: Mapping[str, int], streams_used: frozenset[str]
 ) -> list[StreamUse]:
     """Use of every stream of a log.
 
     Parameters
     ----------
-    graph : PoseGraph
+    graph : FactorGraph
         Finished; its ledger lists the records that were used.
     dropped : mapping of str to int
         Records dropped by the front end and the graph, per ``"stream: reason"``.

@@ -24,7 +24,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.inter_session_loops import InterSessionConfig, InterSessionLoops, SessionMap, TwoSessions
 from graphslam.loops.measure import Loop
 from graphslam.solve.registry import make_solver
@@ -190,7 +190,7 @@ def _localise(
     ties = two.find(config, progress=progress)
     if ties.why:
         return LocalisationResult(ties.why, ties, [])
-    graph = PoseGraph(known.submaps[0].dim)
+    graph = FactorGraph(known.submaps[0].dim)
     solver = make_solver(solver_name, graph)
     add_session(graph, known)
     solver.solve_to_optimum()

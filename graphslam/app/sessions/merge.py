@@ -25,7 +25,7 @@ from graphslam.association.identity import find_association_outliers
 from graphslam.association.merging import mahalanobis_merges
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.join.submap_blocks import scale_covariances
 from graphslam.loops.sessions import Alignment
 from graphslam.maps.global_map import GlobalMap
@@ -148,7 +148,7 @@ def _names(runs: Sequence[Run]) -> list[str]:
 def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: float) -> MergedMap:
     start = time.perf_counter()
     names = _names(runs)
-    graph = PoseGraph()
+    graph = FactorGraph()
     order, alignments, renamed = align_runs(runs, names, by, tolerance)
     keys: dict[int, tuple[int, ...]] = {}
     first: dict[int, int] = {}
@@ -231,7 +231,7 @@ def _sessions(
     keys: dict[int, tuple[int, ...]],
     first: dict[int, int],
     alignments: dict[int, Alignment | None],
-    graph: PoseGraph,
+    graph: FactorGraph,
     solution: Solution,
 ) -> list[Session]:
     node_covariances = solution.node_covariances()
@@ -253,7 +253,7 @@ def _sessions(
     return out
 
 
-def _sightings(sessions: list[Session], graph: PoseGraph, solution: Solution) -> tuple[Ints, Ints]:
+def _sightings(sessions: list[Session], graph: FactorGraph, solution: Solution) -> tuple[Ints, Ints]:
     """Sightings, and number of sessions, of every landmark of the solution."""
     row = {int(i): k for k, i in enumerate(solution.landmark_ids)}
     hits = np.zeros(len(row), dtype=np.int64)

@@ -28,7 +28,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import Metrics, base_metrics
 from graphslam.evaluate.trajectory_error import ate
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.inter_session_loops import InterSessionConfig
 from graphslam.plots.paths import plot_paths
 from graphslam.solve.registry import make_solver
@@ -76,7 +76,7 @@ class MergedSubmaps:
 
     sessions: list[PlacedSession]
     solution: Solution
-    graph: PoseGraph
+    graph: FactorGraph
     metrics: pd.DataFrame
     report: dict[str, Any] = field(default_factory=dict)
 
@@ -135,7 +135,7 @@ def merge_dense(
     dims = {s.submaps[0].dim for s in sessions}
     if len(dims) > 1:
         raise DataError("runs in the plane and in space cannot be merged", got=sorted(dims))
-    graph = PoseGraph(dims.pop())
+    graph = FactorGraph(dims.pop())
     solve = make_solver(solver, graph)
     add_session(graph, sessions[0], use_gps=by != "places")
     solve.solve_to_optimum()
@@ -171,7 +171,7 @@ def merge_dense(
 
 
 def _tie(
-    graph: PoseGraph,
+    graph: FactorGraph,
     solver: Any,
     known: DenseSession,
     known_node: int,

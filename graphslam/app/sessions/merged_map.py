@@ -12,7 +12,7 @@ from graphslam.app.run.run import Run, metric_value
 from graphslam.core.geometry import Array
 from graphslam.core.markup import html_element, html_frame, join_parts
 from graphslam.evaluate.gauge import gauge_directions, inner_covariance
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.places import Ints
 from graphslam.loops.sessions import Alignment
 from graphslam.maps.global_map import GlobalMap
@@ -64,7 +64,7 @@ class MergedMap:
     landmark_covariances: Array
     landmark_sessions: Ints
     solution: Solution
-    graph: PoseGraph
+    graph: FactorGraph
     metrics: pd.DataFrame
     report: dict[str, Any] = field(default_factory=dict)
 

@@ -21,7 +21,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.refined import heading_error
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import Refinement, refine_by_scans
 from graphslam.refine.scans import Scans
@@ -163,7 +163,7 @@ class RefinementTrial(GraphTrial):
     def bent(self, submaps: Sequence[Submap], count: int) -> Array:
         """Path of the graph with wrong loops between places more than 8 m and 30 s apart."""
         c = self.graph
-        graph = PoseGraph(3)
+        graph = FactorGraph(3)
         for s in submaps:
             graph.add_submap(s, spacing=c.spacing, level_sigma=c.level_sigma)
         solver = BatchSolver(graph)

@@ -22,7 +22,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.find_loops import FindConfig, find_loops
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.measure import Loop
@@ -92,7 +92,7 @@ def run_graph_trial(config: GraphTrialConfig, seed: int) -> list[Measurement]:
 class BuiltGraph:
     """A graph, its solution, and how its loops were decided (None: it has none)."""
 
-    graph: PoseGraph
+    graph: FactorGraph
     solution: Solution
     closer: LoopCloser | None
     seconds: float
@@ -133,7 +133,7 @@ class GraphTrial(GridTrial):
     def build(self, submaps: Sequence[Submap], kind: str) -> BuiltGraph:
         """The graph of settled segments, one of :data:`GRAPHS`."""
         c, begin = self.graph, perf_counter()
-        graph = PoseGraph(submaps[0].dim)
+        graph = FactorGraph(submaps[0].dim)
         for s in submaps:
             graph.add_submap(s, spacing=c.spacing, level_sigma=c.level_sigma if s.dim == 3 else None)
         solver = BatchSolver(graph)
@@ -240,7 +240,7 @@ class GraphTrial(GridTrial):
             out[name] = np.einsum("ni,ni->n", e[:, k], np.linalg.solve(S, e[:, k, None])[..., 0]) / len(k)
         return out
 
-    def _decisions(self, kind: str, graph: PoseGraph, closer: LoopCloser) -> Iterator[Measurement]:
+    def _decisions(self, kind: str, graph: FactorGraph, closer: LoopCloser) -> Iterator[Measurement]:
         times = np.zeros(len(graph.values.poses))
         for s in graph.submaps:
             times[list(s.nodes)] = s.times

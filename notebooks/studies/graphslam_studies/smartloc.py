@@ -35,9 +35,9 @@ from graphslam.app.machine import one_blas_thread
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.gnss import TangentPlane
 from graphslam.core.log import SensorLog
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.catalog import load_recording
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies import segslam_report as tables
@@ -116,9 +116,9 @@ def config_of(settings: Settings) -> PseudorangeConfig:
     return PseudorangeConfig(**rest, robust=robust)
 
 
-def solve_street(log: SensorLog, config: PseudorangeConfig) -> PoseGraph:
+def solve_street(log: SensorLog, config: PseudorangeConfig) -> FactorGraph:
     """The graph of a log at its optimum: a node at every record of the odometry, level but for some degrees."""
-    graph = PoseGraph(3)
+    graph = FactorGraph(3)
     nodes = add_odometer(graph, log["odometry"])
     for node in nodes[::5].tolist():
         graph.add_attitude(node, DOWN, LEVEL, evidence="prior")
@@ -133,7 +133,7 @@ def solve_street(log: SensorLog, config: PseudorangeConfig) -> PoseGraph:
 Errors = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
 
-def errors(log: SensorLog, graph: PoseGraph, every: int) -> Errors:
+def errors(log: SensorLog, graph: FactorGraph, every: int) -> Errors:
     """Errors ``(k, 2)`` of the antenna in the plane at every so manieth record of the odometry, and covariances."""
     times, reference = log["odometry"].times, log["reference"]
     k = np.arange(0, len(times), every)

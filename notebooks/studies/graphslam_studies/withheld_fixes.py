@@ -39,10 +39,10 @@ from graphslam.core.se3 import quat_rotate
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import gps_innovations
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.gps import GpsConfig
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.catalog import load_recording
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies.graph.inertial_start import inertial_start, integrate_attitude
@@ -106,7 +106,7 @@ def steady_motion(fixes: Gps, share: float = 1.0) -> Imu:
     )
 
 
-def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> PoseGraph:
+def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> FactorGraph:
     """A node at every position, the IMU between them, the used ones as fixes; at its optimum.
 
     Parameters
@@ -121,7 +121,7 @@ def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> PoseGr
     line = np.stack([np.interp(at, at[used], c) for c in fixes.positions[used].T], axis=-1)
     path = np.concatenate([line - line[0], attitudes], axis=1)
     path[:, :3] -= quat_rotate(attitudes, np.broadcast_to(fixes.lever, (len(at), 3)))
-    graph, P = PoseGraph(3), np.diag(NOTHING**2)
+    graph, P = FactorGraph(3), np.diag(NOTHING**2)
     frame = np.append(path[0, :3], [0.0, 0.0, 0.0, 1.0])  # the first base is level, the others stand as the body does
     for k in range(len(at) - 1):
         local = SE3.between(np.stack([frame, frame]), path[k : k + 2])
@@ -144,7 +144,7 @@ def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> PoseGr
     return graph
 
 
-def predicted(graph: PoseGraph, fixes: Gps) -> Array:
+def predicted(graph: FactorGraph, fixes: Gps) -> Array:
     """Where the graph of :func:`graph_of_fixes` has the positions ``(n, 3)``, used or not."""
     nodes = np.array([s.node for s in graph.submaps] + [graph.submaps[-1].exit_node])
     T = graph.values.poses[nodes]
@@ -195,7 +195,7 @@ def scores_steady(fixes: Gps, every: float, share: float) -> dict[str, float]:
     return scores(graph_of_fixes(steady_motion(fixes.take(used), share), fixes, used, level), fixes, used)
 
 
-def scores(graph: PoseGraph, fixes: Gps, used: Mask) -> dict[str, float]:
+def scores(graph: FactorGraph, fixes: Gps, used: Mask) -> dict[str, float]:
     """Figures of a graph of :func:`graph_of_fixes`; see the module."""
     off = predicted(graph, fixes) - fixes.positions
     wrong = np.linalg.norm(off[~used], axis=1)

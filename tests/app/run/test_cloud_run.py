@@ -24,7 +24,7 @@ from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
 from graphslam.core.submap import Submap
-from graphslam.graph.pose_graph import PoseGraph
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.ledger import LoopDecision
 from graphslam.sim.crawler import simulate_crawler
@@ -90,10 +90,10 @@ class Listener(Observer):
     def __init__(self) -> None:
         self.told: list[Any] = []
 
-    def submap_added(self, submap: Submap, graph: PoseGraph) -> None:
+    def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
         self.told.append(submap.key)
 
-    def loop_decided(self, decision: LoopDecision, graph: PoseGraph) -> None:
+    def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
         if decision.verdict == "accepted":
             assert decision.factor_id in graph.records
             self.told.append((decision.submap_i, decision.submap_j))

@@ -32,8 +32,8 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.loops.inter_session_loops import InterSessionConfig, TwoSessions
 from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
@@ -267,7 +267,7 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
     shift = np.array([-9.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])  # the first drive goes straight on
     wrong = replace(found, loops=tuple(replace(x, T_ij=se3.se3_compose(shift, x.T_ij)) for x in found.loops))
     for ties, named in ((wrong, r"b: \d+ loop closures with a agree .* looks alike"), (found, "")):
-        graph = PoseGraph(3)
+        graph = FactorGraph(3)
         solver = make_solver("batch", graph)
         add_session(graph, known)
         solver.solve_to_optimum()

@@ -13,8 +13,8 @@ from graphslam.core.poses import SE3, level_poses
 from graphslam.core.se3 import quat_multiply, quat_rotate, so3_exp
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN, attitude_terms, level_turn, tangent_basis, up_turn
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.space_chain import dense_chain
@@ -87,7 +87,7 @@ def nees(rng: np.random.Generator, runs: int, level_sigma: float | None) -> np.n
     rows = []
     for _ in range(runs):
         submaps, truth = levelled_chain(rng)
-        g = PoseGraph(3)
+        g = FactorGraph(3)
         for s in submaps:
             g.add_submap(s, level_sigma=level_sigma)
         BatchSolver(g).solve_to_optimum()
@@ -115,7 +115,7 @@ def test_roll_and_pitch_stay_bounded_along_the_chain(rng):
     submaps, _ = levelled_chain(rng, m=40)
     sigma = {}
     for level in (None, SIGMA):
-        g = PoseGraph(3)
+        g = FactorGraph(3)
         for s in submaps:
             g.add_submap(s, level_sigma=level)
         BatchSolver(g).solve_to_optimum()
@@ -129,7 +129,7 @@ def test_roll_and_pitch_stay_bounded_along_the_chain(rng):
 def test_what_the_exit_says_of_all_else_is_kept(rng, spacing):
     """Giving up roll and pitch leaves position and heading as well known as before: seen from a level base."""
     chain = dense_chain(rng, 3, m=1)
-    g, level = PoseGraph(3), PoseGraph(3)
+    g, level = FactorGraph(3), FactorGraph(3)
     g.add_submap(chain.submaps[0], spacing=spacing)
     level.add_submap(chain.submaps[0], spacing=spacing, level_sigma=SIGMA)
     name = f"x{g.submaps[0].exit_node}"
@@ -149,7 +149,7 @@ def test_what_the_exit_says_of_all_else_is_kept(rng, spacing):
 
 def test_tilt_comes_and_goes(rng):
     chain = dense_chain(rng, 3, m=3)
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     solver = Isam2Solver(g)
     for s in chain.submaps:
         g.add_submap(s)
@@ -174,7 +174,7 @@ def test_tilt_comes_and_goes(rng):
 
 
 def test_what_an_attitude_refuses(rng):
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     with pytest.raises(ConfigError, match="must name the streams"):
         g.add_attitude(0, DOWN, 0.01)
     with pytest.raises(DataError, match="not there"):
@@ -184,9 +184,9 @@ def test_what_an_attitude_refuses(rng):
     with pytest.raises(ConfigError, match="positive sigma"):
         g.add_attitude(0, DOWN, 0.0, evidence="prior")
     with pytest.raises(GeometryError, match="plane"):
-        PoseGraph().add_attitude(0, DOWN, 0.01, evidence="prior")
+        FactorGraph().add_attitude(0, DOWN, 0.01, evidence="prior")
     flat = dense_chain(rng, 2, m=1).submaps[0]
     with pytest.raises(ConfigError, match="in space"):
-        PoseGraph().add_submap(flat, level_sigma=0.01)
+        FactorGraph().add_submap(flat, level_sigma=0.01)
     broken = replace(flat, trajectory=Trajectory(np.zeros(0), np.zeros((0, 3))))
-    PoseGraph().add_submap(broken, spacing=3.0)
+    FactorGraph().add_submap(broken, spacing=3.0)

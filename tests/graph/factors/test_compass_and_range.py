@@ -12,13 +12,13 @@ from graphslam.core.poses import SE2, SE3, Group
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.compass import CompassRecord, DeclinationRecord, DeviationPriorRecord
 from graphslam.graph.factors.range import BeaconRangeRecord, RangeRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.pending_measurements import CompassConfig, trilaterate
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.gtsam_optimum import optimise_with_gtsam
@@ -80,8 +80,8 @@ def world(rng: np.random.Generator, dim: int, *, zero: float = 0.7, iron: tuple[
     return truth, submaps, compass, ranges
 
 
-def graph_of(dim: int, submaps, compass=None, ranges=None, config: CompassConfig | None = None) -> PoseGraph:
-    graph = PoseGraph(dim)
+def graph_of(dim: int, submaps, compass=None, ranges=None, config: CompassConfig | None = None) -> FactorGraph:
+    graph = FactorGraph(dim)
     if compass is not None:
         graph.add_compass(compass, config=config)
     if ranges is not None:
@@ -92,10 +92,10 @@ def graph_of(dim: int, submaps, compass=None, ranges=None, config: CompassConfig
     return graph
 
 
-def everything(rng: np.random.Generator, dim: int) -> PoseGraph:
+def everything(rng: np.random.Generator, dim: int) -> FactorGraph:
     """A graph with all five kinds of factors, away from its optimum."""
     truth, submaps, compass, ranges = world(rng, dim)
-    graph = PoseGraph(dim)
+    graph = FactorGraph(dim)
     fixes = truth[:-1, :dim] + 0.2 * rng.standard_normal((len(truth) - 1, dim))
     times, sigma = np.arange(len(fixes)) + 0.5, np.full(len(fixes), 0.2)
     gps = Gps(times=times, positions=fixes, sigma=sigma, lever=np.zeros(dim))
@@ -214,7 +214,7 @@ def test_the_declination_ties_the_compass_to_the_frame_of_gps(rng):
     fixes = truth[:-1, :2][:8] + 1.0 * rng.standard_normal((8, 2))
     sigma = {}
     for declination in (None, 0.1):
-        graph = PoseGraph(2)
+        graph = FactorGraph(2)
         gps = Gps(times=np.arange(8) + 0.5, positions=fixes, sigma=np.full(8, 1.0), lever=np.zeros(2))
         graph.add_gps(gps, config=GpsConfig(baseline=5.0))
         graph.add_compass(compass, config=CompassConfig(declination=declination))
@@ -239,7 +239,7 @@ def test_beacons_wait_until_their_place_is_known(rng):
         trilaterate(bent, np.hypot(bent[:, 0] - 4, bent[:, 1] - 3.0), np.full(12, 0.1)), [4.0, 3.0], atol=1e-8
     )
     P = np.diag(SIGMA[2] ** 2)
-    graph = PoseGraph(2)
+    graph = FactorGraph(2)
     graph.add_beacons(
         LandmarkObservations.range_only(
             times=np.arange(10.0), offsets=np.arange(11), ranges=np.full(10, 5.0), range_sigma=np.full(10, 0.1),
@@ -256,7 +256,7 @@ def test_beacons_wait_until_their_place_is_known(rng):
 
 def test_readings_are_spent_once_thinned_and_dropped_by_name(rng):
     _, submaps, compass, _ = world(rng, 2)
-    graph = PoseGraph(2)
+    graph = FactorGraph(2)
     ids = graph.add_compass(compass, config=CompassConfig(every=2.0))
     assert len(ids) == 12
     assert [e["count"] for e in graph.events if e["event"] == "readings-thinned"] == [12]
@@ -320,4 +320,4 @@ def test_an_unknown_kind_of_factor_is_refused_at_once():
         factor_id, group, rows = 0, "odd", 1
 
     with pytest.raises(ConfigError, match="no kind of factor is registered for Odd"):
-        PoseGraph(2).insert(Odd())
+        FactorGraph(2).insert(Odd())

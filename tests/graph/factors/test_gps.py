@@ -10,11 +10,11 @@ from graphslam.core.errors import ConfigError, EvidenceReusedError, GeometryErro
 from graphslam.core.geometry import se2_compose, se2_exp, se2_transform, wrap_angle
 from graphslam.core.records import Gps
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsRecord, gps_residual
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key
 from graphslam.solve.batch import BatchSolver
 from tests.reference.antenna import antenna_in_base
@@ -23,7 +23,7 @@ from tests.reference.graph_chain import make_chain, make_gps
 DATUM = np.array([120.0, -40.0, 2.3])
 
 
-def fixes(g: PoseGraph) -> list[GpsRecord]:
+def fixes(g: FactorGraph) -> list[GpsRecord]:
     return [r for r in g.records.values() if isinstance(r, GpsRecord)]
 
 
@@ -81,7 +81,7 @@ def test_arm_covariance_by_monte_carlo(rng):
 
 def test_datum_heading_is_recovered(rng):
     chain = make_chain(rng, m=12, landmarks=30)
-    g = PoseGraph()
+    g = FactorGraph()
     solver = BatchSolver(g)
     g.add_gps(make_gps(chain, rng, DATUM, sigma=0.05))
     for s in chain.submaps:
@@ -98,7 +98,7 @@ def test_datum_heading_is_recovered(rng):
 def test_fixes_wait_for_the_baseline(rng):
     chain = make_chain(rng, m=10, landmarks=20)
     gps = make_gps(chain, rng, DATUM)
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_gps(gps, config=GpsConfig(baseline=20.0))
     started = None
     for s in chain.submaps:
@@ -118,7 +118,7 @@ def test_boundary_fix_belongs_to_one_submap_only(rng):
     chain = make_chain(rng, m=4)
     times = np.array([0.0, 10.0, 20.0, 25.0, 30.0, 40.0])
     gps = Gps(times=times, positions=rng.uniform(0, 50, (6, 2)), sigma=np.full(6, 1.0), lever=np.zeros(2))
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_gps(gps, config=GpsConfig(baseline=0.1))
     for s in chain.submaps:
         g.add_submap(s)
@@ -132,7 +132,7 @@ def test_given_late_or_in_portions_it_is_the_same(rng):
     gps = make_gps(chain, rng, DATUM)
     results = []
     for mode in range(3):
-        g = PoseGraph()
+        g = FactorGraph()
         if mode == 0:
             g.add_gps(gps)
         for s in chain.submaps:
@@ -153,7 +153,7 @@ def test_given_late_or_in_portions_it_is_the_same(rng):
 def test_uncovered_fixes_are_dropped_and_counted(rng):
     chain = make_chain(rng, m=2)
     gps = Gps(times=[-3.0, 5.0, 33.0], positions=np.zeros((3, 2)), sigma=np.ones(3), lever=np.zeros(2))
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_gps(gps)
     for s in chain.submaps:
         g.add_submap(s)
@@ -169,7 +169,7 @@ def test_gps_inside_a_submap_that_used_it_is_refused(rng):
     chain = make_chain(rng, m=2)
     greedy = replace(chain.submaps[1], uses=frozenset({"gps", "laser"}))
     gps = make_gps(chain, rng, DATUM)
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_submap(chain.submaps[0])
     g.add_submap(greedy)
     revision = g.revision
@@ -180,7 +180,7 @@ def test_gps_inside_a_submap_that_used_it_is_refused(rng):
     g.add_gps(gps.take(gps.times < 10.0))
     with pytest.raises(EvidenceReusedError, match="second time"):
         g.add_gps(gps.take(gps.times < 10.0))
-    h = PoseGraph()  # and the other way round: the submap comes second
+    h = FactorGraph()  # and the other way round: the submap comes second
     h.add_gps(gps)
     h.add_submap(chain.submaps[0])
     with pytest.raises(EvidenceReusedError, match="submap 1"):
@@ -197,7 +197,7 @@ def test_robust_kernel_against_outliers(rng):
     spoilt = Gps(times=gps.times, positions=wild, sigma=gps.sigma, lever=gps.lever)
     error = {}
     for kind in ("none", "cauchy", "huber"):
-        g = PoseGraph()
+        g = FactorGraph()
         g.add_gps(spoilt, config=GpsConfig(robust=RobustKernel(kind, 1.0)))
         for s in chain.submaps:
             g.add_submap(s)
@@ -215,7 +215,7 @@ def test_segment_bias_is_estimated_where_revisits_show_it(rng):
     shifted = gps.positions + np.where(half[:, None], [2.0, -1.0], 0.0)
     keep = (gps.times < 110) | (gps.times > 125)
     gps = Gps(times=gps.times[keep], positions=shifted[keep], sigma=gps.sigma[keep], lever=gps.lever)
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_gps(gps, config=GpsConfig(bias_sigma=2.0, segment_gap=5.0))
     for s in chain.submaps:
         g.add_submap(s)
@@ -227,7 +227,7 @@ def test_segment_bias_is_estimated_where_revisits_show_it(rng):
 
 def test_arm_uncertainty_is_added(rng):
     chain = make_chain(rng, m=3)
-    g = PoseGraph()
+    g = FactorGraph()
     g.add_gps(make_gps(chain, rng, DATUM, sigma=0.3), config=GpsConfig(baseline=5.0, sigma=0.2))
     for s in chain.submaps:
         g.add_submap(s)
@@ -240,7 +240,7 @@ def test_arm_uncertainty_is_added(rng):
 
 
 def test_bad_input_is_refused(rng):
-    g = PoseGraph()
+    g = FactorGraph()
     with pytest.raises(GeometryError, match="dimension"):
         g.add_gps(Gps(times=[0.0], positions=np.zeros((1, 3)), sigma=np.ones(1), lever=np.zeros(3)))
     with pytest.raises(ConfigError, match=r"gps.baseline"):

@@ -7,11 +7,11 @@ import pytest
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.records import Gps
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import BiasPriorBatch, BiasPriorRecord, level_datum_pose
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.graph.factors.test_gps_space import DATUM, built, fixes_along
@@ -21,7 +21,7 @@ from tests.reference.space_chain import dense_chain
 LASTING = GpsConfig(bias_sigma=0.5, bias_time=20.0, baseline=2.0)
 
 
-def priors(graph: PoseGraph) -> list[BiasPriorRecord]:
+def priors(graph: FactorGraph) -> list[BiasPriorRecord]:
     return [r for r in graph.records.values() if isinstance(r, BiasPriorRecord)]
 
 

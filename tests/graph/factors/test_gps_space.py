@@ -11,11 +11,11 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_multiply, so3_exp
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.gps import GpsRecord, gps_predicted_in_space, level_datum_pose
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.antenna import antenna_in_base
@@ -36,8 +36,8 @@ def fixes_along(
     return Gps(times=times, positions=z, sigma=np.full(len(z), sigma), lever=LEVER)
 
 
-def built(chain: DenseChain, gps: Gps | None = None, config: GpsConfig | None = None, *, late: int = 0) -> PoseGraph:
-    g = PoseGraph(3)
+def built(chain: DenseChain, gps: Gps | None = None, config: GpsConfig | None = None, *, late: int = 0) -> FactorGraph:
+    g = FactorGraph(3)
     for k, s in enumerate(chain.submaps):
         if gps is not None and k == late:
             g.add_gps(gps, config=config)
@@ -46,7 +46,7 @@ def built(chain: DenseChain, gps: Gps | None = None, config: GpsConfig | None = 
     return g
 
 
-def position_error(g: PoseGraph, chain: DenseChain) -> float:
+def position_error(g: FactorGraph, chain: DenseChain) -> float:
     ends = [s.exit_node for s in g.submaps]
     return float(np.sqrt(np.mean(np.sum((g.values.poses[ends] - chain.poses[1:])[:, :3] ** 2, axis=1))))
 
@@ -109,7 +109,7 @@ def test_position_is_honest_with_gps(rng):
 def test_fixes_wait_for_a_level_baseline(rng):
     chain = dense_chain(rng, 3, m=6)
     gps = fixes_along(chain, rng, level_datum_pose(DATUM))
-    g, started = PoseGraph(3), None
+    g, started = FactorGraph(3), None
     g.add_gps(gps, config=GpsConfig(baseline=15.0))
     for s in chain.submaps:
         g.add_submap(s, spacing=4.0)
@@ -118,7 +118,7 @@ def test_fixes_wait_for_a_level_baseline(rng):
         elif started is None:
             started = s.key
     assert started == 1
-    lift = PoseGraph(3)  # fifty metres straight up in a lift: nothing in it says where north is
+    lift = FactorGraph(3)  # fifty metres straight up in a lift: nothing in it says where north is
     times = np.linspace(0, 9.9, 12)
     up = np.column_stack([np.zeros((12, 2)), np.linspace(0, 50, 12)])
     lift.add_gps(Gps(times=times, positions=up, sigma=np.ones(12), lever=np.zeros(3)), config=GpsConfig(baseline=15.0))
@@ -136,7 +136,7 @@ def test_a_late_first_fix_moves_nothing(rng):
     chain = dense_chain(rng, 3, m=6)
     gps = fixes_along(chain, rng, level_datum_pose(DATUM), sigma=0.5)
     gps = gps.take(gps.times > 40.0)
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     solver = Isam2Solver(g)
     for s in chain.submaps[:5]:
         g.add_submap(s, spacing=4.0)
@@ -188,7 +188,7 @@ def test_fixes_tell_the_tilt_of_a_first_base_that_is_not_level(rng):
     gps = fixes_along(chain, rng, T, sigma=0.05)
     results = {}
     for known in (False, True):
-        g = PoseGraph(3)
+        g = FactorGraph(3)
         if known:
             g.add_attitude(0, DOWN, 0.05, evidence="levelled")
         g.add_gps(gps)

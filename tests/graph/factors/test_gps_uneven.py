@@ -10,11 +10,11 @@ import pytest
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.evaluate.gps_innovation import gps_innovations
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsBatch, GpsRecord, antenna_terms, level_datum_pose
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam_studies.graph.gnss import add_odometer, add_pseudoranges
@@ -138,7 +138,7 @@ def test_withheld_fixes_are_foretold_in_space(rng):
 def test_the_datum_stays_with_its_pseudoranges():
     """A graph of pseudoranges keeps its datum when one of them goes, and learns where up is when it is told later."""
     log = simulate_satellites(1, SatelliteConfig(seconds=8.0, satellites=7))
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     nodes = add_odometer(g, log["odometry"])
     ids = add_pseudoranges(g, log["pseudoranges"], PLANE, nodes)
     g.remove(ids[3])

@@ -13,13 +13,13 @@ from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, G
 from graphslam.core.imu import GRAVITY
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
 from graphslam.graph.factors.imu.config import ImuConfig, places_on_nodes
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.graph.variables import gtsam_key, key_name
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -29,14 +29,14 @@ from tests.reference.imu_ring import MOUNT, NOISE, Ring, ring, true_readings
 EVERY = ("imu", "gyro", "imu-bias", "imu-gravity")
 
 
-def chain(made: Ring, spacing: float | None = 3.0, **levelled: float) -> PoseGraph:
-    g = PoseGraph(3)
+def chain(made: Ring, spacing: float | None = 3.0, **levelled: float) -> FactorGraph:
+    g = FactorGraph(3)
     for s in made.submaps:
         g.add_submap(s, spacing=spacing, **levelled)
     return g
 
 
-def mixed(rng) -> tuple[Ring, PoseGraph]:
+def mixed(rng) -> tuple[Ring, FactorGraph]:
     """A graph with every kind of factor of an IMU: two units, one by its gyro alone, pauses, far nodes."""
     made = ring(rng, submaps=4, seconds=6.0)
     g = chain(made)
@@ -47,11 +47,11 @@ def mixed(rng) -> tuple[Ring, PoseGraph]:
     return made, g
 
 
-def kinds(g: PoseGraph) -> list[type]:
+def kinds(g: FactorGraph) -> list[type]:
     return [type(r) for r in g.records.values()]
 
 
-def wobbled(g: PoseGraph, rng, size: float = 0.02):
+def wobbled(g: FactorGraph, rng, size: float = 0.02):
     return g.values.retract(size * rng.standard_normal(g.flat().layout.size))
 
 
@@ -180,7 +180,7 @@ def test_online_is_offline(rng):
     whole = chain(made)
     whole.add_imu(made.imu)
     BatchSolver(whole).solve_to_optimum()
-    g, cut = PoseGraph(3), 5.3
+    g, cut = FactorGraph(3), 5.3
     solver = Isam2Solver(g)
     early, late = made.imu.take(made.imu.times <= cut), made.imu.take(made.imu.times > cut)
     for k, s in enumerate(made.submaps):
@@ -205,14 +205,14 @@ def test_the_last_node_waits_for_the_submap_that_begins_there(rng):
     made = ring(rng, submaps=3, seconds=6.0)
     spacings = (None, 3.0, None)  # far, near, far
     config = ImuConfig(longest=4.0)
-    whole, g = PoseGraph(3), PoseGraph(3)
+    whole, g = FactorGraph(3), FactorGraph(3)
     for k, (s, spacing) in enumerate(zip(made.submaps, spacings)):
         whole.add_submap(s, spacing=spacing)
         g.add_submap(s, spacing=spacing)
         g.add_imu(made.imu.take(slice(None) if k == 0 else slice(0, 0)), config=config, more=k < 2)
     whole.add_imu(made.imu, config=config)
 
-    def told(graph: PoseGraph) -> list[tuple[str, ...]]:
+    def told(graph: FactorGraph) -> list[tuple[str, ...]]:
         return sorted((type(r).__name__, *(v for v in r.variables() if v[0] == "x")) for r in graph.records.values())
 
     assert told(g) == told(whole)
@@ -242,7 +242,7 @@ def test_recentring_leaves_what_is_right(rng):
 
 def test_a_submap_that_used_it_refuses_it(rng):
     made = ring(rng, submaps=3)
-    g = PoseGraph(3)
+    g = FactorGraph(3)
     for k, s in enumerate(made.submaps):
         g.add_submap(replace(s, uses=frozenset({"laser", "imu"} if k == 1 else {"laser"})), spacing=3.0)
     before = (len(g.records), len(g.ledger), g.values.layout())
@@ -271,7 +271,7 @@ def test_and_the_other_way_round(rng):
 # ------------------------------------------------------------------- what is left out
 
 
-def dropped(g: PoseGraph) -> dict[str, int]:
+def dropped(g: FactorGraph) -> dict[str, int]:
     return [e for e in g.events if e["event"] == "imu"][-1]["dropped"]
 
 
@@ -295,7 +295,7 @@ def test_what_is_left_out_is_counted(rng):
     slow = chain(made)
     slow.add_imu(made.imu.take(slice(None, None, 100)), config=ImuConfig(pause=5.0))
     assert dropped(slow)["too few readings"] > 0
-    bare = PoseGraph(3)
+    bare = FactorGraph(3)
     for s in made.submaps:
         bare.add_submap(replace(s, trajectory=None))
     bare.add_imu(made.imu)
@@ -305,7 +305,7 @@ def test_what_is_left_out_is_counted(rng):
 def test_what_it_refuses(rng):
     made = ring(rng, submaps=2)
     with pytest.raises(GeometryError, match="in the plane"):
-        PoseGraph(2).add_imu(made.imu)
+        FactorGraph(2).add_imu(made.imu)
     g = chain(made)
     with pytest.raises(DataError, match="needs readings"):
         g.add_imu(made.imu.take(slice(0, 1)))

@@ -11,8 +11,8 @@ import pytest
 from graphslam.app.solve_file import solve_network_file
 from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.network import PoseNetwork
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.network import network_values
-from graphslam.graph.pose_graph import PoseGraph
 from graphslam.io.g2o import write_g2o
 from graphslam.io.network_file import read_network
 from graphslam.solve.batch import BatchSolver
@@ -106,7 +106,7 @@ def test_a_wound_up_ring_is_a_local_minimum_and_refused() -> None:
 
 def test_a_graph_of_a_run_is_judged_and_started_elsewhere_too(rng: np.random.Generator) -> None:
     net, wound = twisted_ring(20, 1)
-    graph = PoseGraph(2)
+    graph = FactorGraph(2)
     cov = np.linalg.inv(net.information)
     graph.add_betweens(net.edges, net.measurements, cov, poses=wound[1:], evidence="shared-scan")
     solver = BatchSolver(graph)

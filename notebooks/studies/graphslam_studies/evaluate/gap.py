@@ -74,10 +74,10 @@ def objectives_along(submaps: Sequence[Submap], method: str, *, progress: bool =
 
 
 def _isam2_along(submaps: Sequence[Submap], *, progress: bool) -> Array:
-    from graphslam.graph.pose_graph import PoseGraph  # gtsam takes a second to load
+    from graphslam.graph.factor_graph import FactorGraph  # gtsam takes a second to load
     from graphslam.solve.isam2 import Isam2Solver
 
-    graph = PoseGraph()
+    graph = FactorGraph()
     solver = Isam2Solver(graph)
     found = np.empty(len(submaps))
     for k, submap in enumerate(Bar(submaps, name="iSAM2", unit="submap", shown=progress)):

@@ -7,7 +7,7 @@ Examples
 --------
 The path of a pipeline, once per finished submap, and the end of a run::
 
-    graph = PoseGraph()
+    graph = FactorGraph()
     solver = make_solver("isam2", graph)                     # graphslam.solve.registry; "batch" has the same verbs
     config = AssociationConfig(covariance_scale=5.0)         # graphslam.association.landmarks
     graph.add_gps(log["gps"], config=GpsConfig(robust=Robust("cauchy", 2.385)))  # fixes wait for their submap
@@ -56,10 +56,10 @@ from graphslam.graph.noise import NO_KERNEL, RobustKernel, covariance_whiteners,
 from graphslam.graph.pending_measurements import BeaconConfig, CompassConfig
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
-__all__ = ["PoseGraph", "SubmapNode"]
+__all__ = ["FactorGraph", "SubmapNode"]
 
 
-class PoseGraph(FactorGraphState):
+class FactorGraph(FactorGraphState):
     """A graph of submaps, landmarks and GPS, in the plane or in space: the functions that add factors.
 
     The first base is fixed at the origin. Queries of the graph are in
@@ -72,7 +72,7 @@ class PoseGraph(FactorGraphState):
 
     Examples
     --------
-    >>> graph = gs.PoseGraph(dim=2)
+    >>> graph = gs.FactorGraph(dim=2)
     >>> for submap in gs.local_maps(log)[:2]:
     ...     added = graph.add_submap(submap)
     >>> len(graph.submaps)
@@ -80,7 +80,7 @@ class PoseGraph(FactorGraphState):
     """
 
     def __repr__(self) -> str:
-        return f"PoseGraph({len(self.submaps)} submaps, {len(self.values.landmarks)} landmarks, dim={self.dim})"
+        return f"FactorGraph({len(self.submaps)} submaps, {len(self.values.landmarks)} landmarks, dim={self.dim})"
 
     def add_submap(
         self,
@@ -272,7 +272,7 @@ class PoseGraph(FactorGraphState):
         self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # comes and goes with its submap
 
     def _level(self, node: int, sigma: float, time: float) -> int:
-        """A base that was levelled: a declared exception of the ledger, see :meth:`PoseGraph.add_submap`."""
+        """A base that was levelled: a declared exception of the ledger, see :meth:`FactorGraph.add_submap`."""
         return self.add_attitude(
             node, DOWN, sigma, streams=["gravity"], interval=(time, time), evidence=LEVELLED, group=LEVELLED
         )
