@@ -82,6 +82,52 @@ class FactorGraph(FactorGraphState):
     def __repr__(self) -> str:
         return f"FactorGraph({len(self.submaps)} submaps, {len(self.values.landmarks)} landmarks, dim={self.dim})"
 
+    @classmethod
+    def from_submaps(
+        cls,
+        submaps: Iterable[Submap],
+        *,
+        covariance_scale: float = 1.0,
+        spacing: float | None = None,
+        level_sigma: float | None = None,
+        match_robust: RobustKernel = NO_KERNEL,
+    ) -> FactorGraph:
+        """A graph of submaps from anywhere, landmark submaps and dense ones in one chain, with all their matches.
+
+        Parameters
+        ----------
+        submaps : iterable of Submap
+            Each begins where the one before it ends. Landmarks are identified by the submaps' own ids, -1 = new.
+        covariance_scale, spacing, level_sigma
+            As for :meth:`add_submap`; the last two are for dense submaps.
+        match_robust : RobustKernel
+            For the matches.
+
+        Raises
+        ------
+        GeometryError
+            Submaps of two dimensions.
+        DataError
+            No submaps; two of one key; a match into a submap that is not among them.
+        """
+        chain = list(submaps)
+        if not chain:
+            raise DataError("a graph of submaps needs submaps", got="none", wanted="one or more")
+        keys = {dim: [s.key for s in chain if s.dim == dim] for dim in sorted({s.dim for s in chain})}
+        if len(keys) > 1:
+            names = " and ".join(f"{dim}-D submaps {_some(k)}" for dim, k in keys.items())
+            raise GeometryError(
+                "submaps of two dimensions do not fit in one graph", got=names, wanted="a graph of each"
+            )
+        graph = cls(chain[0].dim)
+        for s in chain:
+            dense = {} if s.landmarks is not None else {"spacing": spacing, "level_sigma": level_sigma}
+            graph.add_submap(s, covariance_scale=covariance_scale, **dense)  # type: ignore[arg-type]
+        for s in chain:
+            for m in s.matches:
+                graph.add_match(s.key, m, robust=match_robust)
+        return graph
+
     def add_submap(
         self,
         submap: Submap,
@@ -752,3 +798,8 @@ class FactorGraph(FactorGraphState):
         if group.dim == 3:
             pose = np.concatenate([pose[:3], quat_normalize(pose[3:])])
         return pose
+
+
+def _some(keys: Sequence[int]) -> str:
+    """A few keys and how many there are."""
+    return ", ".join(map(str, keys)) if len(keys) <= 4 else f"{keys[0]}, {keys[1]} … {keys[-1]} ({len(keys)})"
