@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import numpy as np
 import pandas as pd
@@ -28,12 +28,19 @@ from graphslam.join.registry import (
 )
 from graphslam.join.submap_solver import SubmapEstimate
 
+if TYPE_CHECKING:
+    from graphslam.join.graph_join import GraphEstimate
+
 logger = logging.getLogger(__name__)
+
+MapEstimate: TypeAlias = Union[SubmapEstimate, "GraphEstimate"]
+"""A joined map: of landmark submaps in the plane, or of any graph."""
 
 DEFAULT_METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
 JSON_COLUMNS = (
     *("method", "objective", "objective_polished", "seconds", "peak_mb", "states", "landmarks", "nnz"),
     *("dof", "nees_unpolished", "nees", "nees_plain", "nees_dof", "ci_unpolished", "ci"),
+    *("rmse_poses", "rmse_landmarks", "factors"),
 )
 
 
@@ -41,16 +48,16 @@ def default_methods(submaps: Material) -> tuple[str, ...]:
     """All five, but no dense filter where it has no room."""
     if isinstance(submaps, Sequence):
         return DEFAULT_METHODS
-    from graphslam.join.pose_ekf import MOST
+    from graphslam.join.graph_join import MOST_STATES
 
-    if submaps.states <= MOST:
+    if submaps.states <= MOST_STATES:
         return DEFAULT_METHODS
-    logger.warning("no EKF: %d states, a dense filter is limited to %d", submaps.states, MOST)
+    logger.warning("no EKF: %d states, a dense filter is limited to %d", submaps.states, MOST_STATES)
     return tuple(m for m in DEFAULT_METHODS if m != "ekf")
 
 
 def map_nees(
-    estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth, *, chart: str | None = None
+    estimate: MapEstimate, keys: Sequence[int], truth: MapTruth, *, chart: str | None = None
 ) -> tuple[float, int]:
     """Joint NEES of all poses and landmarks of known truth, gauge "first base fixed", and its dimension (eq. 18).
 
@@ -73,52 +80,52 @@ def map_nees(
 
 
 def _errors(
-    estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth, chart: str | None
+    estimate: MapEstimate, keys: Sequence[int], truth: MapTruth, chart: str | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors of all scalars of known truth in a chart, and where they stand in the state vector."""
-    exits = getattr(estimate, "exits", None)
-    if exits is not None:  # of dense submaps: in the right tangents of their exits
-        i, j = match_ids(np.asarray(keys), truth.keys)
-        rows, have = exits[i], truth.exit_poses[j]
-        if have.shape[1] != estimate.poses.shape[1]:
-            raise DataError(
-                "ground truth has another dimension", got=have.shape, wanted=(len(have), estimate.poses.shape[1])
-            )
-        d = group_of(have).dof
-        return pose_error(estimate.poses[rows], have).ravel(), (d * (rows[:, None] - 1) + np.arange(d)).ravel()
     g = group_of(estimate.poses)
     if truth.exit_poses.shape[1] != g.size:
         raise DataError("ground truth has another dimension", got=truth.exit_poses.shape, wanted=f"(m, {g.size})")
-    m = len(estimate.poses) - 1
     i, j = match_ids(np.asarray(keys), truth.keys)
+    a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
+    if not isinstance(estimate, SubmapEstimate):  # right tangents of the exits, then positions
+        layout, rows = estimate.problem.graph.flat().layout, estimate.exits[i]
+        error = pose_error(estimate.poses[rows], truth.exit_poses[j]), truth.landmarks[b] - estimate.landmarks[a]
+        columns = layout.pose_columns(rows).ravel(), layout.at("l", a).ravel()
+        return np.concatenate([e.ravel() for e in error]), np.concatenate(columns)
+    m = len(estimate.poses) - 1
     poses, landmarks = estimate.poses[1:].copy(), estimate.landmarks.copy()  # what has no truth has no error
     poses[i] = truth.exit_poses[j]
-    a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
     landmarks[a] = truth.landmarks[b]
     d, n = g.dof, g.dim
     at = np.concatenate([(d * i[:, None] + np.arange(d)).ravel(), (d * m + n * a[:, None] + np.arange(n)).ravel()])
     return estimate.difference(poses, landmarks, chart=chart)[at], at
 
 
-def _judge(estimate: SubmapEstimate, keys: Sequence[int], truth: MapTruth | None) -> dict[str, Any]:
+def _judge(estimate: MapEstimate, keys: Sequence[int], truth: MapTruth | None) -> dict[str, Any]:
     if truth is None:
         unknown = ("nees", "nees_plain", "nees_dof", "ci", "rmse_poses", "rmse_landmarks")
         return dict.fromkeys(unknown)
     d2, dof = map_nees(estimate, keys, truth)
-    error, known = _errors(estimate, keys, truth, "cartesian")
-    g = group_of(estimate.poses)
-    poses = g.dof * (len(estimate.poses) - 1)
-    position = (known < poses) & np.isin(known % g.dof, np.arange(g.dof)[g.position])
-    landmark = known >= poses
+    plain = isinstance(estimate, SubmapEstimate)
+    rows = np.arange(1, len(estimate.poses)) if isinstance(estimate, SubmapEstimate) else estimate.exits
+    i, j = match_ids(np.asarray(keys), truth.keys)
+    a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
+    dim = group_of(estimate.poses).dim
     return {
         "nees": d2,
         # of poses in tangents there is no plain vector
-        "nees_plain": None if hasattr(estimate, "exits") else map_nees(estimate, keys, truth, chart="cartesian")[0],
+        "nees_plain": map_nees(estimate, keys, truth, chart="cartesian")[0] if plain else None,
         "nees_dof": dof,
         "ci": float(consistency_index(d2, dof)),
-        "rmse_poses": math.sqrt(g.dim * float(np.mean(error[position] ** 2))) if position.any() else None,
-        "rmse_landmarks": math.sqrt(g.dim * float(np.mean(error[landmark] ** 2))) if landmark.any() else None,
+        "rmse_poses": _rmse(estimate.poses[rows[i], :dim] - truth.exit_poses[j, :dim]),
+        "rmse_landmarks": _rmse(estimate.landmarks[a] - truth.landmarks[b]),
     }
+
+
+def _rmse(error: np.ndarray) -> float | None:
+    """Root mean square of distances ``(n, dim)`` [m]."""
+    return math.sqrt(float(np.mean(np.sum(error**2, axis=1)))) if len(error) else None
 
 
 def compare_methods(
@@ -136,7 +143,7 @@ def compare_methods(
 
     Parameters
     ----------
-    submaps : sequence of Submap, or PoseProblem
+    submaps : sequence of Submap, or JoinProblem
         See :func:`join`.
     methods : sequence of str
         See :func:`join`.
@@ -181,7 +188,7 @@ def compare_methods(
             joined = way.joiners[method](submaps)
             if polish:
                 own = _judge(joined, keys, truth)
-            estimate: SubmapEstimate = way.polish(submaps, joined) if polish else joined
+            estimate: MapEstimate = way.polish(submaps, joined) if polish else joined
         else:
             estimate = way.solvers[method](submaps, polish=polish, progress=False)
             if polish and truth is not None:
@@ -207,7 +214,7 @@ def submap_keys(submaps: Material) -> list[int]:
     return [s.key for s in submaps] if isinstance(submaps, Sequence) else submaps.keys.tolist()
 
 
-def degrees_of_freedom(submaps: Material, estimate: SubmapEstimate) -> int:
+def degrees_of_freedom(submaps: Material, estimate: MapEstimate) -> int:
     """Scalars that submaps and their ties measure, less the free ones."""
     if not isinstance(submaps, Sequence):
         return submaps.dof
@@ -215,7 +222,7 @@ def degrees_of_freedom(submaps: Material, estimate: SubmapEstimate) -> int:
     return sum(g.dof + g.dim * (0 if s.landmarks is None else len(s.landmarks)) for s in submaps) - estimate.states
 
 
-def _describe(method: str, submaps: Material, estimate: SubmapEstimate) -> dict[str, Any]:
+def _describe(method: str, submaps: Material, estimate: MapEstimate) -> dict[str, Any]:
     return {
         "method": method,
         "objective": estimate.objective,
@@ -226,7 +233,14 @@ def _describe(method: str, submaps: Material, estimate: SubmapEstimate) -> dict[
         "landmarks": len(estimate.landmark_ids),
         "nnz": estimate.nnz,
         "dof": degrees_of_freedom(submaps, estimate),
+        "factors": factor_text(submaps),
     }
+
+
+def factor_text(submaps: Material) -> str:
+    """Number of factors of each class that every method solves, such as ``"gps 36, imu 12, submap 8"``."""
+    counts = {"submap": len(submaps)} if isinstance(submaps, Sequence) else submaps.factor_counts()
+    return ", ".join(f"{name} {n}" for name, n in counts.items())
 
 
 def _poses_only(truth: MapTruth) -> MapTruth:
@@ -245,7 +259,7 @@ def _json_row(row: Mapping[Any, Any]) -> dict[str, Any]:
         value = row.get(name)
         if value is None or (isinstance(value, float) and not math.isfinite(value)):
             values[name] = None
-        elif name == "method":
+        elif name in ("method", "factors"):
             values[name] = str(value)
         elif name in ("states", "landmarks", "nnz", "dof", "nees_dof"):
             values[name] = int(value)
@@ -289,24 +303,26 @@ def comparison_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             for when in ("before", "after"):
                 value = r[when][key]
                 line[f"{name} {when}"] = value / n if key == "nees" and value is not None and n else value
-        out.append(line | {k: r[k] for k in ("seconds", "peak_mb", "states", "landmarks", "nnz", "dof")})
+        shown = ("rmse_poses", "rmse_landmarks", "seconds", "peak_mb", "states", "landmarks", "nnz", "dof", "factors")
+        out.append(line | {k: r[k] for k in shown})
     known = any(r["nees_dof"] for r in rows)
-    return out if known else [{k: v for k, v in x.items() if not k.startswith(("NEES", "CI"))} for x in out]
+    unknown = ("NEES", "CI", "rmse")
+    return out if known else [{k: v for k, v in x.items() if not k.startswith(unknown)} for x in out]
 
 
 def join_json(
     submaps: Material,
     method: str,
-    estimate: SubmapEstimate,
+    estimate: MapEstimate,
     *,
     truth: MapTruth | None = None,
-    own: SubmapEstimate | None = None,
+    own: MapEstimate | None = None,
 ) -> dict[str, list[dict[str, Any]]]:
     """One joined map in the same form as :func:`methods_json`; memory is not measured.
 
     Parameters
     ----------
-    own : SubmapEstimate, optional
+    own : MapEstimate, optional
         The map before its refinement.
     """
     before = {} if own is None else _judge(own, submap_keys(submaps), truth)

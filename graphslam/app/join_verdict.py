@@ -5,26 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from graphslam.app.compare import MapEstimate
 from graphslam.app.run.summary import headline, length_text
 from graphslam.app.run.verdict import ChiSquareTest, is_finite_number
 from graphslam.core.findings import Finding
-from graphslam.join.submap_solver import SubmapEstimate
 
 SAME = 1e-6
 """Relative difference of two objectives that are one."""
 
 
-def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Sequence[str] = ()) -> list[Finding]:
+def join_verdict(row: Mapping[str, Any], estimate: MapEstimate) -> list[Finding]:
     """Lines of a verdict on one joined map.
 
     Parameters
     ----------
     row : mapping
         Of :func:`graphslam.app.compare.join_json`.
-    estimate : SubmapEstimate
+    estimate : SubmapEstimate or GraphEstimate
         The map that it describes.
-    left_out : sequence of str
-        What the graph of the submaps holds besides.
     """
     out = [_state(row, estimate)]
     judged = {j.code: j for j in join_consistency_tests(row)}
@@ -37,12 +35,6 @@ def join_verdict(row: Mapping[str, Any], estimate: SubmapEstimate, left_out: Seq
         before: Any = row.get("nees_unpolished")
         said = f"; before refinement {before / nees.dof:.3g}" if is_finite_number(before) else ""
         out.append(Finding(nees.level, "nees", f"NEES (ground truth): {nees.text}{said}."))
-    if left_out:
-        text = (
-            f"not included: {', '.join(left_out)} — map-joining methods use submaps and the constraints between them "
-            "only."
-        )
-        out.append(Finding("", "left-out", text))
     return out
 
 
@@ -78,7 +70,7 @@ def join_headline(row: Mapping[str, Any], findings: Sequence[Finding], *, submap
     return headline(findings, facts, judged, known=known)
 
 
-def _state(row: Mapping[str, Any], estimate: SubmapEstimate) -> Finding:
+def _state(row: Mapping[str, Any], estimate: MapEstimate) -> Finding:
     own, best = row["objective"], row["objective_polished"]
     if best is None:
         text = f"solution: χ² {own:.6g} — not refined; the optimum is unknown."

@@ -28,8 +28,8 @@ from graphslam.join.registry import Material, compile_method, join_by_method
 logger = logging.getLogger(__name__)
 
 _TIMEOUT_S = 3600.0
-_PROBLEM = "problem.npz"
-"""File of dense submaps and their ties."""
+_GRAPH = "graph.npz"
+"""File of a graph with all its factors."""
 
 
 class MemoryProbe:
@@ -39,7 +39,7 @@ class MemoryProbe:
 
     Parameters
     ----------
-    submaps : sequence of Submap, PoseProblem or None
+    submaps : sequence of Submap, JoinProblem or None
         None: measure nothing.
     """
 
@@ -53,7 +53,7 @@ class MemoryProbe:
             if isinstance(self._submaps, Sequence):
                 write_submaps(self._folder.name, list(self._submaps))
             else:
-                self._submaps.save(Path(self._folder.name) / _PROBLEM)
+                self._submaps.save(Path(self._folder.name) / _GRAPH)
         return self
 
     def __exit__(
@@ -97,11 +97,11 @@ def _status(field: str) -> int:
 
 
 def _read(folder: Path) -> Material:
-    if not (folder / _PROBLEM).is_file():
+    if not (folder / _GRAPH).is_file():
         return read_submaps(folder)
-    from graphslam.join.pose_problem import PoseProblem
+    from graphslam.join.graph_problem import JoinProblem
 
-    return PoseProblem.load(folder / _PROBLEM)
+    return JoinProblem.load(folder / _GRAPH)
 
 
 def _measure_here(folder: str, method: str, polish: bool) -> float:

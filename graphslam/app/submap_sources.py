@@ -5,44 +5,47 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from graphslam.app.folders.generations import read_consistently
-from graphslam.app.pose_problem_files import load_pose_problem, pose_problem_of_run
 from graphslam.app.run.files import read_options
-from graphslam.app.run.outputs import identified_submaps
+from graphslam.app.run.outputs import GRAPH, identified_submaps
 from graphslam.app.run.run import Run
 from graphslam.core.errors import MissingDataError
 from graphslam.core.json_file import check_json
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import Submap
+from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.io.catalog import load_recording
 from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import read_truth
-from graphslam.join.pose_problem import PoseProblem
-from graphslam.join.registry import Material, are_dense
+from graphslam.join.graph_problem import JoinProblem
+from graphslam.join.registry import Material, are_landmark_submaps
 
 
 @dataclass(frozen=True, slots=True)
 class SubmapSource:
-    """Submaps with what is known beside them.
+    """What is to be joined, with what is known beside it.
 
     Parameters
     ----------
+    submaps : list of Submap
+        None of a pose-graph file or a graph by itself.
     truth : MapTruth or None
         Landmarks only where the submaps' identities are the truth's.
     covariance_scale : float
         Factor that the run used in its own join; 1 elsewhere.
-    problem : PoseProblem or None
-        Dense submaps with all that ties them: a run's matches and loops, a pose-graph file that was cut.
+    problem : JoinProblem or None
+        The graph of a run with all its factors, or a pose-graph file that was cut into submaps.
     """
 
     submaps: list[Submap]
     truth: MapTruth | None = None
     covariance_scale: float = 1.0
-    problem: PoseProblem | None = None
+    problem: JoinProblem | None = None
 
     @property
     def material(self) -> Material:
@@ -62,6 +65,17 @@ class SubmapSource:
         return all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in self.submaps)
 
 
+def source_of_graph(
+    problem: JoinProblem, submaps: list[Submap], truth: MapTruth | None, covariance_scale: float
+) -> SubmapSource:
+    """A solved graph as it is to be joined: all its factors, or landmark submaps where it holds nothing else."""
+    plain = set(problem.factor_counts()) == {"submap"} and are_landmark_submaps(submaps)
+    records = {r.submap_key: r for r in problem.factors if isinstance(r, SubmapRecord)} if plain else {}
+    if not plain or any(r.robot >= 0 for r in records.values()) or [s.key for s in submaps] != list(records):
+        return SubmapSource(submaps, truth, problem=problem)
+    return SubmapSource([s.with_ids(records[s.key].landmark_ids) for s in submaps], truth, covariance_scale)
+
+
 def poses_only(truth: MapTruth | None) -> MapTruth | None:
     """Truth without its landmarks, for maps whose landmarks have names of their own."""
     if truth is None:
@@ -70,49 +84,53 @@ def poses_only(truth: MapTruth | None) -> MapTruth | None:
     return replace(truth, landmark_ids=none, landmarks=np.zeros((0, truth.landmarks.shape[1])))
 
 
-def submap_source(
-    source: Run | SubmapSource | PoseProblem | str | Path | Sequence[Submap], *, submap_poses: int | None = None
-) -> SubmapSource:
+Source: TypeAlias = Run | SubmapSource | JoinProblem | FactorGraph | str | Path | Sequence[Submap]
+
+
+def submap_source(source: Source, *, submap_poses: int | None = None) -> SubmapSource:
     """Submaps from a run, a run folder, a submap store, a card, or a sequence.
 
     Parameters
     ----------
-    source : Run, path, card, sequence of Submap, or PoseProblem
+    source : Run, path, card, sequence of Submap, FactorGraph or JoinProblem
     submap_poses : int, optional
         A pose-graph file is cut into submaps of so many poses.
     """
     if isinstance(source, SubmapSource):
         return source
-    if isinstance(source, PoseProblem):
+    if isinstance(source, FactorGraph):
+        source = JoinProblem.of_graph(source)
+    if isinstance(source, JoinProblem):
         return SubmapSource([], problem=source)
-    if isinstance(source, Run) and are_dense(source.submaps):
-        if source.holds("graph"):
-            return SubmapSource(list(source.submaps), poses_only(source.truth), problem=pose_problem_of_run(source))
-        if source.folder is not None:
-            return submap_source(source.folder)
     if isinstance(source, Run):
+        if source.folder is not None and not source.holds("graph"):
+            return submap_source(source.folder)
         truth = source.truth if source.report.get("identities") == "truth" else poses_only(source.truth)
-        return SubmapSource(list(source.submaps), truth, float(source.report.get("covariance_scale", 1.0)))
+        scale, graph = float(source.report.get("covariance_scale", 1.0)), source.graph
+        if graph is None:
+            return SubmapSource(list(source.submaps), truth, scale)
+        return source_of_graph(JoinProblem.of_graph(graph), list(source.submaps), truth, scale)
     if not isinstance(source, (str, Path)):
         return SubmapSource(list(source))
     path = Path(source)
     if (path / "submaps").is_dir() or (path / "index.json").is_file():
         root = path if (path / "submaps").is_dir() else path.parent
 
-        def read(files: Path) -> tuple[float, str, MapTruth | None, list[Submap], PoseProblem | None]:
+        def read(files: Path) -> SubmapSource:
             submaps = identified_submaps(root if (files / "association.npz").is_file() else path)
-            tied = are_dense(submaps) and (files / "graph.g2o").is_file()
-            problem = load_pose_problem(root, files, submaps) if tied else None
-            return *_run_facts(root), read_truth(files), submaps, problem
+            scale, identities = _run_facts(root)
+            truth = read_truth(files)
+            truth = truth if identities != "run" else poses_only(truth)
+            if not (files / GRAPH).is_file():
+                return SubmapSource(submaps, truth, scale)
+            return source_of_graph(JoinProblem.load(files / GRAPH), submaps, truth, scale)
 
-        scale, identities, truth, submaps, problem = read_consistently(root, read)
-        known = truth if identities != "run" and problem is None else poses_only(truth)
-        return SubmapSource(submaps, known, scale if problem is None else 1.0, problem)
+        return read_consistently(root, read)
     loaded: Any = path if path.is_file() else load_recording(source)
     if isinstance(loaded, Path) and loaded.is_file():
         if submap_poses is None:
             raise MissingDataError(f"{source} holds no submaps; a pose-graph file is cut into some by --submap-poses")
-        return SubmapSource([], problem=PoseProblem.of_network(read_network(loaded), submap_poses))
+        return SubmapSource([], problem=JoinProblem.of_network(read_network(loaded), submap_poses))
     if not (isinstance(loaded, list) and loaded and isinstance(loaded[0], Submap)):
         raise MissingDataError(
             f"{source} holds no submaps",

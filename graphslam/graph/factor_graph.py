@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
-from graphslam.core.geometry import Array, ArrayLike, se2_transform
+from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.imu import Imu
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.se3 import quat_normalize
@@ -48,6 +48,7 @@ from graphslam.graph.factors.imu.states import ImuStates
 from graphslam.graph.factors.landmark_submap import CONSTANT, SubmapRecord
 from graphslam.graph.factors.range import RangeRecord
 from graphslam.graph.factors.sensor_biases import SIZE, SensorBiasRecord, bias_variable_names, sensor_biases_at
+from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.gps import GpsConfig
 from graphslam.graph.imu import RECENTRE
 from graphslam.graph.inner_nodes import cut_submap
@@ -68,7 +69,7 @@ class FactorGraph(FactorGraphState):
     Parameters
     ----------
     dim : int
-        2: poses ``(3,)``; 3: poses ``(7,)`` and submaps without landmarks.
+        2: poses ``(3,)``; 3: poses ``(7,)``.
 
     Examples
     --------
@@ -179,11 +180,6 @@ class FactorGraph(FactorGraphState):
             raise ConfigError(f"levelled bases are in space and need a positive sigma, got {level_sigma}")
         if submap.landmarks is None:
             return self._add_dense(submap, covariance_scale, spacing, level_sigma)
-        if self.dim != 2:
-            raise GeometryError(
-                f"submap {submap.key} has landmarks in space, and a graph holds landmarks in the plane",
-                wanted="submaps joined by graphslam.join_submaps or compared by graphslam.compare",
-            )
         return self._add_landmarks(submap, landmark_ids, covariance_scale)
 
     def _add_landmarks(self, submap: Submap, landmark_ids: npt.ArrayLike | None, covariance_scale: float) -> int:
@@ -200,9 +196,14 @@ class FactorGraph(FactorGraphState):
                 got=f"merged-away ids {gone}" if gone else int(ids.min()),
                 wanted="-1 for new, or an id of the graph or a fresh one",
             )
-        W = whitener(
-            lm.dense_covariance(), what=f"covariance of submap {submap.key}", dim=3 + 2 * n, scale=covariance_scale
-        )
+        record: SubmapRecord | SpaceSubmapRecord
+        if self.dim == 3:
+            record = SpaceSubmapRecord.of_map(-1, submap.key, -1, ids, lm, covariance_scale)
+            W = np.zeros(0)
+        else:
+            W = whitener(
+                lm.dense_covariance(), what=f"covariance of submap {submap.key}", dim=3 + 2 * n, scale=covariance_scale
+            )
         node, fid = self.structure.count("x") - 1, self._next_factor
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         self.ledger.spend(fid, f"submap {submap.key}", submap.assisting_streams, submap.interval, "aid")
@@ -211,13 +212,16 @@ class FactorGraph(FactorGraphState):
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         ids[fresh] = top + np.arange(len(fresh))
         self._next_landmark = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
-        self._start_landmarks(ids, se2_transform(self.pose(node), lm.positions))
+        self._start_landmarks(ids, self.structure.group.transform(self.pose(node), lm.positions))
         robot, z = -1, lm.mean
         if lm.lasting is not None:
             robot = self._robots.get(submap.uses, self.structure.count("wheels"))
             z, W = np.concatenate([z, np.zeros(len(lm.lasting.sigmas))]), np.hstack([W, -W @ lm.lasting.response])
-        record = SubmapRecord(fid, submap.key, node, ids, z, W, chart=lm.chart, robot=robot)
-        ends = np.stack([np.zeros(3), submap.exit_pose])
+        if self.dim == 3:
+            record = replace(record, factor_id=fid, start=node, landmark_ids=ids)
+        else:
+            record = SubmapRecord(fid, submap.key, node, ids, z, W, chart=lm.chart, robot=robot)
+        ends = np.stack([self.structure.group.identity, submap.exit_pose])
         self._append(submap, [record], np.array(submap.interval), ends)
         if lm.lasting is not None:
             self._robots[submap.uses] = robot

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import ItemsView, Iterator, Mapping, MutableMapping, Sequence, ValuesView
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError
-from graphslam.core.geometry import Array, se2_transform
+from graphslam.core.geometry import Array
 from graphslam.core.markup import Markup, html_element, join_parts
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
@@ -20,6 +20,7 @@ from graphslam.graph.factors.batch import FactorRecord, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.gps import AntennaRecord
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
+from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.gps import GpsFixes
 from graphslam.graph.imu import ImuUnits
 from graphslam.graph.ledger import Ledger
@@ -27,6 +28,9 @@ from graphslam.graph.pending_measurements import PendingMeasurements
 from graphslam.graph.score import GraphScore, score_graph
 from graphslam.graph.submap_node import SubmapNode
 from graphslam.graph.variables import Values, VariableLayout
+
+LANDMARK_SUBMAPS = (SubmapRecord, SpaceSubmapRecord)
+"""Records of submaps with landmarks, in the plane and in space."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,6 +198,15 @@ class FactorGraphState:
         self._flat: tuple[int, FactorArrays] | None = None
         self._covariance: tuple[int, Values, JointCovariance] | None = None
 
+    @classmethod
+    def with_values(cls, values: Values) -> Self:
+        """A graph without factors that has variables already: factors can be inserted one by one."""
+        new = cls(values.dim)
+        new.structure = values
+        new._row = {int(i): k for k, i in enumerate(values.landmark_ids)}
+        new._seen_in = {i: set() for i in new._row}
+        return new
+
     # ---------------------------------------------------------------- values
 
     @property
@@ -264,10 +277,10 @@ class FactorGraphState:
         if block is None or not block.kept.any():  # factors that came together spent their evidence together
             self.ledger.release(factor_id if block is None else block.first_id)
         self.revision += 1
-        if isinstance(record, SubmapRecord):
+        if isinstance(record, LANDMARK_SUBMAPS):
             for i in set(record.landmark_ids.tolist()):
                 self._seen_in[i].discard(factor_id)
-            self._drop_landmarks([i for i in set(record.landmark_ids.tolist()) if not self._seen_in[i]])
+            self.drop_landmarks([i for i in set(record.landmark_ids.tolist()) if not self._seen_in[i]])
         self._event("removed", factor_id=factor_id, factor=record.label(), reason=reason)
 
     def merge_landmarks(self, keep: int, drop: int) -> None:
@@ -277,13 +290,13 @@ class FactorGraphState:
         distance = float(np.linalg.norm(self.landmark(keep) - self.landmark(drop)))
         for fid in self._seen_in[drop]:
             record = self.records[fid]
-            assert isinstance(record, SubmapRecord)
+            assert isinstance(record, LANDMARK_SUBMAPS)
             ids = np.where(record.landmark_ids == drop, keep, record.landmark_ids)
             self.records[fid] = replace(record, landmark_ids=ids)  # a new object: solvers see that it changed
             self._seen_in[keep].add(fid)
             self._path_follows(record.submap_key, ids)
         self._seen_in[drop] = set()
-        self._drop_landmarks([drop])
+        self.drop_landmarks([drop])
         self.revision += 1
         self._event("merged", keep=keep, drop=drop, distance=distance)
 
@@ -296,7 +309,7 @@ class FactorGraphState:
             Id of the new landmark, which stands where the submap saw it.
         """
         record = self.records.get(factor_id)
-        if not isinstance(record, SubmapRecord) or not 0 <= entry < len(record.landmark_ids):
+        if not isinstance(record, LANDMARK_SUBMAPS) or not 0 <= entry < len(record.landmark_ids):
             raise DataError(
                 "no such observation to split off", got=(factor_id, entry), wanted="a submap factor's entry"
             )
@@ -306,7 +319,7 @@ class FactorGraphState:
         if old not in ids and len(self._seen_in[old]) < 2:
             raise DataError(f"landmark {old} is seen nowhere else", got=(factor_id, entry), wanted="two observations")
         self._next_landmark += 1
-        seen = se2_transform(self.values.poses[record.start], record.z[3 + 2 * entry : 5 + 2 * entry])
+        seen = self.values.group.transform(self.values.poses[record.start], record.landmark_positions()[entry])
         self._start_landmarks(ids[entry : entry + 1], seen[None])
         if old not in ids:
             self._seen_in[old].discard(factor_id)
@@ -358,7 +371,7 @@ class FactorGraphState:
     def landmark_ids_of(self, submap_key: int) -> npt.NDArray[np.int64]:
         """Graph landmark of every entry of a submap, as it stands now."""
         record = self.records.get(self.submap(submap_key).factor_id) if submap_key in self._place else None
-        return record.landmark_ids.copy() if isinstance(record, SubmapRecord) else np.zeros(0, dtype=np.int64)
+        return record.landmark_ids.copy() if isinstance(record, LANDMARK_SUBMAPS) else np.zeros(0, dtype=np.int64)
 
     def flat(self) -> FactorArrays:
         """Flat arrays of the factors, made once per revision."""
@@ -402,7 +415,7 @@ class FactorGraphState:
         self.revision += 1
         if isinstance(record, AttitudeRecord):
             self._attitude_of[record.node] = self._attitude_of.get(record.node, 0) + 1
-        if isinstance(record, SubmapRecord):
+        if isinstance(record, LANDMARK_SUBMAPS):
             for i in record.landmark_ids.tolist():
                 self._seen_in[i].add(record.factor_id)
 
@@ -423,10 +436,11 @@ class FactorGraphState:
             self._row[i] = len(self._row)
             self._seen_in[i] = set()
         self.structure.append_landmarks(
-            np.array(list(new), dtype=np.int64), np.array(list(new.values())).reshape(-1, 2)
+            np.array(list(new), dtype=np.int64), np.array(list(new.values())).reshape(-1, self.dim)
         )
 
-    def _drop_landmarks(self, ids: Sequence[int]) -> None:
+    def drop_landmarks(self, ids: Sequence[int]) -> None:
+        """Remove landmarks that no factor holds; their ids are not used again."""
         if not ids:
             return
         keep = ~np.isin(self.values.landmark_ids, np.asarray(ids))

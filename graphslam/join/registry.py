@@ -19,7 +19,7 @@ from graphslam.join.submap_blocks import relabel, scale_covariances
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 
 if TYPE_CHECKING:
-    from graphslam.join.pose_problem import PoseProblem
+    from graphslam.join.graph_problem import JoinProblem
 
 
 def _isam2(submaps: Sequence[Submap], *, polish: bool, progress: bool) -> SubmapEstimate:
@@ -45,10 +45,10 @@ JOINERS: dict[str, Callable[..., JoinResult]] = {
 SOLVERS: dict[str, Callable[..., SubmapEstimate]] = {"isam2": _isam2, "batch": _batch}
 
 
-Material: TypeAlias = Union[Sequence[Submap], "PoseProblem"]
-"""What is joined: submaps with landmarks or without; or the latter with all their ties, which is no sequence.
+Material: TypeAlias = Union[Sequence[Submap], "JoinProblem"]
+"""What is joined: landmark submaps in the plane alone, for which there are compiled joiners; or any factor graph.
 
-(The module of a :class:`~graphslam.join.pose_problem.PoseProblem` loads gtsam, which landmark submaps do not need.)
+(The module of a :class:`~graphslam.join.graph_problem.JoinProblem` loads gtsam, which landmark submaps do not need.)
 """
 
 
@@ -65,47 +65,35 @@ class JoinMethods(NamedTuple):
             raise UnknownNameError("method", method, [*self.joiners, *self.solvers])
 
 
-def are_dense(submaps: Sequence[Submap]) -> bool:
-    """Whether submaps are to be joined by their poses: none of them has landmarks."""
-    return bool(submaps) and all(s.landmarks is None for s in submaps)
-
-
-def have_space_landmarks(submaps: Sequence[Submap]) -> bool:
-    """Whether submaps with landmarks are three-dimensional."""
-    return any(s.dim == 3 for s in submaps)
+def are_landmark_submaps(submaps: Sequence[Submap]) -> bool:
+    """Whether the compiled joiners take these submaps: landmarks in the plane, and no matches between submaps."""
+    return any(s.landmarks is not None for s in submaps) and all(s.dim == 2 and not s.matches for s in submaps)
 
 
 def methods_for(material: Material) -> JoinMethods:
-    """The methods that take landmark submaps, in the plane or in space, or those that take dense ones."""
-    if not isinstance(material, Sequence):
-        from graphslam.join.pose_estimate import optimise_poses
-        from graphslam.join.pose_join import POSE_JOINERS, POSE_SOLVERS
+    """The methods that take this material."""
+    if isinstance(material, Sequence):
+        return JoinMethods(JOINERS, SOLVERS, polish_join)
+    from graphslam.join.graph_join import GRAPH_JOINERS, GRAPH_SOLVERS, optimise_estimate
 
-        return JoinMethods(POSE_JOINERS, POSE_SOLVERS, optimise_poses)
-    if have_space_landmarks(material):
-        from graphslam.join.space import SPACE_JOINERS, SPACE_SOLVERS, optimise_space
-
-        return JoinMethods(SPACE_JOINERS, SPACE_SOLVERS, optimise_space)
-    return JoinMethods(JOINERS, SOLVERS, polish_join)
+    return JoinMethods(GRAPH_JOINERS, GRAPH_SOLVERS, optimise_estimate)
 
 
 def prepare_submaps(
     submaps: Material, *, associate: str | MapAssociationConfig = "given", covariance_scale: float = 1.0
 ) -> Material:
-    """Submaps with their covariances as they are to be joined; dense ones with the matches that tie them."""
+    """Landmark submaps in the plane with their covariances scaled; everything else as a graph with all its factors."""
     association = association_of(associate)
-    if isinstance(submaps, Sequence) and not are_dense(submaps):
-        if association is not None and have_space_landmarks(submaps):
-            raise ConfigError(f"landmarks in space are joined by the ids that they bear; got {associate!r}")
+    if isinstance(submaps, Sequence) and are_landmark_submaps(submaps):
         return list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
     if association is not None:
-        raise ConfigError(f"dense submaps have no landmarks to be associated; got {associate!r}, wanted 'given'")
+        raise ConfigError(f"only landmark submaps in the plane are associated while joining; got {associate!r}")
     if isinstance(submaps, Sequence):
-        from graphslam.join.pose_problem import PoseProblem
+        from graphslam.join.graph_problem import JoinProblem
 
-        return PoseProblem.of_submaps(submaps, covariance_scale=covariance_scale)
+        return JoinProblem.of_submaps(submaps, covariance_scale=covariance_scale)
     if covariance_scale != 1.0:
-        raise ConfigError("the covariances of dense submaps with ties are those of their graph: wanted scale 1")
+        raise ConfigError("the covariances of a graph are those of its factors: wanted scale 1")
     return submaps
 
 
@@ -134,9 +122,9 @@ def join_by_method(
 
     Parameters
     ----------
-    submaps : sequence of Submap, or PoseProblem
-        In order; submap k+1 starts where submap k ends. Those without landmarks are joined by their poses: with the
-        matches that they carry, or with all constraints of a :class:`~graphslam.join.pose_problem.PoseProblem`.
+    submaps : sequence of Submap, or JoinProblem
+        In order; submap k+1 starts where submap k ends. Matches that submaps carry are factors too. A
+        :class:`~graphslam.join.graph_problem.JoinProblem` has all factors of a graph.
     method : str
         ``eif-tree``, ``eif-sequential``: extended information filters, in the chart of the submaps; with ``-classical``
         as the paper has them, Cartesian and linearised once. ``ekf``: once linearised. ``eif-online``: in sequence,
@@ -156,8 +144,8 @@ def join_by_method(
     Returns
     -------
     SubmapEstimate
-        A :class:`~graphslam.join.joined_map.JoinResult` for landmark submaps; of dense submaps a
-        :class:`~graphslam.join.pose_estimate.PoseEstimate`.
+        A :class:`~graphslam.join.joined_map.JoinResult` for landmark submaps in the plane, else a
+        :class:`~graphslam.join.graph_join.GraphEstimate`.
 
     Raises
     ------
@@ -171,11 +159,9 @@ def join_by_method(
     if workers is not None and cluster is not None:
         raise ConfigError("wanted either a number of workers or the address of a cluster; got both")
     association = association_of(associate)
-    if not isinstance(submaps, Sequence) or have_space_landmarks(submaps):
+    if not isinstance(submaps, Sequence):
         if workers is not None or cluster is not None:
-            raise ConfigError(
-                "dense submaps and those in space are joined in one process; wanted neither workers nor a cluster"
-            )
+            raise ConfigError("a graph with more than landmark submaps is joined in one process; wanted no workers")
         if method in methods.solvers:
             return methods.solvers[method](submaps, polish=polish, progress=progress)
         found = methods.joiners[method](submaps, progress=progress)
@@ -194,9 +180,11 @@ def compile_method(submaps: Material, method: str, *, polish: bool = False) -> N
 
     What is wrong with the submaps is left to the join of all of them to report.
     """
-    first = submaps[:3] if isinstance(submaps, Sequence) else submaps.part(0, min(3, len(submaps.keys)))
     with contextlib.suppress(GraphSlamError):
-        join_by_method(first, method, polish=polish)
+        if isinstance(submaps, Sequence):
+            join_by_method(submaps[:3], method, polish=polish)
+        else:
+            join_by_method(submaps.first_submaps(3), method, polish=polish)
 
 
 def identify_landmarks(

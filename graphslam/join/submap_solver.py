@@ -125,6 +125,14 @@ class SubmapEstimate:
         assert self.information is not None
         return SymmetricFactor(self.information)
 
+    def map_information(self) -> sp.csc_matrix | None:
+        """Information of poses and landmarks: there is nothing else."""
+        return self.information
+
+    def map_covariance(self) -> Array | None:
+        """Covariance of poses and landmarks, of a method in covariance form."""
+        return self.covariance
+
     def pose_indices(self, k: int) -> Index:
         """Where ``poses[k]`` stands in the state vector (k ≥ 1)."""
         if not 1 <= k < len(self.poses):

@@ -30,7 +30,7 @@ def test_quick_demo_from_the_command_line(tmp_path: Path) -> None:
     assert {"map.ply", "map.bt", "map-level0.pgm", "run.json"} <= {p.name for p in out.iterdir()}
     assert "map_entropy" in done.stdout
     assert str(out / "figures" / "progress.png") in done.stderr
-    assert all(stage in done.stderr for stage in ("1/8 reading", "3/8 front end", "6/8 fused map", "8/8 figures"))
+    assert "8/8 figures" in done.stderr
     # it is gone on with, to the same map
     before = (out / "map.ply").read_bytes()
     again = graphslam("demo", "--preset", "quick", "--out", out, "--json")

@@ -5,11 +5,14 @@ Independent of the code under test: poses are composed with matrices, and noise 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.poses import SE2, SE3
-from graphslam.join.pose_problem import PoseProblem
+from graphslam.core.poses import SE2, SE3, compose_increments
+from graphslam.graph.factor_graph import FactorGraph
+from graphslam.join.graph_problem import JoinProblem
 
 
 def pose_ramp(
@@ -23,7 +26,7 @@ def pose_ramp(
     metres: float = 0.05,
     radians: float = 0.01,
     level_sigma: float | None = None,
-) -> tuple[PoseProblem, Array]:
+) -> tuple[JoinProblem, Array]:
     """A problem and its true poses ``(n, 3|7)`` in the frame of the first.
 
     Parameters
@@ -69,10 +72,15 @@ def pose_ramp(
         directions = quat_rotate(tilted[:, 3:], z)
     i, j = np.array(ends).T
     measured = g.compose(g.between(poses[i], poses[j]), g.exp(size * rng.normal(size=size.shape)))
-    W = np.eye(d) / size[:, :, None]
-    problem = PoseProblem(
-        np.array(ends), measured, W,
-        level_nodes, directions, np.broadcast_to(np.eye(2) / (level_sigma or 1.0), (len(level_nodes), 2, 2)).copy(),
-        keys=np.arange(submaps), bases=np.arange(0, n, steps), times=np.arange(n, dtype=float),
+    step_ij = measured[: n - 1]
+    graph = FactorGraph(dim)
+    start = compose_increments(step_ij)
+    graph.add_betweens(
+        np.array(ends), measured, np.array([np.diag(s**2) for s in size]), poses=start[1:], streams=["ramp"],
+        interval=(0.0, float(n)),
     )  # fmt: skip
-    return problem, poses
+    for node, direction in zip(level_nodes.tolist(), directions):
+        graph.add_attitude(node, direction, float(level_sigma or 1.0), evidence="levelled", group="levelled")
+    bases = np.arange(0, n, steps)
+    chains = np.concatenate([compose_increments(step_ij[a:b]) for a, b in pairwise(bases.tolist())])
+    return JoinProblem(graph, np.arange(submaps), bases, np.arange(n, dtype=float), chains), poses

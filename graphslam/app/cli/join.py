@@ -74,6 +74,7 @@ def join_command(
         estimate = way.polish(material, own)
     truth = s.truth if associate == "given" else None
     value: dict[str, Any] = join_json(material, method, estimate, truth=truth, own=own if polish and filters else None)
+    plain = isinstance(material, Sequence)
     if out is not None:
         write_joined(
             out,
@@ -81,13 +82,13 @@ def join_command(
             estimate.poses,
             estimate.landmark_ids,
             estimate.landmarks,
-            information=estimate.information,
-            covariance=estimate.covariance,
-            state="vector" if isinstance(material, Sequence) else "tangent",
-            chart=estimate.chart,
-            anchors=estimate.anchors,
+            information=estimate.map_information(),
+            covariance=estimate.map_covariance(),
+            state="vector" if plain else "tangent",
+            chart=getattr(estimate, "chart", "cartesian"),
+            anchors=getattr(estimate, "anchors", None),
         )
-    found = join_verdict(value["methods"][0], estimate, () if s.problem is None else s.problem.left_out)
+    found = join_verdict(value["methods"][0], estimate)
     length = Trajectory(np.arange(len(estimate.poses), dtype=np.float64), estimate.poses).length()
     said = join_headline(value["methods"][0], found, submaps=len(submap_keys(material)), length=length)
     value |= {"headline": said.text, "verdict": [f.as_row() for f in found]}

@@ -39,7 +39,8 @@ from graphslam.core.errors import FormatError, GraphSlamError
 GENERATIONS, CURRENT = "generations", "current"
 OWNED = (
     *("run.json", "merge.json", "metrics.json", "timings.json", "events.jsonl", "ledger.csv", "landmarks.csv"),
-    *("map.npz", "merged.npz", "association.npz", "graph.g2o", "trajectory.tum", "trajectory_*.tum", "nodes.tum"),
+    *("map.npz", "merged.npz", "association.npz", "graph.g2o", "graph.npz"),
+    *("trajectory.tum", "trajectory_*.tum", "nodes.tum"),
     *("truth.npz", "truth.tum", "dead_reckoning.tum", "gps_*.npz", "fixes.npz", "taken.npz", "scans.npz"),
     *("inputs/*.npz", "inputs/log.json", "fused_map.json", "map.ply", "map.bt", "cloud.ply", "map.pgm", "map.yaml"),
     *("map-*.pgm", "map-*.yaml"),

@@ -51,6 +51,7 @@ from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, write_tum
+from graphslam.join.graph_problem import JoinProblem
 from graphslam.loops.ledger import LoopLedger, ledger_of_events
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import base_frames
@@ -61,18 +62,10 @@ OF_THE_CLOCK = ("seconds", RESUMED)
 
 
 SAME_BYTES = (
-    *(
-        "config.toml",
-        "draws.json",
-        "submaps/*",
-        "run.json",
-        "metrics.json",
-        "events.jsonl",
-        "ledger.csv",
-        "landmarks.csv",
-        "map.npz",
-    ),
-    *("association.npz", "graph.g2o", "trajectory.tum", "nodes.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
+    *("config.toml", "draws.json", "submaps/*", "run.json", "metrics.json", "events.jsonl", "ledger.csv"),
+    *("landmarks.csv", "map.npz"),
+    *("association.npz", "graph.g2o", "graph.npz", "trajectory.tum", "nodes.tum"),
+    *("truth.npz", "truth.tum", "dead_reckoning.tum"),
     *("gps_*.npz", "fixes.npz", "taken.npz", "inputs/*", "fused_map.json", "map.ply", "map.bt", "cloud.ply"),
     *("two_maps/*",),
     *("scans.npz", "trajectory_graph.tum", "refined/*", "figures/refined.png"),
@@ -104,6 +97,10 @@ SAME_FRAME = 1e-6
 """By how much exits of the refined submaps and the nodes of the map may differ [m], [rad]."""
 
 
+GRAPH = "graph.npz"
+"""The graph with all its factors and values, as the joiners take it."""
+
+
 def write_outputs(folder: Path, run: Run) -> Run:
     """Write a new state of a run folder: everything but ``config.toml`` and ``submaps/``, which are there already.
 
@@ -133,6 +130,7 @@ def _write_files(new: FolderTransaction, run: Run) -> None:
     write_npz(root / "association.npz", _association_arrays(run.submaps) | mark)
     if run.graph is not None:
         write_g2o(root / "graph.g2o", to_network(run.graph))
+        JoinProblem.of_graph(run.graph).save(root / GRAPH)
     if run.truth is not None:
         write_truth(root, run.truth)
     paths = {"truth": run.truth_path, "dead_reckoning": run.dead_reckoning, "trajectory_graph": run.graph_path}

@@ -13,9 +13,10 @@ from graphslam.graph.factors.landmark_submap import PathBatch, SubmapBatch
 from graphslam.graph.factors.range import BeaconRangeBatch, RangeBatch
 from graphslam.graph.factors.sensor_biases import SensorBiasBatch
 from graphslam.graph.factors.sighting import SightingBatch
+from graphslam.graph.factors.space_submap import SpaceSubmapBatch
 
 for _batch in (
-    *(SubmapBatch, PathBatch, SensorBiasBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
+    *(SubmapBatch, SpaceSubmapBatch, PathBatch, SensorBiasBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
     *(ImuBatch, GyroBatch, ImuBiasBatch, ForceBatch),
     *(CompassBatch, DeclinationBatch, DeviationPriorBatch),
     *(RangeBatch, BeaconRangeBatch, SightingBatch),

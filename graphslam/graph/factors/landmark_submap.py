@@ -83,6 +83,10 @@ class SubmapRecord:
         m = 3 + 2 * len(self.landmark_ids)
         return self.z[:m], self.whitener[:, :m]
 
+    def landmark_positions(self) -> Array:
+        """Positions ``(n, 2)`` of the landmarks in the frame of the base."""
+        return self.z[3 : 3 + 2 * len(self.landmark_ids)].reshape(-1, 2)
+
     def entries(self) -> list[str]:
         """Names of what stands behind the two poses, in the order of z."""
         return _entries(self.landmark_ids, self.points, self.robot)

@@ -1,0 +1,406 @@
+"""Gaussian maps over the variables of a graph, in information form, joined by adding their matrices.
+
+A pose is perturbed on the right, ``X Exp(ξ)``, and a landmark in the frame of its *anchor*, the end ``X_a`` of the
+submap that saw it first: ``l = X_a m``, ``m + δ``. An error of a heading then turns a submap and its landmarks
+together. A factor between poses and landmarks is linear in relative quantities, so that the matrix of a map is the same
+in every frame. Therefore the base of a map is kept *in* its matrix, which the gauge makes singular.
+
+To join B, whose base is the end of A, is to move B into the frame of A and to add the two matrices on their common
+variables. Then the factors enter that need both, by a Gauss-Newton step with the base held,
+
+    ξ = -(I + Jᵀ J)⁻¹ (g + Jᵀ r),   X ← X ⊕ ξ,   I ← Tᵀ (I + Jᵀ J) T,   T = blkdiag(J_r⁻¹(ξ_i)).
+
+The map keeps the gradient g too: it is zero but for constants that are held at zero until the map has their prior.
+Nothing is marginalised out, so the matrix is exactly sparse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from graphslam.core.errors import IndeterminateError
+from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.se3 import skew
+from graphslam.graph.variables import KINDS, Values, VariableKind
+from graphslam.join.graph_problem import Index, JoinProblem, rotation_of, rows_in_frame, rule_of
+from graphslam.linear.symmetric_factor import SymmetricFactor
+
+DENSE = 200
+"""Scalars up to which a dense Cholesky factorisation is faster than a sparse one (measured)."""
+PASSES = 3
+"""How often a join is linearised at most."""
+_STEP = 1e-6
+"""… and no more once a step is a thousandth of a standard deviation, on the average over the map."""
+ANCHORED = ("l", "point")
+"""Kinds of variables that hang on the end of the submap that saw them first."""
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMap:
+    """A map of submaps ``first … stop - 1`` in the frame of the base of the first.
+
+    Parameters
+    ----------
+    values : Values
+        Of all variables of the graph; only those of the map mean anything.
+    variables : (v,)
+        Numbers of the variables of the map, rising, its base among them.
+    anchors : (v,)
+        Node that each variable hangs on; -1: none, it is perturbed by itself.
+    information : (n, n) csc_matrix
+        Over the columns of ``variables``.
+    gradient : (n,)
+        Half the gradient of what the map measures, at ``values``.
+    waiting : (w,)
+        Factors of these submaps that cannot be linearised yet.
+    """
+
+    problem: JoinProblem
+    first: int
+    stop: int
+    values: Values
+    variables: Index
+    anchors: Index
+    information: sp.csc_matrix
+    gradient: Array
+    waiting: Index
+
+    @classmethod
+    def start(cls, problem: JoinProblem, k: int, factors: Index) -> GaussianMap:
+        """The values of submap k as it states them; nothing is measured yet."""
+        values = problem.graph.structure.copy()
+        variables = problem.submap_values(k, factors, values)
+        anchors = np.full(len(variables), -1, dtype=np.int64)
+        for word in ANCHORED:
+            a, b = problem.range_of[word]
+            anchors[(variables >= a) & (variables < b)] = problem.bases[k + 1]
+        n = int(problem.width[variables].sum())
+        none = np.zeros(0, dtype=np.int64)
+        return cls(problem, k, k + 1, values, variables, anchors, sp.csc_matrix((n, n)), np.zeros(n), none)
+
+    @classmethod
+    def leaf(cls, problem: JoinProblem, k: int, factors: Index) -> GaussianMap:
+        """Submap k with all factors inside, near its own optimum if it has several."""
+        return cls.start(problem, k, factors).updated(factors, passes=PASSES)
+
+    @property
+    def base(self) -> int:
+        """Variable of the base, which is held."""
+        return int(self.problem.bases[self.first])
+
+    @property
+    def end(self) -> Array:
+        """Pose ``(3|7,)`` of the end of the map in the frame of its base."""
+        return self.values["x"][self.problem.bases[self.stop]].copy()
+
+    @property
+    def columns(self) -> Index:
+        """Columns of the graph that the map has."""
+        return self.problem.columns(self.variables)
+
+    @property
+    def free(self) -> npt.NDArray[np.bool_]:
+        """Which columns move: not the base; not constants, but in a map from the first base on."""
+        rules, width = self.problem.rules, self.problem.width[self.variables]
+        held = [v == self.base or (self.first > 0 and rules[v] == "constant") for v in self.variables.tolist()]
+        return np.repeat(~np.array(held), width)
+
+    @property
+    def _at(self) -> Index:
+        """First local column of each variable."""
+        width = self.problem.width[self.variables]
+        return np.cumsum(width) - width
+
+    def kinds(self) -> Iterator[tuple[str, VariableKind, Index, Index, Index]]:
+        """Word, kind, places in :attr:`variables`, rows of the values, and local columns ``(n, dof)`` of every kind."""
+        at, dim = self._at, self.problem.dim
+        for word in self.problem.words:
+            a, b = self.problem.range_of[word]
+            places = np.flatnonzero((self.variables >= a) & (self.variables < b))
+            if len(places):
+                kind = KINDS[word]
+                yield word, kind, places, self.variables[places] - a, at[places, None] + np.arange(kind.dof(dim))
+
+    # ---------------------------------------------------------------- values
+
+    def moved_by(self, step: Array) -> Values:
+        """Values after a step ``(n,)``."""
+        g, old, new = self.problem.group, self.values, self.values.copy()
+        for word, kind, places, rows, columns in self.kinds():
+            part, group = step[columns], kind.pose_group(self.problem.dim)
+            if group is not None:
+                new[word][rows] = group.compose(old[word][rows], group.exp(part))
+                continue
+            hang = self.anchors[places]
+            free, tied = hang < 0, hang >= 0
+            new[word][rows[free]] = old[word][rows[free]] + part[free]
+            if np.any(tied):
+                m = g.transform(g.inverse(old["x"][hang[tied]]), old[word][rows[tied]]) + part[tied]
+                new[word][rows[tied]] = g.transform(new["x"][hang[tied]], m)
+        return new
+
+    def step_to(self, values: Values) -> Array:
+        """The step ``(n,)`` from the values here to others."""
+        g, step = self.problem.group, np.zeros(len(self.gradient))
+        for word, kind, places, rows, columns in self.kinds():
+            x, y, group = self.values[word][rows], values[word][rows], kind.pose_group(self.problem.dim)
+            if group is not None:
+                step[columns] = group.log(group.between(x, y))
+                continue
+            part, hang = y - x, self.anchors[places]
+            tied = hang >= 0
+            if np.any(tied):
+                before = g.transform(g.inverse(self.values["x"][hang[tied]]), x[tied])
+                part[tied] = g.transform(g.inverse(values["x"][hang[tied]]), y[tied]) - before
+            step[columns] = wrap_angle(part) if word == "compass" else part
+        return step
+
+    def tangents(self, step: Array) -> sp.csc_matrix | None:
+        """``T``: how a small step after ``step`` changes it; None for the identity."""
+        blocks: list[tuple[Index, Array]] = []
+        for _, kind, _, _, columns in self.kinds():
+            g = kind.pose_group(self.problem.dim)
+            if g is not None and np.any(step[columns]):
+                blocks.append((columns, np.asarray(np.linalg.inv(g.right_jacobian(step[columns])), dtype=np.float64)))
+        return self._identity_but(blocks) if blocks else None
+
+    def _identity_but(self, blocks: list[tuple[Index, Array]], more: sp.csc_matrix | None = None) -> sp.csc_matrix:
+        """The identity with other diagonal blocks ``(n, d, d)`` at columns ``(n, d)``, and more entries added."""
+        n = len(self.gradient)
+        diagonal = np.ones(n)
+        rows, columns, data = [], [], []
+        for at, B in blocks:
+            diagonal[at] = 0.0
+            rows.append(np.repeat(at, at.shape[1], axis=1).ravel())
+            columns.append(np.tile(at, (1, at.shape[1])).ravel())
+            data.append(B.ravel())
+        everywhere = np.arange(n)
+        at = np.concatenate([everywhere, *rows]), np.concatenate([everywhere, *columns])
+        T = sp.csc_matrix((np.concatenate([diagonal, *data]), at), shape=(n, n))
+        return T if more is None else sp.csc_matrix(T + more)
+
+    # ---------------------------------------------------------------- frames
+
+    def moved(self, T: Array) -> GaussianMap:
+        """The same map in another frame, in which its base is ``T``."""
+        problem, values = self.problem, self.values.copy()
+        blocks: list[tuple[Index, Array]] = []
+        for word, kind, places, rows, columns in self.kinds():
+            new, J = rows_in_frame(rule_of(word, problem.dim), problem.group, T, values[word][rows])
+            values[word][rows] = new
+            free = self.anchors[places] < 0
+            if J is not None and np.any(free):
+                d = kind.dof(problem.dim)
+                blocks.append((columns[free], np.broadcast_to(np.linalg.inv(J), (len(free), d, d))[free]))
+        return self._changed(values, self._identity_but(blocks) if blocks else None, None)
+
+    def carried(self, step: Array) -> GaussianMap:
+        """The same Gaussian seen from values that lie a step away: its matrix and gradient there."""
+        return self._changed(self.moved_by(step), self.tangents(step), step)
+
+    def _changed(self, values: Values, T: sp.csc_matrix | None, step: Array | None) -> GaussianMap:
+        """``Tᵀ I T`` and ``Tᵀ (g + I ξ)`` at other values."""
+        information, gradient = self.information, self.gradient
+        if step is not None:
+            gradient = gradient + information @ step
+        if T is not None:
+            information, gradient = sp.csc_matrix(T.T @ information @ T), np.asarray(T.T @ gradient)
+        return replace(self, values=values, information=information, gradient=gradient)
+
+    def _arms(self, places: Index, rows: Index, word: str) -> tuple[Array, Array]:
+        """Rotation ``(n, d, d)`` of the anchors of variables, and how a position moves with its anchor ``(n, d, dof)``.
+
+        The second in the frame of the anchor: a shift is itself, a turn acts on the lever ``m``.
+        """
+        g, hang = self.problem.group, self.anchors[places]
+        X = self.values["x"][hang]
+        m = g.transform(g.inverse(X), self.values[word][rows])
+        R = np.array([rotation_of(g, x) for x in X])
+        if g.dim == 2:
+            turn = np.stack([-m[:, 1], m[:, 0]], axis=1)[:, :, None]
+            return R, np.concatenate([np.broadcast_to(np.eye(2), (len(m), 2, 2)), turn], axis=2)
+        return R, np.concatenate([-skew(m), np.broadcast_to(np.eye(3), (len(m), 3, 3))], axis=2)
+
+    def anchor_matrix(self, *, inverse: bool = False) -> sp.csc_matrix | None:
+        """Steps of positions by steps in the frames of their anchors, ``δl = R (δm + D ξ_a)``, or the inverse of it."""
+        at, d = self._at, self.problem.group.dof
+        blocks, entries = [], []
+        for word, _, places, rows, columns in self.kinds():
+            tied = self.anchors[places] >= 0
+            if not np.any(tied):
+                continue
+            R, D = self._arms(places[tied], rows[tied], word)
+            pose = at[np.searchsorted(self.variables, self.anchors[places[tied]])][:, None] + np.arange(d)
+            blocks.append((columns[tied], np.swapaxes(R, 1, 2) if inverse else R))
+            entries.append(self._entries(columns[tied], pose, -D if inverse else R @ D))
+        return self._identity_but(blocks, sp.csc_matrix(sum(entries))) if blocks else None
+
+    def _entries(self, rows: Index, columns: Index, blocks: Array) -> sp.csc_matrix:
+        """A matrix of blocks ``(n, r, c)`` at rows ``(n, r)`` and columns ``(n, c)``."""
+        n = len(self.gradient)
+        at = np.repeat(rows, columns.shape[1], axis=1).ravel(), np.tile(columns, (1, rows.shape[1])).ravel()
+        return sp.csc_matrix((blocks.ravel(), at), shape=(n, n))
+
+    def hung_as(self, other: GaussianMap) -> GaussianMap:
+        """The same Gaussian with the anchors of another map over the same variables, at the values of both."""
+        at, d = self._at, self.problem.group.dof
+        T = None
+        for word, _, places, rows, columns in self.kinds():
+            differ = (self.anchors[places] != other.anchors[places]) & (self.anchors[places] >= 0)
+            if not np.any(differ):
+                continue
+            p, r, c = places[differ], rows[differ], columns[differ]
+            (R, D), (S, E) = self._arms(p, r, word), other._arms(p, r, word)
+            turn = np.swapaxes(R, 1, 2) @ S  # δm = Rᵀ S (δm' + E ξ') - D ξ
+            mine, theirs = (
+                at[np.searchsorted(self.variables, m.anchors[p])][:, None] + np.arange(d) for m in (self, other)
+            )
+            T = self._identity_but([(c, turn)], self._entries(c, theirs, turn @ E) - self._entries(c, mine, D))
+        return replace(self._changed(self.values, T, None), anchors=other.anchors)
+
+    # ---------------------------------------------------------------- joining
+
+    def measured(self, factors: Index) -> tuple[sp.csc_matrix, Array]:
+        """Information and gradient of factors at the values here, over the columns of the map."""
+        system = self.problem.arrays(factors).evaluate(self.values, dense=False)
+        columns = self.columns
+        A, g = sp.csc_matrix(sp.csc_matrix(system.A)[:, columns][columns]), system.g[columns]
+        C = self.anchor_matrix()
+        return (A, g) if C is None else (sp.csc_matrix(C.T @ A @ C), np.asarray(C.T @ g))
+
+    def admitted(self, factors: Index, *, force: bool = False) -> tuple[GaussianMap, Index]:
+        """The map with the variables that factors bring in, and the factors that can be linearised now."""
+        values = self.values.copy()
+        known = np.zeros(len(self.problem.names), dtype=bool)
+        known[self.variables] = True
+        waiting = np.concatenate([self.waiting, factors])
+        enter, later = self.problem.admit(values, known, waiting, base=self.base, force=force)
+        return replace(self.widened(np.flatnonzero(known), values), waiting=later), enter
+
+    def updated(self, factors: Index, *, passes: int = 1, force: bool = False) -> GaussianMap:
+        """The map after factors between its variables, and those that waited.
+
+        Parameters
+        ----------
+        passes : int
+            How often everything that meets here is linearised.
+        force : bool
+            Nothing more will come: no factor may wait.
+
+        Raises
+        ------
+        IndeterminateError
+            A variable is not determined.
+        """
+        begin, enter = self.admitted(factors, force=force)
+        return begin.solved(enter, lambda values: self.carried(self.step_to(values)), passes) if len(enter) else begin
+
+    def solved(self, factors: Index, prior: Callable[[Values], GaussianMap], passes: int) -> GaussianMap:
+        """Gauss-Newton steps on the map and factors, from the values here.
+
+        Parameters
+        ----------
+        prior : callable
+            What the map says without the factors, linearised at other values.
+        """
+        at, done, free = self, self, self.free
+        for k in range(passes):
+            if k:
+                here = prior(done.values)
+                at = replace(here.widened(self.variables, done.values, self.anchors), waiting=self.waiting)
+            H, g = at.information, at.gradient
+            if len(factors):
+                A, b = at.measured(factors)
+                H, g = sp.csc_matrix(H + A), g + b
+            step = np.zeros(len(g))
+            step[free] = -_solve(H, g, free)
+            done = replace(at, information=H, gradient=g).carried(step)
+            if -(g @ step) < _STEP * len(g):
+                break
+        gradient = np.where(free, 0.0, done.gradient)
+        gradient[np.repeat(self.variables == self.base, self.problem.width[self.variables])] = 0.0
+        return replace(done, gradient=gradient)
+
+    def widened(self, variables: Index, values: Values, anchors: Index | None = None) -> GaussianMap:
+        """With more variables, of which nothing is known, at other values."""
+        where = np.searchsorted(variables, self.variables)
+        hang = np.full(len(variables), -1, dtype=np.int64) if anchors is None else anchors.copy()
+        hang[where] = self.anchors  # those of its own variables stay
+        if len(variables) == len(self.variables):
+            return replace(self, values=values, anchors=hang)
+        width, own = self.problem.width[variables], self.problem.width[self.variables]
+        starts = np.cumsum(width) - width
+        at = np.repeat(starts[where] - (np.cumsum(own) - own), own) + np.arange(own.sum())
+        n = int(width.sum())
+        gradient = np.zeros(n)
+        gradient[at] = self.gradient
+        A = self.information.tocoo()
+        A = sp.csc_matrix((A.data, (at[A.row], at[A.col])), shape=(n, n))
+        return replace(self, values=values, variables=variables, anchors=hang, information=A, gradient=gradient)
+
+
+def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tuple[GaussianMap, bool]:
+    """What A and B, whose base is the end of A, say together; and whether B has news of variables of A.
+
+    Parameters
+    ----------
+    values : Values, optional
+        Where both are linearised; by default at the values of A, and at those of B of what is new.
+    """
+    seen = b.moved(a.end if values is None else values["x"][a.problem.bases[a.stop]])
+    common = np.intersect1d(a.variables, b.variables, assume_unique=True)
+    news = len(common) > 1 or (a.first == 0 and b.first > 0 and bool(np.any(b.gradient)))
+    if values is None:
+        values = a.values.copy()
+        for word, _, places, rows, _ in seen.kinds():
+            new = ~np.isin(seen.variables[places], common, assume_unique=True)
+            values[word][rows[new]] = seen.values[word][rows[new]]
+        seen = seen.carried(seen.step_to(values)) if len(common) > 1 else seen
+    else:
+        a, seen = a.carried(a.step_to(values)), seen.carried(seen.step_to(values))
+    variables = np.union1d(a.variables, b.variables)
+    anchors = np.full(len(variables), -1, dtype=np.int64)
+    anchors[np.searchsorted(variables, b.variables)] = b.anchors
+    anchors[np.searchsorted(variables, a.variables)] = a.anchors
+    wide_a = a.widened(variables, values, anchors)
+    wide_b = seen.widened(variables, values, anchors).hung_as(wide_a)
+    joined = replace(
+        wide_a, stop=b.stop, information=sp.csc_matrix(wide_a.information + wide_b.information),
+        gradient=wide_a.gradient + wide_b.gradient, waiting=np.concatenate([a.waiting, b.waiting]),
+    )  # fmt: skip
+    return joined, news
+
+
+def join_two(a: GaussianMap, b: GaussianMap, factors: Index, *, passes: int = PASSES) -> GaussianMap:
+    """Join B, whose base is the end of A, and the factors that need both.
+
+    Parameters
+    ----------
+    factors : (f,)
+        Numbers of the factors that enter here.
+    passes : int
+        How often the two Gaussians and the factors are linearised where they meet.
+    """
+    joined, news = add_maps(a, b)
+    begin, enter = joined.admitted(factors)
+    if not len(enter) and not news:
+        return begin
+    return begin.solved(enter, lambda values: add_maps(a, b, values)[0], passes)
+
+
+def _solve(H: sp.csc_matrix, g: Array, free: npt.NDArray[np.bool_]) -> Array:
+    """``H⁻¹ g`` over the free columns."""
+    at = np.flatnonzero(free)
+    A = H[:, at][at]
+    if len(at) > DENSE:
+        return SymmetricFactor(sp.csc_matrix(A)).solve(g[at])
+    try:
+        return np.asarray(la.cho_solve(la.cho_factor(A.toarray(), lower=True), g[at]))
+    except la.LinAlgError:
+        raise IndeterminateError("the information matrix of a map is singular") from None

@@ -1,0 +1,516 @@
+"""A factor graph cut into steps, one for each submap: which variables and factors a joiner adds when.
+
+A factor belongs to the submaps of its nodes. It enters a join at the lowest node of the tree that holds all of them
+and can linearise it. Three kinds of variables need care there (:data:`RULES`):
+
+* A *small constant* (scale of wheels, bias of an IMU or of GPS fixes) is about zero. Its factors enter at once. In a
+  map that does not begin at the first base it is held at zero, and its information is kept, because its prior enters
+  elsewhere.
+* The datum, gravity, velocities, beacons and the zero of a compass can be anywhere. Their factors wait until they
+  determine the variable, given the nodes. It then starts at the least-squares optimum of these factors alone.
+* A kind whose values in another frame are not known here waits for the frame of the first base.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from graphslam.core.atomic import write_npz
+from graphslam.core.errors import DataError
+from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
+from graphslam.core.poses import Group, compose_increments, heading_of
+from graphslam.core.se3 import quat_rotate, quat_to_matrix, so3_exp
+from graphslam.core.submap import Submap
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.factor_graph_state import LANDMARK_SUBMAPS
+from graphslam.graph.factors.batch import FactorRecord
+from graphslam.graph.factors.landmark_submap import PathRecord
+from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
+from graphslam.join.graph_file import problem_arrays, read_problem_arrays
+from graphslam.join.submap_blocks import check_identified
+
+Index = npt.NDArray[np.int64]
+Rule = Literal["pose", "point", "vector", "constant", "datum", "tilt", "heading", "first-base"]
+
+RULES: dict[str, Rule] = {
+    "x": "pose", "l": "point", "point": "point", "beacon": "point", "velocity": "vector", "datum": "datum",
+    "tilt": "tilt", "compass": "heading", "wheels": "constant", "sensor": "constant", "mount": "constant",
+    "bias": "constant", "imubias": "constant", "deviation": "constant",
+}  # fmt: skip
+"""How the values of a kind of variable change with the frame; a kind that is missing waits for the first base."""
+VAGUE_ANGLE = 0.3
+"""A direction whose standard deviation is larger [rad] is not determined: its factors cannot be linearised yet."""
+UNDETERMINED = 1e-9
+"""Smallest eigenvalue of a scaled information matrix at which its variables count as determined."""
+_STARTS = 20
+"""Gauss-Newton steps at most for the start of variables, given the nodes."""
+
+
+def rule_of(word: str, dim: int) -> Rule:
+    """How values of a kind change with the frame, in the plane or in space."""
+    rule = RULES.get(word, "first-base")
+    return "first-base" if dim == 3 and rule in ("datum", "heading") else rule
+
+
+def tilt_direction(tilt: Array) -> Array:
+    """Unit vector ``(3,)`` that points up, of a tilt ``(2,)``."""
+    return quat_rotate(so3_exp(np.append(tilt, 0.0)), np.array([0.0, 0.0, 1.0]))
+
+
+def tilt_of_direction(up: Array) -> Array:
+    """Inverse of :func:`tilt_direction`."""
+    sine = float(np.hypot(up[0], up[1]))
+    scale = 1.0 if sine < 1e-12 else float(np.arctan2(sine, up[2])) / sine
+    return scale * np.array([-up[1], up[0]])
+
+
+def rotation_of(group: Group, pose: Array) -> Array:
+    """Rotation matrix ``(d, d)`` of a pose."""
+    if group.dim == 3:
+        return quat_to_matrix(pose[3:])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([[c, -s], [s, c]])
+
+
+def rows_in_frame(rule: Rule, group: Group, T: Array, rows: Array) -> tuple[Array, Array | None]:
+    """Values ``(n, size)`` of one kind, known in a frame b, in the frame a, with ``T`` = ``T_a_b``.
+
+    Returns
+    -------
+    rows : (n, size)
+    J : (dof, dof), (n, dof, dof) or None
+        Derivative of a step in frame a by a step in frame b; None for the identity.
+    """
+    if not len(rows) or rule in ("constant", "first-base"):
+        return rows, None
+    if rule == "pose":
+        return group.compose(np.broadcast_to(T, rows.shape), rows), None
+    R = rotation_of(group, T)
+    if rule == "point":
+        return rows @ R.T + T[: group.dim], R
+    if rule == "vector":
+        return rows @ R.T, R
+    if rule == "datum":  # T_gps_a = T_gps_b ∘ T_b_a
+        back = group.inverse(T)
+        return group.compose(rows, np.broadcast_to(back, rows.shape)), group.adjoint(T)
+    if rule == "heading":
+        return rows - heading_of(T), None
+    moved = np.array([tilt_of_direction(R @ tilt_direction(t)) for t in rows])
+    h = 1e-6
+    steps = [
+        [(tilt_of_direction(R @ tilt_direction(t + e)) - tilt_of_direction(R @ tilt_direction(t - e))) / (2 * h)
+         for e in h * np.eye(2)]
+        for t in rows
+    ]  # fmt: skip
+    return moved, np.swapaxes(np.array(steps), 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class JoinProblem:
+    """A factor graph of submaps in one chain, as the joiners take it.
+
+    Parameters
+    ----------
+    graph : FactorGraph
+        It is not changed. Its values are the start of variables that no pose gives.
+    keys : (m,) int64
+        Of the submaps.
+    bases : (m + 1,) int64
+        Node at the base of each submap, then the exit of the last: submap k holds the nodes
+        ``bases[k] … bases[k + 1]``.
+    times : (n,)
+        Of the nodes [s]; their numbers where there is no clock.
+    chains : (n + m - 1, 3|7)
+        Nodes of every submap in the frame of its base, from base to exit, as the submap states them.
+    """
+
+    graph: FactorGraph
+    keys: Index
+    bases: Index
+    times: Array
+    chains: Array
+
+    # ---------------------------------------------------------------- where it comes from
+
+    @classmethod
+    def of_graph(cls, graph: FactorGraph) -> JoinProblem:
+        """All factors of a graph of submaps.
+
+        Raises
+        ------
+        DataError
+            No submaps, or several sessions: submaps are joined along one chain.
+        """
+        chain = graph.submaps
+        if not chain:
+            raise DataError("there are no submaps", got=0, wanted="at least one")
+        if any(a.nodes[-1] != b.node for a, b in pairwise(chain)) or chain[0].node:
+            raise DataError("submaps do not follow each other in one chain", wanted="one session")
+        return cls(
+            graph,
+            np.array([s.key for s in chain], dtype=np.int64),
+            np.array([*(s.node for s in chain), chain[-1].nodes[-1]], dtype=np.int64),
+            np.concatenate([*(s.times[:-1] for s in chain), chain[-1].times[-1:]]),
+            np.concatenate([s.T_base_node for s in chain]),
+        )
+
+    @classmethod
+    def of_submaps(
+        cls, submaps: Sequence[Submap], *, covariance_scale: float = 1.0, match_support: float = 0.5
+    ) -> JoinProblem:
+        """Submaps by themselves, landmark submaps and dense ones, with the matches that they carry.
+
+        Parameters
+        ----------
+        match_support : float
+            A match counts if so large a share of the particles supports it.
+        """
+        check_identified(submaps)
+        chain = [replace(s, matches=tuple(m for m in s.matches if m.support >= match_support)) for s in submaps]
+        return cls.of_graph(FactorGraph.from_submaps(chain, covariance_scale=covariance_scale))
+
+    @classmethod
+    def of_network(cls, network: PoseNetwork, poses: int) -> JoinProblem:
+        """A pose-graph file, cut into submaps of so many steps along the numbers of its vertices."""
+        name, n = network.source, len(network)
+        if poses < 1:
+            raise DataError("a submap has no step", where=name, got=poses, wanted="at least 1 pose")
+        if len(network.landmark_ids):
+            raise DataError("a pose graph with landmarks cannot be cut", where=name, wanted="poses alone")
+        if n < 2 or network.anchors.tolist() != [0]:
+            raise DataError("one vertex is held, the first", where=name, got=network.anchors.tolist()[:5])
+        graph = FactorGraph(network.dim)
+        P = np.linalg.inv(network.information)
+        group, x = graph.structure.group, network.poses
+        graph.add_betweens(
+            network.edges, network.measurements, 0.5 * (P + np.swapaxes(P, 1, 2)),
+            poses=group.between(np.broadcast_to(x[0], x[1:].shape), x[1:]), streams=["file"], interval=(0.0, 0.0),
+        )  # fmt: skip
+        bases = np.append(np.arange(0, n - 1, poses), n - 1)
+        steps = _steps_of_network(network, group)
+        chains = np.concatenate([compose_increments(steps[a:b]) for a, b in pairwise(bases.tolist())])
+        return cls(graph, np.arange(len(bases) - 1), bases, np.arange(n, dtype=np.float64), chains)
+
+    def first_submaps(self, count: int) -> JoinProblem:
+        """The problem of the first submaps alone, for kernels to be compiled on."""
+        m = min(count, len(self.keys))
+        if m == len(self.keys):
+            return self
+        inside = [f for f, high in enumerate(self.spans[1].tolist()) if high < m]
+        names = {n for f in inside for n in self.factors[f].variables()}
+        graph = FactorGraph.with_values(self.graph.values.copy())
+        graph.values.poses = graph.values.poses[: self.bases[m] + 1]
+        graph.drop_landmarks([i for i in graph.values.landmark_ids.tolist() if f"l{i}" not in names])
+        for word in KINDS:
+            if word not in ("x", "l"):
+                used = [split_name(n)[1] for n in names if split_name(n)[0].word == word]
+                graph.values[word] = graph.values[word][: max(used, default=-1) + 1]
+        for f in inside:
+            graph.insert(self.factors[f])
+        stop = int(self.bases[m]) + 1
+        return JoinProblem(graph, self.keys[:m], self.bases[: m + 1], self.times[:stop], self.chains[: stop + m - 1])
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the graph, all values and factors, as an archive of arrays."""
+        write_npz(path, problem_arrays(self))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> JoinProblem:
+        """Inverse of :meth:`save`."""
+        values, records, parts = read_problem_arrays(path)
+        graph = FactorGraph.with_values(values)
+        for r in records:
+            graph.insert(r)
+        return cls(graph, **parts)
+
+    # ---------------------------------------------------------------- what it is
+
+    @property
+    def dim(self) -> int:
+        """2 or 3."""
+        return self.graph.dim
+
+    @property
+    def group(self) -> Group:
+        """SE(2) or SE(3)."""
+        return self.graph.structure.group
+
+    @property
+    def states(self) -> int:
+        """Free scalars."""
+        return self.graph.flat().layout.size
+
+    @property
+    def dof(self) -> int:
+        """Scalars measured, less free ones."""
+        return self.graph.flat().measurements - self.states
+
+    @cached_property
+    def factors(self) -> list[FactorRecord]:
+        """All factors."""
+        return list(self.graph.records.values())
+
+    def factor_counts(self) -> dict[str, int]:
+        """Number of factors by class, in the order of the classes' names."""
+        return dict(sorted(Counter(r.group for r in self.factors).items()))
+
+    @cached_property
+    def layout(self) -> VariableLayout:
+        """Columns of all variables, the first base included."""
+        free = self.graph.structure.layout()
+        return VariableLayout(free.dim, free.counts, free.landmark_ids, fixed=())
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Of the variables, in the order of their numbers and of their columns."""
+        return self.layout.names()
+
+    @cached_property
+    def number(self) -> dict[str, int]:
+        """Number of each variable."""
+        return {n: k for k, n in enumerate(self.names)}
+
+    @cached_property
+    def first(self) -> Index:
+        """First column of each variable, then the number of columns ``(v + 1,)``."""
+        return np.concatenate([[0], np.cumsum(self.width)]).astype(np.int64)
+
+    @cached_property
+    def width(self) -> Index:
+        """Degrees of freedom of each variable ``(v,)``."""
+        return np.array([split_name(n)[0].dof(self.dim) for n in self.names], dtype=np.int64)
+
+    @cached_property
+    def words(self) -> list[str]:
+        """Kinds of variables that the graph has, in the order of the numbers."""
+        return [w for w, n in zip(KINDS, self.layout.counts) if n]
+
+    @cached_property
+    def range_of(self) -> dict[str, tuple[int, int]]:
+        """First number of the variables of each kind, and the number behind the last."""
+        out, n = {}, 0
+        for word, count in zip(KINDS, self.layout.counts):
+            out[word] = (n, n + count)
+            n += count
+        return out
+
+    @cached_property
+    def rules(self) -> list[Rule]:
+        """Rule of each variable."""
+        rules: list[Rule] = []
+        for word in self.words:
+            a, b = self.range_of[word]
+            rules += [rule_of(word, self.dim)] * (b - a)
+        return rules
+
+    @cached_property
+    def variables(self) -> list[Index]:
+        """Numbers of the variables of each factor."""
+        number = self.number
+        return [np.array([number[n] for n in r.variables()], dtype=np.int64) for r in self.factors]
+
+    @cached_property
+    def spans(self) -> tuple[Index, Index]:
+        """First and last submap of each factor: it enters where both have been joined."""
+        n, (x0, x1) = len(self.factors), self.range_of["x"]
+        local = np.zeros(len(self.names), dtype=bool)
+        local[x0:x1] = True
+        low, high = np.full(n, -1), np.full(n, -1)
+        home = np.full(len(self.names), -1)
+        for f, v in enumerate(self.variables):
+            nodes = v[local[v]]
+            if len(nodes):
+                high[f] = np.searchsorted(self.bases[1:], nodes.max(), side="left")
+                low[f] = min(np.searchsorted(self.bases, nodes.min(), side="right") - 1, high[f])
+                for other in v[~local[v]]:
+                    if home[other] < 0 or high[f] < home[other]:
+                        home[other] = high[f]
+        p0, p1 = self.range_of["point"]
+        for f in np.flatnonzero(high < 0).tolist():  # points of a path stand for nodes
+            v = self.variables[f]
+            points = v[(v >= p0) & (v < p1)]
+            if len(points):
+                low[f] = high[f] = home[points].max()
+                unknown = v[home[v] < 0]
+                home[unknown] = high[f]
+        for f in np.flatnonzero(high < 0).tolist():
+            at = home[self.variables[f]]
+            if np.any(at < 0):
+                at = np.array([len(self.keys) - 1])
+            low[f], high[f] = at.min(), at.max()
+        return low, high
+
+    def chain(self, k: int) -> Array:
+        """Nodes of submap k in the frame of its base ``(n, 3|7)``, as the submap states them."""
+        return self.chains[self.bases[k] + k : self.bases[k + 1] + k + 1]
+
+    def submap_values(self, k: int, factors: npt.ArrayLike, values: Values) -> Index:
+        """Write the start of submap k, in the frame of its base, into ``values``; returns its variables.
+
+        Parameters
+        ----------
+        factors : (f,)
+            Numbers of the factors of submap k alone.
+        """
+        a, b = int(self.bases[k]), int(self.bases[k + 1])
+        values["x"][a : b + 1] = self.chain(k)
+        found = set(range(a, b + 1))
+        row_of, (l0, _), (p0, _) = self.layout.row_of, self.range_of["l"], self.range_of["point"]
+        for f in np.asarray(factors).tolist():
+            r = self.factors[f]
+            if isinstance(r, LANDMARK_SUBMAPS):
+                rows = [row_of[i] for i in r.landmark_ids.tolist()]
+                values["l"][rows[::-1]] = r.landmark_positions()[::-1]  # the first observation stands
+                found |= {l0 + i for i in rows}
+            elif isinstance(r, PathRecord):
+                first = 3 + 2 * len(r.landmark_ids)
+                values["point"][r.points] = r.z[first : first + 2 * len(r.points)].reshape(-1, 2)
+                found |= {p0 + i for i in r.points.tolist()}
+        return np.array(sorted(found), dtype=np.int64)
+
+    # ---------------------------------------------------------------- factors that enter
+
+    def arrays(self, factors: npt.ArrayLike) -> FactorArrays:
+        """Some factors as a least-squares problem over :attr:`layout`."""
+        return FactorArrays([self.factors[f] for f in np.asarray(factors).tolist()], self.layout)
+
+    def columns(self, variables: Index) -> Index:
+        """Columns of variables."""
+        within = np.arange(self.width[variables].sum())
+        starts = np.cumsum(self.width[variables]) - self.width[variables]
+        return np.repeat(self.first[variables] - starts, self.width[variables]) + within
+
+    def admit(
+        self, values: Values, known: npt.NDArray[np.bool_], waiting: Index, *, base: int = 0, force: bool = False
+    ) -> tuple[Index, Index]:
+        """Which of the waiting factors can be linearised at ``values``; variables that they bring in get a start there.
+
+        Parameters
+        ----------
+        values : Values
+            In the frame of node ``base``; rows of new variables are written.
+        known : (v,) bool
+            Variables that have values; new ones are entered.
+        waiting : (f,)
+            Numbers of factors.
+        force : bool
+            Nothing more will come: all of them enter.
+
+        Returns
+        -------
+        entered, waiting : (…,)
+        """
+        waiting = np.asarray(waiting, dtype=np.int64)
+        if not len(waiting):
+            return waiting, waiting
+        rules = self.rules
+        enter, later, groups = [], [], []
+        new: dict[int, int] = {}
+        for f in waiting.tolist():
+            unknown = [int(v) for v in self.variables[f] if not known[v]]
+            if base > 0 and not force and any(rules[v] == "first-base" for v in self.variables[f].tolist()):
+                later.append(f)
+                continue
+            open_ = [v for v in unknown if rules[v] != "constant"]
+            if open_:
+                groups.append((f, open_))
+                for v in open_:
+                    new.setdefault(v, len(new))
+            else:
+                enter.append(f)
+        if groups:
+            pairs = [(new[o[0]], new[v]) for _, o in groups for v in o]
+            links = sp.csr_matrix((np.ones(len(pairs)), tuple(np.array(pairs).T)), shape=(len(new), len(new)))
+            count, label = connected_components(links, directed=False)
+            members = list(new)
+            for c in range(count):
+                of = np.array(sorted(members[i] for i in np.flatnonzero(label == c)), dtype=np.int64)
+                mine = [f for f, o in groups if label[new[o[0]]] == c]
+                if self._start(values, of, np.array(mine), known, base) or force:
+                    enter += mine
+                    known[of] = True
+                else:
+                    later += mine
+        for f in enter:
+            for v in self.variables[f].tolist():
+                if not known[v]:  # a constant
+                    known[v] = True
+                    self._row(values, v)[:] = 0.0
+        return np.array(sorted(enter), dtype=np.int64), np.array(sorted(later), dtype=np.int64)
+
+    def _row(self, values: Values, variable: int) -> Array:
+        word = split_name(self.names[variable])[0].word
+        return values[word][variable - self.range_of[word][0]]
+
+    def _start(self, values: Values, new: Index, factors: Index, known: npt.NDArray[np.bool_], base: int) -> bool:
+        """Bring new variables to the optimum of factors, all else held; whether these factors determine them."""
+        given, T = self.graph.values, self.group.inverse(self.graph.values.poses[base])
+        for v in new.tolist():
+            word = split_name(self.names[v])[0].word
+            row = given[word][v - self.range_of[word][0]]
+            self._row(values, v)[:] = rows_in_frame(self.rules[v], self.group, T, row[None])[0][0]
+        for f in factors.tolist():
+            for v in self.variables[f].tolist():
+                if not known[v] and self.rules[v] == "constant":
+                    self._row(values, v)[:] = 0.0
+        problem, at = self.arrays(factors), self.columns(new)
+        angle = np.concatenate([[u == "r" for u in split_name(self.names[v])[0].units[self.dim]] for v in new.tolist()])
+        A = np.zeros((len(at), len(at)))
+        for _ in range(_STARTS):
+            system = problem.evaluate(values, dense=False)
+            A, g = sp.csc_matrix(system.A)[at][:, at].toarray(), system.g[at]
+            size = np.sqrt(np.maximum(np.diag(A), 1e-300))
+            scaled = A / np.outer(size, size)
+            if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] < UNDETERMINED:
+                return False
+            step = -np.linalg.solve(A, g)
+            move_rows(self, values, new, step)
+            if -(g @ step) < 1e-9 * (1.0 + system.objective):
+                break
+        sigma = np.sqrt(np.diag(np.linalg.inv(A)))
+        return not np.any(sigma[angle] > VAGUE_ANGLE)
+
+
+def _steps_of_network(network: PoseNetwork, group: Group) -> Array:
+    """Relative pose ``(n - 1, 3|7)`` from each vertex to the next, by the first edge between them."""
+    n, ends = len(network), network.edges
+    low = ends.min(axis=1)
+    near = np.flatnonzero(np.abs(ends[:, 1] - ends[:, 0]) == 1)
+    node, at = np.unique(low[near], return_index=True)
+    bare = np.setdiff1d(np.arange(n - 1), node)
+    if len(bare):
+        raise DataError(
+            f"nodes {bare[0]} and {bare[0] + 1} are not tied to each other, and submaps are chains",
+            where=network.source, got=f"{len(bare)} gaps", wanted="a relative pose between any two neighbours",
+        )  # fmt: skip
+    edge = near[at]
+    T = network.measurements[edge]
+    return np.where((ends[edge, 0] > ends[edge, 1])[:, None], group.inverse(T), T)
+
+
+def move_rows(problem: JoinProblem, values: Values, variables: Index, step: Array) -> None:
+    """Move some variables of ``values`` by a step ``(k,)`` along their columns, in place."""
+    at = np.cumsum(problem.width[variables]) - problem.width[variables]
+    for word in problem.words:
+        a, b = problem.range_of[word]
+        mine = np.flatnonzero((variables >= a) & (variables < b))
+        if not len(mine):
+            continue
+        kind, rows = KINDS[word], variables[mine] - a
+        part = step[at[mine, None] + np.arange(kind.dof(problem.dim))]
+        g = kind.pose_group(problem.dim)
+        block = values[word]
+        block[rows] = block[rows] + part if g is None else g.compose(block[rows], g.exp(part))
