@@ -33,9 +33,16 @@ def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> S
     return simulate_landmark_field(landmark_field_preset(preset or "A", **changes), seed)
 
 
+def _mixed(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
+    from graphslam.sim.mixed import mixed_preset, simulate_mixed
+
+    return simulate_mixed(mixed_preset(preset or "full", **changes), seed)
+
+
 # name -> what simulates it from a preset, a seed and changed figures
 WORLDS: dict[str, Callable[[str | None, int, dict[str, Any]], SensorLog]] = {
     "landmark-field": _landmark_field,
+    "mixed": _mixed,
 }
 
 
@@ -55,13 +62,14 @@ def simulate(
     ----------
     world : str
         ``landmark-field``; ``point-field``, landmarks in space; ``garage``, ``mine``, ``building``; ``court``, the
-        small one; ``campus``.
+        small one; ``campus``; ``mixed``, a building in a park, in the plane, with every kind of sensor.
     seed : int
         Of every error, and of what can be moved in the world.
     preset : str, optional
         Of the landmark field: ``A``, ``B``, ``C``, ``demo``, ``quick``; ``clutter``, ``pairs``, ``rows`` and ``hard``
         confuse an association. Of the point field: ``flight``, ``drift``, ``quick``. Of the campus: ``full``,
-        ``three-blocks``, ``block``, ``quick``. Of the robot in the other worlds: ``light``, ``full``, ``two-scanners``.
+        ``three-blocks``, ``block``, ``quick``. Of the mixed world: ``full``, ``quick``. Of the robot in the other
+        worlds: ``light``, ``full``, ``two-scanners``.
     layout : str, optional
         Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. ``drawn-17``: a plan
         of the garage, or walls of the mine or of the building, drawn by that number.

@@ -138,7 +138,7 @@ class ImuSource:
 
         Those the front end uses, too: a path that is made with wrong axes contradicts the forces.
         """
-        if self.config.axes == "ignore" or graph.dim != 3 or not graph.submaps:
+        if self.config.axes == "ignore" or not graph.submaps:
             return
         now = graph.submaps[-1].interval[1]
         for name, imu in self.imus.items():
@@ -157,12 +157,6 @@ class ImuSource:
         """
         made = 0
         for name in self._wanted(graph):
-            if graph.dim != 3:
-                if more:
-                    continue
-                graph.log_event("imu-not-used", stream=name, why="the graph is in the plane")
-                logger.warning("%s is not used: the graph is in the plane", name)
-                continue
             imu = self.imus[name]
             if name in self._given:  # its readings are there already: only submaps are new
                 imu = imu.take(np.zeros(len(imu.times), dtype=bool))

@@ -48,13 +48,16 @@ class ImuNoise:
 class Imu:
     """Angular rates and specific forces.
 
+    A planar IMU (yaw rate and two accelerations, gravity taken out) has zeros in the rates about x and y and in the
+    forces along z, in every record. A graph in the plane uses it, and also a unit with three axes on a level body.
+
     Parameters
     ----------
     times : (n,)
     angular_rate : (n, 3)
         [rad/s], frame of the unit.
     specific_force : (n, 3)
-        [m/s²], frame of the unit; (0, 0, +g) at rest and level.
+        [m/s²], frame of the unit; (0, 0, +g) at rest and level, (0, 0, 0) of a planar unit.
     noise : ImuNoise
     attitude : (n, 2) or None
         The unit's own roll and pitch [rad]: gravity is seen, heading is not.
@@ -98,6 +101,11 @@ class Imu:
                 k = int(np.argwhere(~finite_mask(a))[0][0])
                 raise DataError(f"IMU {name} of record {k} is not finite", got=a[k], wanted="finite numbers")
             object.__setattr__(self, name, a)
+
+    @property
+    def planar(self) -> bool:
+        """Yaw rate and two accelerations without gravity; see above."""
+        return not (np.any(self.angular_rate[:, :2]) or np.any(self.specific_force[:, 2]))
 
     def take(self, index: Any) -> Imu:
         """See :class:`graphslam.core.records.Stream`."""

@@ -351,7 +351,8 @@ def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
         sigma = np.sqrt(np.diag(P))
         prefix = stream if stream.startswith("imu") else f"imu_{stream}"
         out.add(f"{prefix}_nodes", len(states.order))
-        for name, part, unit in (("gyro", slice(0, 3), "rad/s"), ("force", slice(3, 6), "m/s²")):
+        turns = 1 if graph.dim == 2 else 3
+        for name, part, unit in (("gyro", slice(turns), "rad/s"), ("force", slice(turns, None), "m/s²")):
             out.add(f"{prefix}_{name}_bias", float(np.linalg.norm(bias[part])), unit)
             out.add(f"{prefix}_{name}_bias_sigma", float(np.linalg.norm(sigma[part])), unit)
         graph.log_event("imu-bias", stream=stream, bias=bias.tolist(), sigma=sigma.tolist())

@@ -48,6 +48,8 @@ def check_imu(imu: Imu, name: str) -> list[Finding]:
 
 def _gravity(imu: Imu, name: str) -> list[Finding]:
     usual = float(np.median(np.linalg.norm(imu.specific_force, axis=1)))
+    if imu.planar and np.any(imu.specific_force):
+        return []
     if abs(usual / GRAVITY - 1.0) <= GRAVITY_OFF:
         return []
     if abs(usual - 1.0) <= GRAVITY_OFF:

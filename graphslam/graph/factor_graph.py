@@ -387,13 +387,16 @@ class FactorGraph(FactorGraphState):
     ) -> list[int]:
         """Give the graph an IMU that no front end used; its readings between existing nodes become factors.
 
+        In the plane it is planar, or it has three axes and the body is level
+        (:mod:`graphslam.graph.factors.imu.plane`). No start velocity is needed: a velocity follows from the two poses
+        and the accelerations of a way.
+
         Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
-        preintegrated way (:mod:`graphslam.graph.factors.imu.preintegration`,
-        :mod:`graphslam.graph.factors.imu.batch`), inner nodes
-        included; inside levelled submaps their relative roll and pitch is then the gyro's word alone. A way brings in
-        the velocity of the unit and its biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over
-        pauses. A node without a way sees gravity: the mean specific force about it, as sure as the body was still. The
-        first factor brings in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
+        preintegrated way (:mod:`graphslam.graph.factors.imu.batch`), inner nodes included; inside levelled submaps
+        their relative roll and pitch is then the gyro's word alone. A way brings in the velocity of the unit and its
+        biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over pauses. In space a node without a
+        way sees gravity: the mean specific force about it, as sure as the body was still, and the first factor brings
+        in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
 
         It may be called again when there are more submaps, with the readings that follow (or with none): ways that
         are there stay. Everything left out is counted by reason (event ``imu``).
@@ -422,7 +425,7 @@ class FactorGraph(FactorGraphState):
         DataError
             Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
         GeometryError
-            In the plane.
+            A planar IMU in space.
         ConfigError, CovarianceError
         """
         return self.imu.add(imu, stream=stream, config=config, more=more)

@@ -1,4 +1,4 @@
-"""What a graph in space makes of IMUs: ways between near nodes, gravity at far ones, biases.
+"""What a graph makes of IMUs: ways between near nodes, gravity at far ones (in space), biases.
 
 Everything about the states of an IMU can be read off the factors: which velocity and which bias are a node's, and in
 which order the biases follow each other. So that is where it is kept, and removing factors needs no other book.
@@ -21,9 +21,18 @@ from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, up_turn, 
 from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.imu.axes import check_imu_axes
-from graphslam.graph.factors.imu.batch import GYRO_ROWS, XI, XJ, PreintegrationArrays, preintegration_terms
+from graphslam.graph.factors.imu.batch import (
+    GYRO_ROWS,
+    PLANE_GYRO_ROWS,
+    PLANE_ROWS,
+    XI,
+    XJ,
+    PreintegrationArrays,
+    preintegration_terms,
+)
 from graphslam.graph.factors.imu.config import BodyPlace, ImuConfig, body_path, places_on_nodes
 from graphslam.graph.factors.imu.plan import FEWEST, ImuFactorPlan, force_window, join_readings, plan_factors
+from graphslam.graph.factors.imu.plane import IN_PLANE, lift, planar_imu, with_gravity
 from graphslam.graph.factors.imu.preintegration import Preintegrated, bias_sigma, mean_force, preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.factors.imu.states import ImuStates, renumber_states, required_bias_links
@@ -41,26 +50,48 @@ RECENTRE = 2e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuUse:
-    """An IMU in a graph: its readings so far, and how they were to be used."""
+    """An IMU in a graph: its readings so far, and how they were to be used.
+
+    Parameters
+    ----------
+    imu : Imu
+        As factors use it; in the plane in the axes of the body.
+    given : Imu
+        As it came.
+    """
 
     imu: Imu
     config: ImuConfig
+    given: Imu
 
 
 class ImuUnits:
-    """The IMUs of a graph in space."""
+    """The IMUs of a graph."""
 
     def __init__(self, graph: FactorGraphState) -> None:
         self.graph = graph
         self.used: dict[str, ImuUse] = {}
+        plane = graph.dim == 2
+        self._bias = IN_PLANE["imubias"] if plane else list(range(6))  # of a bias in space, what the graph has
+        self._rows = PLANE_ROWS if plane else np.arange(15)
+        self._gyro_rows = PLANE_ROWS[PLANE_GYRO_ROWS] if plane else GYRO_ROWS
 
     def add(self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False) -> list[int]:
         """See :meth:`~graphslam.graph.factor_graph.FactorGraph.add_imu`."""
-        if self.graph.dim != 3:
-            raise GeometryError("an IMU says little of poses in the plane", where=stream, wanted="a graph in space")
         known = self.used.get(stream)
         cfg = config or (ImuConfig() if known is None else known.config)
-        imu = imu if known is None else join_readings(known.imu, imu, stream)
+        given = imu if known is None else join_readings(known.given, imu, stream)
+        if known is not None and given is known.given:
+            imu = known.imu
+        elif self.graph.dim == 2:
+            imu = planar_imu(given, stream)
+        elif given.planar and len(given.times):
+            raise GeometryError(
+                "a planar IMU does not say how a body moves in space", where=stream,
+                got="no angular rate about x or y and no force along z", wanted="three axes, gravity among the forces",
+            )  # fmt: skip
+        else:
+            imu = given
         if len(imu.times) < 2:
             raise DataError("an IMU needs readings", where=stream, got=len(imu.times), wanted="two or more")
         bias_sigma(imu.noise)
@@ -68,14 +99,16 @@ class ImuUnits:
         waiting = self.graph.submaps[-1].exit_node if more and self.graph.submaps else None
         if waiting is not None:
             places.pop(waiting, None)
-        plan = plan_factors(self.graph.submaps, self.graph.records.values(), imu, stream, cfg, places, waiting)
+        plan = plan_factors(
+            self.graph.submaps, self.graph.records.values(), imu, stream, cfg, places, waiting, dim=self.graph.dim
+        )
         for a, b in plan.pairs:
             self.graph.ledger.check(f"{stream} x{a} → x{b}", [stream], (places[a].time, places[b].time))
         for n in plan.gravity:
             self.graph.ledger.check(f"gravity seen by {stream} at x{n}", [stream], force_window(places[n].time, cfg))
         if not more:
-            self.check(imu, stream=stream, axes=cfg.axes)
-        self.used[stream] = ImuUse(imu, cfg)
+            self.check(given, stream=stream, axes=cfg.axes)
+        self.used[stream] = ImuUse(imu, cfg, given)
         ids = self._add_ways(imu, stream, cfg, places, plan.pairs)
         ids += self._add_forces(imu, stream, cfg, places, plan)
         ids += self._relink(stream)
@@ -92,7 +125,7 @@ class ImuUnits:
         if axes == "ignore":
             return ""
         try:
-            found = check_imu_axes(imu, body_path(self.graph.submaps, self.graph.values))
+            found = check_imu_axes(with_gravity(imu), body_path(self.graph.submaps, self.graph.values))
         except DataError as error:
             self.graph.log_event("imu-axes", stream=stream, verdict="not checked", why=str(error))
             return ""
@@ -113,7 +146,8 @@ class ImuUnits:
         changed = 0
         for stream, use in self.used.items():
             old = [r for r in self.graph.records.values() if isinstance(r, ImuRecord) and r.stream == stream]
-            now = np.array([self.graph.values.imu_biases[r.biases[0]] for r in old]).reshape(-1, 6)
+            rows = [r.biases[0] for r in old]
+            now = lift("imubias", self.graph.values.imu_biases[rows])
             about = np.array([r.bias for r in old]).reshape(-1, 6)
             turned = np.linalg.norm((now - about)[:, :3], axis=1) * np.array([r.seconds for r in old])
             some = np.flatnonzero(turned > limit)
@@ -154,7 +188,8 @@ class ImuUnits:
     ) -> list[int]:
         if not pairs:
             return []
-        if cfg.accelerometer:
+        plane = self.graph.dim == 2
+        if cfg.accelerometer and not plane:
             self.graph.start_tilt()
         begin, end = (np.array([places[pair[k]].time for pair in pairs]) for k in (0, 1))
         unit = {n: places[n].unit(imu.T_base_imu) for pair in pairs for n in pair}
@@ -167,16 +202,16 @@ class ImuUnits:
         for k, (a, b) in enumerate(pairs):
             for n in (a, b):
                 if n not in biases:
-                    biases[n] = self.graph.values.append("imubias", start)
+                    biases[n] = self.graph.values.append("imubias", start[self._bias])
                 if cfg.accelerometer and n not in velocities:
-                    velocities[n] = self.graph.values.append("velocity", np.full(3, np.nan))
+                    velocities[n] = self.graph.values.append("velocity", np.full(self.graph.dim, np.nan))
             va, vb = velocities.get(a, -1), velocities.get(b, -1)
             local = np.stack([unit[a][1], unit[b][1]])
             made.append(
                 kind(
                     self.graph.next_factor(), stream, a, b, (begin[k], end[k]), (va, vb), (biases[a], biases[b]),
                     unit[a][0], unit[b][0], pim.R[k], pim.p[k], pim.v[k], pim.J[k], pim.bias[k],
-                    np.eye(15 if cfg.accelerometer else 9), local, cfg.robust,
+                    np.eye(len(self._rows if cfg.accelerometer else self._gyro_rows)), local, cfg.robust, planar=plane,
                 )
             )  # fmt: skip
         self._start_velocities(made, new_v)
@@ -217,10 +252,11 @@ class ImuUnits:
     ) -> Array:
         """Where biases start: at the last one known, or by how much faster the gyro turns than the nodes do."""
         if states.bias:
-            return self.graph.values.imu_biases[states.bias[states.order[-1]]].copy()
+            last = states.bias[states.order[-1]]
+            return lift("imubias", self.graph.values.imu_biases[last : last + 1])[0].copy()
         i, j = np.array(pairs).T
         q = [
-            quat_multiply(self.graph.values.poses[n, 3:], np.array([unit[k][0][3:] for k in n.tolist()]))
+            quat_multiply(lift("x", self.graph.values.poses[n])[:, 3:], np.array([unit[k][0][3:] for k in n.tolist()]))
             for n in (i, j)
         ]
         turn = quat_multiply(q[0] * [-1.0, -1.0, -1.0, 1.0], q[1])
@@ -234,23 +270,25 @@ class ImuUnits:
         v = self.graph.values.velocities
         if len(v) == first:
             return
-        assert self.graph.values.tilt is not None
-        up = GRAVITY * up_turn(self.graph.values.tilt)[0][:, 2]
+        tilt = self.graph.values.tilt
+        up = np.zeros(3) if tilt is None else GRAVITY * up_turn(tilt)[0][:, 2]  # the forces of the plane have none
         for r in ways:
             a, b = r.velocities
-            X = se3_compose(self.graph.values.poses[[r.i, r.j]], np.stack([r.T_i_imu, r.T_j_imu]))
+            X = se3_compose(lift("x", self.graph.values.poses[[r.i, r.j]]), np.stack([r.T_i_imu, r.T_j_imu]))
             T, R = r.seconds, quat_to_matrix(X[0, 3:])
             at_i = (X[1, :3] - X[0, :3] + 0.5 * up * T**2 - R @ r.p) / T
             if a >= first and not np.isfinite(v[a, 0]):
-                v[a] = at_i
+                v[a] = at_i[: self.graph.dim]
             if b >= first:
-                v[b] = at_i - up * T + R @ r.v  # the next way, if there is one, knows no better
+                v[b] = (at_i - up * T + R @ r.v)[: self.graph.dim]  # the next way, if there is one, knows no better
 
     def _weigh(self, records: Sequence[ImuRecord], pim: Preintegrated) -> None:
         """Put ways into the graph as preintegrated, with the covariance of where the unit is on the nodes."""
         tilt = np.zeros(2) if self.graph.values.tilt is None else self.graph.values.tilt  # the gyro alone asks for none
-        v = np.vstack([self.graph.values.velocities, np.zeros(3)])  # row -1: of ways by the gyro alone
-        b, x = self.graph.values.imu_biases, self.graph.values.poses
+        v = np.vstack(
+            [lift("velocity", self.graph.values.velocities), np.zeros(3)]
+        )  # row -1: of ways by the gyro alone
+        b, x = lift("imubias", self.graph.values.imu_biases), lift("x", self.graph.values.poses)
         fresh = [replace(r, R=R, p=p, v=w, J=J, bias=c) for r, R, p, w, J, c in zip(
             records, pim.R, pim.p, pim.v, pim.J, pim.bias)]  # fmt: skip
         i, j = (np.array([getattr(r, n) for r in fresh]) for n in "ij")
@@ -265,8 +303,8 @@ class ImuUnits:
             U = J[:, :, columns] @ se3_adjoint(L)  # by the unit's own right tangent
             P += U @ local[:, side] @ np.swapaxes(U, 1, 2)
         for r, Pk in zip(fresh, P):
-            gyro = isinstance(r, GyroRecord)
-            Pk = Pk[np.ix_(GYRO_ROWS, GYRO_ROWS)] if gyro else Pk
+            rows = self._gyro_rows if isinstance(r, GyroRecord) else self._rows
+            Pk = Pk[np.ix_(rows, rows)]
             W = whitener(Pk, what=f"covariance of {r.label()}", dim=len(Pk))
             self.graph.insert(replace(r, whitener=W))
 
@@ -304,6 +342,7 @@ class ImuUnits:
         """The first bias starts, and each that no way ties to the one before walks on from it."""
         noise = self.used[stream].imu.noise
         wanted = required_bias_links(self.states(stream), self.graph.records.values(), stream, noise)
+        wanted = {link: sigma[self._bias] for link, sigma in wanted.items()}
         for fid, r in list(self.graph.records.items()):
             if isinstance(r, ImuBiasRecord) and r.stream == stream:
                 sigma = wanted.get((r.before, r.bias))

@@ -121,11 +121,11 @@ for _kind in (
         remedy="the vertical is unconstrained: add the attitude of a node that is connected to x0.",
     ),
     VariableKind(
-        "velocity", "v", {3: "mmm"}, classes=("imu",),
+        "velocity", "v", {2: "mm", 3: "mmm"}, classes=("imu",),
         remedy="the velocity or the bias of an IMU is unconstrained: add readings, or remove its factors.",
     ),
     VariableKind(
-        "imubias", "i", {3: "rrrmmm"}, classes=("imu-bias", "imu"),
+        "imubias", "i", {2: "rmm", 3: "rrrmmm"}, classes=("imu-bias", "imu"),
         remedy="the velocity or the bias of an IMU is unconstrained: add readings, or remove its factors.",
     ),
 ):  # fmt: skip
@@ -264,9 +264,9 @@ class Values:
     biases = property(lambda self: self["bias"], lambda self, a: self.__setitem__("bias", a))
     """``(s, dim)`` GPS biases of the segments in the GPS frame [m]."""
     velocities = property(lambda self: self["velocity"], lambda self, a: self.__setitem__("velocity", a))
-    """``(v, 3)`` of an IMU in the frame of the first base [m/s]; which nodes they are of, the factors say."""
+    """``(v, dim)`` of an IMU in the frame of the first base [m/s]; which nodes they are of, the factors say."""
     imu_biases = property(lambda self: self["imubias"], lambda self, a: self.__setitem__("imubias", a))
-    """``(b, 6)`` of its gyro [rad/s] and its accelerometer [m/s²]."""
+    """``(b, 6)`` of its gyro [rad/s] and its accelerometer [m/s²]; ``(b, 3)`` in the plane: yaw rate, x and y."""
     datum = property(lambda self: self._one("datum"), lambda self, a: self._set_one("datum", a))
     """``(3,)``, ``(4,)`` or None: ``T_gps_world``, positions counted from the first fix."""
     tilt = property(lambda self: self._one("tilt"), lambda self, a: self._set_one("tilt", a))

@@ -178,13 +178,15 @@ class CampusConfig:
 
     def draw(self, tree: SeedTree) -> dict[str, float]:
         """A figure out of every range: logarithms uniform."""
-        out = {}
-        for f in dataclasses.fields(self):
-            value = getattr(self, f.name)
-            if isinstance(f.default, tuple) and f.name not in ("size", "lever"):
-                low, high = np.log(value)
-                out[f.name] = float(np.exp(tree.child(f.name).generator().uniform(low, high)))
-        return out
+        ranges = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if isinstance(f.default, tuple)}
+        return draw_log_uniform({k: v for k, v in ranges.items() if k not in ("size", "lever")}, tree)
+
+
+def draw_log_uniform(ranges: Mapping[str, Range], tree: SeedTree) -> dict[str, float]:
+    """A figure out of every range, each from the branch of its name: logarithms are uniform."""
+    return {
+        name: float(np.exp(tree.child(name).generator().uniform(*np.log(limits)))) for name, limits in ranges.items()
+    }
 
 
 _MAY_BE_NONE = (

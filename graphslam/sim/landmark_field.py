@@ -12,10 +12,12 @@ one half of them each; ``C`` is ``A`` with the sensor of the classic simulator.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
@@ -78,36 +80,65 @@ def visible_landmarks(
 
 
 def _measure_landmarks(world: _World) -> LandmarkObservations:
-    c, rng = world.config, world.noise("landmarks")
-    steps = np.arange(c.scan_stride, c.steps + 1, c.scan_stride)
-    scan, ids, ranges, bearings = visible_landmarks(c, world.poses[steps], world.landmarks)
+    steps = np.arange(world.config.scan_stride, world.config.steps + 1, world.config.scan_stride)
+    return observe_landmarks(
+        world.config, world.stamps(steps), world.poses[steps], world.landmarks, world.seeds, drops=world.drops
+    )
+
+
+def observe_landmarks(
+    c: LandmarkFieldConfig,
+    times: Array,
+    poses: Array,
+    landmarks: Array,
+    seeds: SeedTree,
+    *,
+    drops: DropCounter,
+    hidden: Callable[[Array, npt.NDArray[np.intp]], npt.NDArray[np.bool_]] | None = None,
+) -> LandmarkObservations:
+    """Range and bearing of point features, with noise, misses and clutter.
+
+    Parameters
+    ----------
+    times, poses : (n,), (n, 3)
+        Stamps of the scans [s] and true poses of the sensor, in the frame of ``landmarks``.
+    landmarks : (m, 2)
+        Their rows are the identities.
+    seeds : SeedTree
+        Its branches ``noise/landmarks`` and ``noise/clutter`` draw.
+    hidden : callable, optional
+        Given the plan position of a sensor ``(q, 2)`` and the row of a landmark ``(q,)``: is the line of sight blocked?
+    """
+    rng, clutter = (seeds.child("noise", name).generator() for name in ("landmarks", "clutter"))
+    scan, ids, ranges, bearings = visible_landmarks(c, poses, landmarks)
     # the tree's order is its own affair: sort, so that the draws below belong to the same features everywhere
     order = np.lexsort((ids, scan))
+    if hidden is not None:
+        order = order[~hidden(poses[scan[order], :2], ids[order])]
     scan, ids, ranges, bearings = scan[order], ids[order], ranges[order], bearings[order]
 
     detected = rng.random(len(scan)) < c.detection_probability
     ranges = ranges + c.noise_scale * c.sigma_range * rng.standard_normal(len(scan))
     bearings = bearings + c.noise_scale * c.sigma_bearing * rng.standard_normal(len(scan))
-    world.drops.drop("landmarks", "visible but not detected", int(np.sum(~detected)))
-    world.drops.drop("landmarks", "measured range not positive", int(np.sum(detected & (ranges <= 0))))
+    drops.drop("landmarks", "visible but not detected", int(np.sum(~detected)))
+    drops.drop("landmarks", "measured range not positive", int(np.sum(detected & (ranges <= 0))))
     keep = detected & (ranges > 0)
 
-    clutter = world.noise("clutter")
-    counts = clutter.poisson(c.clutter_rate, len(steps))
+    counts = clutter.poisson(c.clutter_rate, len(times))
     q = int(counts.sum())
     # uniform over the area of the sector: r² is uniform
     clutter_ranges = np.sqrt(clutter.uniform(c.min_range**2, c.max_range**2, q))
     clutter_bearings = clutter.uniform(-c.field_of_view / 2, c.field_of_view / 2, q)
 
-    scan = np.concatenate([scan[keep], np.repeat(np.arange(len(steps)), counts)])
+    scan = np.concatenate([scan[keep], np.repeat(np.arange(len(times)), counts)])
     ids = np.concatenate([ids[keep], np.full(q, -1)])
     ranges = np.concatenate([ranges[keep], clutter_ranges])
     bearings = wrap_angle(np.concatenate([bearings[keep], clutter_bearings]))
     order = np.lexsort((bearings, scan))  # right to left, as a sensor sweeps: the order tells nothing of identity
     sigmas = np.tile([c.sigma_range, c.sigma_bearing], (len(scan), 1))
     return LandmarkObservations(
-        times=world.stamps(steps),
-        offsets=np.searchsorted(scan[order], np.arange(len(steps) + 1)),
+        times=times,
+        offsets=np.searchsorted(scan[order], np.arange(len(times) + 1)),
         ranges=ranges[order],
         bearings=bearings[order],
         sigmas=sigmas,

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from graphslam.core.geometry import Array, rotation2, se2_between, se2_compose, se2_exp, se2_log, wrap_angle
 from graphslam.core.imu import Imu, ImuNoise
@@ -116,14 +117,16 @@ def stated_covariance(factor: float) -> Inject:
 
 
 def with_imu(log: SensorLog) -> SensorLog:
-    """A sound IMU on top, standing level: it measures gravity and the turns of the path."""
+    """A sound IMU on top, standing level: it measures gravity, and turns and accelerations of the path."""
     assert log.truth is not None
     path = log.truth.trajectory
     t = np.arange(path.times[0], path.times[-1], 0.02)
-    heading = np.interp(t, path.times, np.unwrap(path.poses[:, 2]))
-    rng = np.random.default_rng(9)
-    rate = np.column_stack([np.zeros((len(t), 2)), np.gradient(heading, t)]) + 0.001 * rng.standard_normal((len(t), 3))
-    force = np.array([0.0, 0.0, 9.81]) + 0.02 * rng.standard_normal((len(t), 3))
+    along = CubicSpline(path.times, np.column_stack([path.positions, np.unwrap(path.poses[:, 2])]))
+    (c, s), a = (f(along(t)[:, 2]) for f in (np.cos, np.sin)), along(t, 2)
+    rng, none = np.random.default_rng(9), np.zeros(len(t))
+    rate = np.column_stack([none, none, along(t, 1)[:, 2]]) + 0.007 * rng.standard_normal((len(t), 3))
+    force = np.column_stack([c * a[:, 0] + s * a[:, 1], c * a[:, 1] - s * a[:, 0], none + 9.81])
+    force += 0.07 * rng.standard_normal((len(t), 3))
     noise = ImuNoise(
         gyro=1e-3, gyro_bias=1e-3, gyro_walk=1e-4, accelerometer=1e-2, accelerometer_bias=0.1, accelerometer_walk=1e-3
     )

@@ -243,7 +243,7 @@ def _rows() -> list[Row]:
         for f, i, o, s in ODOMETRY:  # one filter over a whole log is over-confident without a gap, too, and says so
             out: Outcome = "reported" if frontend == "rbpf-slam" and o == "handled" else o
             rows.append(Row("odometry", f, i, out, s, frontend, "increments"))
-        rows.append(Row("IMU", "asked for in the plane", inject.with_imu, "reported", "imu-not-used", frontend))
+        rows.append(Row("IMU", "level, in the plane", inject.with_imu, "handled", "", frontend))
         rows[-1] = replace(rows[-1], config={**KNOWN, "imu": {"use": "imu"}})
     rows.append(Row("wheels", "10 s without wheels", inject.gap(10.0), "handled", "motion-gap", log="velocities"))
     used = {"gps": {"use": "all"}}

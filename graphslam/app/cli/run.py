@@ -225,7 +225,8 @@ def demo_command(
 def simulate_command(
     world: str = typer.Argument(
         ...,
-        help="Name of the world: landmark-field, garage, court or campus; of the studies: point-field, mine, building.",
+        help="Name of the world: mixed, landmark-field, garage, court or campus; of the studies: point-field, mine or "
+        "building.",
     ),
     out: Path = typer.Option(..., help="Folder for the log, with the true path and map."),
     seed: int = typer.Option(0, help="Seed for sensor noise and for movable objects in the world."),
@@ -236,7 +237,7 @@ def simulate_command(
     preset: str | None = typer.Option(
         None,
         help="Landmark field: A, B, C, demo or quick. Campus: full, three-blocks, block or quick. "
-        "Other worlds: light, full or two-scanners.",
+        "Mixed: full or quick. Other worlds: light, full or two-scanners.",
     ),
     world_seed: int | None = typer.Option(
         None, help="Seed of the place: sessions with the same --world-seed and different --seed share a place."

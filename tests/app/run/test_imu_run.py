@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from graphslam.app.run import pipeline
 from graphslam.app.run.config import RunConfig
+from graphslam.app.worlds import simulate
 from graphslam.backend.back_end import Observer
 from graphslam.core.config import build_config
 from graphslam.core.errors import ConfigError, DataError, EvidenceReusedError, MissingDataError
-from graphslam.core.imu import Imu
+from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -23,7 +25,6 @@ from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.ring_hall import ring_hall
 from tests.app.run.test_pipeline_space import Ring as HandedOver
-from tests.app.run.test_pipeline_space import ring as flat_ring
 from tests.reference.imu_ring import STEP, ring
 
 SWAP = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -162,12 +163,37 @@ def test_options_of_the_factors_are_options_of_a_run(monkeypatch):
     assert not any("pause" in reason for reason in said["dropped"])
 
 
-def test_in_the_plane_it_is_left_out(monkeypatch):
-    log, front = flat_ring(2)
-    imu = made()[0]["imu"]
+@pytest.mark.parametrize("gravity", [False, True], ids=["planar", "three axes"])
+def test_wheels_and_an_imu_in_the_plane(gravity):
+    """Landmark submaps from wheels and sightings, and an IMU in their graph: consistent, and nearer to the truth."""
+    log = simulate("landmark-field", seed=4).slice(0.0, 250.0)
+    path, rng = log.truth.trajectory, np.random.default_rng(1)
+    t = np.arange(path.times[0], path.times[-1], 0.01)
+    along = CubicSpline(path.times, np.column_stack([path.positions, np.unwrap(path.poses[:, 2])]))
+    c, s = np.cos(along(t)[:, 2]), np.sin(along(t)[:, 2])
+    a, rate = along(t, 2), along(t, 1)[:, 2]
+    sigma = np.array([1e-3, 1e-2, 1e-2])
+    z = np.column_stack([rate, c * a[:, 0] + s * a[:, 1], c * a[:, 1] - s * a[:, 0]])
+    z += np.array([2e-3, -0.02, 0.01]) + 10 * sigma * rng.standard_normal(z.shape)
+    noise = ImuNoise(
+        gyro=1e-3, gyro_bias=2e-3, gyro_walk=2e-5, accelerometer=1e-2, accelerometer_bias=0.02, accelerometer_walk=1e-4
+    )
+    none = np.zeros(len(t))
+    force = np.column_stack([z[:, 1:], none + 9.81 if gravity else none])
+    imu = Imu(times=t, angular_rate=np.column_stack([none, none, z[:, 0]]), specific_force=force, noise=noise)
     both = replace(log, streams={**log.streams, "imu": imu})
-    r = solved(both, list(front.made), monkeypatch, config={"imu": {"use": "auto"}})
-    assert [e["why"] for e in r.events if e["event"] == "imu-not-used"] == ["the graph is in the plane"]
+    r = pipeline.run(both, frontend="rbpf-ekf", seed=0, progress=False, config={"imu": {"use": "auto"}})
+    bare = pipeline.run(both, frontend="rbpf-ekf", seed=0, progress=False)
+    (said,) = [e for e in r.events if e["event"] == "imu"]
+    assert said["ways"] == len(r.graph.submaps)
+    assert not said["dropped"]
+    assert r.metric("imu_gyro_bias") == pytest.approx(2e-3, abs=4 * r.metric("imu_gyro_bias_sigma"))
+    assert r.metric("imu_gyro_bias_sigma") < 1e-3
+    assert r.metric("converged") == 1.0
+    assert r.metric("path_rmse_aligned") < 0.9 * bare.metric("path_rmse_aligned")
+    assert [f.level for f in r.verdict if f.code == "nees"] == ["good", "good"]
+    assert not [f for f in r.verdict if f.level == "bad"]
+    assert not [f for f in r.verdict if f.code == "imu-gravity"]
 
 
 def test_its_options_are_checked():

@@ -35,6 +35,7 @@ from graphslam.core.se3 import (
 )
 from graphslam.graph.factors.attitude import up_turn
 from graphslam.graph.factors.batch import UniformBatch
+from graphslam.graph.factors.imu.plane import IN_PLANE, lift
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.variables import VariableLayout
 
@@ -44,6 +45,12 @@ XI, VI, BI, XJ, VJ, BJ, TILT = (
 )
 GYRO_ROWS = np.r_[0:3, 9:15]
 GYRO_COLUMNS = np.r_[XI, BI, XJ, BJ]
+_BLOCKS = (("x", XI), ("velocity", VI), ("imubias", BI), ("x", XJ), ("velocity", VJ), ("imubias", BJ))
+PLANE_ROWS = np.array([2, 3, 4, 6, 7, 11, 12, 13])
+PLANE_COLUMNS = np.concatenate([block.start + np.array(IN_PLANE[word]) for word, block in _BLOCKS])
+PLANE_GYRO_ROWS = np.array([0, 5, 6, 7])
+PLANE_GYRO_COLUMNS = np.r_[0:3, 5:11, 13:16]
+"""Of the rows and columns of the plane, those of the gyro alone."""
 
 
 class PreintegrationArrays:
@@ -111,6 +118,19 @@ def preintegration_terms(
     return r, J
 
 
+def planar_terms(ways: PreintegrationArrays, *blocks: Array) -> tuple[Array, Array]:
+    """The same in the plane: residuals ``(k, 8)`` and Jacobians ``(k, 8, 16)``, of what is left of both there.
+
+    Parameters
+    ----------
+    blocks : (k, 3), (k, 2), (k, 3), (k, 3), (k, 2), (k, 3)
+        x_i, v_i, b_i, x_j, v_j, b_j.
+    """
+    lifted = [lift(word, rows) for (word, _), rows in zip(_BLOCKS, blocks)]
+    r, J = preintegration_terms(ways, *[*lifted, np.zeros(2)])
+    return r[:, PLANE_ROWS], J[:, PLANE_ROWS[:, None], PLANE_COLUMNS]
+
+
 def force_terms(x: Array, L: Array, bias: Array, tilt: Array, force: Array) -> tuple[Array, Array]:
     """Residuals ``(k, 3)`` and Jacobians ``(k, 3, 14)`` on (x, bias, tilt), not whitened.
 
@@ -146,10 +166,12 @@ class ImuBatch(UniformBatch):
     def keys(record: ImuRecord) -> Sequence[int | None]:
         """Node, velocity and bias at both ends, tilt."""
         (va, vb), (ba, bb) = record.velocities, record.biases
-        return record.i, va, ba, record.j, vb, bb, 0
+        return record.i, va, ba, record.j, vb, bb, None if record.planar else 0
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
+        if self.dim == 2:
+            return planar_terms(self._ways, *blocks[:6])
         x_i, v_i, b_i, x_j, v_j, b_j, tilt = blocks
         return preintegration_terms(self._ways, x_i, v_i, b_i, x_j, v_j, b_j, tilt[0])
 
@@ -172,7 +194,10 @@ class GyroBatch(UniformBatch):
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         x_i, b_i, x_j, b_j = blocks
-        none = np.zeros((len(self), 3))
+        none = np.zeros((len(self), self.dim))
+        if self.dim == 2:
+            r, J = planar_terms(self._ways, x_i, none, b_i, x_j, none, b_j)
+            return r[:, PLANE_GYRO_ROWS], J[:, PLANE_GYRO_ROWS][:, :, PLANE_GYRO_COLUMNS]
         r, J = preintegration_terms(self._ways, x_i, none, b_i, x_j, none, b_j, np.zeros(2))
         return r[:, GYRO_ROWS], J[:, GYRO_ROWS][:, :, GYRO_COLUMNS]
 
@@ -197,8 +222,9 @@ class ImuBiasBatch(UniformBatch):
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         before, now = blocks
-        J = np.concatenate([-np.eye(6), np.eye(6)], axis=1)
-        return now - before, np.broadcast_to(J, (len(self), 6, 12))
+        d = now.shape[1]
+        J = np.concatenate([-np.eye(d), np.eye(d)], axis=1)
+        return now - before, np.broadcast_to(J, (len(self), d, 2 * d))
 
 
 class ForceBatch(UniformBatch):

@@ -11,9 +11,10 @@ import numpy as np
 from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import Array
-from graphslam.core.poses import SE3
+from graphslam.core.poses import SE3, group_of
 from graphslam.core.se3 import se3_adjoint, se3_inverse, so3_exp
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factors.imu.plane import lift, lift_covariances, lift_path
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.submap_node import SubmapNode
 from graphslam.graph.variables import Values
@@ -25,14 +26,15 @@ class ImuConfig:
 
     Parameters
     ----------
-    longest : float
-        Nodes that follow each other within so many seconds are tied by a preintegrated way; farther ones see gravity.
+    longest : float or None
+        Nodes that follow each other within so many seconds are tied by a preintegrated way; in space farther ones see
+        gravity. None: 10 s in space, 120 s in the plane.
     pause : float or None
         No way over a pause of the readings that is longer [s]; None: five times the usual, and at least 0.1 s.
     accelerometer : bool
         False: the gyro alone, neither velocities nor gravity.
     gravity : bool
-        Nodes without a way get the mean specific force about them.
+        In space, nodes without a way get the mean specific force about them.
     window : float
         Over so many seconds it is averaged.
     acceleration : float
@@ -45,7 +47,7 @@ class ImuConfig:
         Kernel on every way.
     """
 
-    longest: float = 10.0
+    longest: float | None = None
     pause: float | None = None
     accelerometer: bool = True
     gravity: bool = True
@@ -62,6 +64,10 @@ class ImuConfig:
                 raise ConfigError(f"imu.{name} must be positive, got {value}")
         if self.axes not in ("refuse", "warn", "ignore"):
             raise ConfigError(f"imu.axes = {self.axes!r}; known: refuse, warn, ignore")
+
+    def span(self, dim: int) -> float:
+        """Longest way allowed in a graph of so many dimensions [s]."""
+        return self.longest or (10.0 if dim == 3 else 120.0)
 
     def pause_of(self, times: Array) -> float:
         """Longest pause allowed in readings at ``times`` ``(n,)``, n ≥ 2."""
@@ -102,29 +108,31 @@ def places_on_nodes(submaps: Sequence[SubmapNode], window: float) -> dict[int, B
     out: dict[int, BodyPlace] = {}
     for s in submaps:
         path = s.trajectory
-        if path is None or len(path) < 2 or path.dim != 3:
+        if path is None or len(path) < 2:
             continue
+        group = group_of(path.poses)
 
         def moved(t: float, path: Trajectory = path) -> float:
             ends = np.clip([t - 0.5 * window, t + 0.5 * window], path.times[0], path.times[-1])
-            return float(np.linalg.norm(np.diff(path.interpolate(ends)[:, :3], axis=0)))
+            return float(np.linalg.norm(np.diff(path.interpolate(ends)[:, : path.dim], axis=0)))
 
         inner = [k for k in range(len(s.nodes) - 1) if path.times[0] <= s.times[k] <= path.times[-1]]
         if inner:
             T, P = s.local(s.times[inner], np.array(inner, dtype=np.intp))
-            P = np.zeros((len(inner), 6, 6)) if P is None else P
-            for k, Tk, Pk in zip(inner, T, P):
+            P = np.zeros((len(inner), 6, 6)) if P is None else lift_covariances(P)
+            for k, Tk, Pk in zip(inner, lift("x", T), P):
                 t = float(s.times[k])
                 out[s.nodes[k]] = BodyPlace(t, Tk, Pk if k == 0 else np.zeros((6, 6)), moved(t))
         t = float(s.times[-1])
         if path.times[0] <= t <= path.times[-1] + 1e-9:
             T_end = path.interpolate(min(t, float(path.times[-1])))[0]
-            out[s.exit_node] = BodyPlace(t, SE3.between(s.T_base_node[-1], T_end), np.zeros((6, 6)), moved(t))
+            T_exit_end = lift("x", group.between(s.T_base_node[-1], T_end)[None])[0]
+            out[s.exit_node] = BodyPlace(t, T_exit_end, np.zeros((6, 6)), moved(t))
     return out
 
 
 def body_path(submaps: Sequence[SubmapNode], values: Values) -> Trajectory:
-    """Path of the body in the level frame at the first base, by rigid submaps at their nodes."""
+    """Path of the body in space, in the level frame at the first base, by rigid submaps at their nodes."""
     times, poses = [np.zeros(0)], [np.zeros((0, 7))]
     level = SE3.identity.copy()
     if values.tilt is not None:
@@ -132,11 +140,12 @@ def body_path(submaps: Sequence[SubmapNode], values: Values) -> Trajectory:
     for s in submaps:
         if s.trajectory is None:
             continue
-        T = SE3.compose(level, values.poses[s.node])
-        new = s.trajectory.times > (times[-1][-1] if len(times[-1]) else -np.inf)
+        path = lift_path(s.trajectory)
+        T = SE3.compose(level, lift("x", values.poses[s.node : s.node + 1])[0])
+        new = path.times > (times[-1][-1] if len(times[-1]) else -np.inf)
         if np.any(new):
-            times.append(s.trajectory.times[new])
-            poses.append(SE3.compose(np.broadcast_to(T, s.trajectory.poses[new].shape), s.trajectory.poses[new]))
+            times.append(path.times[new])
+            poses.append(SE3.compose(np.broadcast_to(T, path.poses[new].shape), path.poses[new]))
     if len(times) == 1:
         raise DataError("no submap has a path", wanted="submaps with trajectories")
     return Trajectory(np.concatenate(times), np.concatenate(poses))

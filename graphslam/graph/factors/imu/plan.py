@@ -48,6 +48,8 @@ def plan_factors(
     cfg: ImuConfig,
     places: dict[int, BodyPlace],
     waiting: int | None = None,
+    *,
+    dim: int = 3,
 ) -> ImuFactorPlan:
     """Pairs and nodes that get factors, besides those of ``records``, and a count of those that get none by reason.
 
@@ -63,7 +65,7 @@ def plan_factors(
         for a, b in zip(s.nodes, s.nodes[1:]):
             if (a, b) in had:
                 continue
-            why = _why_not(places.get(a), places.get(b), t, cfg.longest, pause)
+            why = _why_not(places.get(a), places.get(b), t, cfg.span(dim), pause)
             if why:
                 dropped[why] += 1
             else:
@@ -72,7 +74,7 @@ def plan_factors(
     gravity: list[int] = []
     last = -np.inf
     for n, place in sorted(places.items(), key=lambda item: item[1].time):
-        if not (cfg.gravity and cfg.accelerometer) or n in near:
+        if not (cfg.gravity and cfg.accelerometer and dim == 3) or n in near:
             continue
         begin, end = force_window(place.time, cfg)
         if n in heard:

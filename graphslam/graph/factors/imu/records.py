@@ -30,9 +30,11 @@ class ImuRecord:
     bias : (6,)
         About which they were preintegrated.
     whitener : (15, 15)
-        Of ``[φ, p, v, b_g, b_a]``.
+        Of ``[φ, p, v, b_g, b_a]``; in the plane (8, 8), of what these have in the plane.
     local : (2, 6, 6)
         Covariances of ``T_i_imu`` and ``T_j_imu`` (right tangents) that the whitener holds.
+    planar : bool
+        In a graph of the plane: all else is embedded in space (:mod:`graphslam.graph.factors.imu.plane`).
     """
 
     factor_id: int
@@ -53,6 +55,7 @@ class ImuRecord:
     local: Array
     robust: RobustKernel = NO_KERNEL
     group: str = "imu"
+    planar: bool = False
 
     @property
     def seconds(self) -> float:
@@ -67,7 +70,8 @@ class ImuRecord:
     def variables(self) -> list[str]:
         """Names of the variables."""
         (va, vb), (ba, bb) = self.velocities, self.biases
-        return [f"x{self.i}", f"velocity{va}", f"imubias{ba}", f"x{self.j}", f"velocity{vb}", f"imubias{bb}", "tilt"]
+        names = [f"x{self.i}", f"velocity{va}", f"imubias{ba}", f"x{self.j}", f"velocity{vb}", f"imubias{bb}"]
+        return names if self.planar else [*names, "tilt"]
 
     def label(self) -> str:
         """Name for messages."""
@@ -76,7 +80,7 @@ class ImuRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroRecord(ImuRecord):
-    """The same by the gyro alone: ``whitener`` (9, 9) of ``[φ, b_g, b_a]``; no velocity and no gravity."""
+    """The same by the gyro alone: ``whitener`` (9, 9) of ``[φ, b_g, b_a]``, or (4, 4); no velocity, no gravity."""
 
     def variables(self) -> list[str]:
         """Names of the variables."""
@@ -93,7 +97,7 @@ class ImuBiasRecord:
         Row of the bias before; None at the start, where the bias is zero within ``sigma``.
     bias : int
         Row.
-    sigma : (6,)
+    sigma : (6,) or (3,)
     """
 
     factor_id: int
@@ -106,7 +110,7 @@ class ImuBiasRecord:
     @property
     def rows(self) -> int:
         """Dimension of the residual."""
-        return 6
+        return len(self.sigma)
 
     def variables(self) -> list[str]:
         """Names of the variables."""
