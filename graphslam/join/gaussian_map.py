@@ -34,7 +34,7 @@ from graphslam.linear.symmetric_factor import SymmetricFactor
 DENSE = 200
 """Scalars up to which a dense Cholesky factorisation is faster than a sparse one (measured)."""
 PASSES = 3
-"""How often a join is linearised at most."""
+"""How often a join of maps with common variables is linearised at most."""
 _STEP = 1e-6
 """… and no more once a step is a thousandth of a standard deviation, on the average over the map."""
 ANCHORED = ("l", "point")
@@ -377,21 +377,22 @@ def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tu
     return joined, news
 
 
-def join_two(a: GaussianMap, b: GaussianMap, factors: Index, *, passes: int = PASSES) -> GaussianMap:
+def join_two(a: GaussianMap, b: GaussianMap, factors: Index, *, passes: int | None = None) -> GaussianMap:
     """Join B, whose base is the end of A, and the factors that need both.
 
     Parameters
     ----------
     factors : (f,)
         Numbers of the factors that enter here.
-    passes : int
-        How often the two Gaussians and the factors are linearised where they meet.
+    passes : int, optional
+        How often the two Gaussians and the factors are linearised where they meet. By default up to :data:`PASSES`
+        times where the maps have common variables, and once where relative poses alone enter.
     """
     joined, news = add_maps(a, b)
     begin, enter = joined.admitted(factors)
     if not len(enter) and not news:
         return begin
-    return begin.solved(enter, lambda values: add_maps(a, b, values)[0], passes)
+    return begin.solved(enter, lambda values: add_maps(a, b, values)[0], passes or (PASSES if news else 1))
 
 
 def _solve(H: sp.csc_matrix, g: Array, free: npt.NDArray[np.bool_]) -> Array:

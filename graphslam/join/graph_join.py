@@ -23,7 +23,7 @@ from graphslam.core.markup import html_element, join_parts
 from graphslam.core.progress import Bar
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.variables import Values
-from graphslam.join.gaussian_map import PASSES, GaussianMap, add_maps, join_two
+from graphslam.join.gaussian_map import GaussianMap, add_maps, join_two
 from graphslam.join.graph_problem import Index, JoinProblem
 from graphslam.linear.symmetric_factor import SymmetricFactor
 from graphslam.solve.batch import LevenbergConfig, optimise_problem
@@ -202,13 +202,13 @@ def _of_root(problem: JoinProblem, root: GaussianMap, method: str, start: float)
     return _estimate(problem, root.values, method, seconds, information=sp.csc_matrix(A[d:, d:]))
 
 
-def join_sequential(problem: JoinProblem, *, passes: int = PASSES, progress: bool = False) -> GraphEstimate:
+def join_sequential(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
     """Extended information filter, submap after submap (Combined SLAM eq. 13-16).
 
     Parameters
     ----------
-    passes : int
-        How often the factors of a join are linearised.
+    passes : int, optional
+        How often a join is linearised (:func:`~graphslam.join.gaussian_map.join_two`).
     progress : bool
         Show a progress bar.
     """
@@ -219,7 +219,7 @@ def join_sequential(problem: JoinProblem, *, passes: int = PASSES, progress: boo
     return _of_root(problem, _finished(joined), "eif-sequential", start)
 
 
-def join_tree(problem: JoinProblem, *, passes: int = PASSES, progress: bool = False) -> GraphEstimate:
+def join_tree(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
     """Extended information filter by binary tree: submaps pairwise, then the pairs, and so on.
 
     Parameters

@@ -9,15 +9,16 @@ import pytest
 
 import graphslam as gs
 from graphslam.app.compare import map_nees
-from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.se3 import se3_between, se3_inverse, se3_transform
 from graphslam.core.submap import Submap
 from graphslam.io.submap_store import read_submaps, write_submaps
-from graphslam.join.registry import join_by_method
+from graphslam.join.graph_join import join_sequential
+from graphslam.join.registry import join_by_method, prepare_submaps
 
-METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf", "eif-tree-classical", "eif-sequential-classical")
+METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
 FIELD = {"seconds": 60.0, "points": 150}
 
 
@@ -53,17 +54,21 @@ def test_every_method_ends_at_one_optimum(drifting) -> None:
     assert np.ptp(table["nees"]) < 1e-4 * table["nees"].iloc[0]
     assert (table["objective"] > best.min() * (1 - 1e-12)).all()
     by = table.set_index("method")
-    assert by.loc["eif-tree", "objective"] < 1.05 * best.min() < by.loc["eif-tree-classical", "objective"]
-    assert by.loc["eif-tree", "nees_unpolished"] < 0.5 * by.loc["eif-tree-classical", "nees_unpolished"]
+    # linearised once, an error of six degrees in heading is not small
+    assert by.loc["eif-tree", "objective"] < 1.05 * best.min() < by.loc["ekf", "objective"]
+    assert by.loc["eif-tree", "nees_unpolished"] < 0.5 * by.loc["ekf", "nees_unpolished"]
 
 
 def test_the_filters_in_both_forms_are_one_algebra(drifting) -> None:
     """The Kalman filter and the classical information filter in sequence are linearised at the same places."""
     submaps = drifting[0][:3]
-    covariance, information = join_by_method(submaps, "ekf"), join_by_method(submaps, "eif-sequential-classical")
+    covariance = join_by_method(submaps, "ekf")
+    information = join_sequential(prepare_submaps(submaps), passes=1)
     np.testing.assert_allclose(covariance.poses, information.poses, atol=1e-7)
     np.testing.assert_allclose(covariance.landmarks, information.landmarks, atol=1e-7)
-    np.testing.assert_allclose(covariance.covariance, information.joint_covariance(), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        covariance.covariance, np.linalg.inv(information.information.toarray()), rtol=1e-5, atol=1e-9
+    )
 
 
 def test_a_tree_of_two_is_the_sequence(drifting) -> None:
@@ -73,7 +78,7 @@ def test_a_tree_of_two_is_the_sequence(drifting) -> None:
     np.testing.assert_array_equal(tree.information.toarray(), sequence.information.toarray())
 
 
-def test_joined_maps_are_honest() -> None:
+def test_joined_maps_are_consistent() -> None:
     """Eight flights: the optimum inside two-sided bounds that a halved or a doubled covariance leaves."""
     d2, dof = 0.0, 0
     for seed in range(8):
@@ -105,13 +110,13 @@ def test_a_submap_without_landmarks_measures_its_end(drifting) -> None:
 
 def test_what_cannot_be_joined_is_refused(drifting) -> None:
     submaps = drifting[0]
-    with pytest.raises(ConfigError, match="by the ids that they bear"):
+    with pytest.raises(ConfigError, match="only landmark submaps in the plane"):
         join_by_method(submaps, associate="joint")
     with pytest.raises(ConfigError, match="one process"):
         join_by_method(submaps, workers=2)
     nobody = [submaps[0].with_ids(np.full(len(submaps[0].landmarks), -1)), *submaps[1:]]
-    with pytest.raises(DataError, match="has no id, or its id is repeated"):
+    with pytest.raises(DataError, match="without an identity"):
         join_by_method(nobody)
     flat = gs.local_maps(gs.simulate("landmark-field", preset="quick", seed=1))[0]
-    with pytest.raises(DataError, match="two dimensions"):
+    with pytest.raises(GeometryError, match="two dimensions"):
         join_by_method([submaps[0], flat])
