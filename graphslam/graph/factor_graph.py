@@ -218,7 +218,8 @@ class FactorGraph(FactorGraphState):
             z, W = np.concatenate([z, np.zeros(len(lm.lasting.sigmas))]), np.hstack([W, -W @ lm.lasting.response])
         record = SubmapRecord(fid, submap.key, node, ids, z, W, chart=lm.chart, robot=robot)
         ends = np.stack([np.zeros(3), submap.exit_pose])
-        self._append(submap, [record], np.array(submap.interval), ends)
+        stated = covariance_scale * submap.exit_covariance[None]
+        self._append(submap, [record], np.array(submap.interval), ends, np.zeros((0, 3, 3)), stated)
         if lm.lasting is not None:
             self._robots[submap.uses] = robot
             self._tell_lasting(lm.lasting, robot, submap.uses, covariance_scale)
