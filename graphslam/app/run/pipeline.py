@@ -27,7 +27,7 @@ from graphslam.app.run.calibration import (
     without_noise,
 )
 from graphslam.app.run.choice import choose_front_end, reading_line
-from graphslam.app.run.files import read_options, removed_loops_of_run
+from graphslam.app.run.files import read_options, read_report, removed_loops_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
 from graphslam.app.run.front_ends import (
     FrontEndLike,
@@ -374,6 +374,9 @@ def resolve_from_folder(folder: str | Path) -> tuple[FactorGraph, Solution]:
     with one_blas_thread():
         taken, _ = read_consistently(root, read_inputs)
         _, _, back, submaps = _stored(root, taken, [])
+        attempts = read_consistently(root, read_report).get("map_attempts", [])
+        if any(a["kept"] and a["loops"] for a in attempts):  # of "auto", once its first map contradicted itself
+            back.config = replace(back.config, loops=True)
         for s in submaps:
             back.add(s)
         solution = back.finish(removed_loops_of_run(root))
