@@ -108,13 +108,16 @@ def flag_counts(submaps: Sequence[Submap]) -> dict[str, int]:
 def solution_metrics(out: Metrics, solution: Solution, confirmed: int) -> None:
     """Objective per class, gap, landmarks."""
     out.add("objective", solution.objective, "", "lower")
-    for name in solution.score:
-        c = solution.score[name]
+    classes: dict[str, tuple[float, float]] = {}
+    for name, c in solution.score.classes.items():
         label = "join" if name in ("submap", "dense-submap") else name
-        out.add(f"{label}_chi2", c.chi2)
-        out.add(f"{label}_dof", c.dof)
-        if c.dof > 0:
-            out.add(f"{label}_chi2_per_dof", c.chi2_per_dof, "", "one")
+        chi2, dof = classes.get(label, (0.0, 0.0))
+        classes[label] = chi2 + c.chi2, dof + c.dof
+    for label, (chi2, dof) in classes.items():
+        out.add(f"{label}_chi2", chi2)
+        out.add(f"{label}_dof", dof)
+        if dof > 0:
+            out.add(f"{label}_chi2_per_dof", chi2 / dof, "", "one")
     out.add("gap", solution.gap if solution.gap is not None else float("nan"), "", "lower")
     out.add("converged", float(solution.converged), "", "higher")
     out.add("states", solution.states)

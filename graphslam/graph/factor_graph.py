@@ -221,8 +221,9 @@ class FactorGraph(FactorGraphState):
             record = replace(record, factor_id=fid, start=node, landmark_ids=ids)
         else:
             record = SubmapRecord(fid, submap.key, node, ids, z, W, chart=lm.chart, robot=robot)
-        ends = np.stack([self.structure.group.identity, submap.exit_pose])
-        self._append(submap, [record], np.array(submap.interval), ends)
+        d, ends = self.structure.group.dof, np.stack([self.structure.group.identity, submap.exit_pose])
+        stated = covariance_scale * submap.exit_covariance[None]
+        self._append(submap, [record], np.array(submap.interval), ends, np.zeros((0, d, d)), stated)
         if lm.lasting is not None:
             self._robots[submap.uses] = robot
             self._tell_lasting(lm.lasting, robot, submap.uses, covariance_scale)

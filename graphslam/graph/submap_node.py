@@ -116,7 +116,7 @@ class SubmapNode:
         Of the increments from node to node as they stand in the graph, right tangent at the later one.
     stated : (k + 1, d, d)
         The same as the submap stated them, before a levelled exit gave up its relative roll and pitch: what a chain of
-        relative poses by itself is worth, for instance in cycles of loops and chain.
+        relative poses by itself is worth, for instance in cycles of loops and chain. Of a landmark submap, its exit.
     inner_points : InnerPoints or None
         Of a landmark submap that holds points of its path.
     lasting : SensorBiases or None

@@ -181,8 +181,8 @@ class GaussianMap:
             columns.append(np.tile(at, (1, at.shape[1])).ravel())
             data.append(B.ravel())
         everywhere = np.arange(n)
-        at = np.concatenate([everywhere, *rows]), np.concatenate([everywhere, *columns])
-        T = sp.csc_matrix((np.concatenate([diagonal, *data]), at), shape=(n, n))
+        places = np.concatenate([everywhere, *rows]), np.concatenate([everywhere, *columns])
+        T = sp.csc_matrix((np.concatenate([diagonal, *data]), places), shape=(n, n))
         return T if more is None else sp.csc_matrix(T + more)
 
     # ---------------------------------------------------------------- frames

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.submap import Submap
+from graphslam.evidence.views import has_dense_view
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import (
@@ -139,7 +140,9 @@ class LoopSearch:
         closer, measurer = self.closer, self._measurer
         closer.extend_chain(ours, *chain_of_graph(graph))
         measurer.extend_chain(submaps, p)
-        shared, since = pairs_sharing_scans(submaps), 0 if last else self._seen
+        bare = [k for k, s in enumerate(submaps) if not has_dense_view(s)]
+        shared = pairs_sharing_scans(submaps) | {(min(a, b), max(a, b)) for a in bare for b in range(len(submaps))}
+        since = 0 if last else self._seen
 
         def go(candidates: Sequence[LoopCandidate]) -> int:
             before = len(closer.accepted)
@@ -176,10 +179,10 @@ class LoopSearch:
         c, measurer = self.config, self._measurer
         if c.appearance is None or measurer is None or len(measurer.submaps) < 2:
             return
-        parts = [
-            describe_places(measurer.prepared(k).view, p.T_base_node[p.of_submap(k)], c.descriptors)
-            for k in range(len(measurer.submaps))
-        ]
+        parts = []
+        for k, s in enumerate(measurer.submaps):
+            view = measurer.prepared(k).view if has_dense_view(s) else None
+            parts.append(describe_places(view, p.T_base_node[p.of_submap(k)], c.descriptors))
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
         alike = appearance_candidates(p, concatenate_descriptors(parts), c.appearance, exclude=shared)
         go([x for x in alike if (int(p.submap[x.i]), round(float(p.way[x.j]), 1)) not in seen])

@@ -11,6 +11,7 @@ from graphslam.core.geometry import Array
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
@@ -34,7 +35,7 @@ def places_of_graph(graph: FactorGraph) -> Places:
         wanted = 0 if k == 0 else graph.submaps[k - 1].exit_node
         if not s.nodes or s.nodes != tuple(range(wanted, wanted + len(s.nodes))):
             raise DataError(
-                f"submap {s.key} does not go on where the one before ended: loops need one chain of dense submaps",
+                f"submap {s.key} does not go on where the one before ended: loops need one chain of submaps",
                 got=s.nodes[:1],
                 wanted=wanted,
             )
@@ -45,10 +46,15 @@ def chain_of_graph(graph: FactorGraph) -> tuple[Array, Array]:
     """Increments ``(n, 7|3)`` from node to node and their covariances ``(n, d, d)``, as the submaps stated them.
 
     The factor of a levelled exit gave up its relative roll and pitch to an attitude, which a chain by itself has not.
+    Of a landmark submap it is the exit alone.
     """
     T: list[Array] = []
     P: list[Array] = []
     for s in graph.submaps:
+        if isinstance(graph.records.get(s.factor_id), SubmapRecord):
+            T.append(s.T_base_node[1])
+            P.append(s.stated[0])
+            continue
         for k, fid in enumerate(s.factor_ids[: len(s.nodes) - 1]):
             r = graph.records.get(fid)
             if not isinstance(r, BetweenRecord) or (r.i, r.j) != (s.nodes[k], s.nodes[k + 1]):

@@ -144,8 +144,8 @@ class RunMap:
 
 
 def has_maps(submaps: Sequence[Submap]) -> bool:
-    """Has every submap a dense map, an evidence grid or a cloud?"""
-    return bool(submaps) and all(has_dense_view(s) for s in submaps)
+    """Has any submap a dense map, an evidence grid or a cloud? In a mixed run some have landmarks instead."""
+    return any(has_dense_view(s) for s in submaps)
 
 
 def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
@@ -180,7 +180,7 @@ def make_run_map(
     Parameters
     ----------
     submaps : sequence of Submap
-        With dense maps and paths.
+        With dense maps and paths; those with landmarks alone add nothing to the map.
     m : GlobalMap
         Solved.
     reach : float, optional
@@ -196,10 +196,9 @@ def make_run_map(
     """
     config = MapConfig() if config is None else config
     if not has_maps(submaps):
-        bare = [s.key for s in submaps if not has_dense_view(s)]
         raise MissingDataError(
             "submaps have no evidence grids or clouds to make a map of",
-            got=f"{len(bare)} of {len(submaps)} without",
+            got=f"{len(submaps)} submaps without",
             wanted="a run of a front end with dense maps: segslam, scan-window, lidar-odometry, rbpf-grid",
         )
     nodes = nodes_by_submap(submaps, m)
@@ -214,7 +213,8 @@ def make_run_map(
         nodes={key: times for key, (times, _) in nodes.items()},
     )
     divide_s, begin = time.perf_counter() - begin, time.perf_counter()
-    grid = submaps[0].grid
+    dense = [s for s in submaps if has_dense_view(s)]
+    grid = dense[0].grid
     model = grid.model if isinstance(grid, EvidenceGrid) else None
     at = solved_poses(divided, nodes)
     divided, coarsened = _held(divided, at)
@@ -226,7 +226,7 @@ def make_run_map(
     fused.release_scratch()
     points = fused_points(submaps, nodes, level_nodes=level_nodes, config=division)
     move_s = time.perf_counter() - begin
-    knows_space = all(dense_view(s).knows_space for s in submaps)
+    knows_space = all(dense_view(s).knows_space for s in dense)
     bands = floor_bands(m.trajectory.positions, config) if m.dim == 3 else {}
     return RunMap(
         fused,

@@ -13,6 +13,7 @@ from graphslam.core.poses import SE2, SE3, group_of, remove_roll_pitch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.views import has_dense_view
 from graphslam.maps.increment import own_evidence
 from graphslam.maps.pieces import DivisionConfig, Piece, PieceId, node_times_every, pieces_of_submap
 
@@ -70,7 +71,7 @@ def divide_submaps(
     Parameters
     ----------
     submaps : sequence of Submap
-        Each base is the exit of the one before.
+        Each base is the exit of the one before; those without a dense map have no pieces.
     every : float, optional
         Way between nodes, about [m]; None: one piece a submap, led by its base.
     config : DivisionConfig, optional
@@ -88,14 +89,20 @@ def divide_submaps(
     """
     if not submaps:
         raise DataError("there are no submaps to make a map of", wanted="one at least")
+    dense = [s for s in submaps if has_dense_view(s)]
     if grids is None and own:
-        grids, _ = own_evidence(submaps)
+        grids, _ = own_evidence(dense)
     if grids is not None:
-        submaps = [replace(s, grid=grids.get(s.key)) for s in submaps]
+        dense = [replace(s, grid=grids.get(s.key)) for s in dense]
+    mapped = {s.key: s for s in dense}
     group = SE3 if submaps[0].dim == 3 else SE2
     out = DividedSubmaps({}, {}, {}, {}, level_nodes)
     base = group.identity
     for s in submaps:
+        if s.key not in mapped:
+            base = group.compose(base, s.exit_pose)
+            continue
+        s = mapped[s.key]
         given = None if nodes is None else np.asarray(nodes[s.key], dtype=np.float64)
         if (every is None) if given is None else len(given) < 2:
             times, local = np.array([s.interval[0]]), group.identity[None]

@@ -87,18 +87,23 @@ class PlaceDescriptors:
 
 
 def describe_places(
-    view: DenseMapView, T_base_place: ArrayLike, config: DescriptorConfig | None = None
+    view: DenseMapView | None, T_base_place: ArrayLike, config: DescriptorConfig | None = None
 ) -> PlaceDescriptors:
     """Descriptors of places of one map.
 
     Parameters
     ----------
+    view : DenseMapView or None
+        None: a submap without a dense map, whose places know nothing.
     T_base_place : (n, 7) or (n, 3)
         In the frame of the map. Roll and pitch are left out: only the heading turns the sectors.
     """
     c = DescriptorConfig() if config is None else config
     T = remove_roll_pitch(np.asarray(T_base_place, dtype=np.float64))
     g = group_of(T)
+    if view is None:
+        nothing = np.zeros((len(T), c.rings, c.sectors))
+        return PlaceDescriptors(nothing, nothing, c)
     if T.ndim != 2 or g.dim != view.dim:
         raise GeometryError("places do not fit the map", got=T.shape, wanted=f"(n, {7 if view.dim == 3 else 3})")
     occupied = view.points()

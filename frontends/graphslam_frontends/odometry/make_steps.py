@@ -69,7 +69,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
     """
     config = config or StepConfig()
     count = DropCounter()
-    names = config.scanners or _scanners(log)
+    names = config.scanners or scanner_names(log)
     source = motion_source(log, config, 2 if isinstance(log[names[0]], LaserScans) else 3)
     sources = _beam_sources(log, names, source, config, count)
     beam_times = np.concatenate([s.times for s in sources])
@@ -138,7 +138,8 @@ def level_on_the_whole(tilt: Array | None, increments: Array) -> Array | None:
     return tilt - np.median(tilt[moved if moved.any() else slice(None)], axis=0)
 
 
-def _scanners(log: SensorLog) -> tuple[str, ...]:
+def scanner_names(log: SensorLog) -> tuple[str, ...]:
+    """Streams of beams that steps are made of where the configuration names none."""
     for kind in (RangeScans, PointClouds, LaserScans):
         names = tuple(name for name, s in log.streams.items() if isinstance(s, kind))
         if names:

@@ -67,8 +67,10 @@ def add_run_commands(app: typer.Typer) -> None:
 
 def run_command(
     source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
-    frontend: str | None = typer.Option(
-        None, help="Name of the front end that makes submaps from the log. Default: by the streams of the log."
+    frontend: list[str] = typer.Option(
+        [],
+        help="Name of the front end that makes submaps from the log. Default: by the streams of the log. "
+        "Twice: one of landmarks and one of planar scans, each in the intervals that suit it.",
     ),
     solver: str = typer.Option("isam2", help="Name of the solver: isam2, lm, batch, gnc or pcg."),
     reader: str | None = READER,
@@ -103,7 +105,7 @@ def run_command(
         observers = [LiveView(source, file) for file in ([None] if live else []) + ([live_file] if live_file else [])]
     result = run_pipeline(
         source,
-        frontend=frontend,
+        frontend=frontend or None,
         solver=solver,
         seed=seed,
         out=out,

@@ -28,6 +28,7 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.landmarks.config import RbpfEkfConfig, SensorBiasConfig
 from graphslam_frontends.landmarks.prepare import landmark_stream
+from graphslam_frontends.mixed import MixedFrontEnd
 from graphslam_frontends.odometry.motion import motion_stream
 
 LANDMARKS, SCANS = "rbpf-ekf", "segslam"
@@ -55,6 +56,9 @@ def apply_calibration(
     own : bool
         Is there a preset for this very set?
     """
+    if isinstance(front, MixedFrontEnd):  # the motion is that of both; landmarks show its errors better
+        part = min(front.parts, key=lambda p: front_kind(p) != "sightings")
+        front, options = part, {"frontend": options.get("frontend", {}).get(part.name, {})}
     if config.given is not None:  # what a user wrote down stands before what would be estimated
         said = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
         return apply_corrections(log, config.given), config, said, None
@@ -127,14 +131,24 @@ def uses_preset_noise(options: Mapping[str, Any]) -> bool:
     return not isinstance(asked, Mapping) or ("given" not in asked and asked.get("use", "auto") != "always")
 
 
-def without_noise(suggested: Mapping[str, Any]) -> dict[str, Any]:
-    """A preset without its noise and constants of the sensors; what says how a log is read stays."""
-    front = {k: v for k, v in suggested.get("frontend", {}).items() if k not in ("motion", "noise", "smoothing_noise")}
-    if isinstance(front.get("steps"), Mapping):
-        front["steps"] = {k: v for k, v in front["steps"].items() if k != "yaw_per_metre"}
+def without_noise(suggested: Mapping[str, Any], *, mixed: bool = False) -> dict[str, Any]:
+    """A preset without its noise and constants of the sensors; what says how a log is read stays.
+
+    ``mixed``: of several front ends, whose options stand under their names.
+    """
+    front = _without_front_noise(suggested.get("frontend", {}))
+    if mixed:
+        front = {k: _without_front_noise(v) for k, v in suggested.get("frontend", {}).items()}
     back = {k: v for k, v in suggested.get("backend", {}).items() if k != "covariance_scale"}
     kept = {"frontend": front, "backend": back}
     return {**suggested, **{k: v for k, v in kept.items() if k in suggested}}
+
+
+def _without_front_noise(options: Mapping[str, Any]) -> dict[str, Any]:
+    front = {k: v for k, v in options.items() if k not in ("motion", "noise", "smoothing_noise")}
+    if isinstance(front.get("steps"), Mapping):
+        front["steps"] = {k: v for k, v in front["steps"].items() if k != "yaw_per_metre"}
+    return front
 
 
 def can_calibrate(front: FrontEnd) -> bool:
@@ -170,6 +184,12 @@ def configure_for_calibration(
     The walks of a grid filter stand for errors of poor odometry that last. In space they would shake odometry by
     lidar and IMU, which is better than they are; what scans say of it at several distances holds what lasts.
     """
+    if isinstance(front, MixedFrontEnd):
+        own = options.get("frontend", {})
+        parts = [
+            configure_for_calibration(p, log, given, found, {"frontend": own.get(p.name, {})}) for p in front.parts
+        ]
+        return MixedFrontEnd(tuple(parts))
     contradicted = found is not None and bool(found.contradictions())
     config: Any = front.config
     if given is not None and not contradicted and isinstance(config, RbpfEkfConfig):

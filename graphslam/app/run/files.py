@@ -190,7 +190,7 @@ def read_options(root: Path) -> dict[str, Any]:
     values = read_toml(file)
     shape = {f"{k}?": _PART for k in values}
     if "run" in values:
-        shape["run?"] = {"source?": str, "frontend?": str, "solver?": str, "seed?": int}
+        shape["run?"] = {"source?": str, "frontend?": object, "solver?": str, "seed?": int}
     return dict(check_json(values, shape, str(file)))
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias, cast
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.choice import kind_preset
@@ -14,6 +14,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.plugins import load_plugin, plugins, unknown
 from graphslam.io.readers import list_readers
 from graphslam_frontends.base import FrontEnd
+from graphslam_frontends.mixed import MixedFrontEnd
 
 GROUP = "graphslam.frontends"
 RENAMED = {"kiss-icp": "lidar-odometry"}
@@ -35,8 +36,22 @@ def check_name(name: str) -> None:
     raise unknown(GROUP, "front end", name, known)
 
 
-def name_of(front: str | FrontEnd | type[FrontEnd]) -> str:
-    """Name of a front end that is given by its name, as a class or as an object."""
+FrontEndLike: TypeAlias = str | FrontEnd | type[FrontEnd]
+
+
+def name_of(front: FrontEndLike | Sequence[FrontEndLike]) -> str | list[str]:
+    """Name of a front end that is given by its name, as a class or as an object; of several of them their names."""
+    if isinstance(front, MixedFrontEnd):
+        return [p.name for p in front.parts]
+    if isinstance(front, (list, tuple)):
+        names = [_name(f) for f in front]
+        if len(names) != len(set(names)):
+            raise ConfigError(f"front ends of a run: got {', '.join(names)}; wanted each once")
+        return names
+    return _name(front)
+
+
+def _name(front: Any) -> str:
     if isinstance(front, str):
         return front
     kind = front if isinstance(front, type) else type(front)
@@ -57,21 +72,32 @@ def _kind(name: str | type[FrontEnd]) -> tuple[Any, Any]:
     return kind, typing.get_type_hints(kind)["config"]
 
 
-def make_front_end(front: str | FrontEnd | type[FrontEnd], options: Mapping[str, Any]) -> FrontEnd:
+def make_front_end(
+    front: FrontEndLike | Sequence[FrontEndLike], options: Mapping[str, Any], where: str = "frontend"
+) -> FrontEnd:
     """Build a front end with ``options`` checked against its own configuration class.
 
     Parameters
     ----------
-    front : str, class or object
-        An object has its configuration and is taken as it is.
+    front : str, class or object, or a sequence of these
+        An object has its configuration and is taken as it is. Several map one log together
+        (:class:`~graphslam_frontends.mixed.MixedFrontEnd`); the options of each stand under its name.
+    where : str
+        Table of the options, in errors.
     """
     name = name_of(front)
+    if isinstance(front, (list, tuple)):
+        for key in options:
+            if key not in name:
+                tables = " or ".join(f"{where}.{n}" for n in name)
+                raise ConfigError(f"{where}.{key}: this run has several front ends; wanted options in {tables}")
+        return MixedFrontEnd(tuple(make_front_end(f, options.get(_name(f), {}), f"{where}.{_name(f)}") for f in front))
     if not isinstance(front, (str, type)):
         if options:
             raise ConfigError(f"front end {name!r} is given as an object, which has its options; got also {options}")
-        return front
+        return cast(FrontEnd, front)
     kind, config_type = _kind(front)
-    made = kind(config=build_config(config_type, options, "frontend"))
+    made = kind(config=build_config(config_type, options, where))
     if not isinstance(made, FrontEnd):
         raise ConfigError(
             f"front end {name!r} is none: {kind.__name__} does not inherit from graphslam_frontends.base.FrontEnd"
@@ -93,7 +119,15 @@ def current_options(stored: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def recommended_options(log: SensorLog, frontend: str, preset: str | None = None) -> dict[str, Any]:
+def options_of_scans(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Options of the front end of a run that works on scans, of several the one that has ``steps``."""
+    own: Mapping[str, Any] = values.get("frontend", {})
+    if isinstance(values.get("run", {}).get("frontend"), list):
+        return next((v for v in own.values() if "steps" in v), {})
+    return own
+
+
+def recommended_options(log: SensorLog, frontend: str | Sequence[str], preset: str | None = None) -> dict[str, Any]:
     """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise.
 
     Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set, layouts of a simulated world
@@ -101,9 +135,19 @@ def recommended_options(log: SensorLog, frontend: str, preset: str | None = None
 
     Parameters
     ----------
+    frontend : str or sequence of str
+        Of several, the options of each stand under its name, and the rest is that of all together.
     preset : str, optional
         Name of a preset instead; ``none``: defaults.
     """
+    if not isinstance(frontend, str):
+        out: dict[str, Any] = {}
+        for name in frontend:
+            known = preset in (None, "none") or preset in cfg.preset_names(name)
+            values = recommended_options(log, name, preset if known else "none")
+            own = {"frontend": {name: values["frontend"]}} if "frontend" in values else {}
+            out = merge_options(out, {**values, **own})
+        return out
     if preset is not None:
         return named_preset(frontend, preset)
     values = cfg.preset(f"{preset_of(log, frontend)[0]}.{frontend}")
@@ -127,12 +171,15 @@ def named_preset(frontend: str, preset: str | None) -> dict[str, Any]:
     return cfg.preset(f"{preset}.{frontend}")
 
 
-def preset_of(log: SensorLog, frontend: str) -> tuple[str, bool]:
+def preset_of(log: SensorLog, frontend: str | Sequence[str]) -> tuple[str, bool]:
     """Name of the preset that :func:`recommended_options` takes, empty where there is none; and is it made for this
     very set?
 
     That of a reader or of a kind of log says how it is read; its noise is that of other robots.
     """
+    if not isinstance(frontend, str):
+        found = [preset_of(log, name) for name in frontend]
+        return ", ".join(dict.fromkeys(n for n, _ in found if n)), all(own for _, own in found)
     name = log.name.partition("/")[0]
     read: Any = log.meta.get("reader")
     known = list_readers().get(read.get("name", "")) if isinstance(read, Mapping) else None

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.front_ends import options_of_scans
 from graphslam.core.heap import trim_heap
 from graphslam.maps.coarse import drawable_map
 from graphslam.maps.export import save_maps, save_points
@@ -78,5 +79,5 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
 
 def sensor_reach(values: Mapping[str, Any]) -> float | None:
     """Range at which the front end cut its beams [m], from the options of a run; None where they do not say."""
-    reach = values.get("frontend", {}).get("steps", {}).get("max_range")
+    reach = options_of_scans(values).get("steps", {}).get("max_range")
     return float(reach) if isinstance(reach, (int, float)) else None

@@ -27,9 +27,16 @@ from graphslam.app.run.calibration import (
     without_noise,
 )
 from graphslam.app.run.choice import choose_front_end, reading_line
-from graphslam.app.run.files import read_options, removed_loops_of_run
+from graphslam.app.run.files import read_options, read_report, removed_loops_of_run
 from graphslam.app.run.folder import CONFIG, RunFolder
-from graphslam.app.run.front_ends import check_name, make_front_end, name_of, preset_of, recommended_options
+from graphslam.app.run.front_ends import (
+    FrontEndLike,
+    check_name,
+    make_front_end,
+    name_of,
+    preset_of,
+    recommended_options,
+)
 from graphslam.app.run.front_to_back import FrontEndTiming, SubmapPipeline
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_metrics, write_outputs
@@ -103,7 +110,7 @@ logger = logging.getLogger(__name__)
 def run(
     source: str | Path | SensorLog,
     *,
-    frontend: str | FrontEnd | type[FrontEnd] | None = None,
+    frontend: FrontEndLike | Sequence[FrontEndLike] | None = None,
     solver: str = "isam2",
     seed: int = 0,
     out: str | Path | None = None,
@@ -121,9 +128,11 @@ def run(
     Parameters
     ----------
     source : card name, file, folder, or SensorLog
-    frontend : str, class or object, optional
+    frontend : str, class or object, or a list of these, optional
         Registered name; by default the one that fits what the log holds (:mod:`graphslam.app.run.choice`). Or a class
         that inherits from :class:`~graphslam_frontends.base.FrontEnd`, or an object of one, which has its own options.
+        One of landmarks and one of planar scans map a log together: each the intervals that suit it
+        (:mod:`graphslam_frontends.mixed`), in one graph.
     solver : str
         Registered name.
     seed : int
@@ -166,10 +175,13 @@ def run(
     >>> made.metric("converged")
     1.0
     """
+    if isinstance(frontend, (list, tuple)) and len(frontend) < 2:
+        frontend = frontend[0] if frontend else None
     # what is wrong with the call is said before anything is read (of a log in memory, a moment later)
     name = None if frontend is None else name_of(frontend)
-    if isinstance(frontend, str) and not isinstance(source, SensorLog):
-        check_name(frontend)
+    for each in frontend if isinstance(frontend, (list, tuple)) else [frontend]:
+        if isinstance(each, str) and not isinstance(source, SensorLog):
+            check_name(each)
     if solver not in SOLVERS:
         raise UnknownNameError("solver", solver, SOLVERS)
     with one_blas_thread(), RunBar(progress) as bar:
@@ -179,15 +191,17 @@ def run(
         loading = begin.seconds()
         bar.log_read(log)
         name, suggested, own = _chosen(log, name, preset)
-        front: str | FrontEnd | type[FrontEnd] = name if frontend is None else frontend
-        if not isinstance(front, (str, type)):
+        front: FrontEndLike | Sequence[FrontEndLike] = name if frontend is None else frontend
+        if isinstance(front, FrontEnd) and not isinstance(front, type):
             suggested = {k: v for k, v in suggested.items() if k != "frontend"}
         asked = config or {}
         watch = [bar, *observers]
         return _run(log, begin, loading, front, solver, seed, out, suggested, own, asked, resume, undo, watch)
 
 
-def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[str, dict[str, Any], bool]:
+def _chosen(
+    log: SensorLog, frontend: str | list[str] | None, preset: str | None
+) -> tuple[str | list[str], dict[str, Any], bool]:
     """Front end, preset, and whether it was made for this very set; what was read and chosen is told in a line each."""
     read = reading_line(log)
     if read:
@@ -199,7 +213,8 @@ def _chosen(log: SensorLog, frontend: str | None, preset: str | None) -> tuple[s
     options = recommended_options(log, frontend, preset)
     if read:
         taken = preset or preset_of(log, frontend)[0] or "none"
-        logger.warning("front end: %s (%s); preset: %s", frontend, why, taken)
+        names = frontend if isinstance(frontend, str) else ", ".join(frontend)
+        logger.warning("front end: %s (%s); preset: %s", names, why, taken)
     own = bool(options) and (preset is not None or preset_of(log, frontend)[1])
     return frontend, options, own
 
@@ -208,7 +223,7 @@ def _run(
     log: SensorLog,
     begin: Stopwatch,
     loading: float,
-    frontend: str | FrontEnd | type[FrontEnd],
+    frontend: FrontEndLike | Sequence[FrontEndLike],
     solver: str,
     seed: int,
     out: str | Path | None,
@@ -220,7 +235,9 @@ def _run(
     observers: Sequence[Observer],
 ) -> Run:
     seconds = {"load": loading}
-    options = merge_options(suggested if own and uses_preset_noise(config) else without_noise(suggested), config)
+    mixed = isinstance(frontend, (list, tuple))
+    kept = suggested if own and uses_preset_noise(config) else without_noise(suggested, mixed=mixed)
+    options = merge_options(kept, config)
     settings: cfg.RunConfig = build_config(cfg.RunConfig, options)
     front = make_front_end(frontend, settings.frontend)
     noticed = check_streams(log)
@@ -357,6 +374,9 @@ def resolve_from_folder(folder: str | Path) -> tuple[FactorGraph, Solution]:
     with one_blas_thread():
         taken, _ = read_consistently(root, read_inputs)
         _, _, back, submaps = _stored(root, taken, [])
+        attempts = read_consistently(root, read_report).get("map_attempts", [])
+        if any(a["kept"] and a["loops"] for a in attempts):  # of "auto", once its first map contradicted itself
+            back.config = replace(back.config, loops=True)
         for s in submaps:
             back.add(s)
         solution = back.finish(removed_loops_of_run(root))
@@ -368,7 +388,7 @@ def _stored(
 ) -> tuple[dict[str, Any], cfg.RunConfig, BackEnd, list[Submap]]:
     """Options and submaps of a run folder, and a back end that is to have them."""
     effective = read_options(root)
-    wanted = {"run": {"source": str, "frontend": str, "solver": str, "seed": int}}
+    wanted = {"run": {"source": str, "frontend": object, "solver": str, "seed": int}}
     said = check_json(effective, wanted, str(root / CONFIG))["run"]
     settings: cfg.RunConfig = build_config(cfg.RunConfig, {k: v for k, v in effective.items() if k != "run"})
     back = back_end(RecordSource(taken.log), settings, said["solver"], observers)
@@ -515,7 +535,7 @@ def gps_stream(log: SensorLog) -> Gps | None:
 
 
 def effective_config(
-    source: str, frontend: str, solver: str, seed: int, front_config: Any, settings: cfg.RunConfig
+    source: str, frontend: str | list[str], solver: str, seed: int, front_config: Any, settings: cfg.RunConfig
 ) -> dict[str, Any]:
     """What ``config.toml`` holds: names, seed, and every option with its value."""
     run_part = {"source": source, "frontend": frontend, "solver": solver, "seed": seed}
@@ -625,6 +645,7 @@ def _evaluate_run(
     report = {
         "format": "graphslam.run/1",
         **effective["run"],
+        "frontend": names if isinstance(names := effective["run"]["frontend"], str) else ", ".join(names),
         "backend": effective["backend"],
         "gps": effective["gps"],
         "imu": effective["imu"],

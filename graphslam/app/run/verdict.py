@@ -172,7 +172,26 @@ def findings_from_run(
     for n in noticed:
         level: Level = "look" if n.finding.level == "bad" and n.stream not in used else n.finding.level
         out.append(replace(n.finding, level=level))
-    return [*out, *_of_events(events), *_of_submaps(submaps)]
+    return [*out, *_shares(submaps), *_of_events(events), *_of_submaps(submaps)]
+
+
+def _shares(submaps: Sequence[Submap]) -> list[Finding]:
+    """Which front end mapped which interval of a mixed run."""
+    spans: dict[str, list[tuple[float, float]]] = {}
+    for s in submaps:
+        name = s.report.get("front_end")
+        if name is None:
+            continue
+        here = spans.setdefault(name, [])
+        if here and here[-1][1] == s.interval[0]:
+            here[-1] = here[-1][0], s.interval[1]
+        else:
+            here.append(s.interval)
+    if not spans:
+        return []
+    streams = {s.report["front_end"]: ", ".join(sorted(s.uses)) for s in submaps if "front_end" in s.report}
+    each = [f"{n} ({streams[n]}) {', '.join(f'{a:.1f} to {b:.1f} s' for a, b in t)}" for n, t in spans.items()]
+    return [Finding("", "front-ends", f"intervals of the front ends: {'; '.join(each)}.")]
 
 
 def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:

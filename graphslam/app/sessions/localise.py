@@ -172,8 +172,8 @@ def submaps_of_stretch(run: Run, log: SensorLog) -> list[Submap]:
     if folder is None or not folder.is_file():
         raise DataError("a run without a folder does not say its front end's options", where=run.name)
     options = read_options(folder.parent)
-    name = str(run.report["frontend"])
-    front: Any = make_front_end(RENAMED.get(name, name), options.get("frontend", {}))
+    name = options.get("run", {}).get("frontend", run.report["frontend"])
+    front: Any = make_front_end(RENAMED.get(name, name) if isinstance(name, str) else name, options.get("frontend", {}))
     seed = SeedTree(int(run.report["seed"])).child("localise")
     submaps = list(front.submaps(log, seed=seed, after=None, drops=DropCounter()))
     if not submaps:
