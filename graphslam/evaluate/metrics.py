@@ -89,9 +89,12 @@ def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:
         chi2, dof = sum(r["chi2"] for r in reports), sum(r["dof"] for r in reports)
         used, scans = sum(r["used"] for r in reports), sum(r["scans"] for r in reports)
         out.add("submap_chi2_per_dof", chi2 / dof, "", "one")
-        out.add("submap_chi2_range", sum(r["chi2_range"] for r in reports) / max(used, 1), "per observation")
-        out.add("submap_chi2_bearing", sum(r["chi2_bearing"] for r in reports) / max(used, 1), "per observation")
-        out.add("submap_chi2_odometry", sum(r["chi2_odometry"] for r in reports) / (3 * scans), "per component")
+        for part in ("range", "bearing"):
+            if all(f"chi2_{part}" in r for r in reports):
+                total = sum(r[f"chi2_{part}"] for r in reports)
+                out.add(f"submap_chi2_{part}", total / max(used, 1), "per observation")
+        if all("chi2_odometry" in r for r in reports):
+            out.add("submap_chi2_odometry", sum(r["chi2_odometry"] for r in reports) / (3 * scans), "per component")
     if all("min_ess" in r for r in reports):
         out.add("min_ess_median", float(np.median([r["min_ess"] for r in reports])), "particles", "higher")
     if any("flag" in r for r in reports):

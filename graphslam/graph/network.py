@@ -14,6 +14,7 @@ from graphslam.graph.factors.batch import FactorBatch
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.sighting import SightingBatch
+from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import KINDS, Values, VariableLayout
 from graphslam.linear.symmetric_factor import elimination_order
@@ -87,7 +88,7 @@ def to_network(graph: FactorGraph) -> PoseNetwork:
 
     A landmark submap becomes one edge between its nodes and one observation per entry, each with its own marginal
     information: the correlations between them have no place in such a file, so its optimum is near the graph's but
-    not the same. GPS factors, attitudes and robust kernels have no place either.
+    not the same. GPS factors, attitudes, robust kernels and landmarks in space have no place either.
 
     Returns
     -------
@@ -120,7 +121,12 @@ def to_network(graph: FactorGraph) -> PoseNetwork:
                 seen.append((r.start, row_of[i]))
                 where.append(r.z[c])
                 seen_information.append(np.asarray(np.linalg.inv(P[c, c])))
+        elif isinstance(r, SpaceSubmapRecord):
+            edges.append((r.start, r.start + 1))
+            measured.append(r.map.poses[0])
+            information.append(np.asarray(np.linalg.inv(r.exit_covariance())))
     n = len(v.poses)
+    marks = np.zeros((0, 2)) if graph.dim == 3 else v.landmarks.reshape(-1, 2)
     return PoseNetwork(
         dim=graph.dim,
         ids=np.arange(n),
@@ -130,9 +136,9 @@ def to_network(graph: FactorGraph) -> PoseNetwork:
         measurements=np.array(measured).reshape(-1, v.group.size),
         information=np.array(information).reshape(-1, d, d),
         fixed=np.arange(n) == 0,
-        landmark_ids=n + np.arange(len(v.landmarks)),
-        landmarks=v.landmarks.reshape(-1, 2),
-        has_landmark=np.ones(len(v.landmarks), dtype=bool),
+        landmark_ids=n + np.arange(len(marks)),
+        landmarks=marks,
+        has_landmark=np.ones(len(marks), dtype=bool),
         observations=np.array(seen, dtype=np.intp).reshape(-1, 2),
         observation_values=np.array(where).reshape(-1, 2),
         observation_information=np.array(seen_information).reshape(-1, 2, 2),

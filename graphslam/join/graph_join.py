@@ -170,7 +170,7 @@ def _estimate(
 # ---------------------------------------------------------------- information filters
 
 
-class _Schedule:
+class JoinSchedule:
     """When each factor enters: inside one submap, or where two submaps meet."""
 
     def __init__(self, problem: JoinProblem) -> None:
@@ -212,7 +212,7 @@ def join_sequential(problem: JoinProblem, *, passes: int | None = None, progress
     progress : bool
         Show a progress bar.
     """
-    start, plan = time.perf_counter(), _Schedule(problem)
+    start, plan = time.perf_counter(), JoinSchedule(problem)
     joined = GaussianMap.leaf(problem, 0, plan.inside[0])
     for k in Bar(range(1, len(problem.keys)), name="join", unit="submap", shown=progress):
         joined = join_two(joined, GaussianMap.leaf(problem, k, plan.inside[k]), plan.at_last[k], passes=passes)
@@ -227,7 +227,7 @@ def join_tree(problem: JoinProblem, *, passes: int | None = None, progress: bool
     problem, passes, progress
         As in :func:`join_sequential`.
     """
-    start, plan = time.perf_counter(), _Schedule(problem)
+    start, plan = time.perf_counter(), JoinSchedule(problem)
     with Bar(total=len(problem.keys) - 1, name="join", unit="join", shown=progress) as bar:
 
         def joined(a: int, b: int, factors: Index) -> GaussianMap:
@@ -260,7 +260,7 @@ def join_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEstimate:
     """
     if problem.states > MOST_STATES:
         raise DataError("the dense filter has no room for so many states", got=problem.states, wanted=MOST_STATES)
-    start, plan, d = time.perf_counter(), _Schedule(problem), problem.group.dof
+    start, plan, d = time.perf_counter(), JoinSchedule(problem), problem.group.dof
     size, m = int(problem.first[-1]), len(problem.keys)
     P = np.zeros((size, size))
     state: GaussianMap | None = None
@@ -283,6 +283,9 @@ def join_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEstimate:
         nothing = sp.csc_matrix((n, n))
         state = replace(joined, values=joined.moved_by(step), information=nothing, gradient=np.zeros(n))
     assert state is not None
+    if len(state.variables) < len(problem.names):
+        lost = [n for k, n in enumerate(problem.names) if k not in set(state.variables.tolist())]
+        raise IndeterminateError(f"no factor is on {', '.join(lost[:5])}")
     C = state.anchor_matrix()
     if C is not None:
         P = C @ (C @ P).T
@@ -341,7 +344,7 @@ def _update_covariance(P: Array, S: sp.csc_matrix, G: Array, columns: Index, old
 
 def _start_values(problem: JoinProblem) -> Values:
     """The chain of submaps alone: nodes end to end, landmarks where they were seen first."""
-    plan = _Schedule(problem)
+    plan = JoinSchedule(problem)
     values = problem.graph.structure.copy()
     known = np.zeros(len(problem.names), dtype=bool)
     for k in range(len(problem.keys)):
@@ -401,7 +404,7 @@ def solve_isam2(problem: JoinProblem, *, polish: bool = True, progress: bool = F
     """
     from graphslam.solve.isam2 import Isam2Solver
 
-    start, plan = time.perf_counter(), _Schedule(problem)
+    start, plan = time.perf_counter(), JoinSchedule(problem)
     graph = FactorGraph.with_values(problem.graph.values.copy())
     solver = Isam2Solver(graph)
     known = np.zeros(len(problem.names), dtype=bool)

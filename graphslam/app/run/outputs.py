@@ -206,19 +206,12 @@ def _same_file(a: Path, b: Path) -> bool:
 
 
 def landmarks_csv(m: GlobalMap) -> str:
-    """``id,x,y,cov_xx,cov_xy,cov_yy,hits`` in the frame of the first base [m, m²]."""
-    P = m.landmark_covariances
-    table = pd.DataFrame(
-        {
-            "id": m.landmark_ids,
-            "x": m.landmarks[:, 0],
-            "y": m.landmarks[:, 1],
-            "cov_xx": P[:, 0, 0],
-            "cov_xy": P[:, 0, 1],
-            "cov_yy": P[:, 1, 1],
-            "hits": m.landmark_hits,
-        }
-    )
+    """``id,x,y,cov_xx,cov_xy,cov_yy,hits`` in the frame of the first base [m, m²]; in space also z."""
+    P, axes = m.landmark_covariances, "xyz"[: m.dim]
+    columns = {"id": m.landmark_ids, **{a: m.landmarks[:, i] for i, a in enumerate(axes)}}
+    pairs = [(i, j) for i in range(m.dim) for j in range(i, m.dim)]
+    columns |= {f"cov_{axes[i]}{axes[j]}": P[:, i, j] for i, j in pairs}
+    table = pd.DataFrame(columns | {"hits": m.landmark_hits})
     return str(table.to_csv(index=False, float_format="%.9g"))
 
 

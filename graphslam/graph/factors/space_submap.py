@@ -13,7 +13,7 @@ import scipy.sparse as sp
 
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import quat_to_matrix
-from graphslam.core.submap import LandmarkMap
+from graphslam.core.submap import LandmarkMap, turned_covariance
 from graphslam.graph.factors.batch import FactorBatch, block_offsets, pose_array, safe_factor
 from graphslam.graph.noise import whitener
 from graphslam.graph.variables import Values, VariableLayout, gtsam_key
@@ -75,6 +75,11 @@ class SpaceSubmapRecord:
     def label(self) -> str:
         """Name for messages."""
         return f"submap {self.submap_key} (factor {self.factor_id})"
+
+    def exit_covariance(self) -> Array:
+        """Marginal covariance ``(6, 6)`` of the exit in its right tangent."""
+        P = np.linalg.inv(self.map.information.toarray())[:6, :6]
+        return turned_covariance(quat_to_matrix(self.map.poses[0, 3:]).T, P)
 
     def landmark_positions(self) -> Array:
         """Positions ``(n, 3)`` of the entries in the frame of the base."""
