@@ -27,6 +27,7 @@ EXTRAS = {
         "triangle meshes of surfaces (map --surface), path planning on terrain", ("skimage", "trimesh"), 60
     ),
     "open3d": Extra("gs.to_open3d(run), Poisson surfaces", ("open3d",), 1020),
+    "kiss-icp": Extra("front end kiss-icp: the odometry of KISS-ICP", ("kiss_icp",), 17),
     "ros": Extra("bags of ROS 1 and ROS 2, MCAP; no ROS needed", ("rosbags", "mcap"), 45),
     "las": Extra("LAS and LAZ clouds", ("laspy", "lazrs"), 2),
     "live": Extra("run --live: the Rerun viewer during a run", ("rerun",), 670),

@@ -171,10 +171,10 @@ class LidarFrontEnd(FrontEnd):
         name = self._named(feed.name, self._stream(feed))
         while not feed.ended and (feed.count(name) < FIRST or self.config.imu not in (*feed.names(object), *UNNAMED)):
             yield None
-        unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
+        unit = Unit(feed, self._imu(feed, name), self.config.odometry)
         wheels = _Wheels(feed, self._wheels(feed, name))
         yield from unit.rehearse(name)
-        odometry = unit.odometry()
+        odometry = self._odometry(unit)
         odometry.reckoned = wheels.reckoned
         seen: list[FollowedScan] = []
         self._made[:] = [feed, seen, unit, wheels.name]
@@ -236,12 +236,12 @@ class LidarFrontEnd(FrontEnd):
         made = bool(self._made) and self._made[0].ended and self._made[0].log is log
         if not (made and len(self._made[1]) == len(clouds)):
             feed = RecordSource(log)
-            unit = _Unit(feed, self._imu(feed, name), self.config.odometry)
+            unit = Unit(feed, self._imu(feed, name), self.config.odometry)
             for _ in unit.rehearse(name):
                 pass
             wheels = _Wheels(feed, self._wheels(feed, name))
             wheels.hear()
-            odometry = unit.odometry()
+            odometry = self._odometry(unit)
             odometry.reckoned = wheels.reckoned
             followed = [self._follow(odometry, clouds, k) for k in range(len(clouds))]
             self._made[:] = [feed, followed, unit, wheels.name]
@@ -252,6 +252,10 @@ class LidarFrontEnd(FrontEnd):
     def forget(self) -> None:
         """Let go of the path and the scans of the last log."""
         self._made.clear()
+
+    def _odometry(self, unit: Unit) -> LidarOdometry:
+        """The odometry at its start."""
+        return unit.odometry()
 
     def _stream(self, streams: SensorLog | RecordSource) -> str | None:
         return self.config.stream or streams.of_type(PointClouds)
@@ -344,7 +348,7 @@ class _Heard(ABC):
         return self.feed.part(self.name, first, last)
 
 
-class _Unit(_Heard):
+class Unit(_Heard):
     """The IMU of a feed, if there is one, and what of it is known."""
 
     def __init__(self, feed: RecordSource, name: str | None, config: LidarOdometryConfig) -> None:
@@ -423,7 +427,7 @@ def start_odometry(clouds: PointClouds, config: LidarOdometryConfig, imu: Imu | 
     believed; then they are to be followed anew, so that not even the first of them is bent.
     """
     streams: dict[str, Stream] = {"clouds": clouds} if imu is None else {"clouds": clouds, "imu": imu}
-    unit = _Unit(RecordSource(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
+    unit = Unit(RecordSource(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
     for _ in unit.rehearse("clouds"):
         pass
     return unit.odometry()

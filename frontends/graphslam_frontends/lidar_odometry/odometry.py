@@ -230,7 +230,7 @@ class LidarOdometry:
         self.points, self.spread = np.zeros((0, 3)), np.zeros((6, 6))
         self.changes: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
         self.missed: deque[tuple[float, float]] = deque(maxlen=2 * REMEMBERED)
-        self.errors = WindowCovariance()
+        self.errors, self.off = WindowCovariance(), np.zeros(6)
         self.lost, self.loose, self.held = 0, 1, 0
         self.first = 0
         side = range(-SEARCH_SIDE, SEARCH_SIDE + 1)
@@ -299,7 +299,7 @@ class LidarOdometry:
         points = self.points[chosen]
         if seen.bridged and bridge is not None:
             predicted = bridge
-        self._doubt(raw, points, before, predicted, even, dt, fit, seen, Q if seen.bridged else None)
+        self._doubt(raw, points, before, predicted, even, dt, fit, seen, self._instead(seen, before, predicted, Q))
         sure = fit is not None and not seen.unheld and not self.lost and seen.state in MAPPED
         if sure and told is not None and self.reckoned is not None:
             made, guess = (np.asarray(se3.se3_between(before, x)) for x in (self.pose, even))
@@ -333,6 +333,10 @@ class LidarOdometry:
                 for level in self.levels:
                     level.keep_since(since)
         return seen
+
+    def _instead(self, seen: ScanResult, before: Array, predicted: Array, Q: Array | None) -> Array | None:
+        """Covariance ``(6, 6)`` of the motion where that of an even one is not enough: of odometry in its place."""
+        return Q if seen.bridged else None
 
     def _bent(self, raw: RawScan) -> Array:
         """Covariance of what an uneven motion within a scan does to its pose.
@@ -424,7 +428,7 @@ class LidarOdometry:
             Q = self.spread = (2 * self.loose - 1) * reckoned
         H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
         if fit is not None and self.errors.ends:
-            H, M, G = self.levels[-1].by_slot(points, *_split(self.pose), SCALE, np.array(self.errors.ends))
+            H, M, G = self.levels[-1].by_slot(points, *split_pose(self.pose), SCALE, np.array(self.errors.ends))
         if fit is not None and M.any():
             M *= np.interp(fit.misfit, *SPREADS)
             # how far residuals of a whole part of the scan agree, beside what those of one cell would
@@ -433,10 +437,10 @@ class LidarOdometry:
             M *= LASTING * float(np.mean(self.agreeing))
             F = observable_gradient(fit.H, fit.every)
             H, M = F @ H, F @ M @ F.T
-        self.errors.step(self.pose, motion, Q, H, M, self._bent(raw))
+        self.errors.step(self.pose, motion, Q, H, M, self._bent(raw), self.off)
 
     def _add(self, points: Array, alone: bool) -> None:
-        R, t = _split(self.pose)
+        R, t = split_pose(self.pose)
         world = points @ R.T + t
         for level in self.levels:
             level.add(world, self.scan, None if level is self.levels[0] else self.levels[0])
@@ -506,13 +510,13 @@ class LidarOdometry:
         if unheld and bridge is None and len(self.missed) < 3:
             # nobody knows yet how it moves: rest is believed where the scan fits there as well
             points = self._unbent(raw, pose, time)[chosen]
-            if self.levels[-1].fit(points, *_split(pose), SCALE).overlap < LIKELY * fit.overlap:
+            if self.levels[-1].fit(points, *split_pose(pose), SCALE).overlap < LIKELY * fit.overlap:
                 pose = free
         if state != "new space":
             self.overlaps.append(fit.overlap)
             self.qualities.append(fit.quality)
             self.coarse.append(
-                top[-1].fit(points[evenly_spaced_rows(len(points), COARSE_POINTS)], *_split(pose), SCALE).overlap
+                top[-1].fit(points[evenly_spaced_rows(len(points), COARSE_POINTS)], *split_pose(pose), SCALE).overlap
             )
         return pose, fit, ScanResult(len(points), fit.overlap, unheld, state, searched)
 
@@ -544,7 +548,7 @@ class LidarOdometry:
         """Gauss–Newton on one level after the other; on coarse ones the start stands along what no surface holds."""
         fit = None
         for level in levels:
-            R, t = _split(pose.copy())
+            R, t = split_pose(pose.copy())
             if level is self.levels[-1]:
                 prior = COARSE + self._coarser(points, R, t)
                 fit = level.descend(points, R, t, SCALE, prior, STILL, MOST_STEPS)
@@ -572,7 +576,7 @@ class LidarOdometry:
         """The best rotations about each centre on the coarsest level, matched on ``levels``: (overlap, pose)."""
         out = []
         for centre in centres:
-            R, t = _split(centre)
+            R, t = split_pose(centre)
             tries = R @ rotations
             scores = self.levels[0].scores(few, tries, t)
             for k in np.argsort(-scores, kind="stable")[:best]:
@@ -626,7 +630,8 @@ def _directions(H: Array, every: Array) -> tuple[Array, Array, Array]:
     return *direction_strengths(H, every, NORMAL_SIGMA), B
 
 
-def _split(pose: Array) -> tuple[Array, Array]:
+def split_pose(pose: Array) -> tuple[Array, Array]:
+    """Rotation ``(3, 3)`` and translation ``(3,)`` of a pose ``(7,)``."""
     return np.ascontiguousarray(se3.quat_to_matrix(pose[3:])), np.ascontiguousarray(pose[:3])
 
 

@@ -31,19 +31,20 @@ class WindowCovariance:
         self.poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1))
         self.ends: list[float] = []
         self.P = np.zeros((12, 12))
+        self.offset = np.zeros(12)
         self._scan = 0
 
     @property
     def joint(self) -> Array:
         """``(12, 12)``: of the pose where the submap began, and the pose of now."""
         at = np.r_[6:12, 0:6]
-        return np.asarray(self.P[np.ix_(at, at)])
+        return np.asarray(self.P[np.ix_(at, at)] + np.outer(self.offset[at], self.offset[at]))
 
     def begin(self) -> None:
         """A submap begins at the pose of now."""
         self._clone(1)
 
-    def step(self, pose: Array, motion: Array, Q: Array, H: Array, M: Array, bent: Array) -> None:
+    def step(self, pose: Array, motion: Array, Q: Array, H: Array, M: Array, bent: Array, off: Array) -> None:
         """The pose of now becomes the next one.
 
         Parameters
@@ -59,6 +60,8 @@ class WindowCovariance:
             Covariance of the noise of the gradient.
         bent : (6, 6)
             Covariance of what an uneven motion within the scan does to its pose.
+        off : (6,)
+            Known difference of ``pose`` to the best match, right tangent; its consequences are one error, as large.
         """
         L = np.linalg.inv(Q)
         total = H.sum(axis=0)
@@ -74,6 +77,7 @@ class WindowCovariance:
         new = GP @ G.T + own
         self.P[:6, 6:], self.P[6:, :6] = GP[:, 6:], GP[:, 6:].T
         self.P[:6, :6] = 0.5 * (new + new.T)
+        self.offset[:6] = G @ self.offset + off
         self.poses[0] = pose
 
     def lay(self, scan: int, alone: bool = False) -> None:
@@ -89,20 +93,20 @@ class WindowCovariance:
             self.ends.pop(0)
             self.poses = np.delete(self.poses, 2, axis=0)
             keep = np.r_[0:12, 18 : len(self.P)]
-            self.P = np.ascontiguousarray(self.P[np.ix_(keep, keep)])
+            self.P, self.offset = np.ascontiguousarray(self.P[np.ix_(keep, keep)]), self.offset[keep]
         self.ends.append(float(scan) + 0.5)
         self._scan = scan
         self.poses = np.concatenate([self.poses, self.poses[:1]])
         n = len(self.P)
         P = np.zeros((n + 6, n + 6))
         P[:n, :n] = self.P
-        self.P = P
+        self.P, self.offset = P, np.append(self.offset, np.zeros(6))
         self._clone(len(self.poses) - 1)
 
     def forget(self) -> None:
         """A new map begins."""
         self.ends, self.poses = [], self.poses[:2].copy()
-        self.P = self.P[:12, :12].copy()
+        self.P, self.offset = self.P[:12, :12].copy(), self.offset[:12].copy()
 
     def _clone(self, slot: int) -> None:
         at = slice(6 * slot, 6 * slot + 6)
@@ -110,3 +114,4 @@ class WindowCovariance:
         self.P[at] = self.P[:6]
         self.P[:, at] = self.P[:, :6]
         self.P[at, at] = self.P[:6, :6]
+        self.offset[at] = self.offset[:6]

@@ -17,8 +17,6 @@ from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.mixed import MixedFrontEnd
 
 GROUP = "graphslam.frontends"
-RENAMED = {"kiss-icp": "lidar-odometry"}
-"""Front ends by their name in older run folders."""
 
 
 def front_end_names() -> list[str]:
@@ -29,11 +27,8 @@ def front_end_names() -> list[str]:
 def check_name(name: str) -> None:
     """See that a front end of that name is installed."""
     known = front_end_names()
-    if name in known:
-        return
-    if name in RENAMED:
-        raise ConfigError(f"front end {name!r} is now called {RENAMED[name]!r}; use that name")
-    raise unknown(GROUP, "front end", name, known)
+    if name not in known:
+        raise unknown(GROUP, "front end", name, known)
 
 
 FrontEndLike: TypeAlias = str | FrontEnd | type[FrontEnd]
@@ -110,12 +105,10 @@ def make_front_end(
 def current_options(stored: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration of a run folder in the names of today, without options that were removed since."""
     out = without_removed(cfg.RunConfig, stored)
-    run = out.get("run")
-    if isinstance(run, Mapping) and isinstance(name := run.get("frontend"), str):
-        name = RENAMED.get(name, name)
-        out["run"] = {**run, "frontend": name}
-        if isinstance(out.get("frontend"), Mapping) and name in front_end_names():
-            out["frontend"] = without_removed(_kind(name)[1], out["frontend"], "frontend")
+    run, options = out.get("run"), out.get("frontend")
+    name = run.get("frontend") if isinstance(run, Mapping) else None
+    if isinstance(options, Mapping) and isinstance(name, str) and name in front_end_names():
+        out["frontend"] = without_removed(_kind(name)[1], options, "frontend")
     return out
 
 

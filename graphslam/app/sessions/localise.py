@@ -13,7 +13,7 @@ import numpy as np
 from graphslam.app.folders.generations import current_outputs
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.files import read_options
-from graphslam.app.run.front_ends import RENAMED, make_front_end
+from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import load_log_source
@@ -173,7 +173,7 @@ def submaps_of_stretch(run: Run, log: SensorLog) -> list[Submap]:
         raise DataError("a run without a folder does not say its front end's options", where=run.name)
     options = read_options(folder.parent)
     name = options.get("run", {}).get("frontend", run.report["frontend"])
-    front: Any = make_front_end(RENAMED.get(name, name) if isinstance(name, str) else name, options.get("frontend", {}))
+    front: Any = make_front_end(name, options.get("frontend", {}))
     seed = SeedTree(int(run.report["seed"])).child("localise")
     submaps = list(front.submaps(log, seed=seed, after=None, drops=DropCounter()))
     if not submaps:

@@ -6,16 +6,14 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
 
 import graphslam as gs
 from graphslam.app.run import front_ends
-from graphslam.app.run.folder import RunFolder
 from graphslam.core import plugins
-from graphslam.core.errors import ConfigError, RunFolderError, UnknownNameError
+from graphslam.core.errors import UnknownNameError
 from graphslam_frontends.base import FrontEnd
 
 
@@ -49,26 +47,6 @@ def test_a_front_end_without_motion_is_not_given_any(monkeypatch: pytest.MonkeyP
     assert front_ends.make_front_end("plain", values.get("frontend", {})).config == Plain()
     with pytest.raises(UnknownNameError, match="plain"):
         front_ends.make_front_end("rbpf-ekf", {})
-
-
-def test_a_renamed_front_end_is_named() -> None:
-    """Asked for by its old name; folders that hold the old name are still resumed."""
-    assert "kiss-icp" not in gs.front_ends()
-    for ask in (front_ends.check_name, lambda name: front_ends.make_front_end(name, {})):
-        with pytest.raises(ConfigError, match="'kiss-icp' is now called 'lidar-odometry'"):
-            ask("kiss-icp")
-
-
-def test_a_folder_with_the_old_name_is_resumed(tmp_path: Path) -> None:
-    config = {"run": {"frontend": "kiss-icp", "log": {}}}
-    with RunFolder.start(tmp_path / "run", config, resume=False):
-        pass
-    (tmp_path / "run" / "run.json").write_text("{}")
-    now = {"run": {"frontend": "lidar-odometry", "log": {}}}
-    with RunFolder.start(tmp_path / "run", now, resume=True) as folder:
-        assert folder.path == tmp_path / "run"
-    with pytest.raises(RunFolderError, match=r"run\.frontend was"):
-        RunFolder.start(tmp_path / "run", {"run": {"frontend": "segslam", "log": {}}}, resume=True).__enter__()
 
 
 @pytest.mark.parametrize(("before", "after"), [(None, "1"), ("3", "3")])
