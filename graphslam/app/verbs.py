@@ -294,7 +294,7 @@ def join_submaps(
     -------
     SubmapEstimate
         Poses ``(m + 1, 3)``, landmarks ``(n, 2)`` and their joint information, in the frame of the first base; of
-        submaps without landmarks a :class:`~graphslam.join.pose_estimate.PoseEstimate`.
+        any other graph a :class:`~graphslam.join.graph_join.GraphEstimate`.
 
     Raises
     ------

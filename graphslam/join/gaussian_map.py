@@ -26,9 +26,9 @@ import scipy.sparse as sp
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, wrap_angle
-from graphslam.core.se3 import skew
 from graphslam.graph.variables import KINDS, Values, VariableKind
-from graphslam.join.graph_problem import Index, JoinProblem, rotation_of, rows_in_frame, rule_of
+from graphslam.join.frames import lever_matrix, rotation_of, rows_in_frame, rule_of
+from graphslam.join.graph_problem import Index, JoinProblem
 from graphslam.linear.symmetric_factor import SymmetricFactor
 
 DENSE = 200
@@ -222,10 +222,7 @@ class GaussianMap:
         X = self.values["x"][hang]
         m = g.transform(g.inverse(X), self.values[word][rows])
         R = np.array([rotation_of(g, x) for x in X])
-        if g.dim == 2:
-            turn = np.stack([-m[:, 1], m[:, 0]], axis=1)[:, :, None]
-            return R, np.concatenate([np.broadcast_to(np.eye(2), (len(m), 2, 2)), turn], axis=2)
-        return R, np.concatenate([-skew(m), np.broadcast_to(np.eye(3), (len(m), 3, 3))], axis=2)
+        return R, lever_matrix(g, m)
 
     def anchor_matrix(self, *, inverse: bool = False) -> sp.csc_matrix | None:
         """Steps of positions by steps in the frames of their anchors, ``δl = R (δm + D ξ_a)``, or the inverse of it."""

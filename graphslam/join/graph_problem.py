@@ -1,7 +1,7 @@
 """A factor graph cut into steps, one for each submap: which variables and factors a joiner adds when.
 
 A factor belongs to the submaps of its nodes. It enters a join at the lowest node of the tree that holds all of them
-and can linearise it. Three kinds of variables need care there (:data:`RULES`):
+and can linearise it. Three kinds of variables need care there (:data:`~graphslam.join.frames.RULES`):
 
 * A *small constant* (scale of wheels, bias of an IMU or of GPS fixes) is about zero. Its factors enter at once. In a
   map that does not begin at the first base it is held at zero, and its information is kept, because its prior enters
@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +29,7 @@ from graphslam.core.atomic import write_npz
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.core.poses import Group, compose_increments, heading_of
-from graphslam.core.se3 import quat_rotate, quat_to_matrix, so3_exp
+from graphslam.core.poses import Group, compose_increments
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factor_graph import FactorGraph
@@ -39,83 +37,17 @@ from graphslam.graph.factor_graph_state import LANDMARK_SUBMAPS
 from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.landmark_submap import PathRecord
 from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
+from graphslam.join.frames import Rule, rows_in_frame, rule_of
 from graphslam.join.graph_file import problem_arrays, read_problem_arrays
 from graphslam.join.submap_blocks import check_identified
 
 Index = npt.NDArray[np.int64]
-Rule = Literal["pose", "point", "vector", "constant", "datum", "tilt", "heading", "first-base"]
-
-RULES: dict[str, Rule] = {
-    "x": "pose", "l": "point", "point": "point", "beacon": "point", "velocity": "vector", "datum": "datum",
-    "tilt": "tilt", "compass": "heading", "wheels": "constant", "sensor": "constant", "mount": "constant",
-    "bias": "constant", "imubias": "constant", "deviation": "constant",
-}  # fmt: skip
-"""How the values of a kind of variable change with the frame; a kind that is missing waits for the first base."""
 VAGUE_ANGLE = 0.3
 """A direction whose standard deviation is larger [rad] is not determined: its factors cannot be linearised yet."""
 UNDETERMINED = 1e-9
 """Smallest eigenvalue of a scaled information matrix at which its variables count as determined."""
 _STARTS = 20
 """Gauss-Newton steps at most for the start of variables, given the nodes."""
-
-
-def rule_of(word: str, dim: int) -> Rule:
-    """How values of a kind change with the frame, in the plane or in space."""
-    rule = RULES.get(word, "first-base")
-    return "first-base" if dim == 3 and rule in ("datum", "heading") else rule
-
-
-def tilt_direction(tilt: Array) -> Array:
-    """Unit vector ``(3,)`` that points up, of a tilt ``(2,)``."""
-    return quat_rotate(so3_exp(np.append(tilt, 0.0)), np.array([0.0, 0.0, 1.0]))
-
-
-def tilt_of_direction(up: Array) -> Array:
-    """Inverse of :func:`tilt_direction`."""
-    sine = float(np.hypot(up[0], up[1]))
-    scale = 1.0 if sine < 1e-12 else float(np.arctan2(sine, up[2])) / sine
-    return scale * np.array([-up[1], up[0]])
-
-
-def rotation_of(group: Group, pose: Array) -> Array:
-    """Rotation matrix ``(d, d)`` of a pose."""
-    if group.dim == 3:
-        return quat_to_matrix(pose[3:])
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.array([[c, -s], [s, c]])
-
-
-def rows_in_frame(rule: Rule, group: Group, T: Array, rows: Array) -> tuple[Array, Array | None]:
-    """Values ``(n, size)`` of one kind, known in a frame b, in the frame a, with ``T`` = ``T_a_b``.
-
-    Returns
-    -------
-    rows : (n, size)
-    J : (dof, dof), (n, dof, dof) or None
-        Derivative of a step in frame a by a step in frame b; None for the identity.
-    """
-    if not len(rows) or rule in ("constant", "first-base"):
-        return rows, None
-    if rule == "pose":
-        return group.compose(np.broadcast_to(T, rows.shape), rows), None
-    R = rotation_of(group, T)
-    if rule == "point":
-        return rows @ R.T + T[: group.dim], R
-    if rule == "vector":
-        return rows @ R.T, R
-    if rule == "datum":  # T_gps_a = T_gps_b ∘ T_b_a
-        back = group.inverse(T)
-        return group.compose(rows, np.broadcast_to(back, rows.shape)), group.adjoint(T)
-    if rule == "heading":
-        return rows - heading_of(T), None
-    moved = np.array([tilt_of_direction(R @ tilt_direction(t)) for t in rows])
-    h = 1e-6
-    steps = [
-        [(tilt_of_direction(R @ tilt_direction(t + e)) - tilt_of_direction(R @ tilt_direction(t - e))) / (2 * h)
-         for e in h * np.eye(2)]
-        for t in rows
-    ]  # fmt: skip
-    return moved, np.swapaxes(np.array(steps), 1, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,6 +284,18 @@ class JoinProblem:
                 at = np.array([len(self.keys) - 1])
             low[f], high[f] = at.min(), at.max()
         return low, high
+
+    @cached_property
+    def landmark_anchors(self) -> Index:
+        """Exit of the submap that saw each landmark first ``(L,)``; -1 of one that no submap has."""
+        first, count = self.range_of["l"][0], self.layout.count("l")
+        anchors = np.full(count, -1, dtype=np.int64)
+        high = self.spans[1]
+        for f in np.argsort(high, kind="stable")[::-1].tolist():
+            if isinstance(self.factors[f], LANDMARK_SUBMAPS):
+                rows = self.variables[f] - first
+                anchors[rows[(rows >= 0) & (rows < count)]] = self.bases[high[f] + 1]
+        return anchors
 
     def chain(self, k: int) -> Array:
         """Nodes of submap k in the frame of its base ``(n, 3|7)``, as the submap states them."""

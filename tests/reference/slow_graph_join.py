@@ -15,8 +15,9 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import Values, split_name
+from graphslam.join.frames import rows_in_frame, rule_of
 from graphslam.join.gaussian_map import GaussianMap
-from graphslam.join.graph_problem import JoinProblem, rows_in_frame, rule_of
+from graphslam.join.graph_problem import JoinProblem
 
 STEP = 1e-6
 

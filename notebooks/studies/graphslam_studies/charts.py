@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from graphslam.app.compare import map_nees
+from graphslam.app.compare import MapEstimate, map_nees
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.core.errors import GraphSlamError
@@ -44,8 +44,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinResult
 from graphslam.join.optimise import optimise_from_join
-from graphslam.join.registry import JOINERS, methods_for
-from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
+from graphslam.join.registry import JOINERS, methods_for, prepare_submaps
+from graphslam.join.submap_solver import solve_submaps
 from graphslam_studies.evaluate.submap_consistency import submap_nees
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
@@ -155,14 +155,15 @@ def _trial_in_space(c: PointFieldConfig, seed: int) -> Iterator[Measurement]:
     assert log.truth is not None
     yield from _local(submaps, log.truth)
     truth = _truth_of(submaps, log.truth)
-    methods = methods_for(submaps)
-    optimum = methods.solvers["batch"](submaps)
+    problem = prepare_submaps(submaps)
+    methods = methods_for(problem)
+    optimum = methods.solvers["batch"](problem)
     yield from _judged("batch", optimum, submaps, truth, optimum.objective)
     plain = [replace(s, landmarks=replace(s.landmarks, chart="cartesian")) for s in submaps if s.landmarks is not None]
-    cartesian = methods.solvers["batch"](plain)
+    cartesian = methods.solvers["batch"](prepare_submaps(plain))
     yield from _judged("batch-cartesian", cartesian, submaps, truth, cartesian.objective)
-    for name in JOINED:
-        yield from _judged(name, methods.joiners[name](submaps), submaps, truth, optimum.objective)
+    for name, join in methods.joiners.items():
+        yield from _judged(name, join(problem), submaps, truth, optimum.objective)
 
 
 def _local(submaps: Sequence[Submap], truth: Truth) -> Iterator[Measurement]:
@@ -210,7 +211,7 @@ def _trial(c: ChartConfig, seed: SeedTree) -> Iterator[Measurement]:
 
 
 def _judged(
-    name: str, estimate: SubmapEstimate, submaps: list[Submap], truth: MapTruth, optimum: float
+    name: str, estimate: MapEstimate, submaps: list[Submap], truth: MapTruth, optimum: float
 ) -> Iterator[Measurement]:
     keys = [s.key for s in submaps]
     ends = replace(truth, landmark_ids=truth.landmark_ids[:0], landmarks=truth.landmarks[:0])
@@ -227,7 +228,7 @@ def _judged(
     yield Measurement(name, "objective_ratio", _objective(estimate) / optimum)
 
 
-def _objective(estimate: SubmapEstimate) -> float:
+def _objective(estimate: MapEstimate) -> float:
     """Of the map as it is: that of the optimum where it was polished."""
     polished = estimate.objective_polished
     return estimate.objective if polished is None else polished
