@@ -20,7 +20,7 @@ def sensor_kinds() -> dict[str, type[SensorFactors]]:
     """Kinds of sensors by name."""
     for module in iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
-    return {kind.name: kind for kind in SensorFactors.kinds}
+    return {kind.name: kind for kind in sorted(SensorFactors.kinds, key=lambda kind: kind.name)}
 
 
 def kind_of(readings: Any) -> type[SensorFactors]:

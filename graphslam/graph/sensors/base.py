@@ -20,6 +20,8 @@ class SensorFactors(ABC):
     ----------
     name : str
         Of the kind; the default name of a stream, and the section of its options.
+    title : str
+        Of the kind in messages: "the log has no ...".
     readings : type
         Record type of its streams.
     options : type or None
@@ -27,6 +29,7 @@ class SensorFactors(ABC):
     """
 
     name: ClassVar[str]
+    title: ClassVar[str]
     readings: ClassVar[type]
     options: ClassVar[type | None] = None
     kinds: ClassVar[list[type[SensorFactors]]] = []
@@ -73,7 +76,3 @@ class SensorFactors(ABC):
     def waiting_readings(self) -> int:
         """Readings that are no factor yet."""
         return 0
-
-    def usage(self) -> list[str]:
-        """Why readings of a graph that is finished are in no factor, a sentence each; empty where nothing is to say."""
-        return []

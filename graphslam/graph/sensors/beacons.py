@@ -73,6 +73,7 @@ class BeaconFactors(PendingMeasurements):
     """
 
     name: ClassVar[str] = "beacons"
+    title: ClassVar[str] = "landmark observations"
     readings = LandmarkObservations
     options = BeaconConfig
     unit = "distance"

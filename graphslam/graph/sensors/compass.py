@@ -72,6 +72,7 @@ class CompassFactors(PendingMeasurements):
     """
 
     name: ClassVar[str] = "compass"
+    title: ClassVar[str] = "compass"
     readings = Compass
     options = CompassConfig
     unit = "heading"

@@ -224,6 +224,7 @@ class GpsFactors(SensorFactors):
     """
 
     name: ClassVar[str] = "gps"
+    title: ClassVar[str] = "GPS fixes"
     readings = Gps
     options = GpsConfig
     graph: FactorGraphState

@@ -80,6 +80,7 @@ class ImuFactors(SensorFactors):
     """
 
     name: ClassVar[str] = "imu"
+    title: ClassVar[str] = "IMU"
     readings = Imu
     options = ImuConfig
     graph: FactorGraphState
