@@ -24,6 +24,7 @@ from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
+from graphslam.graph.sensors.gps import GpsFactors
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
 from graphslam.loops.find_loops import FindConfig, LoopSearch
@@ -124,15 +125,15 @@ class BackEnd:
         have, want = gps.positions.shape[1], self.graph.dim
         if have > want:
             gps = replace(gps, positions=gps.positions[:, :want], lever=gps.lever[:want])
-        self.graph.add_gps(gps, config=config)
+        self.graph.add_sensor(gps, config=config)
 
     def add_compass(self, name: str, compass: Compass, config: CompassOptions) -> None:
         """Give the graph the headings of a compass; they wait for the submaps that hold them."""
-        self._later.append(lambda graph: graph.add_compass(compass, stream=name, config=config))
+        self._later.append(lambda graph: graph.add_sensor(compass, stream=name, config=config))
 
     def add_beacons(self, name: str, ranges: LandmarkObservations, config: BeaconOptions) -> None:
         """Give the graph distances to beacons; they wait for the submaps that hold them."""
-        self._later.append(lambda graph: graph.add_beacons(ranges, stream=name, config=config))
+        self._later.append(lambda graph: graph.add_sensor(ranges, stream=name, config=config))
 
     def add(self, submap: Submap) -> None:
         """Associate, add, solve; now and then merge landmarks that turned out to be one."""
@@ -233,12 +234,11 @@ class BackEnd:
             submaps has them, and then one that is not in this graph is noted and stays undone.
         """
         self._give_fixes(np.inf)
-        self.graph.finish_gps()
-        self.graph.finish_readings()
+        self.graph.finish_sensors()
         if self.imu is not None:
             self.imu.attach(self.graph)
         repreintegrate_until_converged(self.graph, self.solver)
-        if self.graph.gps.config.errors == "fitted" and fit_fix_errors(self.graph) is not None:
+        if GpsFactors.of(self.graph).config.errors == "fitted" and fit_fix_errors(self.graph) is not None:
             self.solver.solve_to_optimum()
         for _ in range(10):
             if not self.merge():

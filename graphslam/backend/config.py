@@ -10,9 +10,10 @@ import numpy as np
 from graphslam.core.config import flattened_field
 from graphslam.core.errors import ConfigError
 from graphslam.graph.factors.imu.config import ImuConfig
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
-from graphslam.graph.pending_measurements import BeaconConfig, CompassConfig
+from graphslam.graph.sensors.beacons import BeaconConfig
+from graphslam.graph.sensors.compass import CompassConfig
+from graphslam.graph.sensors.gps import GpsConfig
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,8 +27,8 @@ from graphslam.core.geometry import Array
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsBatch, GpsRecord
-from graphslam.graph.gps import FixErrors
 from graphslam.graph.noise import whitener
+from graphslam.graph.sensors.gps import FixErrors, GpsFactors
 
 logger = logging.getLogger(__name__)
 GATE = 8.0
@@ -55,7 +55,7 @@ def fit_fix_errors(graph: FactorGraph) -> FixErrors | None:
 
     The graph is to be solved anew then. None: nothing was changed.
     """
-    gps = graph.gps
+    gps = GpsFactors.of(graph)
     fixes = sorted((r for r in graph.records.values() if isinstance(r, GpsRecord)), key=lambda r: r.time)
     if gps.fitted is not None or len(fixes) < LEAST or any(r.bias is not None or r.stated is None for r in fixes):
         return None

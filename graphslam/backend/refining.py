@@ -19,8 +19,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.ledger import EXCLUSIVE, Ledger
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.moving import moving_points, without_moving
 from graphslam.maps.refined import base_frames, refined_map, refined_submaps

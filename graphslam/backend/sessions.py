@@ -143,8 +143,8 @@ def add_session(graph: FactorGraph, session: DenseSession, start: Array | None =
             robust=t.robust, group="match",
         )  # fmt: skip
     if use_gps and session.fixes is not None:
-        graph.add_gps(session.fixes, config=session.gps)
-        graph.finish_gps()
+        graph.add_sensor(session.fixes, config=session.gps)
+        graph.finish_sensors()
     return node
 
 

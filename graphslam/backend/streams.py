@@ -16,6 +16,7 @@ from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.evaluate.gps_repeatability import fix_segments
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.ledger import EXCLUSIVE
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.registry import Solver
 
 logger = logging.getLogger(__name__)
@@ -145,7 +146,7 @@ class ImuSource:
             begin = max(float(imu.times[0]), graph.submaps[0].interval[0]) if len(imu.times) else np.inf
             if name not in self._looked and now - begin >= CHECKED_AFTER:
                 self._looked.add(name)
-                graph.check_imu(imu, stream=name, axes=self.config.axes)
+                ImuFactors.of(graph).check(imu, stream=name, axes=self.config.axes)
 
     def attach(self, graph: FactorGraph, *, more: bool = False) -> int:
         """Give the graph the IMUs that are to be used; returns the number of new factors.
@@ -160,7 +161,7 @@ class ImuSource:
             imu = self.imus[name]
             if name in self._given:  # its readings are there already: only submaps are new
                 imu = imu.take(np.zeros(len(imu.times), dtype=bool))
-            made += len(graph.add_imu(imu, stream=name, config=self.config, more=more))
+            made += len(ImuFactors.of(graph).add(imu, stream=name, config=self.config, more=more))
             self._given.add(name)
         return made
 
@@ -177,6 +178,6 @@ def repreintegrate_until_converged(graph: FactorGraph, solver: Solver) -> None:
     """Solve, preintegrate anew about the biases found, and solve again, until nothing moves."""
     solver.solve_to_optimum()
     for _ in range(RECENTRED):
-        if not graph.recentre_imu():
+        if not ImuFactors.of(graph).recentre():
             return
         solver.solve_to_optimum()

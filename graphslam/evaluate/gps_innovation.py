@@ -24,7 +24,7 @@ from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bo
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord, antenna_terms
 from graphslam.graph.factors.sensor_biases import sensor_biases_at
-from graphslam.graph.gps import FixErrors, arm_jacobian, datum_columns, lever_arm
+from graphslam.graph.sensors.gps import FixErrors, GpsFactors, arm_jacobian, datum_columns, lever_arm
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from graphslam.graph.submap_node import SubmapNode
 
@@ -169,7 +169,7 @@ def gps_innovations(
     times, z = gps.times[found], gps.positions[found, :d] - graph.gps_origin
     node, arm = node[found], arm[found]
     n = len(times)
-    fitted = graph.gps.fitted
+    fitted = GpsFactors.of(graph).fitted
     lasting = fitted is not None and fitted.bias_sigma > 0
     bias = np.full(n, -1, dtype=np.int64) if lasting else _biases(graph, times, bias_sigma, segment_gap)
     own = (bias >= 0) & (bias < len(values.biases))

@@ -29,6 +29,7 @@ from graphslam.evaluate.map_error import landmark_error, match_ids
 from graphslam.evaluate.residual_consistency import class_consistency, two_sided_bounds
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.solution import Solution
 
 logger = logging.getLogger(__name__)
@@ -345,8 +346,9 @@ def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, sc
 def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
     """Biases as they are at the end, factors, and what was left out; also into the events and the counts."""
     said: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
-    for stream in graph.imu.used:
-        states = graph.imu_states(stream)
+    imus = ImuFactors.of(graph)
+    for stream in imus.used:
+        states = imus.states(stream)
         mine = [e for e in said if e["stream"] == stream]
         for reason, n in (mine[-1]["dropped"] if mine else {}).items():
             drops.drop(stream, f"no factor: {reason}", n)
@@ -367,7 +369,7 @@ def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
 
 def _contradiction(graph: FactorGraph) -> None:
     """Say so if the χ² of the ways is larger than it is by chance once in two thousand runs."""
-    ways = class_consistency(graph).get("imu") if graph.imu.used else None
+    ways = class_consistency(graph).get("imu") if ImuFactors.of(graph).used else None
     if ways is None or not np.isfinite(ways.ratio):
         return
     high = two_sided_bounds(ways.ratio, ways.dof, 0.999)[1]

@@ -10,12 +10,12 @@ The path of a pipeline, once per finished submap, and the end of a run::
     graph = FactorGraph()
     solver = make_solver("isam2", graph)                     # graphslam.solve.registry; "batch" has the same verbs
     config = AssociationConfig(covariance_scale=5.0)         # graphslam.association.landmarks
-    graph.add_gps(log["gps"], config=GpsConfig(robust=Robust("cauchy", 2.385)))  # fixes wait for their submap
+    graph.add_sensor(log["gps"], config=GpsConfig(robust=Robust("cauchy", 2.385)))  # fixes wait for their submap
     for submap in submaps:
         ids = associate(graph, submap, config)               # -1 = new
         graph.add_submap(submap, landmark_ids=ids, covariance_scale=5.0)
         solver.update()
-    graph.finish_gps()
+    graph.finish_sensors()
     for keep, drop in euclidean_merges(graph, 0.7):          # graphslam.association.merging
         graph.merge_landmarks(keep, drop)
     solver.solve_to_optimum()
@@ -28,14 +28,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
-from graphslam.core.imu import Imu
-from graphslam.core.records import Compass, Gps, LandmarkObservations
+from graphslam.core.records import Stream
 from graphslam.core.se3 import quat_normalize
 from graphslam.core.sensor_biases import SensorBiases
 from graphslam.core.submap import Match, Submap
@@ -43,18 +43,14 @@ from graphslam.graph.factor_graph_state import BetweenBlock, FactorGraphState
 from graphslam.graph.factors.attitude import DOWN, LEVELLED, AttitudeRecord, without_tilt
 from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.factors.imu.config import ImuConfig
-from graphslam.graph.factors.imu.states import ImuStates
 from graphslam.graph.factors.landmark_submap import CONSTANT, SubmapRecord
 from graphslam.graph.factors.range import RangeRecord
 from graphslam.graph.factors.sensor_biases import SIZE, SensorBiasRecord, bias_variable_names, sensor_biases_at
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
-from graphslam.graph.gps import GpsConfig
-from graphslam.graph.imu import RECENTRE
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, covariance_whiteners, whitener
-from graphslam.graph.pending_measurements import BeaconConfig, CompassConfig
+from graphslam.graph.sensors import kind_of
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
 __all__ = ["FactorGraph", "SubmapNode"]
@@ -231,8 +227,8 @@ class FactorGraph(FactorGraphState):
             inner = InnerPoints(lm.path, lm.mean, lm.dense_covariance(), covariance_scale, lasting=lm.lasting)
             self.submaps[-1] = replace(self.submaps[-1], inner_points=inner)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
-        self.gps.attach(self.submaps[-1])
-        self.readings.attach(self.submaps[-1])
+        for sensor in self.sensors.values():
+            sensor.add_factors(self.submaps[-1])
         return fid
 
     def _tell_lasting(self, lasting: SensorBiases, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
@@ -310,8 +306,8 @@ class FactorGraph(FactorGraphState):
         self._event(
             "submap", factor_id=fid, submap=submap.key, landmarks=0, new=0, scale=covariance_scale, nodes=len(records)
         )
-        self.gps.attach(self.submaps[-1])
-        self.readings.attach(self.submaps[-1])
+        for sensor in self.sensors.values():
+            sensor.add_factors(self.submaps[-1])
         return fid
 
     def _level_ends(self, sigma: float) -> None:
@@ -359,152 +355,36 @@ class FactorGraph(FactorGraphState):
         for record in records:
             self.insert(record)
 
-    def add_gps(self, gps: Gps, *, stream: str = "gps", config: GpsConfig | None = None) -> list[int]:
-        """Give the graph position fixes, at any time and in any portion; each finds its own submap.
-
-        Fixes wait until their submap is there, and until :attr:`GpsConfig.baseline` is spanned; then the datum starts
-        by rigid alignment and all of them become factors. The map stays where it is then, however late that be: its
-        first base is fixed and the datum is solved for. Fixes that no submap covers are dropped and counted
-        (:attr:`events`, kind ``gps-dropped``). Each is attached to the node nearest in time, the base or an inner one.
-
-        Returns
-        -------
-        list of int
-            Factor ids, one a fix.
-
-        Raises
-        ------
-        EvidenceReusedError
-            A submap that holds the fix already used ``stream``, or the fix was given before. No fix is taken then.
-        """
-        return self.gps.add(gps, stream, config)
-
-    def finish_gps(self) -> None:
-        """No more submaps will come: the last instant belongs to the last submap, later fixes are dropped."""
-        self.gps.finish()
-
-    def add_imu(
-        self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False
-    ) -> list[int]:
-        """Give the graph an IMU that no front end used; its readings between existing nodes become factors.
-
-        In the plane it is planar, or it has three axes and the body is level
-        (:mod:`graphslam.graph.factors.imu.plane`). No start velocity is needed: a velocity follows from the two poses
-        and the accelerations of a way.
-
-        Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
-        preintegrated way (:mod:`graphslam.graph.factors.imu.batch`), inner nodes included; inside levelled submaps
-        their relative roll and pitch is then the gyro's word alone. A way brings in the velocity of the unit and its
-        biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over pauses. In space a node without a
-        way sees gravity: the mean specific force about it, as sure as the body was still, and the first factor brings
-        in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
-
-        It may be called again when there are more submaps, with the readings that follow (or with none): ways that
-        are there stay. Everything left out is counted by reason (event ``imu``).
+    def add_sensor(self, readings: Stream, *, stream: str | None = None, config: Any = None) -> list[int]:
+        """Give the graph readings of a sensor that no front end used; each finds its own submap.
 
         Parameters
         ----------
-        imu : Imu
-            ``T_base_imu`` is its mounting on the body; the body is where the paths of the submaps say.
-        stream : str
-            Its name in the ledger.
-        config : ImuConfig, optional
-            By default that of the call before.
-        more : bool
-            It will be called again with more submaps: the last node waits for the one that begins there, and axes are
-            not checked, and dropped readings are not counted.
+        readings : Stream
+            Of a kind in :func:`graphslam.graph.sensors.sensor_kinds`: :class:`~graphslam.core.records.Gps` fixes, an
+            :class:`~graphslam.core.imu.Imu`, ... What becomes of them the class of the kind says.
+        stream : str, optional
+            Its name in the ledger; by default that of the kind.
+        config : optional
+            Options of the kind.
 
         Returns
         -------
         list of int
-            Ids of the new factors.
+            Ids of the factors that they are or will be.
 
         Raises
         ------
         EvidenceReusedError
-            A submap, or another factor, used the stream over an overlapping interval. Nothing is changed then.
-        DataError
-            Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
-        GeometryError
-            A planar IMU in space.
-        ConfigError, CovarianceError
+            A submap or another factor used them already. Nothing is changed then.
+        DataError, GeometryError, ConfigError
         """
-        return self.imu.add(imu, stream=stream, config=config, more=more)
+        return kind_of(readings).of(self).add(readings, stream=stream, config=config)
 
-    def check_imu(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
-        """Compare the axes of an IMU with the paths of the submaps; returns what is wrong in words, or nothing.
-
-        Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
-
-        Raises
-        ------
-        DataError
-            The mounting is contradicted and ``axes`` is ``"refuse"``.
-        """
-        return self.imu.check(imu, stream=stream, axes=axes)
-
-    def recentre_imu(self, *, limit: float = RECENTRE) -> int:
-        """Preintegrate again, about their present bias, ways whose gyro bias has moved; returns how many.
-
-        Ways know how they change with the biases to first order only. After solving, call this and solve again until
-        it returns nothing: twice is enough, most of the time.
-        """
-        return self.imu.recentre(limit=limit)
-
-    def imu_states(self, stream: str = "imu") -> ImuStates:
-        """Nodes, velocities and biases of an IMU, in order of time."""
-        return self.imu.states(stream)
-
-    def add_compass(
-        self, compass: Compass, *, stream: str = "compass", config: CompassConfig | None = None
-    ) -> list[int]:
-        """Give the graph headings, at any time and in any portion; each finds its own submap.
-
-        The zero of the compass, where magnetic east is in the frame of the first base, is a variable; so is the
-        deviation by iron on the robot if the configuration says so (:mod:`graphslam.graph.factors.compass`).
-
-        Returns
-        -------
-        list of int
-            Factor ids, one a reading that was kept (:attr:`CompassConfig.every`).
-
-        Raises
-        ------
-        EvidenceReusedError
-            A submap that holds a reading already used ``stream``, or the reading was given before.
-        """
-        return self.readings.add_compass(compass, stream, config)
-
-    def add_beacons(
-        self,
-        ranges: LandmarkObservations,
-        *,
-        stream: str = "beacons",
-        config: BeaconConfig | None = None,
-        lever: ArrayLike | None = None,
-    ) -> list[int]:
-        """Give the graph distances to beacons of unknown position; each finds its own submap.
-
-        A beacon gets a place when it was heard often enough from places that do not lie on one line; its distances
-        become factors then (:mod:`graphslam.graph.factors.range`).
-
-        Parameters
-        ----------
-        ranges : LandmarkObservations
-            With known identities; bearings are not used.
-        lever : (dim,), optional
-            Antenna in the body frame; by default the place of the stream's sensor.
-
-        Returns
-        -------
-        list of int
-            Factor ids, one a distance that was kept.
-        """
-        return self.readings.add_beacons(ranges, stream, config, None if lever is None else np.asarray(lever))
-
-    def finish_readings(self) -> None:
-        """No more submaps will come: headings and distances that still wait are dropped, and counted."""
-        self.readings.finish()
+    def finish_sensors(self) -> None:
+        """No more submaps will come: readings that still wait are dropped, and counted."""
+        for sensor in self.sensors.values():
+            sensor.finish()
 
     def add_attitude(
         self,

@@ -21,11 +21,9 @@ from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.gps import AntennaRecord
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
-from graphslam.graph.gps import GpsFixes
-from graphslam.graph.imu import ImuUnits
 from graphslam.graph.ledger import Ledger
-from graphslam.graph.pending_measurements import PendingMeasurements
 from graphslam.graph.score import GraphScore, score_graph
+from graphslam.graph.sensors.base import SensorFactors
 from graphslam.graph.submap_node import SubmapNode
 from graphslam.graph.variables import Values, VariableLayout
 
@@ -186,7 +184,8 @@ class FactorGraphState:
         self.revision = 0
         self.submaps: list[SubmapNode] = []
         self._place: dict[int, int] = {}  # submap key -> place in submaps
-        self.gps, self.imu, self.readings = GpsFixes(self), ImuUnits(self), PendingMeasurements(self)
+        self.sensors: dict[str, SensorFactors] = {}
+        """By the name of their kind, those that were ever asked for."""
         self.gps_origin: Array | None = None
         self._row: dict[int, int] = {}
         self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
@@ -250,20 +249,18 @@ class FactorGraphState:
         removed = self.records[factor_id]
         owner = next((s for s in self.submaps if factor_id in s.factor_ids), None)
         if owner is not None:
-            self.readings.detach(owner)
-            self.imu.detach(owner)
+            for sensor in self.sensors.values():
+                sensor.remove(owner)
         for fid in (factor_id,) if owner is None else owner.factor_ids:
             if fid in self.records:
                 self.take_out(fid, reason)
         if owner is not None:
-            self.gps.detach(owner)
             used = {n for r in self.records.values() for n in r.variables()}
             if owner.key == self.submaps[-1].key and not any(f"x{n}" in used for n in owner.nodes[1:]):
                 self.values.poses = self.values.poses[: owner.node + 1].copy()
                 self._place.pop(self.submaps.pop().key)
-        self.gps.remove_unused()
-        self.imu.remove_unused(removed)
-        self.readings.remove_unused()
+        for sensor in self.sensors.values():
+            sensor.remove_unused(removed)
         if self.structure.count("tilt") and not any("tilt" in r.variables() for r in self.records.values()):
             self.values.tilt = None
             self.revision += 1
@@ -399,7 +396,7 @@ class FactorGraphState:
 
     def diagnose(self, values: Values | None = None) -> Diagnosis:
         """Unconstrained variables and what would fix them; ``.raise_if_bad()`` makes it an error."""
-        waiting = len(self.gps.waiting) + len(self.gps.tied)
+        waiting = sum(sensor.waiting_readings() for sensor in self.sensors.values())
         return diagnose(self.flat(), values or self.values, waiting_fixes=waiting)
 
     def _repr_html_(self) -> str:

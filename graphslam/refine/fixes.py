@@ -2,7 +2,7 @@
 
 A fix at ``t`` between two nodes sees the antenna on the line between where it was at both. The frame of the fixes is a
 state of its own, ``T_gps_world``, since the first pose of the path is held; so are errors of fixes that last, as in the
-graph (:mod:`graphslam.graph.gps`)::
+graph (:mod:`graphslam.graph.sensors.gps`)::
 
     r = T_gps_world p + bias - z,    p = (1 - a) T_k l + a T_{k+1} l
 """
@@ -19,7 +19,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.graph.gps import GpsConfig, arm_jacobian, greatest_distance, start_datum
+from graphslam.graph.sensors.gps import GpsConfig, arm_jacobian, greatest_distance, start_datum
 from graphslam.refine.motion import MotionModel, MotionTerms, States
 
 Index = npt.NDArray[np.int64]

@@ -21,7 +21,7 @@ from graphslam.core.heap import trim_heap
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.spill_cache import CacheEntry
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.fixes import FixModel, FixReport
 from graphslam.refine.motion import MotionModel, States

@@ -9,9 +9,9 @@ import pytest
 from graphslam.core.geometry import se2_between
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.variables import gtsam_key
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import solve_submaps
@@ -27,7 +27,7 @@ def build(rng, *, gps: bool, robust: RobustKernel, update=lambda g: None) -> Fac
     g = FactorGraph()
     if gps:
         fixes = make_gps(chain, rng, np.array([30.0, -10.0, 2.0]), step=2.0)
-        g.add_gps(fixes, config=GpsConfig(robust=robust, bias_sigma=1.0, segment_gap=1.9))
+        g.add_sensor(fixes, config=GpsConfig(robust=robust, bias_sigma=1.0, segment_gap=1.9))
     for s in chain.submaps:
         g.add_submap(s)
         update(g)

@@ -13,8 +13,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies.trust_worlds import lasting
 
@@ -47,8 +47,8 @@ def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tu
 
 
 def solved(graph: FactorGraph, fixes: Gps, robust: RobustKernel = CAUCHY) -> FactorGraph:
-    graph.add_gps(fixes, config=GpsConfig(robust=robust))
-    graph.finish_gps()
+    graph.add_sensor(fixes, config=GpsConfig(robust=robust))
+    graph.finish_sensors()
     BatchSolver(graph).solve_to_optimum()
     return graph
 
@@ -164,8 +164,8 @@ def test_few_fixes_or_biases_that_are_stated_are_left_alone(rng):
     few = solved(graph, fixes.take(slice(0, LEAST - 1)))
     assert fit_fix_errors(few) is None
     graph, _, fixes = drive(rng, lasting(rng, 60, 1.0, 30.0, 2))
-    graph.add_gps(fixes, config=GpsConfig(bias_sigma=1.0, bias_time=20.0))
-    graph.finish_gps()
+    graph.add_sensor(fixes, config=GpsConfig(bias_sigma=1.0, bias_time=20.0))
+    graph.finish_sensors()
     BatchSolver(graph).solve_to_optimum()
     assert fit_fix_errors(graph) is None
 

@@ -22,8 +22,8 @@ from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Gps
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import level_datum_pose
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -62,10 +62,10 @@ def error(chain: DenseChain, gps: Gps, kernel: RobustKernel) -> float:
     """Mean squared error at the ends of the submaps [m²]."""
     dim = group_of(chain.poses).dim
     g = FactorGraph(dim)
-    g.add_gps(gps, config=GpsConfig(robust=kernel))
+    g.add_sensor(gps, config=GpsConfig(robust=kernel))
     for s in chain.submaps:
         g.add_submap(s, spacing=4.0)
-    g.finish_gps()
+    g.finish_sensors()
     BatchSolver(g).solve_to_optimum()
     ends = [s.exit_node for s in g.submaps]
     return float(np.mean(np.sum((g.values.poses[ends] - chain.poses[1:])[:, :dim] ** 2, axis=1)))

@@ -27,7 +27,8 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.preintegration import preintegrate
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.io.euroc import read_euroc
 from graphslam.solve.batch import BatchSolver
 from tests.conftest import data_root
@@ -85,16 +86,16 @@ def flown(
         frame = path[k + 1]
     g.add_attitude(0, [0.0, 0.0, -1.0], 0.2, evidence="prior")
     fixes = Gps(times=at, positions=points, sigma=np.full(len(at), sigma), lever=PRISM)
-    g.add_gps(fixes, config=GpsConfig(baseline=0.3))
-    g.finish_gps()
+    g.add_sensor(fixes, config=GpsConfig(baseline=0.3))
+    g.finish_sensors()
     if g.values.datum is None:
         return None
-    g.add_imu(imu, config=ImuConfig(axes="ignore"))
+    g.add_sensor(imu, config=ImuConfig(axes="ignore"))
     try:
         solver = BatchSolver(g)
         solver.solve_to_optimum()
         for _ in range(5):
-            if not g.recentre_imu():
+            if not ImuFactors.of(g).recentre():
                 break
             solver.solve_to_optimum()
     except GraphSlamError:
@@ -142,7 +143,7 @@ def euroc(
         return f"every {every:g} s: no start leads anywhere"
     withheld = np.array([k for k in keep if k not in set(nodes) and at[0] < tz[k] < at[-1]])
     T_gps = level_datum_pose(g.values.datum, g.values.tilt)
-    states = g.imu_states()
+    states = ImuFactors.of(g).states()
     node_at = np.array([s.node for s in g.submaps])
     which = np.searchsorted(at, tz[withheld], side="right") - 1
     v = g.values.velocities[[states.velocity[n] for n in node_at[which]]]
@@ -203,10 +204,10 @@ def carried(root: Path, drift: float, seed: int = 0) -> str:
         down = -se3.quat_rotate(poses[0, 3:] * CONJUGATE, [0.0, 0.0, 1.0])
         g.add_attitude(0, down, 0.02, evidence="prior")
         if use:
-            g.add_imu(imu, config=ImuConfig(axes="warn"))
+            g.add_sensor(imu, config=ImuConfig(axes="warn"))
         solver = BatchSolver(g)
         solver.solve_to_optimum()
-        while use and g.recentre_imu():
+        while use and ImuFactors.of(g).recentre():
             solver.solve_to_optimum()
         ends = np.array([s.node for s in g.submaps])
         begun = np.searchsorted(times, [s.interval[0] for s in g.submaps])
@@ -214,7 +215,7 @@ def carried(root: Path, drift: float, seed: int = 0) -> str:
         off = SE3.transform(T, g.values.poses[ends, :3]) - poses[begun, :3]
         out.append(f"{'with' if use else 'without'} {np.sqrt(np.mean(np.sum(off**2, axis=1))):.3f} m")
     axes = [e for e in g.events if e["event"] == "imu-axes"]
-    states, score = g.imu_states(), class_consistency(g)
+    states, score = ImuFactors.of(g).states(), class_consistency(g)
     bias = g.values.imu_biases[states.bias[states.order[-1]]]
     return (
         f"drift × {drift:g}: aligned {', '.join(out)}; axes {axes[-1]['verdict']}; "

@@ -50,7 +50,7 @@ def ours(n: int, data: tuple[np.ndarray, ...], close: bool) -> tuple[np.ndarray,
     solver = Isam2Solver(graph)
     times = np.arange(n + 1, dtype=np.float64)
     gps = Gps(times=times[EVERY::EVERY], positions=fixes, sigma=np.full(len(fixes), FIX), lever=np.zeros(3))
-    graph.add_gps(gps)
+    graph.add_sensor(gps)
     at = {int(j): int(i) for i, j in loops} if close else {}
     add, update, loop = np.zeros(n), np.zeros(n), []
     for k in range(n):

@@ -25,7 +25,7 @@ from graphslam.evaluate.covariance_assessment import (
 from graphslam.evaluate.residual_consistency import LASTING, class_consistency
 from graphslam.evaluate.whiteness import residual_whiteness
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.registry import make_solver
 from tests.reference.graph_chain import make_chain
 
@@ -86,12 +86,12 @@ def solved(rng, errors) -> FactorGraph:
         where.append(chain.poses[k, :2] + np.array([[c, -s], [s, c]]) @ T[:2])
     fixes = np.array(where) + errors(len(times))
     graph = FactorGraph()
-    graph.add_gps(
+    graph.add_sensor(
         Gps(times=times, positions=fixes, sigma=np.ones(len(times)), lever=np.zeros(2)), config=GpsConfig(baseline=5.0)
     )
     for s in chain.submaps:
         graph.add_submap(s)
-    graph.finish_gps()
+    graph.finish_sensors()
     make_solver("batch", graph).solve_to_optimum()
     return graph
 

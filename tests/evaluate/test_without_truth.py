@@ -14,8 +14,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps_innovation import GpsInnovations, _arm_covariance, gps_innovations
 from graphslam.evaluate.residual_consistency import class_consistency, correlated_dof, two_sided_bounds
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 from graphslam.solve.registry import make_solver
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf, RbpfEkfConfig
@@ -42,10 +42,10 @@ def solved_graph(rng, *, robust=NO_KERNEL, bias_sigma=None, m=6) -> tuple[Factor
     gps = fixes_of(chain, rng, np.arange(0.5, 10.0 * m, 1.5))
     graph = FactorGraph()
     config = GpsConfig(robust=robust, baseline=5.0, bias_sigma=bias_sigma, segment_gap=4.0)
-    graph.add_gps(gps.take(slice(0, None, 2)), config=config)
+    graph.add_sensor(gps.take(slice(0, None, 2)), config=config)
     for s in chain.submaps:
         graph.add_submap(s)
-    graph.finish_gps()
+    graph.finish_sensors()
     make_solver("batch", graph).solve_to_optimum()
     return graph, gps.take(slice(1, None, 2))
 
@@ -109,8 +109,8 @@ def test_a_withheld_fix_is_predicted_as_if_it_were_added_with_no_weight(rng):
     graph, withheld = solved_graph(rng)
     got = gps_innovations(graph, withheld, sigma=0.3)
     before = graph.values.copy()
-    graph.add_gps(withheld, config=GpsConfig(sigma=1000.0, baseline=5.0))
-    graph.finish_gps()
+    graph.add_sensor(withheld, config=GpsConfig(sigma=1000.0, baseline=5.0))
+    graph.finish_sensors()
     make_solver("batch", graph).solve_to_optimum()
     assert np.allclose(graph.values.poses, before.poses, atol=1e-4)
     after = {r.time: r for r in graph.records.values() if type(r).__name__ == "GpsRecord"}
@@ -194,10 +194,10 @@ def small_run(seed: int, scale: float, robust: RobustKernel) -> tuple[FactorGrap
     front = RbpfEkf(RbpfEkfConfig(association="known", particles=10, max_range=20.0))
     gps, graph = log["gps"], FactorGraph()
     used = np.arange(len(gps.times)) % 2 == 0
-    graph.add_gps(gps.take(used), config=GpsConfig(robust=robust))
+    graph.add_sensor(gps.take(used), config=GpsConfig(robust=robust))
     for s in front.submaps(log, seed=SeedTree(seed)):
         graph.add_submap(s)
-    graph.finish_gps()
+    graph.finish_sensors()
     make_solver("batch", graph).solve_to_optimum()
     return graph, gps.take(~used)
 

@@ -13,8 +13,8 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
 
@@ -24,7 +24,9 @@ def rich_graph(rng) -> FactorGraph:
     chain = make_chain(rng, m=6, landmarks=10)
     g = FactorGraph()
     gps = make_gps(chain, rng, np.array([5.0, -3.0, 1.1]), step=2.0)
-    g.add_gps(gps, config=GpsConfig(robust=RobustKernel("cauchy", 1.0), bias_sigma=0.5, segment_gap=9.0, baseline=15.0))
+    g.add_sensor(
+        gps, config=GpsConfig(robust=RobustKernel("cauchy", 1.0), bias_sigma=0.5, segment_gap=9.0, baseline=15.0)
+    )
     for s in chain.submaps:
         g.add_submap(s)
     C = np.diag([1e-2, 2e-2, 1e-3])

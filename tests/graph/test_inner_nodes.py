@@ -16,8 +16,8 @@ from graphslam.core.submap import Match
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.inner_nodes import cut_submap, inner_rows
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.space_chain import STEP_SIGMA, dense_chain
@@ -263,13 +263,13 @@ def test_fixes_hang_on_the_node_nearest_in_time(rng, dim):
     g = FactorGraph(dim)
     times = np.arange(0.2, 30.0, 0.7)
     points = np.array([_at(chain, t, dim) for t in times]) + 0.05 * rng.standard_normal((len(times), dim))
-    g.add_gps(
+    g.add_sensor(
         Gps(times=times, positions=points, sigma=np.full(len(times), 0.05), lever=np.zeros(dim)),
         config=GpsConfig(baseline=5.0),
     )
     for s in chain.submaps:
         g.add_submap(s, spacing=3.0)
-    g.finish_gps()
+    g.finish_sensors()
     records = [r for r in g.records.values() if isinstance(r, GpsRecord)]
     assert len(records) == len(times)
     for r in records:

@@ -15,7 +15,7 @@ from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_value
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.variables import gtsam_key
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.solve.registry import make_solver
@@ -55,7 +55,7 @@ def graph(rng) -> FactorGraph:
     submaps = [with_errors(rng, s, points=2) for s in chain.submaps]
     times = np.concatenate([s.landmarks.path.times for s in submaps])
     places = np.concatenate([s.landmarks.path.positions for s in submaps])
-    g.add_gps(
+    g.add_sensor(
         replace(gps, times=times, positions=places + 1.0, sigma=np.ones(len(places)), lever=np.zeros(2)),
         config=GpsConfig(baseline=0.1),
     )

@@ -17,7 +17,7 @@ from graphslam.core.submap import Submap
 from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.landmark_submap import PathRecord
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -57,13 +57,13 @@ def submaps_of(log: SensorLog, front_end: str = "rbpf-ekf") -> list[Submap]:
 
 def solved(submaps, gps, *, solver=BatchSolver, **config) -> FactorGraph:
     graph = FactorGraph()
-    graph.add_gps(gps, config=GpsConfig(baseline=5.0, **config))
+    graph.add_sensor(gps, config=GpsConfig(baseline=5.0, **config))
     made = solver(graph)
     for s in submaps:
         graph.add_submap(s)
         if solver is Isam2Solver:
             made.update()
-    graph.finish_gps()
+    graph.finish_sensors()
     made.solve_to_optimum()
     return graph
 
@@ -215,8 +215,8 @@ def test_a_withheld_fix_is_predicted_by_the_joint_rows(drive):
     used, withheld = gps.take(slice(0, None, 2)), gps.take(slice(1, None, 2))
     graph = solved(submaps, used)
     got = gps_innovations(graph, withheld)
-    graph.add_gps(withheld, config=GpsConfig(sigma=1000.0, baseline=5.0))
-    graph.finish_gps()
+    graph.add_sensor(withheld, config=GpsConfig(sigma=1000.0, baseline=5.0))
+    graph.finish_sensors()
     BatchSolver(graph).solve_to_optimum()
     lay, cov, v = graph.flat().layout, graph.covariance(), graph.values
     R = rotation2(v.datum[2])

@@ -159,7 +159,7 @@ def test_removal_restores_the_graph(graph, chain):
 
 def test_removing_the_last_submap_takes_its_node_landmarks_and_fixes(rng, chain):
     g = FactorGraph()
-    g.add_gps(make_gps(chain, rng, np.array([0.0, 0.0, 1.0])))
+    g.add_sensor(make_gps(chain, rng, np.array([0.0, 0.0, 1.0])))
     for s in chain.submaps[:6]:
         g.add_submap(s)
     before = state(g)
@@ -174,7 +174,7 @@ def test_removing_the_last_submap_takes_its_node_landmarks_and_fixes(rng, chain)
 
 def test_removing_all_fixes_removes_the_datum(rng, chain):
     g = FactorGraph()
-    ids = g.add_gps(make_gps(chain, rng, np.array([0.0, 0.0, 1.0]), step=5.0))
+    ids = g.add_sensor(make_gps(chain, rng, np.array([0.0, 0.0, 1.0]), step=5.0))
     for s in chain.submaps:
         g.add_submap(s)
     assert g.values.datum is not None
@@ -263,7 +263,7 @@ def test_one_common_landmark_leaves_a_rotation_free(rng, shared, ok):
 
 def test_datum_with_one_place_is_named(rng, chain):
     g = FactorGraph()
-    ids = g.add_gps(make_gps(chain, rng, np.array([0.0, 0.0, 1.0]), step=5.0))
+    ids = g.add_sensor(make_gps(chain, rng, np.array([0.0, 0.0, 1.0]), step=5.0))
     for s in chain.submaps:
         g.add_submap(s)
     for i in ids[1:]:

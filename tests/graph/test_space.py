@@ -18,10 +18,10 @@ from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose, pose_array
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import to_network
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms, whitener
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.variables import Values, gtsam_key, key_name
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.solve.batch import BatchSolver
@@ -298,7 +298,9 @@ def test_what_a_graph_in_space_refuses(rng):
     with pytest.raises(DataError, match="wrong shape"):
         g.add_between(0, 1, SE3.identity, np.eye(3), evidence="shared-scan")
     with pytest.raises(GeometryError, match="dimension"):
-        g.add_gps(Gps(times=[0.0], positions=np.zeros((1, 2)), sigma=np.ones(1), lever=np.zeros(2)), config=GpsConfig())
+        g.add_sensor(
+            Gps(times=[0.0], positions=np.zeros((1, 2)), sigma=np.ones(1), lever=np.zeros(2)), config=GpsConfig()
+        )
 
 
 def test_network_in_space_is_the_same_problem(rng, tmp_path):

@@ -11,7 +11,7 @@ from scipy import stats
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.geometry import rotation2, se2_between, se2_log, wrap_angle
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import make_chain, make_gps
 
@@ -56,14 +56,14 @@ def test_order_of_factors_does_not_matter(rng):
     for late in (False, True):
         g = FactorGraph()
         if not late:
-            g.add_gps(gps, config=GpsConfig(baseline=10.0))
+            g.add_sensor(gps, config=GpsConfig(baseline=10.0))
         for s in chain.submaps:
             g.add_submap(s)
             if s.key == 5 and not late:
                 g.add_between(1, 4, T, C, evidence="shared-scan")
         if late:
             g.add_between(1, 4, T, C, evidence="shared-scan")
-            g.add_gps(gps, config=GpsConfig(baseline=10.0))
+            g.add_sensor(gps, config=GpsConfig(baseline=10.0))
         BatchSolver(g).update()
         results.append(g)
     assert results[0].objective().total == pytest.approx(results[1].objective().total, rel=1e-10)
@@ -78,7 +78,7 @@ def test_moving_the_gps_frame_moves_the_datum_alone(rng):
     graphs = []
     for stream in (gps, moved):
         g = FactorGraph()
-        g.add_gps(stream)
+        g.add_sensor(stream)
         for s in chain.submaps:
             g.add_submap(s)
         BatchSolver(g).update()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from graphslam.core.geometry import Array
 from graphslam.core.trajectory import Trajectory
-from graphslam.graph.gps import lever_arm
+from graphslam.graph.sensors.gps import lever_arm
 
 
 def antenna_in_base(trajectory: Trajectory, times: Array, lever: Array) -> tuple[Array, Array]:

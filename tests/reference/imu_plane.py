@@ -13,6 +13,7 @@ from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.imu.config import ImuConfig
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.batch import BatchSolver
 
 NOISE = ImuNoise(
@@ -121,11 +122,11 @@ def solved(made: list[Submap], imu: Imu | None, config: ImuConfig | None = None)
     for s in made:
         g.add_submap(s, spacing=3.0)
     if imu is not None:
-        g.add_imu(imu, config=config)
+        g.add_sensor(imu, config=config)
     solver = BatchSolver(g)
     solver.solve_to_optimum()
     for _ in range(4):
-        if not g.recentre_imu():
+        if not ImuFactors.of(g).recentre():
             break
         solver.solve_to_optimum()
     return g
@@ -133,7 +134,7 @@ def solved(made: list[Submap], imu: Imu | None, config: ImuConfig | None = None)
 
 def nees(g: FactorGraph, imu: Imu, bias: np.ndarray | None) -> dict[str, float]:
     """Mean NEES over the nodes by block, over its degrees of freedom."""
-    states, cov = g.imu_states(), g.covariance()
+    states, cov = ImuFactors.of(g).states(), g.covariance()
     t = np.array([states.time[n] for n in states.order])
     e = se2_log(se2_between(g.values.poses[list(states.order)], true_pose(t)))
     some = np.array(states.order) > 0

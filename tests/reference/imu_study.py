@@ -15,7 +15,8 @@ from graphslam.core.se3 import align_se3, quat_rotate, quat_to_matrix, so3_exp
 from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.imu.config import ImuConfig
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.batch import BatchSolver
 from tests.reference.imu_ring import STEP, Ring, ring, true_pose
 
@@ -47,14 +48,14 @@ def solved(
     if gps:
         t = np.arange(0.25, made.submaps[-1].interval[1], 1.0)
         z = SE3.transform(true_pose(t), np.broadcast_to(LEVER, (len(t), 3))) + 0.3 * rng.standard_normal((len(t), 3))
-        g.add_gps(Gps(times=t, positions=z, sigma=np.full(len(t), 0.3), lever=LEVER), config=GpsConfig(baseline=5.0))
-        g.finish_gps()
+        g.add_sensor(Gps(times=t, positions=z, sigma=np.full(len(t), 0.3), lever=LEVER), config=GpsConfig(baseline=5.0))
+        g.finish_sensors()
     if imu is not None:
-        g.add_imu(made.imu, config=imu)
+        g.add_sensor(made.imu, config=imu)
     solver = BatchSolver(g)
     solver.solve_to_optimum()
     for _ in range(4):
-        if not g.recentre_imu():
+        if not ImuFactors.of(g).recentre():
             break
         solver.solve_to_optimum()
     return g
@@ -91,7 +92,7 @@ def trial(
         return float(np.mean(np.einsum("ki,ki->k", e, np.linalg.solve(P, e[..., None])[..., 0])) / e.shape[1])
 
     nees = {name: of(e[:, s], P[:, s, s]) for name, s in BLOCKS.items()}
-    states = g.imu_states()
+    states = ImuFactors.of(g).states()
     cov = g.covariance()
     if states.velocity:
         t = np.array([states.time[n] for n in states.velocity])

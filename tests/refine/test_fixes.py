@@ -10,8 +10,8 @@ import pytest
 from graphslam.backend.refining import refinement_findings
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.refine.fixes import FixModel
 from graphslam.refine.problem import RefinementProblem
 from graphslam.refine.refine import refine_by_scans

@@ -11,7 +11,7 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.gnc import GncConfig, GncSolver, find_outliers
 from graphslam.solve.registry import SOLVERS, make_solver
 
@@ -31,7 +31,7 @@ def spoilt(rng: np.random.Generator, dim: int, wild: int, wrong: int) -> tuple[F
     fixes = poses[:-1, :dim] + 0.3 * rng.standard_normal((n, dim))
     far = rng.choice(n, wild, replace=False)
     fixes[far] += rng.uniform(5, 30, (wild, dim)) * rng.choice([-1, 1], (wild, dim))
-    ids = graph.add_gps(
+    ids = graph.add_sensor(
         Gps(times=t, positions=fixes, sigma=np.full(n, 0.3), lever=np.zeros(dim)), config=GpsConfig(baseline=8.0)
     )
     bad = {ids[k] for k in far}
@@ -39,7 +39,7 @@ def spoilt(rng: np.random.Generator, dim: int, wild: int, wrong: int) -> tuple[F
         T = G.compose(G.between(poses[k], poses[k + 1]), G.exp(SIGMA[dim] * rng.standard_normal(G.dof)))
         path = Trajectory(np.array([k, k + 1.0]), np.stack([G.identity, T]), np.stack([0 * P, P]))
         graph.add_submap(Submap(key=k, interval=(float(k), k + 1.0), exit_pose=T, exit_covariance=P, trajectory=path))
-    graph.finish_gps()
+    graph.finish_sensors()
     for i in range(0, 20, 2):
         T = G.compose(G.between(poses[i], poses[i + 20]), G.exp(SIGMA[dim] * rng.standard_normal(G.dof)))
         graph.add_between(i, i + 20, T, P, evidence="shared-scan", group="match")

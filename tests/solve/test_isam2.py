@@ -13,8 +13,8 @@ from graphslam.core.errors import ConfigError, IndeterminateError, SolverError, 
 from graphslam.core.geometry import se2_between
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver, optimise_graph, state_of
 from graphslam.solve.isam2 import FactorRejectedError, Isam2Solver
 from graphslam.solve.registry import SOLVERS, make_solver
@@ -198,7 +198,7 @@ def test_removal_and_merging_follow_the_graph(rng):
     g = FactorGraph()
     solver = Isam2Solver(g)
     gps = make_gps(chain, rng, np.array([3.0, 4.0, 0.7]), step=2.5)
-    ids = g.add_gps(gps, config=GpsConfig(robust=RobustKernel("cauchy", 1.0), baseline=10.0))
+    ids = g.add_sensor(gps, config=GpsConfig(robust=RobustKernel("cauchy", 1.0), baseline=10.0))
     for s in chain.submaps:
         g.add_submap(s, landmark_ids=s.landmarks.ids + (100 if s.key >= 6 else 0))
         solver.update()
@@ -216,7 +216,7 @@ def test_removal_and_merging_follow_the_graph(rng):
     assert set(solver._known) == set(g.values.layout().names())
     solver.solve_to_optimum()
     other = FactorGraph()
-    other.add_gps(gps.take(np.arange(len(gps.times)) != 7), config=GpsConfig(robust=RobustKernel("cauchy", 1.0)))
+    other.add_sensor(gps.take(np.arange(len(gps.times)) != 7), config=GpsConfig(robust=RobustKernel("cauchy", 1.0)))
     for s in chain.submaps:
         other.add_submap(s)
     BatchSolver(other).solve_to_optimum()

@@ -20,7 +20,7 @@ DATUM = np.array([100.0, 20.0, -1.0])
 def solved(rng):
     chain = make_chain(rng, m=8, landmarks=20)
     g = FactorGraph()
-    g.add_gps(make_gps(chain, rng, DATUM, step=3.0))
+    g.add_sensor(make_gps(chain, rng, DATUM, step=3.0))
     for s in chain.submaps:
         g.add_submap(s)
     solver = BatchSolver(g)

@@ -14,6 +14,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import Compass, Gps
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord
+from graphslam.graph.sensors import sensor_kinds
 
 Role = Literal["input", "gps", "imu", "compass", "beacons", "unused"]
 
@@ -115,4 +116,20 @@ def stream_use(
                 reasons.append(f"{outside} at times that no factor covers")
             why = ", ".join(reasons) or ("no part of this run reads it" if role == "unused" else "")
         out.append(StreamUse(name, role, len(times), used, asked, why))
+    for option, why in _idle_options(log, settings, out):
+        graph.log_event("no-effect", option=option, why=why)
+    return out
+
+
+def _idle_options(log: SensorLog, settings: RunConfig, streams: list[StreamUse]) -> list[tuple[str, str]]:
+    """Options that ask for sensors of a kind that the log does not have, or that a front end used, and why."""
+    out = []
+    for name, kind in sensor_kinds().items():
+        use = getattr(getattr(settings, name, None), "use", "none")
+        own = [s for s in streams if isinstance(log[s.name], kind.readings)]
+        if use == "none" or (own and any(s.role != "input" for s in own)):
+            continue
+        front = ", ".join(s.name for s in own)
+        why = f"the front end used {front}" if own else f"the log has no {kind.title}"
+        out.append((f"{name}.use={use}", why))
     return out

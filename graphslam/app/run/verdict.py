@@ -223,6 +223,8 @@ def _of_events(events: Sequence[Mapping[str, Any]]) -> list[Finding]:
         out.append(Finding("look", "outliers", text))
     out += [_fix_errors(e) for e in events if e.get("event") == "gps-errors"]
     for e in events:
+        if e.get("event") == "no-effect":
+            out.append(Finding("look", "no-effect", f"{e['option']} has no effect — {e['why']}."))
         if e.get("event") == "beacon-not-placed":
             text = f"beacon {e['beacon']}: no position after {e['distances']} distances — {e['why']}."
             out.append(Finding("look", "beacon-not-placed", text))

@@ -48,7 +48,7 @@ class AntennaRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpsRecord(AntennaRecord):
-    """One position fix inside a submap; see :mod:`graphslam.graph.gps` for the residual.
+    """One position fix inside a submap; see :mod:`graphslam.graph.sensors.gps` for the residual.
 
     Parameters
     ----------
@@ -351,7 +351,7 @@ class GpsBatch(UniformBatch):
 
 
 def _in_the_plane(names: list[str], record: GpsRecord, origin: Array) -> Terms:
-    """``W (arm - x⁻¹ T_gps_world⁻¹ (z - bias))`` (see :mod:`graphslam.graph.gps`) in scalar arithmetic.
+    """``W (arm - x⁻¹ T_gps_world⁻¹ (z - bias))`` (see :mod:`graphslam.graph.sensors.gps`) in scalar arithmetic.
 
     There are hundreds of fixes and every one hangs on the datum, so this runs more often than anything else here:
     numpy's overhead on arrays of two would be most of the time.

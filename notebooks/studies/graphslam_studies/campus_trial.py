@@ -105,7 +105,7 @@ def with_fixes(end: BackEnd, gps: Gps, how: GpsOptions) -> tuple[Solution, Array
     """The graph as it is, with these fixes and no others; and its frame in that of the fixes."""
     without_fixes(end)
     end.add_gps(split_fixes(gps, how)[0], how)
-    end.graph.finish_gps()
+    end.graph.finish_sensors()
     end.solver.solve_to_optimum()
     values, origin = end.graph.values, end.graph.gps_origin
     assert values.datum is not None

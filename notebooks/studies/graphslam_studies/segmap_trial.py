@@ -140,8 +140,8 @@ class GraphTrial(GridTrial):
         solver.solve_to_optimum()
         closer = None
         if kind == "gps":  # what fixes say is known when loops are looked for
-            graph.add_gps(self.fixes(submaps[0].dim))
-            graph.finish_gps()
+            graph.add_sensor(self.fixes(submaps[0].dim))
+            graph.finish_sensors()
             solver.solve_to_optimum()
         if kind != "chain":
             few = replace(c.find, rounds=0, appearance=None)

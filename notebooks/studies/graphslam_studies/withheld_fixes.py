@@ -42,7 +42,8 @@ from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import antenna_terms
 from graphslam.graph.factors.imu.config import ImuConfig
-from graphslam.graph.gps import GpsConfig
+from graphslam.graph.sensors.gps import GpsConfig
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.io.catalog import load_recording
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies.graph.inertial_start import inertial_start, integrate_attitude
@@ -132,13 +133,13 @@ def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> Factor
         )
         frame = path[k + 1]
     graph.add_attitude(0, [0.0, 0.0, -1.0], 0.2, evidence="prior")
-    graph.add_gps(fixes.take(used), config=GpsConfig(baseline=0.3))
-    graph.finish_gps()
-    graph.add_imu(imu, config=ImuConfig(axes="ignore", longest=60.0, pause=60.0))
+    graph.add_sensor(fixes.take(used), config=GpsConfig(baseline=0.3))
+    graph.finish_sensors()
+    graph.add_sensor(imu, config=ImuConfig(axes="ignore", longest=60.0, pause=60.0))
     solver = BatchSolver(graph)
     solver.update()
     for _ in range(4):
-        if not graph.recentre_imu():
+        if not ImuFactors.of(graph).recentre():
             break
         solver.update()
     return graph

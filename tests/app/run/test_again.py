@@ -80,7 +80,7 @@ def test_with_imu_factors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     short = replace(log, streams={"imu": log["imu"].take(log["imu"].times > 1.0)})
     run = solved(short, submaps, monkeypatch, tmp_path / "run", config={"imu": {"use": "auto"}}, solver="batch")
     monkeypatch.undo()
-    assert run.graph.imu.used
+    assert run.graph.sensors["imu"].used
     remade(tmp_path / "run")
     settings = build_config(cfg.RunConfig, {"imu": {"use": "auto"}})
     back = solve_choice(submaps, frozenset(), BackEndConfig(), imu=ImuSource(RecordSource(short), settings.imu))

@@ -25,8 +25,8 @@ from graphslam.core.config import (
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.removed_options import REMOVED
 from graphslam.graph.factors.imu.config import ImuConfig
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam_frontends.landmarks.config import RbpfEkfConfig
 from graphslam_frontends.segslam.front_end import SegSlamFrontEndConfig
 

@@ -115,7 +115,7 @@ def test_a_gap_in_the_readings_is_counted_and_bridged_by_the_submaps(every, monk
 def test_what_the_front_end_used_is_not_used_again(monkeypatch):
     log, submaps = made(frozenset({"laser", "imu"}))
     r = solved(log, submaps, monkeypatch, config={"imu": {"use": "auto"}})
-    assert not r.graph.imu.used
+    assert not r.graph.sensors["imu"].used
     with pytest.raises(EvidenceReusedError, match=r"'imu' .* a second time: submap 0"):
         solved(log, submaps, monkeypatch, config={"imu": {"use": "imu"}})
     with pytest.raises(MissingDataError, match=r"imu.use names no IMU .* got imu7"):

@@ -173,7 +173,7 @@ def test_gps_is_spent_once_and_withheld_fixes_are_scored(log):
     T_true = r.map.T_gps_world  # the simulator's GPS frame is the first base's
     assert abs(T_true[2]) < 0.05
     with pytest.raises(EvidenceReusedError):
-        r.graph.add_gps(log["gps"].take(slice(0, 1)))
+        r.graph.add_sensor(log["gps"].take(slice(0, 1)))
 
 
 def test_unknown_association_finds_the_true_one(log):

@@ -16,9 +16,10 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.compass import CompassRecord, DeclinationRecord, DeviationPriorRecord
 from graphslam.graph.factors.range import BeaconRangeRecord, RangeRecord
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
-from graphslam.graph.pending_measurements import CompassConfig, trilaterate
+from graphslam.graph.sensors.beacons import trilaterate
+from graphslam.graph.sensors.compass import CompassConfig
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.gtsam_optimum import optimise_with_gtsam
@@ -83,12 +84,12 @@ def world(rng: np.random.Generator, dim: int, *, zero: float = 0.7, iron: tuple[
 def graph_of(dim: int, submaps, compass=None, ranges=None, config: CompassConfig | None = None) -> FactorGraph:
     graph = FactorGraph(dim)
     if compass is not None:
-        graph.add_compass(compass, config=config)
+        graph.add_sensor(compass, config=config)
     if ranges is not None:
-        graph.add_beacons(ranges, lever=np.zeros(dim))
+        graph.add_sensor(ranges)
     for s in submaps:
         graph.add_submap(s)
-    graph.finish_readings()
+    graph.finish_sensors()
     return graph
 
 
@@ -99,13 +100,13 @@ def everything(rng: np.random.Generator, dim: int) -> FactorGraph:
     fixes = truth[:-1, :dim] + 0.2 * rng.standard_normal((len(truth) - 1, dim))
     times, sigma = np.arange(len(fixes)) + 0.5, np.full(len(fixes), 0.2)
     gps = Gps(times=times, positions=fixes, sigma=sigma, lever=np.zeros(dim))
-    graph.add_gps(gps, config=GpsConfig(baseline=5.0))
-    graph.add_compass(compass, config=CompassConfig(declination=0.1, hard_iron=0.2))
-    graph.add_beacons(ranges, lever=np.zeros(dim))
+    graph.add_sensor(gps, config=GpsConfig(baseline=5.0))
+    graph.add_sensor(compass, config=CompassConfig(declination=0.1, hard_iron=0.2))
+    graph.add_sensor(ranges)
     for s in submaps:
         graph.add_submap(s)
-    graph.finish_gps()
-    graph.finish_readings()
+    graph.finish_sensors()
+    graph.finish_sensors()
     arm = 0.3 * rng.standard_normal((4, dim))
     graph.add_range(2, 9, 4.0, 0.3, arm_i=arm[0], arm_j=arm[1], evidence="shared-scan")
     graph.add_range(0, 12, 7.0, 0.3, arm_i=arm[2], arm_j=arm[3], evidence="shared-scan")
@@ -216,12 +217,12 @@ def test_the_declination_ties_the_compass_to_the_frame_of_gps(rng):
     for declination in (None, 0.1):
         graph = FactorGraph(2)
         gps = Gps(times=np.arange(8) + 0.5, positions=fixes, sigma=np.full(8, 1.0), lever=np.zeros(2))
-        graph.add_gps(gps, config=GpsConfig(baseline=5.0))
-        graph.add_compass(compass, config=CompassConfig(declination=declination))
+        graph.add_sensor(gps, config=GpsConfig(baseline=5.0))
+        graph.add_sensor(compass, config=CompassConfig(declination=declination))
         for s in submaps:
             graph.add_submap(s)
-        graph.finish_gps()
-        graph.finish_readings()
+        graph.finish_sensors()
+        graph.finish_sensors()
         BatchSolver(graph).solve_to_optimum()
         sigma[declination] = float(np.sqrt(graph.covariance().marginal("datum")[2, 2]))
         if declination is not None:
@@ -240,7 +241,7 @@ def test_beacons_wait_until_their_place_is_known(rng):
     )
     P = np.diag(SIGMA[2] ** 2)
     graph = FactorGraph(2)
-    graph.add_beacons(
+    graph.add_sensor(
         LandmarkObservations.range_only(
             times=np.arange(10.0), offsets=np.arange(11), ranges=np.full(10, 5.0), range_sigma=np.full(10, 0.1),
             ids=np.full(10, 7),
@@ -248,7 +249,7 @@ def test_beacons_wait_until_their_place_is_known(rng):
     )  # fmt: skip
     for k in range(10):
         graph.add_submap(submap(k, np.array([1.0, 0.0, 0.0]), P))
-    graph.finish_readings()
+    graph.finish_sensors()
     assert graph.structure.count("beacon") == 0
     assert [e["distances"] for e in graph.events if e["event"] == "beacon-not-placed"] == [10]
     assert not graph.ledger.table()["stream"].str.contains("beacons").any()
@@ -257,20 +258,20 @@ def test_beacons_wait_until_their_place_is_known(rng):
 def test_readings_are_spent_once_thinned_and_dropped_by_name(rng):
     _, submaps, compass, _ = world(rng, 2)
     graph = FactorGraph(2)
-    ids = graph.add_compass(compass, config=CompassConfig(every=2.0))
+    ids = graph.add_sensor(compass, config=CompassConfig(every=2.0))
     assert len(ids) == 12
     assert [e["count"] for e in graph.events if e["event"] == "readings-thinned"] == [12]
     with pytest.raises(EvidenceReusedError):
-        graph.add_compass(compass)
+        graph.add_sensor(compass)
     for s in submaps[:10]:
         graph.add_submap(s)
-    graph.finish_readings()
+    graph.finish_sensors()
     assert len(graph.records) == 10 + 6
     assert [e["why"] for e in graph.events if e["event"] == "readings-dropped"] == ["no submap covers it"]
     with pytest.raises(ConfigError, match="hard_iron"):
         CompassConfig(hard_iron=0.0)
     with pytest.raises(DataError, match="known identities"):
-        graph.add_beacons(
+        graph.add_sensor(
             LandmarkObservations.range_only(
                 times=np.zeros(1),
                 offsets=np.array([0, 1]),

@@ -13,8 +13,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsRecord, gps_residual
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig, GpsFactors
 from graphslam.graph.variables import gtsam_key
 from graphslam.solve.batch import BatchSolver
 from tests.reference.antenna import antenna_in_base
@@ -83,7 +83,7 @@ def test_datum_heading_is_recovered(rng):
     chain = make_chain(rng, m=12, landmarks=30)
     g = FactorGraph()
     solver = BatchSolver(g)
-    g.add_gps(make_gps(chain, rng, DATUM, sigma=0.05))
+    g.add_sensor(make_gps(chain, rng, DATUM, sigma=0.05))
     for s in chain.submaps:
         g.add_submap(s)
         solver.update()
@@ -99,7 +99,7 @@ def test_fixes_wait_for_the_baseline(rng):
     chain = make_chain(rng, m=10, landmarks=20)
     gps = make_gps(chain, rng, DATUM)
     g = FactorGraph()
-    g.add_gps(gps, config=GpsConfig(baseline=20.0))
+    g.add_sensor(gps, config=GpsConfig(baseline=20.0))
     started = None
     for s in chain.submaps:
         g.add_submap(s)
@@ -119,11 +119,11 @@ def test_boundary_fix_belongs_to_one_submap_only(rng):
     times = np.array([0.0, 10.0, 20.0, 25.0, 30.0, 40.0])
     gps = Gps(times=times, positions=rng.uniform(0, 50, (6, 2)), sigma=np.full(6, 1.0), lever=np.zeros(2))
     g = FactorGraph()
-    g.add_gps(gps, config=GpsConfig(baseline=0.1))
+    g.add_sensor(gps, config=GpsConfig(baseline=0.1))
     for s in chain.submaps:
         g.add_submap(s)
-    assert [f.time for f in g.gps.waiting] == [40.0]
-    g.finish_gps()
+    assert [f.time for f in GpsFactors.of(g).waiting] == [40.0]
+    g.finish_sensors()
     assert {r.time: r.node for r in fixes(g)} == {0.0: 0, 10.0: 1, 20.0: 2, 25.0: 2, 30.0: 3, 40.0: 3}
 
 
@@ -134,14 +134,14 @@ def test_given_late_or_in_portions_it_is_the_same(rng):
     for mode in range(3):
         g = FactorGraph()
         if mode == 0:
-            g.add_gps(gps)
+            g.add_sensor(gps)
         for s in chain.submaps:
             g.add_submap(s)
             if mode == 1:
                 t0, t1 = s.interval
-                g.add_gps(gps.take((gps.times >= t0) & (gps.times < t1)))
+                g.add_sensor(gps.take((gps.times >= t0) & (gps.times < t1)))
         if mode == 2:
-            g.add_gps(gps)
+            g.add_sensor(gps)
         solver = BatchSolver(g)
         solver.update()
         results.append((len(fixes(g)), g.values.poses, g.objective().total))
@@ -154,10 +154,10 @@ def test_uncovered_fixes_are_dropped_and_counted(rng):
     chain = make_chain(rng, m=2)
     gps = Gps(times=[-3.0, 5.0, 33.0], positions=np.zeros((3, 2)), sigma=np.ones(3), lever=np.zeros(2))
     g = FactorGraph()
-    g.add_gps(gps)
+    g.add_sensor(gps)
     for s in chain.submaps:
         g.add_submap(s)
-    g.finish_gps()
+    g.finish_sensors()
     dropped = [e["reason"] for e in g.events if e["event"] == "gps-dropped"]
     assert dropped == ["no submap covers it", "after the last submap"]
     assert not [e for e in g.ledger.entries() if e.stream == "gps" and e.t_start != 5.0]
@@ -174,14 +174,14 @@ def test_gps_inside_a_submap_that_used_it_is_refused(rng):
     g.add_submap(greedy)
     revision = g.revision
     with pytest.raises(EvidenceReusedError, match="gps"):
-        g.add_gps(gps)
+        g.add_sensor(gps)
     assert g.revision == revision
-    assert not g.gps.tied
-    g.add_gps(gps.take(gps.times < 10.0))
+    assert not GpsFactors.of(g).tied
+    g.add_sensor(gps.take(gps.times < 10.0))
     with pytest.raises(EvidenceReusedError, match="second time"):
-        g.add_gps(gps.take(gps.times < 10.0))
+        g.add_sensor(gps.take(gps.times < 10.0))
     h = FactorGraph()  # and the other way round: the submap comes second
-    h.add_gps(gps)
+    h.add_sensor(gps)
     h.add_submap(chain.submaps[0])
     with pytest.raises(EvidenceReusedError, match="submap 1"):
         h.add_submap(greedy)
@@ -198,7 +198,7 @@ def test_robust_kernel_against_outliers(rng):
     error = {}
     for kind in ("none", "cauchy", "huber"):
         g = FactorGraph()
-        g.add_gps(spoilt, config=GpsConfig(robust=RobustKernel(kind, 1.0)))
+        g.add_sensor(spoilt, config=GpsConfig(robust=RobustKernel(kind, 1.0)))
         for s in chain.submaps:
             g.add_submap(s)
         BatchSolver(g).update()
@@ -216,7 +216,7 @@ def test_segment_bias_is_estimated_where_revisits_show_it(rng):
     keep = (gps.times < 110) | (gps.times > 125)
     gps = Gps(times=gps.times[keep], positions=shifted[keep], sigma=gps.sigma[keep], lever=gps.lever)
     g = FactorGraph()
-    g.add_gps(gps, config=GpsConfig(bias_sigma=2.0, segment_gap=5.0))
+    g.add_sensor(gps, config=GpsConfig(bias_sigma=2.0, segment_gap=5.0))
     for s in chain.submaps:
         g.add_submap(s)
     BatchSolver(g).update()
@@ -228,7 +228,7 @@ def test_segment_bias_is_estimated_where_revisits_show_it(rng):
 def test_arm_uncertainty_is_added(rng):
     chain = make_chain(rng, m=3)
     g = FactorGraph()
-    g.add_gps(make_gps(chain, rng, DATUM, sigma=0.3), config=GpsConfig(baseline=5.0, sigma=0.2))
+    g.add_sensor(make_gps(chain, rng, DATUM, sigma=0.3), config=GpsConfig(baseline=5.0, sigma=0.2))
     for s in chain.submaps:
         g.add_submap(s)
     first, last = fixes(g)[0], fixes(g)[9]
@@ -242,6 +242,6 @@ def test_arm_uncertainty_is_added(rng):
 def test_bad_input_is_refused(rng):
     g = FactorGraph()
     with pytest.raises(GeometryError, match="dimension"):
-        g.add_gps(Gps(times=[0.0], positions=np.zeros((1, 3)), sigma=np.ones(1), lever=np.zeros(3)))
+        g.add_sensor(Gps(times=[0.0], positions=np.zeros((1, 3)), sigma=np.ones(1), lever=np.zeros(3)))
     with pytest.raises(ConfigError, match=r"gps.baseline"):
         GpsConfig(baseline=-1.0)

@@ -14,8 +14,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.gps import GpsRecord, gps_predicted_in_space, level_datum_pose
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.noise import RobustKernel
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.antenna import antenna_in_base
@@ -40,9 +40,9 @@ def built(chain: DenseChain, gps: Gps | None = None, config: GpsConfig | None = 
     g = FactorGraph(3)
     for k, s in enumerate(chain.submaps):
         if gps is not None and k == late:
-            g.add_gps(gps, config=config)
+            g.add_sensor(gps, config=config)
         g.add_submap(s, spacing=4.0)
-    g.finish_gps()
+    g.finish_sensors()
     return g
 
 
@@ -110,7 +110,7 @@ def test_fixes_wait_for_a_level_baseline(rng):
     chain = dense_chain(rng, 3, m=6)
     gps = fixes_along(chain, rng, level_datum_pose(DATUM))
     g, started = FactorGraph(3), None
-    g.add_gps(gps, config=GpsConfig(baseline=15.0))
+    g.add_sensor(gps, config=GpsConfig(baseline=15.0))
     for s in chain.submaps:
         g.add_submap(s, spacing=4.0)
         if g.values.datum is None:
@@ -121,7 +121,9 @@ def test_fixes_wait_for_a_level_baseline(rng):
     lift = FactorGraph(3)  # fifty metres straight up in a lift: nothing in it says where north is
     times = np.linspace(0, 9.9, 12)
     up = np.column_stack([np.zeros((12, 2)), np.linspace(0, 50, 12)])
-    lift.add_gps(Gps(times=times, positions=up, sigma=np.ones(12), lever=np.zeros(3)), config=GpsConfig(baseline=15.0))
+    lift.add_sensor(
+        Gps(times=times, positions=up, sigma=np.ones(12), lever=np.zeros(3)), config=GpsConfig(baseline=15.0)
+    )
     s = dense_chain(rng, 3, m=1).submaps[0]
     path = Trajectory(times=s.trajectory.times, poses=np.column_stack(
         [np.zeros((25, 2)), np.linspace(0, 50, 25), np.tile([0, 0, 0, 1.0], (25, 1))]
@@ -143,7 +145,7 @@ def test_a_late_first_fix_moves_nothing(rng):
         solver.update()
     before = g.values.poses.copy()
     P = g.covariance().poses()
-    g.add_gps(gps, config=GpsConfig(baseline=5.0))
+    g.add_sensor(gps, config=GpsConfig(baseline=5.0))
     assert g.values.datum is not None
     np.testing.assert_array_equal(g.values.poses, before)
     solver.update()
@@ -191,7 +193,7 @@ def test_fixes_tell_the_tilt_of_a_first_base_that_is_not_level(rng):
         g = FactorGraph(3)
         if known:
             g.add_attitude(0, DOWN, 0.05, evidence="levelled")
-        g.add_gps(gps)
+        g.add_sensor(gps)
         for s in chain.submaps:
             g.add_submap(s, spacing=4.0)
         BatchSolver(g).solve_to_optimum()

@@ -13,8 +13,8 @@ from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsBatch, GpsRecord, antenna_terms, level_datum_pose
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
+from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam_studies.graph.gnss import add_odometer, add_pseudoranges

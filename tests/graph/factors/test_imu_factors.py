@@ -18,8 +18,9 @@ from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
 from graphslam.graph.factors.imu.config import ImuConfig, places_on_nodes
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
-from graphslam.graph.gps import GpsConfig
 from graphslam.graph.gtsam_values import to_gtsam
+from graphslam.graph.sensors.gps import GpsConfig
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.graph.variables import gtsam_key, key_name
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -41,9 +42,9 @@ def mixed(rng) -> tuple[Ring, FactorGraph]:
     made = ring(rng, submaps=4, seconds=6.0)
     g = chain(made)
     hole = made.imu.take((made.imu.times < 6.5) | (made.imu.times > 13.0))
-    g.add_imu(hole, stream="imu")
-    g.add_imu(replace(made.imu, T_base_imu=MOUNT), stream="second", config=ImuConfig(accelerometer=False))
-    g.add_imu(made.imu, stream="third", config=ImuConfig(longest=0.6, acceleration=2.0))
+    g.add_sensor(hole, stream="imu")
+    g.add_sensor(replace(made.imu, T_base_imu=MOUNT), stream="second", config=ImuConfig(accelerometer=False))
+    g.add_sensor(made.imu, stream="third", config=ImuConfig(longest=0.6, acceleration=2.0))
     return made, g
 
 
@@ -178,22 +179,22 @@ def test_online_is_offline(rng):
     """Readings in two portions and submaps one by one, solved in between, end where all at once do."""
     made = ring(rng, submaps=3, seconds=4.0)
     whole = chain(made)
-    whole.add_imu(made.imu)
+    whole.add_sensor(made.imu)
     BatchSolver(whole).solve_to_optimum()
     g, cut = FactorGraph(3), 5.3
     solver = Isam2Solver(g)
     early, late = made.imu.take(made.imu.times <= cut), made.imu.take(made.imu.times > cut)
     for k, s in enumerate(made.submaps):
         g.add_submap(s, spacing=3.0)
-        g.add_imu(early if k == 0 else late if k == 1 else late.take(slice(0, 0)))
+        g.add_sensor(early if k == 0 else late if k == 1 else late.take(slice(0, 0)))
         solver.update()
     with pytest.raises(DataError, match="were given before"):
-        g.add_imu(late)
+        g.add_sensor(late)
     solver.solve_to_optimum()
     for _ in range(3):
-        g.recentre_imu(limit=0.0)
+        ImuFactors.of(g).recentre(limit=0.0)
         BatchSolver(g).solve_to_optimum()
-        whole.recentre_imu(limit=0.0)
+        ImuFactors.of(whole).recentre(limit=0.0)
         BatchSolver(whole).solve_to_optimum()
     np.testing.assert_allclose(g.values.poses, whole.values.poses, atol=1e-5)
     assert len(g.values.velocities) == len(whole.values.velocities)
@@ -209,8 +210,9 @@ def test_the_last_node_waits_for_the_submap_that_begins_there(rng):
     for k, (s, spacing) in enumerate(zip(made.submaps, spacings)):
         whole.add_submap(s, spacing=spacing)
         g.add_submap(s, spacing=spacing)
-        g.add_imu(made.imu.take(slice(None) if k == 0 else slice(0, 0)), config=config, more=k < 2)
-    whole.add_imu(made.imu, config=config)
+        readings = made.imu.take(slice(None) if k == 0 else slice(0, 0))
+        ImuFactors.of(g).add(readings, config=config, more=k < 2)
+    whole.add_sensor(made.imu, config=config)
 
     def told(graph: FactorGraph) -> list[tuple[str, ...]]:
         return sorted((type(r).__name__, *(v for v in r.variables() if v[0] == "x")) for r in graph.records.values())
@@ -223,14 +225,14 @@ def test_the_last_node_waits_for_the_submap_that_begins_there(rng):
 def test_recentring_leaves_what_is_right(rng):
     made = ring(rng, submaps=2, noise=replace(NOISE, gyro_bias=0.05))
     g = chain(made, spacing=None)
-    g.add_imu(made.imu)
+    g.add_sensor(made.imu)
     solver = BatchSolver(g)
     solver.solve_to_optimum()
     for _ in range(5):
-        if not g.recentre_imu(limit=1e-6):
+        if not ImuFactors.of(g).recentre(limit=1e-6):
             break
         solver.solve_to_optimum()
-    assert g.recentre_imu(limit=1e-6) == 0
+    assert ImuFactors.of(g).recentre(limit=1e-6) == 0
     for r in g.records.values():
         if isinstance(r, ImuRecord):
             direct = preintegrate(made.imu, [r.interval[0]], [r.interval[1]], g.values.imu_biases[r.biases[0]])
@@ -247,16 +249,16 @@ def test_a_submap_that_used_it_refuses_it(rng):
         g.add_submap(replace(s, uses=frozenset({"laser", "imu"} if k == 1 else {"laser"})), spacing=3.0)
     before = (len(g.records), len(g.ledger), g.values.layout())
     with pytest.raises(EvidenceReusedError, match=r"use stream 'imu' .* a second time: submap 1"):
-        g.add_imu(made.imu)
+        g.add_sensor(made.imu)
     assert (len(g.records), len(g.ledger), g.values.layout()) == before
-    assert not g.imu.used
-    g.add_imu(made.imu, stream="other")
+    assert not ImuFactors.of(g).used
+    g.add_sensor(made.imu, stream="other")
 
 
 def test_and_the_other_way_round(rng):
     made = ring(rng, submaps=2)
     g = chain(made)
-    g.add_imu(made.imu)
+    g.add_sensor(made.imu)
     with pytest.raises(EvidenceReusedError, match="imu x0"):
         g.add_between(0, 2, SE3.identity, np.eye(6), streams=["imu"], interval=(0.0, 1.0))
     node = g.start_session(SE3.identity)
@@ -281,7 +283,7 @@ def test_what_is_left_out_is_counted(rng):
     g = chain(made)
     steps = sum(len(s.nodes) - 1 for s in g.submaps)
     late = made.imu.take((t > 4.0) & ~((t > 9.0) & (t < 10.0)) & (t < 20.0))
-    ids = g.add_imu(late, config=ImuConfig(gravity=False))
+    ids = g.add_sensor(late, config=ImuConfig(gravity=False))
     counts = dropped(g)
     assert set(counts) == {"before the first reading", "a pause in the readings", "after the last reading"}
     ways = sum(isinstance(r, ImuRecord) for r in g.records.values())
@@ -290,15 +292,15 @@ def test_what_is_left_out_is_counted(rng):
     assert [r.before is None for r in links] == [True, False]  # the start, and the walk over the pause
     assert len(ids) == ways + 2
     far = chain(made)
-    far.add_imu(made.imu, config=ImuConfig(longest=1.0))
+    far.add_sensor(made.imu, config=ImuConfig(longest=1.0))
     assert dropped(far)["too far apart"] == steps
     slow = chain(made)
-    slow.add_imu(made.imu.take(slice(None, None, 100)), config=ImuConfig(pause=5.0))
+    slow.add_sensor(made.imu.take(slice(None, None, 100)), config=ImuConfig(pause=5.0))
     assert dropped(slow)["too few readings"] > 0
     bare = FactorGraph(3)
     for s in made.submaps:
         bare.add_submap(replace(s, trajectory=None))
-    bare.add_imu(made.imu)
+    bare.add_sensor(made.imu)
     assert dropped(bare) == {"the path does not reach the node": 4}
 
 
@@ -306,12 +308,12 @@ def test_what_it_refuses(rng):
     made = ring(rng, submaps=2)
     g = chain(made)
     with pytest.raises(DataError, match="needs readings"):
-        g.add_imu(made.imu.take(slice(0, 1)))
+        g.add_sensor(made.imu.take(slice(0, 1)))
     for bad in ({"longest": 0.0}, {"window": -1.0}, {"pause": np.nan}, {"axes": "shrug"}):
         with pytest.raises(ConfigError, match=f"imu.{next(iter(bad))}"):
             ImuConfig(**bad)
     with pytest.raises(ConfigError, match="without noise"):
-        g.add_imu(replace(made.imu, noise=replace(NOISE, accelerometer=0.0)))
+        g.add_sensor(replace(made.imu, noise=replace(NOISE, accelerometer=0.0)))
     assert not any(isinstance(r, ImuRecord) for r in g.records.values())
 
 
@@ -322,16 +324,16 @@ def test_swapped_axes_are_named(rng):
     g = chain(made)
     size = len(g.records)
     with pytest.raises(DataError, match=r"imu: the axes .*: x reads −y, y reads x"):
-        g.add_imu(swapped)
+        g.add_sensor(swapped)
     assert len(g.records) == size
-    g.add_imu(swapped, config=ImuConfig(axes="warn"))
+    g.add_sensor(swapped, config=ImuConfig(axes="warn"))
     said = [e for e in g.events if e["event"] == "imu-axes"]
     assert [e["verdict"] for e in said] == ["wrong", "wrong"]
     right = chain(made)
-    right.add_imu(made.imu)
+    right.add_sensor(made.imu)
     assert [e["verdict"] for e in right.events if e["event"] == "imu-axes"] == ["as stated"]
     brief = chain(ring(rng, submaps=1))
-    brief.add_imu(made.imu)
+    brief.add_sensor(made.imu)
     assert [e["verdict"] for e in brief.events if e["event"] == "imu-axes"] == ["not checked"]
 
 
@@ -341,7 +343,7 @@ def test_swapped_axes_are_named(rng):
 def test_removal_gives_back_and_links(rng):
     made = ring(rng, submaps=3)
     g = chain(made)
-    g.add_imu(made.imu)
+    g.add_sensor(made.imu)
     solver = Isam2Solver(g)
     solver.update()
     middle = [r for r in g.records.values() if isinstance(r, ImuRecord)][3]
@@ -384,9 +386,9 @@ def test_fixes_take_the_tilt_when_it_comes(rng):
     z = made.truth(t)[:, :3] + 0.05 * rng.standard_normal((32, 3))
     gps = Gps(times=t, positions=z, sigma=np.full(32, 0.05), lever=np.zeros(3))
     g = chain(made)
-    g.add_gps(gps, config=GpsConfig(baseline=5.0))
-    g.finish_gps()
-    g.add_imu(made.imu)
+    g.add_sensor(gps, config=GpsConfig(baseline=5.0))
+    g.finish_sensors()
+    g.add_sensor(made.imu)
     solver = Isam2Solver(g)
     solver.update()
     solver.solve_to_optimum()
@@ -399,7 +401,7 @@ def test_inside_levelled_submaps_the_gyro_says_roll_and_pitch(rng):
     g = chain(made, level_sigma=0.03)
     s = g.submaps[0]
     before = [g.records[f].whitener for f in s.factor_ids[: len(s.nodes) - 1]]
-    ids = g.add_imu(made.imu)
+    ids = g.add_sensor(made.imu)
     s = g.submaps[0]
     after = [g.records[f].whitener for f in s.factor_ids[: len(s.nodes) - 1]]
     assert all(c[0, 0] > 1.0 > d[0, 0] for c, d in zip(s.covariances, s.stated))
@@ -414,5 +416,5 @@ def test_inside_levelled_submaps_the_gyro_says_roll_and_pitch(rng):
     BatchSolver(g).solve_to_optimum()
     plain = chain(made)
     first = plain.records[plain.submaps[0].factor_ids[0]]
-    plain.add_imu(made.imu)
+    plain.add_sensor(made.imu)
     assert plain.records[first.factor_id] is first  # a path that did not take them from gravity keeps them

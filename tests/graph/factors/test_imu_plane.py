@@ -17,6 +17,7 @@ from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.plane import LEAN, LEAN_TIME
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.gtsam_values import to_gtsam
+from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference import imu_plane, imu_ring
@@ -37,8 +38,8 @@ def mixed(rng) -> FactorGraph:
     """Two units on dense submaps and submaps with landmarks, one by its gyro alone, and a pause."""
     g = chain(rng)
     imu, _ = imu_plane.readings(T, rng)
-    g.add_imu(imu.take((imu.times < 6.5) | (imu.times > 13.0)), stream="imu")
-    g.add_imu(imu_plane.readings(T, rng)[0], stream="second", config=ImuConfig(accelerometer=False))
+    g.add_sensor(imu.take((imu.times < 6.5) | (imu.times > 13.0)), stream="imu")
+    g.add_sensor(imu_plane.readings(T, rng)[0], stream="second", config=ImuConfig(accelerometer=False))
     return g
 
 
@@ -112,7 +113,7 @@ def test_readings_without_error_have_no_residual(rng, monkeypatch):
     monkeypatch.setattr(imu_plane, "STEP", np.full(3, 1e-9))
     for lean in (None, np.zeros((len(T), 2))):
         g = chain(rng, landmarks=False)
-        g.add_imu(imu_plane.readings(T, None, lean=lean)[0])
+        g.add_sensor(imu_plane.readings(T, None, lean=lean)[0])
         BatchSolver(g).solve_to_optimum()
         assert g.objective()["imu"].chi2 < 1e-2
         np.testing.assert_allclose(g.values.imu_biases, 0.0, atol=1e-3)
@@ -155,10 +156,10 @@ def test_what_it_refuses(rng):
         imu_ring.ring(rng, submaps=1).imu, T_base_imu=np.array([0.0, 0, 0, np.sin(0.4), 0, 0, np.cos(0.4)])
     )
     with pytest.raises(DataError, match=r"imu: .*not level.*mean specific force .* T_base_imu as it is mounted"):
-        g.add_imu(tilted)
+        g.add_sensor(tilted)
     planar, _ = imu_plane.readings(T, rng)
     with pytest.raises(GeometryError, match="a planar IMU does not say how a body moves in space"):
-        FactorGraph(3).add_imu(planar)
+        FactorGraph(3).add_sensor(planar)
     assert not any(isinstance(r, ImuRecord) for r in g.records.values())
 
 
@@ -167,10 +168,10 @@ def test_wrong_axes_are_named(rng):
     for lean in (None, np.zeros((len(T), 2))):
         imu, _ = imu_plane.readings(T, rng, lean=lean, turn=0.0)
         g = chain(rng)
-        g.add_imu(imu)
+        g.add_sensor(imu)
         assert [e["verdict"] for e in g.events if e["event"] == "imu-axes"] == ["as stated"]
         with pytest.raises(DataError, match="z reads −z"):
-            g.check_imu(replace(imu, angular_rate=-imu.angular_rate))
+            ImuFactors.of(g).check(replace(imu, angular_rate=-imu.angular_rate))
     assert abs(imu.specific_force[:, 2].mean() - GRAVITY) < 1e-9
 
 

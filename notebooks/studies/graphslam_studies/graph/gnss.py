@@ -18,8 +18,8 @@ from graphslam.core.poses import SE3
 from graphslam.core.records import Odometry
 from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.gps import antenna_terms
-from graphslam.graph.gps import datum_columns, start_datum
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, covariance_whiteners
+from graphslam.graph.sensors.gps import datum_columns, start_datum
 from graphslam_studies.graph.odometer import OdometerPriorRecord, OdometerRecord
 from graphslam_studies.graph.pseudorange import ClockRecord, PseudorangeRecord, SatelliteBiasRecord
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +18,13 @@ from graphslam.core.geometry import Array, align_se2, rotation2, se2_transform
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.se3 import quat_to_matrix, skew
+from graphslam.graph.factor_graph_state import FactorGraphState
+from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.gps import AntennaRecord, BiasPriorRecord, GpsRecord, antenna_terms
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.noise import RobustKernel, whitener
+from graphslam.graph.sensors.base import SensorFactors
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
-
-if TYPE_CHECKING:
-    from graphslam.graph.factor_graph_state import FactorGraphState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,15 +211,26 @@ def start_datum(world: Array, fixes: Array, sigma: Array) -> Array:
     return T
 
 
-class GpsFixes:
+class GpsFactors(SensorFactors):
     """The fixes of a graph: those that are not factors yet, and how they become so.
+
+    Fixes wait until their submap is there, and until :attr:`GpsConfig.baseline` is spanned; then the datum starts by
+    rigid alignment and all of them become factors. The map stays where it is then, however late that be: its first
+    base is fixed and the datum is solved for. Fixes that no submap covers are dropped and counted (event
+    ``gps-dropped``). Each is attached to the node nearest in time, the base or an inner one.
 
     A fix at ``t`` belongs to the submap with ``t_start <= t < t_end``: exactly on a boundary it belongs to the later
     one. The very last instant of a finished graph belongs to the last submap.
     """
 
+    name: ClassVar[str] = "gps"
+    title: ClassVar[str] = "GPS fixes"
+    readings = Gps
+    options = GpsConfig
+    graph: FactorGraphState
+
     def __init__(self, graph: FactorGraphState) -> None:
-        self.graph = graph
+        super().__init__(graph)
         self.config = GpsConfig()
         self.waiting: list[PendingFix] = []  # for their submap, in the order of time
         self.tied: list[AttachedFix] = []  # for a datum
@@ -227,9 +238,9 @@ class GpsFixes:
         self.bias_begin = -np.inf  # of the last bias
         self.fitted: FixErrors | None = None
 
-    def add(self, gps: Gps, stream: str, config: GpsConfig | None) -> list[int]:
-        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.add_gps`."""
-        g = self.graph
+    def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
+        """See :meth:`SensorFactors.add`; ids one a fix."""
+        g, gps, stream = self.graph, readings, stream or self.name
         if gps.positions.shape[1] != g.dim:
             raise GeometryError(
                 "GPS positions and map differ in dimension",
@@ -253,8 +264,16 @@ class GpsFixes:
                 self.attach(s, more=s is not g.submaps[-1])
         return [f.factor_id for f in fixes]
 
+    def add_factors(self, submap: SubmapNode) -> None:
+        """See :meth:`SensorFactors.add_factors`."""
+        self.attach(submap)
+
+    def waiting_readings(self) -> int:
+        """For a submap, or for a datum."""
+        return len(self.waiting) + len(self.tied)
+
     def finish(self) -> None:
-        """No more submaps will come."""
+        """The last instant belongs to the last submap, later fixes are dropped."""
         if self.graph.submaps:
             self.attach(self.graph.submaps[-1], closed=True)
         self._drop([(f.factor_id, "after the last submap") for f in self.waiting])
@@ -303,9 +322,9 @@ class GpsFixes:
         turn = J[:, :2] if self.graph.dim == 2 else J[:, 3:6]  # the node's axes in the GPS frame
         return np.asarray(t.fix.uneven + turn @ t.covariance @ turn.T)
 
-    def detach(self, s: SubmapNode) -> None:
+    def remove(self, submap: SubmapNode) -> None:
         """Take out the fixes of a submap that goes: their arms come from its trajectory."""
-        own = set(s.nodes[:-1])
+        s, own = submap, set(submap.nodes[:-1])
         inside = [r.factor_id for r in self.graph.records.values() if isinstance(r, GpsRecord) and r.node in own]
         for fid in inside:
             del self.graph.records[fid]
@@ -314,7 +333,7 @@ class GpsFixes:
         self._drop([(i, "its submap was removed") for i in [*tied, *inside]])
         self._leave_points(self.graph.submap(s.key))
 
-    def remove_unused(self) -> None:
+    def remove_unused(self, removed: FactorRecord) -> None:
         """A datum that no fix holds any more goes, and the biases with it."""
         g = self.graph
         if g.structure.count("datum") and not any(isinstance(r, AntennaRecord) for r in g.records.values()):

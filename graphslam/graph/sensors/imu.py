@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.se3 import matrix_to_quat, quat_multiply, quat_to_matrix, se3_adjoint, se3_compose, so3_log
+from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.attitude import LEVELLED, AttitudeRecord, up_turn, without_tilt
 from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.between import BetweenRecord
@@ -37,10 +38,8 @@ from graphslam.graph.factors.imu.preintegration import Preintegrated, bias_sigma
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.factors.imu.states import ImuStates, renumber_states, required_bias_links
 from graphslam.graph.noise import whitener
+from graphslam.graph.sensors.base import SensorFactors
 from graphslam.graph.submap_node import SubmapNode
-
-if TYPE_CHECKING:
-    from graphslam.graph.factor_graph_state import FactorGraphState
 
 logger = logging.getLogger(__name__)
 
@@ -65,19 +64,69 @@ class ImuUse:
     given: Imu
 
 
-class ImuUnits:
-    """The IMUs of a graph."""
+class ImuFactors(SensorFactors):
+    """The IMUs of a graph: preintegrated ways, gravity, biases.
+
+    In the plane it is planar, or it has three axes and the body is level
+    (:mod:`graphslam.graph.factors.imu.plane`). No start velocity is needed: a velocity follows from the two poses
+    and the accelerations of a way.
+
+    Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
+    preintegrated way (:mod:`graphslam.graph.factors.imu.batch`), inner nodes included; inside levelled submaps
+    their relative roll and pitch is then the gyro's word alone. A way brings in the velocity of the unit and its
+    biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over pauses. In space a node without a
+    way sees gravity: the mean specific force about it, as sure as the body was still, and the first factor brings
+    in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
+    """
+
+    name: ClassVar[str] = "imu"
+    title: ClassVar[str] = "IMU"
+    readings = Imu
+    options = ImuConfig
+    graph: FactorGraphState
 
     def __init__(self, graph: FactorGraphState) -> None:
-        self.graph = graph
+        super().__init__(graph)
         self.used: dict[str, ImuUse] = {}
         plane = graph.dim == 2
         self._bias = IN_PLANE["imubias"] if plane else list(range(6))  # of a bias in space, what the graph has
         self._rows = PLANE_ROWS if plane else np.arange(15)
         self._gyro_rows = PLANE_ROWS[PLANE_GYRO_ROWS] if plane else GYRO_ROWS
 
-    def add(self, imu: Imu, *, stream: str = "imu", config: ImuConfig | None = None, more: bool = False) -> list[int]:
-        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.add_imu`."""
+    def add(self, readings: Any, *, stream: str | None = None, config: Any = None, more: bool = False) -> list[int]:
+        """Give the graph an IMU that no front end used; its readings between existing nodes become factors.
+
+        It may be called again when there are more submaps, with the readings that follow (or with none): ways that
+        are there stay. Everything left out is counted by reason (event ``imu``).
+
+        Parameters
+        ----------
+        readings : Imu
+            ``T_base_imu`` is its mounting on the body; the body is where the paths of the submaps say.
+        stream : str
+            Its name in the ledger.
+        config : ImuConfig, optional
+            By default that of the call before.
+        more : bool
+            It will be called again with more submaps: the last node waits for the one that begins there, and axes are
+            not checked, and dropped readings are not counted.
+
+        Returns
+        -------
+        list of int
+            Ids of the new factors.
+
+        Raises
+        ------
+        EvidenceReusedError
+            A submap, or another factor, used the stream over an overlapping interval. Nothing is changed then.
+        DataError
+            Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
+        GeometryError
+            A planar IMU in space.
+        ConfigError, CovarianceError
+        """
+        imu, stream = readings, stream or self.name
         known = self.used.get(stream)
         cfg = config or (ImuConfig() if known is None else known.config)
         given = imu if known is None else join_readings(known.given, imu, stream)
@@ -121,7 +170,15 @@ class ImuUnits:
         return ids
 
     def check(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
-        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.check_imu`."""
+        """Compare the axes of an IMU with the paths of the submaps; returns what is wrong in words, or nothing.
+
+        Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
+
+        Raises
+        ------
+        DataError
+            The mounting is contradicted and ``axes`` is ``"refuse"``.
+        """
         if axes == "ignore":
             return ""
         try:
@@ -142,7 +199,11 @@ class ImuUnits:
         return words
 
     def recentre(self, *, limit: float = RECENTRE) -> int:
-        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.recentre_imu`."""
+        """Preintegrate again, about their present bias, ways whose gyro bias has moved; returns how many.
+
+        Ways know how they change with the biases to first order only. After solving, call this and solve again until
+        it returns nothing: twice is enough, most of the time.
+        """
         changed = 0
         for stream, use in self.used.items():
             old = [r for r in self.graph.records.values() if isinstance(r, ImuRecord) and r.stream == stream]
@@ -158,12 +219,12 @@ class ImuUnits:
         return changed
 
     def states(self, stream: str = "imu") -> ImuStates:
-        """See :meth:`~graphslam.graph.factor_graph.FactorGraph.imu_states`."""
+        """Nodes, velocities and biases of an IMU, in order of time."""
         return ImuStates.of(self.graph.records.values(), stream)
 
-    def detach(self, s: SubmapNode) -> None:
+    def remove(self, submap: SubmapNode) -> None:
         """Take out what IMUs said inside a submap that goes."""
-        inside = set(s.nodes)
+        inside = set(submap.nodes)
         for fid, r in list(self.graph.records.items()):
             way = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
             if way or (isinstance(r, ForceRecord) and r.node in inside):
