@@ -26,13 +26,15 @@ import scipy.sparse as sp
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, wrap_angle
-from graphslam.graph.variables import KINDS, Values, VariableKind
+from graphslam.graph.variables import KINDS, Values, VariableKind, split_name
 from graphslam.join.frames import lever_matrix, rotation_of, rows_in_frame, rule_of
 from graphslam.join.graph_problem import Index, JoinProblem
 from graphslam.linear.symmetric_factor import SymmetricFactor
 
 DENSE = 200
 """Scalars up to which a dense Cholesky factorisation is faster than a sparse one (measured)."""
+LARGEST_NAMED = 3000
+"""Scalars of a singular map up to which the variables that it leaves open are searched for."""
 PASSES = 3
 """How often a join of maps with common variables is linearised at most."""
 _STEP = 1e-6
@@ -316,13 +318,42 @@ class GaussianMap:
                 A, b = at.measured(factors)
                 H, g = sp.csc_matrix(H + A), g + b
             step = np.zeros(len(g))
-            step[free] = -_solve(H, g, free)
+            step[free] = -self._solve(H, g, free)
             done = replace(at, information=H, gradient=g).carried(step)
             if -(g @ step) < _STEP * len(g):
                 break
         gradient = np.where(free, 0.0, done.gradient)
         gradient[np.repeat(self.variables == self.base, self.problem.width[self.variables])] = 0.0
         return replace(done, gradient=gradient)
+
+    def _solve(self, H: sp.csc_matrix, g: Array, free: npt.NDArray[np.bool_]) -> Array:
+        """``H⁻¹ g`` over the free columns."""
+        at = np.flatnonzero(free)
+        A = sp.csc_matrix(H[:, at][at])
+        try:
+            if len(at) > DENSE:
+                found = SymmetricFactor(A).solve(g[at])
+            else:
+                found = np.asarray(la.cho_solve(la.cho_factor(A.toarray(), lower=True), g[at]))
+        except (la.LinAlgError, IndeterminateError):
+            found = np.full(len(at), np.nan)
+        if not np.all(np.isfinite(found)):
+            raise self._indeterminate(A, at)
+        return found
+
+    def _indeterminate(self, A: sp.csc_matrix, at: Index) -> IndeterminateError:
+        """Which variables of the map a singular matrix leaves open, and what would determine them."""
+        problem, keys = self.problem, self.problem.keys
+        where = f"submaps {keys[self.first]} to {keys[self.stop - 1]}"
+        if A.shape[0] > LARGEST_NAMED or not np.all(np.isfinite(A.data)):
+            return IndeterminateError(f"the joined map of {where} is not determined")
+        size = np.sqrt(np.maximum(A.diagonal(), 1e-300))
+        _, vector = la.eigh(A.toarray() / np.outer(size, size), subset_by_index=[0, 0])
+        share, owner = np.abs(vector[:, 0] / size), np.repeat(self.variables, problem.width[self.variables])[at]
+        names = list(dict.fromkeys(problem.names[owner[k]] for k in np.argsort(-share) if share[k] > 0.1 * share.max()))
+        advice = {KINDS[split_name(n)[0].word].remedy for n in names} - {""}
+        text = f"the factors of {where} do not determine {', '.join(names[:5])}"
+        return IndeterminateError(": ".join([text, *sorted(advice)]), tuple(names))
 
     def widened(self, variables: Index, values: Values, anchors: Index | None = None) -> GaussianMap:
         """With more variables, of which nothing is known, at other values."""
@@ -390,15 +421,3 @@ def join_two(a: GaussianMap, b: GaussianMap, factors: Index, *, passes: int | No
     if not len(enter) and not news:
         return begin
     return begin.solved(enter, lambda values: add_maps(a, b, values)[0], passes or (PASSES if news else 1))
-
-
-def _solve(H: sp.csc_matrix, g: Array, free: npt.NDArray[np.bool_]) -> Array:
-    """``H⁻¹ g`` over the free columns."""
-    at = np.flatnonzero(free)
-    A = H[:, at][at]
-    if len(at) > DENSE:
-        return SymmetricFactor(sp.csc_matrix(A)).solve(g[at])
-    try:
-        return np.asarray(la.cho_solve(la.cho_factor(A.toarray(), lower=True), g[at]))
-    except la.LinAlgError:
-        raise IndeterminateError("the information matrix of a map is singular") from None

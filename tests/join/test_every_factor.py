@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import graphslam as gs
 from graphslam.app.compare import compare_methods
+from graphslam.core.errors import IndeterminateError
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.noise import RobustKernel
@@ -107,3 +109,22 @@ def test_the_dense_filter_is_the_information_filter_in_sequence(problem: JoinPro
     P = np.linalg.inv(sparse.information.toarray())
     scale = np.sqrt(np.outer(np.diag(P), np.diag(P)))
     np.testing.assert_allclose(dense.covariance / scale, P / scale, atol=1e-5)
+
+
+def test_a_map_that_factors_do_not_determine_is_named() -> None:
+    """A bias of GPS fixes without its prior: the variable, the submaps and the remedy are in the message."""
+    graph = build(np.random.default_rng(3), gps=True, robust=RobustKernel())
+    BatchSolver(graph).solve_to_optimum()
+    prior = next(r for r in graph.records.values() if r.group == "gps-bias" and r.bias == 2)
+    fixes = [r for r in graph.records.values() if r.group == "gps" and r.bias == 2]
+    for r in fixes[:-1]:
+        graph.take_out(r.factor_id, "test")
+    graph.take_out(prior.factor_id, "test")
+    last = fixes[-1]
+    graph.insert(replace(last, whitener=np.array([[last.whitener[0, 0], 0.0], [0.0, 0.0]])))
+    problem = JoinProblem.of_graph(graph)
+    with pytest.raises(
+        IndeterminateError, match=r"submaps \d+ to \d+ do not determine bias2: .*set bias_sigma"
+    ) as error:
+        join_sequential(problem)
+    assert error.value.variables == ("bias2",)

@@ -75,6 +75,9 @@ def test_join_and_compare_print_the_documented_json(run_folder):
         "nees_dof",
         "ci_unpolished",
         "ci",
+        "rmse_poses",
+        "rmse_landmarks",
+        "factors",
         "before",
         "after",
     }
