@@ -8,6 +8,7 @@ from pathlib import Path
 
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
+from graphslam.app.run.run_bar import RunBar
 from graphslam.app.worlds import simulate
 from graphslam.backend.back_end import Observer
 from graphslam.core.atomic import part_path
@@ -48,7 +49,7 @@ def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool
     truth = None if log.truth is None else log.truth.trajectory
     watch = DemoProgress(out / "figures" / "progress.png", truth)
     return run(
-        log, frontend="segslam", seed=seed, out=out, config=options, resume=True, progress=progress, observers=[watch]
+        log, frontend="segslam", seed=seed, out=out, config=options, resume=True, progress=[RunBar(progress), watch]
     )
 
 

@@ -17,9 +17,9 @@ from graphslam.app.run.front_ends import front_end_names, recommended_options
 from graphslam.app.run.local_maps import first_particles as first_particles
 from graphslam.app.run.local_maps import local_maps as local_maps
 from graphslam.app.run.outputs import read_run_folder as read_run
-from graphslam.app.run.pipeline import resolve_from_folder
 from graphslam.app.run.pipeline import run as run
 from graphslam.app.run.remake_map import map_of_folder
+from graphslam.app.run.reopened import resolve_from_folder
 from graphslam.app.run.run import DeferredPart, Run
 from graphslam.app.run.source import load_log_source
 from graphslam.app.studies import find_study as find_study

@@ -65,9 +65,7 @@ class Seen(Observer):
 def test_a_recording_replays_the_run(log: SensorLog, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     seen, file = Seen(), tmp_path / "new" / "run.rrd"
-    run = gs.run(
-        log, frontend="ekf", config=PLANE, progress=False, preset="none", observers=[LiveView(log.name, file), seen]
-    )
+    run = gs.run(log, frontend="ekf", config={"preset": "none", **PLANE}, progress=[LiveView(log.name, file), seen])
     rows = read_back(file)
     paths = rows["/map/path"]
     assert [r["submap"] for r in paths] == [*range(1, len(run.submaps) + 1), len(run.submaps)]
@@ -93,8 +91,7 @@ def test_clouds_and_loops_are_where_the_graph_has_them(tmp_path: Path) -> None:
         clouds(),
         frontend="lidar-odometry",
         config=options,
-        progress=False,
-        observers=[LiveView("building", file), seen],
+        progress=[LiveView("building", file), seen],
     )
     rows = read_back(file)
     for s in run.submaps:

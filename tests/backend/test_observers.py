@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import graphslam as gs
-from graphslam.app.run import front_ends, pipeline
+from graphslam.app.run import front_ends
+from graphslam.app.run import options as run_options
 from graphslam.app.run.config import RunConfig
 from graphslam.backend.back_end import Observer
 from graphslam.core.errors import ConfigError
@@ -49,16 +50,16 @@ class Watched(Ring):
 
 def test_submaps_steps_and_the_solution_are_told_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     log, front = ring(2)
-    monkeypatch.setattr(pipeline, "make_front_end", lambda *_: Watched(front.made))
-    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
+    monkeypatch.setattr(run_options, "make_front_end", lambda *_: Watched(front.made))
+    monkeypatch.setattr(run_options, "recommended_options", lambda *_: {})
     heard = Listener()
-    r = gs.run(log, frontend="ring", progress=False, observers=[heard, Observer()], out=tmp_path / "run")
+    r = gs.run(log, frontend="ring", progress=[heard, Observer()], out=tmp_path / "run")
     n = len(front.made)
     told = [("step", k) if first else ("submap", (k, k + 1)) for k in range(n) for first in (True, False)]
     assert heard.told == [*told, ("solved", len(r.solution.poses))]
     # a resumed run tells of the submaps that are there already; and it is the same run without a listener
     again = Listener()
-    back = gs.run(log, frontend="ring", progress=False, observers=[again], out=tmp_path / "run", resume=True)
+    back = gs.run(log, frontend="ring", progress=[again], out=tmp_path / "run", resume=True)
     assert again.told == [x for x in heard.told if x[0] != "step"]
     alone = gs.run(log, frontend="ring", progress=False)
     np.testing.assert_array_equal(back.map.node_poses, alone.map.node_poses)

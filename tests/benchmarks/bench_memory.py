@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 import graphslam as gs
-from graphslam.app.run import front_to_back, outputs, pipeline
+from graphslam.app.run import outputs, pipeline, submap_slam
 from graphslam.backend import refining
 from graphslam.backend.back_end import BackEnd
 from graphslam.core.spill_cache import SPILL_CACHE
@@ -37,8 +37,8 @@ from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 STAGES: list[tuple[Any, str, str]] = [
     (pipeline, "load_log_source", "log opened"),
-    (front_to_back.SubmapPipeline, "step", "front end, back end"),
-    (pipeline, "release_memory", "scans for the refinement"),
+    (submap_slam.SubmapSlam, "step", "front end, back end"),
+    (submap_slam.SubmapSlam, "release_memory", "scans for the refinement"),
     (BackEnd, "finish", "loops, solved"),
     (refining, "refine_by_scans", "refinement"),
     (refining, "refined_submaps", "submaps drawn anew"),

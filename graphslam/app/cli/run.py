@@ -96,26 +96,29 @@ def run_command(
 ) -> None:
     """Make a map from a recorded log: submaps, factor graph, solution, map, and a verdict on its consistency."""
     from graphslam.app.run.pipeline import run as run_pipeline
+    from graphslam.app.run.run_bar import RunBar
+    from graphslam.app.run.source import load_log_source
 
     options = run_options(config, setting)
-    observers = []
+    if preset is not None:
+        options["preset"] = preset
+    log: Any = source
+    if reader is not None or reader_option:
+        log = load_log_source(source, reader=reader, **reader_options(reader_option))
+    observers: list[Any] = []
     if live or live_file is not None:
         from graphslam.app.live import LiveView
 
         observers = [LiveView(source, file) for file in ([None] if live else []) + ([live_file] if live_file else [])]
     result = run_pipeline(
-        source,
+        log,
         frontend=frontend or None,
         solver=solver,
         seed=seed,
         out=out,
         config=options,
         resume=resume,
-        progress=not as_json,
-        reader=reader,
-        reader_options=reader_options(reader_option),
-        preset=preset,
-        observers=observers,
+        progress=[RunBar(not as_json), *observers],
     )
     rows = result.metrics.to_dict("records")
     value = {"out": str(out), "verdict": result.report["verdict"], "metrics": rows, "report": result.report}

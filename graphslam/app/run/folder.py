@@ -19,12 +19,14 @@ from typing import Any
 
 from graphslam.app.folders.generations import check_links, current_outputs, is_empty, remove_stale_files
 from graphslam.app.folders.lock import lock_folder, make_folder
+from graphslam.app.run.files import removed_loops_of_run
 from graphslam.app.run.front_ends import current_options
 from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
 from graphslam.core.reading import resolve_inside
 from graphslam.io.submap_store import GridLoader, SubmapStore
+from graphslam.loops.ledger import LoopDecision
 
 logger = logging.getLogger(__name__)
 CONFIG, SUBMAPS, DRAWS = "config.toml", "submaps", "draws.json"
@@ -57,12 +59,17 @@ class RunFolder:
 
     @classmethod
     @contextmanager
-    def start(cls, path: str | os.PathLike[str], config: Mapping[str, Any], *, resume: bool) -> Iterator[RunFolder]:
+    def start(
+        cls, path: str | os.PathLike[str] | None, config: Mapping[str, Any], *, resume: bool
+    ) -> Iterator[RunFolder | None]:
         """Make a new folder, or reopen one whose configuration and log are the same; no other process writes into it
-        until the block ends.
+        until the block ends. Without a path there is none.
 
         A folder in which a run left no finished submap is begun anew.
         """
+        if path is None:
+            yield None
+            return
         folder = cls(path)
         make_folder(folder.path)
         if not (folder.path / CONFIG).is_file() and not is_empty(folder.path):  # before a lock is put there
@@ -86,6 +93,10 @@ class RunFolder:
         """Write the configuration anew, with what is known of the log at its end."""
         with atomic_open(self.path / CONFIG, "w") as stream:
             stream.write(dump_toml(config))
+
+    def removed_loops(self) -> list[LoopDecision]:
+        """Loops that were taken out of the run by hand."""
+        return removed_loops_of_run(self.path)
 
     def _begun(self) -> bool:
         """Is there a run with anything to lose?"""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -18,6 +19,13 @@ STAGES = {
     "evaluation": 4.0, "figures": 7.0,
 }  # fmt: skip
 """Stages of a run in their order, and about what share of its time each takes [%]."""
+
+
+def bar_among(progress: bool | Sequence[Observer]) -> tuple[RunBar, list[Observer]]:
+    """The bar of a run, shown or not, and all who are told what goes on, the bar first."""
+    told = [] if isinstance(progress, bool) else list(progress)
+    bar = next((o for o in told if isinstance(o, RunBar)), None) or RunBar(progress is True)
+    return bar, [bar, *(o for o in told if o is not bar)]
 
 
 class RunBar(Observer):

@@ -6,25 +6,21 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from graphslam.app.machine import Stopwatch, one_blas_thread
-from graphslam.app.run import config as cfg
-from graphslam.app.run.calibration import can_calibrate
+from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.folder import RunFolder
-from graphslam.app.run.front_ends import make_front_end, named_preset
-from graphslam.app.run.front_to_back import SubmapPipeline
+from graphslam.app.run.options import RunOptions
 from graphslam.app.run.outputs import write_outputs
-from graphslam.app.run.pipeline import back_end, effective_config, run, solve_and_evaluate, with_digest, with_grids
+from graphslam.app.run.pipeline import finish_run, run
 from graphslam.app.run.run import Run
+from graphslam.app.run.stages import RunClock
+from graphslam.app.run.submap_slam import SubmapSlam
 from graphslam.backend.back_end import Observer
-from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
-from graphslam.core.random import SeedTree
 from graphslam.core.records import Stream
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -34,7 +30,6 @@ from graphslam.io.log_kinds import kind_name
 from graphslam.maps.global_map import GlobalMap, make_global_map
 from graphslam.solve.batch import state_of
 from graphslam.solve.solution import make_solution
-from graphslam_frontends.base import FrontEnd
 
 
 class Slam:
@@ -67,9 +62,8 @@ class Slam:
     out : path, optional
         Run folder; without one nothing is written.
     config : mapping, optional
-        Nested options: ``{"frontend": {...}, "backend": {...}, "gps": {...}}``.
-    preset : str, optional
-        Name of the source whose recommended settings are taken; by default none.
+        Nested options: ``{"frontend": {...}, "backend": {...}, "gps": {...}}``; ``"preset"`` names a source whose
+        recommended settings are used, by default none.
     observers : sequence of Observer
         Told what goes on while it does (:class:`graphslam.backend.back_end.Observer`).
     records : path, optional
@@ -99,18 +93,15 @@ class Slam:
         seed: int = 0,
         out: str | Path | None = None,
         config: Mapping[str, Any] | None = None,
-        preset: str | None = None,
         observers: Sequence[Observer] = (),
         records: str | Path | None = None,
     ) -> None:
-        options = merge_options(named_preset(frontend, preset), config or {})
-        settings: cfg.RunConfig = build_config(cfg.RunConfig, options)
-        front = make_front_end(frontend, settings.frontend)
-        self.waits_for = _waits_for(front, settings)
+        options = RunOptions.for_records(name, frontend, solver, seed, config)
+        self.waits_for = _waits_for(options)
         """What has to wait for the end of the log; empty where submaps are made while records come."""
         self._asked: dict[str, Any] = {
-            "frontend": frontend, "solver": solver, "seed": seed, "out": out, "config": config, "preset": preset,
-            "observers": observers,
+            "frontend": frontend, "solver": solver, "seed": seed, "out": out,
+            "config": {"preset": "none", **(config or {})}, "progress": list(observers) or False,
         }  # fmt: skip
         self._stack, self._closed = ExitStack(), False
         self._run: Run | None = None
@@ -118,19 +109,12 @@ class Slam:
         with self._closing_on_error():
             folder = records or self._stack.enter_context(tempfile.TemporaryDirectory(prefix="graphslam-records-"))
             self._feed = GrowingLog(name, folder)
-            self._work: SubmapPipeline | None = None
+            self._slam: SubmapSlam | None = None
             if self.waits_for:
                 return
-            own = replace(settings.calibrate, use="none") if can_calibrate(front) else settings.calibrate
-            self._settings = replace(settings, calibrate=own)
-            self._effective = effective_config(name, frontend, solver, seed, front.config, self._settings)
-            self._folder: RunFolder | None = None
-            if out is not None:
-                self._folder = self._stack.enter_context(RunFolder.start(out, self._effective, resume=False))
+            self._folder = self._stack.enter_context(RunFolder.start(out, options.as_config(), resume=False))
             self._stack.enter_context(one_blas_thread())
-            back = back_end(self._feed, self._settings, solver, observers)
-            tree = SeedTree(seed)
-            self._work = SubmapPipeline(self._feed, front, back, tree, self._folder, with_grids(self._settings))
+            self._slam = SubmapSlam(options, self._feed, observers, self._folder)
 
     def add(self, records: Stream, stream: str | None = None) -> None:
         """Take one record or more of a sensor, and go on as far as they allow.
@@ -155,9 +139,9 @@ class Slam:
             raise DataError("records after the end", where=self._feed.name, wanted="a new Slam")
         begin = time.perf_counter()
         self._feed.add(stream or kind_name(records), records)
-        if self._work is not None:
+        if self._slam is not None:
             try:
-                self._work.step()
+                self._slam.step()
             except BaseException:
                 self.close()
                 raise
@@ -166,7 +150,7 @@ class Slam:
     @property
     def submaps(self) -> Sequence[Submap]:
         """Those that are finished, and in the graph."""
-        return () if self._work is None else tuple(self._work.submaps)
+        return () if self._slam is None else tuple(self._slam.submaps)
 
     @property
     def map(self) -> GlobalMap:
@@ -179,14 +163,15 @@ class Slam:
         """
         if self._run is not None:
             return self._run.map
-        if self._work is None or not self._work.submaps:
+        if self._slam is None or not self._slam.submaps:
             why = self.waits_for or "the first submap ends after its last record"
             raise MissingDataError(f"no submap is finished yet: {why}", where=self._feed.name)
-        back, submaps = self._work.back, self._work.submaps
+        back, submaps = self._slam.back, self._slam.submaps
         here = make_solution(
             self._asked["solver"], back.graph, state_of(back.graph), iterations=0, gap=None, seconds=0.0
         )
-        return make_global_map(here, submaps, back.landmark_hits(submaps), self._settings.backend.confirmed_hits)
+        least = self._slam.options.settings.backend.confirmed_hits
+        return make_global_map(here, submaps, back.landmark_hits(submaps), least)
 
     @property
     def path(self) -> Trajectory:
@@ -213,7 +198,7 @@ class Slam:
         self._closed = True
         with self._stack:
             self._feed.end()
-            self._run = self._whole() if self._work is None else self._finished(self._work)
+            self._run = self._whole() if self._slam is None else self._finished(self._slam)
         return self._run
 
     def close(self) -> None:
@@ -228,18 +213,15 @@ class Slam:
         self.close()
 
     def _whole(self) -> Run:
-        return run(self._feed.log, progress=False, **{**self._asked, "preset": self._asked["preset"] or "none"})
+        return run(self._feed.log, **self._asked)
 
-    def _finished(self, work: SubmapPipeline) -> Run:
-        log, seconds = self._feed.log, {"load": 0.0, "calibrate": 0.0}
-        begin = Stopwatch(self._seconds)  # time in which records were waited for is nobody's
+    def _finished(self, slam: SubmapSlam) -> Run:
+        log, clock = self._feed.log, RunClock(self._seconds)  # time in which records were waited for is nobody's
         noticed = check_streams(log)
-        effective = self._effective
         if self._folder is not None:
-            effective = with_digest(effective, log)
-            self._folder.describe(effective)
-        work.step()
-        result = solve_and_evaluate(log, work, self._settings, effective, seconds, begin, (), noticed)
+            slam.options = slam.options.with_digest(log)
+            self._folder.describe(slam.options.as_config())
+        result = finish_run(log, slam, clock, noticed)
         return result if self._folder is None else write_outputs(self._folder.path, result)
 
     def _closing_on_error(self) -> ExitStack:
@@ -248,8 +230,10 @@ class Slam:
         return guard
 
 
-def _waits_for(front: FrontEnd, settings: cfg.RunConfig) -> str:
+def _waits_for(options: RunOptions) -> str:
     """What has to wait for the end of the log; empty where nothing has."""
+    front, settings = options.front, options.settings
+    assert front is not None
     if not front.incremental():
         return f"the front end {front.name} needs the whole log"
     for what, use in (("imu", settings.imu.use), ("compass", settings.compass.use), ("beacons", settings.beacons.use)):

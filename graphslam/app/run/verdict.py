@@ -82,6 +82,11 @@ class RunMetrics:
     events: Sequence[Mapping[str, Any]] = ()
     sessions: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
 
+    @classmethod
+    def of_table(cls, report: Mapping[str, Any], metrics: Any, events: Sequence[Mapping[str, Any]] = ()) -> RunMetrics:
+        """Those of a table of metrics (``key``, ``value``)."""
+        return cls(report, dict(zip(metrics["key"], metrics["value"])), events)
+
     def part(self, name: str) -> Mapping[str, Any]:
         """A mapping inside the report; empty where it is none."""
         found = self.report.get(name)

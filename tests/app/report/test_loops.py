@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from graphslam.app.cli import app
 from graphslam.app.report.loops import COLUMNS
 from graphslam.app.report.report import PAGE, make_report
+from graphslam.app.run import options as run_options
 from graphslam.app.run import pipeline
 from graphslam.loops.ledger import LoopDecision
 from tests.app.run.test_pipeline_space import ring
@@ -26,8 +27,8 @@ def run_ring(dim: int, out: Path) -> Path:
     """A chain driven twice whose second lap was matched, one match vaguely."""
     log, front = ring(dim)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "make_front_end", lambda *_: front)
-        patch.setattr(pipeline, "recommended_options", lambda *_: {})
+        patch.setattr(run_options, "make_front_end", lambda *_: front)
+        patch.setattr(run_options, "recommended_options", lambda *_: {})
         config = {"gps": {"use": "every-second", "robust": "none"}}
         pipeline.run(log, frontend="ring", out=out, config=config, progress=False, solver="batch")
     return out
@@ -169,8 +170,8 @@ def test_nees_of_the_ends_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(report_figures, "Consistency", keep)
     log, front = ring(3)
-    monkeypatch.setattr(pipeline, "make_front_end", lambda *_: front)
-    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
+    monkeypatch.setattr(run_options, "make_front_end", lambda *_: front)
+    monkeypatch.setattr(run_options, "recommended_options", lambda *_: {})
     r = pipeline.run(log, frontend="ring", out=tmp_path / "run", progress=False, solver="batch")
     assert r.solution is not None
     assert r.truth is not None

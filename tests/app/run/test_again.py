@@ -17,7 +17,7 @@ from graphslam.app.run import config as cfg
 from graphslam.app.run import pipeline
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.outputs import SAME_BYTES
-from graphslam.app.run.pipeline import rerun_without_loops
+from graphslam.app.run.reopened import rerun_without_loops
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import solve_choice
 from graphslam.backend.streams import ImuSource
@@ -172,7 +172,7 @@ def test_a_run_that_failed_before_its_first_submap_does_not_block(
     log: SensorLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as m:
-        m.setattr(pipeline.SubmapPipeline, "step", lambda _: None)
+        m.setattr(pipeline.SubmapSlam, "step", lambda _: None)
         with pytest.raises(MissingDataError, match="no submap"):
             gs.run(log, seed=1, out=tmp_path / "run", progress=False)
     assert (tmp_path / "run" / "config.toml").is_file()

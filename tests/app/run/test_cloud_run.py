@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 import graphslam as gs
 from graphslam.app.cli import app
-from graphslam.app.run import pipeline
+from graphslam.app.run import options as run_options
 from graphslam.app.run.files import loops_of_run
 from graphslam.app.run.outputs import SAME_BYTES
 from graphslam.app.run.run import Run
@@ -44,8 +44,10 @@ def log() -> SensorLog:
 def go(log: SensorLog) -> Any:
     """Runs the log with the front end of clouds through the public verb."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "recommended_options", lambda *_: {})
-        patch.setattr(pipeline, "make_front_end", lambda _, o: CloudFrontEnd(build_config(CloudConfig, o, "frontend")))
+        patch.setattr(run_options, "recommended_options", lambda *_: {})
+        patch.setattr(
+            run_options, "make_front_end", lambda _, o: CloudFrontEnd(build_config(CloudConfig, o, "frontend"))
+        )
 
         def run(out: Path | None = None, *, every: int = 2, loops: bool = True, **how: Any) -> Run:
             front = {k: how.pop(k) for k in ("origins", "grid") if k in how}
@@ -53,7 +55,7 @@ def go(log: SensorLog) -> Any:
                 "frontend": {"length": 8.0, "steps": {"max_range": 8.0}, **front},
                 "backend": {"loops": loops, "look_every": every},
             }
-            return gs.run(log, frontend="clouds", config=options, out=out, progress=False, **how)
+            return gs.run(log, frontend="clouds", config=options, out=out, **{"progress": False, **how})
 
         yield run
 
@@ -101,8 +103,8 @@ class Listener(Observer):
 
 def test_loops_enter_while_the_run_goes_on(go: Callable[..., Run], log: SensorLog) -> None:
     heard, late = Listener(), Listener()
-    now = go(every=1, observers=[heard])
-    end = go(every=0, observers=[late])
+    now = go(every=1, progress=[heard])
+    end = go(every=0, progress=[late])
     last = [s.key for s in now.submaps][-1]
     for n, x in enumerate(heard.told):
         if isinstance(x, tuple):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from graphslam.app.run import options as run_options
 from graphslam.app.run import pipeline
 from graphslam.app.run.config import RunConfig
 from graphslam.app.worlds import simulate
@@ -44,9 +45,9 @@ def made(uses: frozenset[str] = frozenset({"laser"})) -> tuple[SensorLog, list[S
 
 
 def solved(log: SensorLog, submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, out: Any = None, **options: Any):
-    monkeypatch.setattr(pipeline, "make_front_end", lambda *_: HandedOver(tuple(submaps)))
-    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
-    return pipeline.run(log, frontend="ring", out=out, progress=False, **options)
+    monkeypatch.setattr(run_options, "make_front_end", lambda *_: HandedOver(tuple(submaps)))
+    monkeypatch.setattr(run_options, "recommended_options", lambda *_: {})
+    return pipeline.run(log, frontend="ring", out=out, progress=options.pop("progress", False), **options)
 
 
 @pytest.mark.parametrize("solver", ["isam2", "lm", "gnc"])
@@ -232,7 +233,7 @@ def test_it_enters_while_the_run_goes_on_and_ends_where_it_would(longest, monkey
     for every in (0, 3, 1):
         config = {"imu": {"use": "auto", "longest": longest}, "backend": {"look_every": every}}
         seen.clear()
-        runs[every] = solved(log, submaps, monkeypatch, config=config, observers=[Count()])
+        runs[every] = solved(log, submaps, monkeypatch, config=config, progress=[Count()])
         steps = np.diff([0, *seen])
         assert np.all((steps > 0) == (np.arange(1, 9) % every == 0 if every else np.zeros(8, bool)))
 

@@ -124,7 +124,7 @@ def test_a_resumed_run_is_the_run_that_was_never_stopped(run, log, tmp_path):
                 raise Stop
 
     with pytest.raises(Stop):
-        gs.run(log, frontend=BOTH, config=CONFIG, progress=False, out=tmp_path / "run", observers=[Stopper()])
+        gs.run(log, frontend=BOTH, config=CONFIG, progress=[Stopper()], out=tmp_path / "run")
     again = gs.run(log, frontend=BOTH, config=CONFIG, progress=False, out=tmp_path / "run", resume=True)
     assert again.report["resumed_submaps"] == stop
     a, b = (current_outputs(p) / "metrics.json" for p in (run.folder, tmp_path / "run"))

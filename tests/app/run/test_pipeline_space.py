@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from graphslam.app.run import options as run_options
 from graphslam.app.run import pipeline
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.core.errors import ConfigError
@@ -78,8 +79,8 @@ def ring(dim: int, seed: int = 4) -> tuple[SensorLog, Ring]:
 
 def solved(dim: int, monkeypatch: pytest.MonkeyPatch, out: Any = None, *, seed: int = 4, **options: Any) -> Any:
     log, front = ring(dim, seed)
-    monkeypatch.setattr(pipeline, "make_front_end", lambda *_: front)
-    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
+    monkeypatch.setattr(run_options, "make_front_end", lambda *_: front)
+    monkeypatch.setattr(run_options, "recommended_options", lambda *_: {})
     config = {"gps": {"use": "every-second", "robust": "none"}, **options.pop("config", {})}
     return pipeline.run(log, frontend="ring", out=out, config=config, progress=False, **options)
 
@@ -190,8 +191,8 @@ def test_a_flat_front_end_takes_the_level_part_of_fixes_in_space(monkeypatch):
     log, _ = ring(3)
     flat, front = ring(2)
     flat = SensorLog(name="ring", streams=log.streams, truth=flat.truth)
-    monkeypatch.setattr(pipeline, "make_front_end", lambda *_: front)
-    monkeypatch.setattr(pipeline, "recommended_options", lambda *_: {})
+    monkeypatch.setattr(run_options, "make_front_end", lambda *_: front)
+    monkeypatch.setattr(run_options, "recommended_options", lambda *_: {})
     r = pipeline.run(flat, frontend="ring", config={"gps": {"use": "all"}}, progress=False)
     assert r.graph.dim == 2
     assert r.dead_reckoning.dim == 2

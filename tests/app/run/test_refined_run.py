@@ -16,10 +16,11 @@ import graphslam
 from graphslam.app.export import export
 from graphslam.app.hypotheses import minimum_entropy_loops, write_minimum_entropy
 from graphslam.app.report.report import make_report
-from graphslam.app.run import outputs, pipeline
+from graphslam.app.run import outputs, stages, submap_slam
 from graphslam.app.run.outputs import SAME_BYTES, read_run_folder, refined_submaps_of
-from graphslam.app.run.pipeline import rerun_without_loops, run
+from graphslam.app.run.pipeline import run
 from graphslam.app.run.remake_map import map_of_folder
+from graphslam.app.run.reopened import rerun_without_loops
 from graphslam.app.run.run import Run
 from graphslam.app.sessions.localise import localise
 from graphslam.backend.back_end import BackEnd
@@ -177,7 +178,7 @@ def test_interrupted_and_made_again_it_is_the_same_to_the_last_byte(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as m:
-        m.setattr(pipeline, "refine_run", stopped)
+        m.setattr(stages, "refine_run", stopped)
         with pytest.raises(KeyboardInterrupt):
             made(log, tmp_path / "stopped")
     assert not (tmp_path / "stopped" / "run.json").exists()
@@ -198,7 +199,7 @@ def test_without_it_everything_is_as_it_was(tmp_path: Path, monkeypatch: pytest.
     assert plain.refined is None
     assert not any(k.startswith("refine") for k in plain.metrics["key"])
     with monkeypatch.context() as m:
-        m.setattr(pipeline.Scans, "of", staticmethod(lambda *_: None))
+        m.setattr(submap_slam.Scans, "of", staticmethod(lambda *_: None))
         made(log, tmp_path / "none")
     off, none = (snapshot(tmp_path / n, SAME_BYTES) for n in ("off", "none"))
     assert differing(off, none) == ["config.toml"]

@@ -115,7 +115,12 @@ def test_a_fed_run_is_the_run_over_the_stored_log(
         assert (before > 0) == (not slam.waits_for)
         run = slam.finish()
     stored = gs.run(
-        slam.log, frontend=frontend, seed=4, out=tmp_path / "stored", config=config, preset="none", progress=False
+        slam.log,
+        frontend=frontend,
+        seed=4,
+        out=tmp_path / "stored",
+        config={"preset": "none", **config},
+        progress=False,
     )
     a, b = same_files(tmp_path / "fed"), same_files(tmp_path / "stored")
     assert len([n for n in a if n.startswith("submaps/")]) > len(run.submaps) >= max(before, 1)
@@ -127,7 +132,7 @@ def test_a_fed_run_is_the_run_over_the_stored_log(
     if frontend not in ("ekf", "lidar-odometry"):
         return
     # the records themselves are those that were given
-    gs.run(log, frontend=frontend, seed=4, out=tmp_path / "own", config=config, preset="none", progress=False)
+    gs.run(log, frontend=frontend, seed=4, out=tmp_path / "own", config={"preset": "none", **config}, progress=False)
     own = same_files(tmp_path / "own")
     unnamed = [n for n in a if fnmatch(n, "submaps/*.npz") or n in ("graph.g2o", "trajectory.tum", "landmarks.csv")]
     assert [n for n in unnamed if a[n] != own[n]] == []
@@ -220,6 +225,6 @@ def test_what_needs_the_whole_log_is_named() -> None:
     with pytest.raises(UnknownNameError):
         gs.Slam("kis-icp")
     with pytest.raises(UnknownNameError):
-        gs.Slam("ekf", preset="nowhere")
+        gs.Slam("ekf", config={"preset": "nowhere"})
     with pytest.raises(ConfigError):
         gs.Slam("ekf", config={"frontend": {"particle": 3}})

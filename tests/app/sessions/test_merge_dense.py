@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import graphslam
 from graphslam.app.cli import app
 from graphslam.app.folders.generations import current_outputs
+from graphslam.app.run import options as run_options
 from graphslam.app.run import pipeline
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.surface import scanned_path
@@ -100,8 +101,8 @@ def scanned_from(logs: list[tuple[Any, SensorLog]]) -> Any:
 
 def solved(d: HallDrive, name: str, out: Path, *, gps: str = "none", seed: int = 0) -> Any:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "make_front_end", lambda *_: Ready(tuple(d.submaps)))
-        patch.setattr(pipeline, "recommended_options", lambda *_: {})
+        patch.setattr(run_options, "make_front_end", lambda *_: Ready(tuple(d.submaps)))
+        patch.setattr(run_options, "recommended_options", lambda *_: {})
         config = {"gps": {"use": gps, "robust": "none"}}
         return pipeline.run(log_of(d, name, seed), frontend="ready", out=out, config=config, progress=False)
 
@@ -302,10 +303,10 @@ def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path)
 
 def test_a_run_goes_on_in_a_saved_map(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "make_front_end", lambda *_: Ready(tuple(drives[1].submaps)))
-        patch.setattr(pipeline, "recommended_options", lambda *_: {})
+        patch.setattr(run_options, "make_front_end", lambda *_: Ready(tuple(drives[1].submaps)))
+        patch.setattr(run_options, "recommended_options", lambda *_: {})
         patch.setattr(pipeline, "load_log_source", lambda *_, **__: log_of(drives[1], "again", 1))
-        patch.setattr(pipeline, "check_name", lambda *_: None)
+        patch.setattr(pipeline, "check_names", lambda *_: None)
         arguments = ["run", "again", "--frontend", "ready", "--continue", str(runs[0].folder), "--json"]
         out = tmp_path / "again"
         done = CliRunner().invoke(app, [*arguments, "--out", str(out)], catch_exceptions=False)

@@ -1,0 +1,170 @@
+"""What a run is made with: front end, solver, seed, and every option with its value."""
+
+from __future__ import annotations
+
+import logging
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from graphslam.app.run.calibration import (
+    apply_calibration,
+    can_calibrate,
+    configure_for_calibration,
+    uses_preset_noise,
+    without_noise,
+)
+from graphslam.app.run.choice import choose_front_end, reading_line
+from graphslam.app.run.config import RunConfig
+from graphslam.app.run.files import read_options
+from graphslam.app.run.folder import CONFIG
+from graphslam.app.run.front_ends import (
+    FrontEndLike,
+    check_name,
+    make_front_end,
+    name_of,
+    named_preset,
+    preset_of,
+    recommended_options,
+)
+from graphslam.core.config import build_config, dump_toml, merge_options, options_dict
+from graphslam.core.errors import UnknownNameError
+from graphslam.core.json_file import check_json
+from graphslam.core.log import SensorLog
+from graphslam.evaluate.stream_checks import StreamFinding
+from graphslam.io.log_digest import log_digest
+from graphslam.solve.registry import SOLVERS
+from graphslam_frontends.base import FrontEnd
+
+logger = logging.getLogger(__name__)
+FrontEnds = FrontEndLike | Sequence[FrontEndLike]
+
+
+def check_names(frontend: FrontEnds | None, solver: str) -> None:
+    """See that what is named is there, before anything is read."""
+    for each in frontend if isinstance(frontend, (list, tuple)) else [frontend]:
+        if isinstance(each, str):
+            check_name(each)
+    if solver not in SOLVERS:
+        raise UnknownNameError("solver", solver, SOLVERS)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run is made with.
+
+    Parameters
+    ----------
+    settings : RunConfig
+    named : mapping
+        Source, front end, solver, seed, and the digest of the log.
+    front : FrontEnd or None
+        None where submaps come from a folder.
+    asked : mapping
+        What the user set: calibration leaves it alone.
+    own : bool
+        Is there a preset for this very data set?
+    """
+
+    settings: RunConfig
+    named: Mapping[str, Any]
+    front: FrontEnd | None = None
+    asked: Mapping[str, Any] | None = None
+    own: bool = False
+    stored: Mapping[str, Any] | None = None
+
+    @classmethod
+    def for_log(
+        cls, log: SensorLog, frontend: FrontEnds | None, solver: str, seed: int, config: Mapping[str, Any] | None
+    ) -> RunOptions:
+        """Front end and options for a log: defaults, below the preset, below what the user set.
+
+        ``config["preset"]`` names another preset than that of the log; ``"none"``: defaults.
+        """
+        asked = dict(config or {})
+        preset = asked.pop("preset", None)
+        if isinstance(frontend, (list, tuple)) and len(frontend) < 2:
+            frontend = frontend[0] if frontend else None
+        why, read = "as asked for", reading_line(log)
+        if read:
+            logger.warning(read)
+        if frontend is None:
+            choice = choose_front_end(log)
+            frontend, why = choice.frontend, choice.why
+        name = name_of(frontend)
+        suggested = recommended_options(log, name, preset)
+        taken, for_this_set = preset_of(log, name)
+        if read:
+            names = name if isinstance(name, str) else ", ".join(name)
+            logger.warning("front end: %s (%s); preset: %s", names, why, preset or taken or "none")
+        own = bool(suggested) and (preset is not None or for_this_set)
+        if isinstance(frontend, FrontEnd) and not isinstance(frontend, type):
+            suggested = {k: v for k, v in suggested.items() if k != "frontend"}
+        if not (own and uses_preset_noise(asked)):
+            suggested = without_noise(suggested, mixed=not isinstance(name, str))
+        settings: RunConfig = build_config(RunConfig, merge_options(suggested, asked))
+        front = make_front_end(frontend, settings.frontend)  # type: ignore[arg-type]
+        named = {"source": log.name, "frontend": name, "solver": solver, "seed": seed}
+        return cls(settings, named, front, asked, own)
+
+    @classmethod
+    def for_records(
+        cls, name: str, frontend: str, solver: str, seed: int, config: Mapping[str, Any] | None
+    ) -> RunOptions:
+        """Options for records that are still to come: nothing is estimated from them."""
+        asked = dict(config or {})
+        options = merge_options(named_preset(frontend, asked.pop("preset", None)), asked)
+        settings: RunConfig = build_config(RunConfig, options)
+        front = make_front_end(frontend, settings.frontend)
+        if can_calibrate(front) and settings.calibrate.given is None and settings.calibrate.use == "auto":
+            settings = replace(settings, calibrate=replace(settings.calibrate, use="none"))
+        return cls(settings, {"source": name, "frontend": frontend, "solver": solver, "seed": seed}, front, asked)
+
+    @classmethod
+    def of_folder(cls, root: Path) -> RunOptions:
+        """Those of a run folder."""
+        stored = read_options(root)
+        wanted = {"run": {"source": str, "frontend": object, "solver": str, "seed": int}}
+        named = check_json(stored, wanted, str(root / CONFIG))["run"]
+        settings: RunConfig = build_config(RunConfig, {k: v for k, v in stored.items() if k != "run"})
+        return cls(settings, named, stored=stored)
+
+    @property
+    def solver(self) -> str:
+        """Name of the solver."""
+        return str(self.named["solver"])
+
+    @property
+    def with_grids(self) -> bool:
+        """Are the grids of stored submaps needed?"""
+        return bool(self.settings.backend.looks or self.settings.map.fuse)
+
+    def with_digest(self, log: SensorLog) -> RunOptions:
+        """With what tells a log from others, for a folder."""
+        return replace(self, named={**self.named, "log": log_digest(log)})
+
+    def searching_loops(self) -> RunOptions:
+        """The same with loops that the back end looks for."""
+        return replace(self, settings=replace(self.settings, backend=replace(self.settings.backend, loops=True)))
+
+    def calibrated(self, log: SensorLog) -> tuple[SensorLog, RunOptions, list[StreamFinding]]:
+        """The log with corrections, the options that go with it, and what is said of it."""
+        assert self.front is not None
+        asked, config = self.asked or {}, self.settings.calibrate
+        seed = self.named["seed"]
+        log, applied, said, found = apply_calibration(log, self.front, config, asked, own=self.own, seed=seed)
+        front = configure_for_calibration(self.front, log, applied.given, found, asked)
+        options = replace(self, settings=replace(self.settings, calibrate=applied), front=front)
+        return log, options, [StreamFinding("", f) for f in said]
+
+    def as_config(self) -> dict[str, Any]:
+        """What ``config.toml`` holds: names, seed, and every option with its value."""
+        if self.stored is not None:
+            return dict(self.stored)
+        assert self.front is not None
+        parts = ("backend", "gps", "imu", "compass", "beacons", "refine", "map", "calibrate")
+        out = {"run": dict(self.named), "frontend": options_dict(self.front.config)}
+        out |= {name: options_dict(getattr(self.settings, name)) for name in parts}
+        return tomllib.loads(dump_toml(out)) if "log" in self.named else out  # as it comes back from the folder

@@ -1,0 +1,191 @@
+"""Submaps in, a solved graph out: `run` feeds it from a whole log, `gs.Slam` from records as they come."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from graphslam.app.run.audit import reference_identities
+from graphslam.app.run.folder import RunFolder
+from graphslam.app.run.options import RunOptions
+from graphslam.app.run.run_bar import RunBar
+from graphslam.app.run.run_inputs import RunInputs, collect_inputs
+from graphslam.backend.back_end import BackEnd, Observer
+from graphslam.backend.streams import GpsSource, ImuSource, beacons_of, compasses_of
+from graphslam.core.geometry import Array
+from graphslam.core.heap import trim_heap
+from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.random import SeedTree
+from graphslam.core.record_source import RecordSource
+from graphslam.core.submap import Submap
+from graphslam.evaluate.stream_checks import StreamFinding
+from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.spilled_grid import load_spilled, spill_grid
+from graphslam.loops.ledger import LoopDecision
+from graphslam.refine.scans import Scans
+from graphslam.solve.solution import Solution
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FrontEndTiming:
+    """What the front end did in this session.
+
+    Parameters
+    ----------
+    resumed : int
+        Submaps that were there already.
+    per_scan : (k,)
+        Seconds a scan of each submap but the first, which may have compiled.
+    """
+
+    seconds: float
+    resumed: int
+    per_scan: Array
+
+
+class SubmapSlam:
+    """A front end and a back end: every submap is in the graph, and stored, as soon as the records that make it came.
+
+    Parameters
+    ----------
+    feed : RecordSource
+        Of the log.
+    observers : sequence of Observer
+        Told what goes on.
+    folder : RunFolder, optional
+        Where submaps are stored; those that are there already are not made again.
+    draw : int, optional
+        Which draw of random numbers it is; by default the first one, or that which the folder settled on.
+    """
+
+    def __init__(
+        self,
+        options: RunOptions,
+        feed: RecordSource,
+        observers: Sequence[Observer] = (),
+        folder: RunFolder | None = None,
+        draw: int | None = None,
+    ) -> None:
+        self.options, self.feed, self.folder = options, feed, folder
+        self.back = self._back_end(options, observers)
+        self.drops = DropCounter()
+        self.settled = None if folder is None else folder.settled()
+        """What earlier draws of the folder came to, where that is decided."""
+        settled = 0 if self.settled is None else self.settled.draw
+        self.draw = settled if draw is None else draw
+        self._resumed, self._seconds, self._since, self._cost = 0, 0.0, 0.0, list[float]()
+        self.store = None
+        if folder is not None:
+            load = load_spilled if options.with_grids else None
+            self.store = folder.submaps_with(load, draw=None if self.draw == settled else self.draw)
+        self.submaps: list[Submap] = [] if self.store is None else self.store.complete_prefix()
+        if self.store is not None and options.front is not None:
+            self.store.truncate(len(self.submaps))
+        self._resumed = len(self.submaps)
+        for s in self.submaps:
+            self.back.add(s)
+        self._stream: Iterator[Submap | None] = iter(()) if options.front is None else self._follow()
+
+    def _follow(self) -> Iterator[Submap | None]:
+        assert self.options.front is not None
+        last = self.submaps[-1] if self.submaps else None
+        if last is not None:
+            logger.info("resumed after submap %d at %.2f s", last.key, last.interval[1])
+        seed = SeedTree(self.options.named["seed"])
+        drawn = seed.child("draw", self.draw, "frontend") if self.draw else seed.child("frontend")
+        return self.options.front.follow(self.feed, seed=drawn, after=last, drops=self.drops, watch=self._watch)
+
+    def _back_end(self, options: RunOptions, observers: Sequence[Observer]) -> BackEnd:
+        """A back end that has its IMUs, and the fixes that are to be used."""
+        feed, settings = self.feed, options.settings
+        imu, fixes = ImuSource(feed, settings.imu), GpsSource(feed, settings.gps)
+        back = BackEnd(settings.backend, options.solver, imu=imu, observers=observers, fixes=fixes)
+        if feed.ended:  # compasses and beacons are given whole
+            for name, compass in compasses_of(feed.log, settings.compass).items():
+                back.add_compass(name, compass, settings.compass)
+            for name, ranges in beacons_of(feed.log, settings.beacons).items():
+                back.add_beacons(name, ranges, settings.beacons)
+        return back
+
+    def step(self) -> None:
+        """Use what has come; at the end of the log everything is used."""
+        while True:
+            start = time.perf_counter()
+            submap = next(self._stream, None)
+            spent = time.perf_counter() - start
+            self._seconds, self._since = self._seconds + spent, self._since + spent
+            if submap is None:  # more records are wanted, or there are none
+                return
+            if isinstance(submap.grid, EvidenceGrid):
+                submap.grid.pool.release_scratch()
+                submap = replace(submap, grid=spill_grid(submap.grid))
+            if self.store is not None:
+                self.store.append(submap)
+            self.back.add(submap)
+            self.submaps.append(submap)
+            self._cost.append(self._since / max(int(submap.report.get("scans", 1)), 1))
+            self._since = 0.0
+
+    def finish(self, undo: Sequence[int | LoopDecision] = ()) -> Solution:
+        """Last factors, loops, and the optimum; without the loops ``undo``."""
+        tell_stage(self.back.observers, "graph")
+        return self.back.finish(undo)
+
+    def inputs(self, log: SensorLog, noticed: Sequence[StreamFinding]) -> RunInputs:
+        """What the graph and its evaluation need of the log; what making the submaps took is let go of."""
+        front = self.options.front
+        assert front is not None
+        steps = front.steps(log) if self.options.settings.refine.use else None
+        scans = None if steps is None else Scans.of(steps)
+        del steps
+        self.release_memory()
+        return collect_inputs(log, self.drops.counts, reference_identities(log, front), noticed, scans)
+
+    def release_memory(self) -> None:
+        """Let go of what making the submaps took."""
+        if self.options.front is not None:
+            self.options.front.forget()
+        trim_heap()
+
+    def next_draw(self) -> SubmapSlam:
+        """The same log with the next draw of random numbers: all submaps made anew."""
+        bars = self._bars()
+        tell_stage(bars, "front end")
+        made = SubmapSlam(self.options, RecordSource(self.feed.log), bars, self.folder, self.draw + 1)
+        made.step()
+        made.release_memory()
+        return made
+
+    def searching_loops(self) -> SubmapSlam:
+        """The same submaps in another graph, with loops that the back end looks for."""
+        made = copy.copy(self)
+        made.back = self._back_end(self.options.searching_loops(), self._bars())
+        for s in self.submaps:
+            made.back.add(s)
+        return made
+
+    @property
+    def timing(self) -> FrontEndTiming:
+        """What the front end did so far."""
+        return FrontEndTiming(self._seconds, self._resumed, np.array(self._cost[1:]))
+
+    def _bars(self) -> list[Observer]:
+        return [o for o in self.back.observers if isinstance(o, RunBar)]
+
+    def _watch(self, at: Any) -> None:
+        for o in self.back.observers:
+            o.front_end_at(at)
+
+
+def tell_stage(observers: Sequence[Observer], name: str) -> None:
+    """Tell them that a stage of the run begins."""
+    for o in observers:
+        o.stage(name)
