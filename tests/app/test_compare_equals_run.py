@@ -1,0 +1,71 @@
+"""`compare` of a run solves the graph of the run: the same factors, the same objective, in memory and from the folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import graphslam as gs
+from graphslam.app.run.run import Run
+
+
+def same(run: Run, folder: Path) -> None:
+    """Both sources, every method: the objective of the run, and every factor of its graph."""
+    assert run.graph is not None
+    best = run.graph.objective().total
+    groups: dict[str, int] = {}
+    for r in run.graph.records.values():
+        groups[r.group] = groups.get(r.group, 0) + 1
+    text = ", ".join(f"{k} {v}" for k, v in sorted(groups.items()))
+    for source in (run, folder):
+        table = gs.compare(source, ["isam2", "eif-tree"], memory=False)
+        np.testing.assert_allclose(table["objective_polished"], best, rtol=1e-9, atol=1e-9)
+        assert set(table["factors"]) == {text}
+
+
+MIXED: dict[str, Any] = {"imu": {"use": "all"}, "gps": {"use": "all"}}
+
+
+@pytest.mark.parametrize(
+    ("world", "preset", "frontend", "config", "groups"),
+    [
+        ("landmark-field", "quick", "rbpf-ekf", {}, {"submap"}),
+        ("garage", "quick", "segslam", {"refine": {"use": False}}, {"dense-submap", "levelled"}),
+        ("mixed", "quick", ["segslam", "rbpf-ekf"], MIXED, {"submap", "dense-submap", "gps", "imu", "imu-bias"}),
+        ("mixed", "quick", ["segslam", "rbpf-ekf"], {"gps": {"use": "none"}}, {"submap", "dense-submap"}),
+    ],
+)
+def test_on_a_simulated_run(
+    world: str, preset: str, frontend: Any, config: dict[str, Any], groups: set[str], tmp_path: Path
+) -> None:
+    log = gs.simulate(world, preset=preset, seed=2)
+    run = gs.run(log, frontend=frontend, config=config, out=tmp_path / "run", progress=False)
+    assert run.graph is not None
+    assert groups <= {r.group for r in run.graph.records.values()}
+    same(run, tmp_path / "run")
+
+
+def test_on_a_plain_table_of_landmarks_that_was_calibrated(tmp_path: Path) -> None:
+    """A log of CSV files; calibration adds constant errors of wheels and sensor to the graph."""
+    log = gs.simulate("landmark-field", preset="quick", seed=4)
+    wheels, seen = log["wheels"], log["landmarks"]
+    speed, rate = wheels.values.T if hasattr(wheels, "values") else (wheels.speed, wheels.yaw_rate)
+    rows = np.repeat(np.arange(len(seen.times)), np.diff(seen.offsets))
+    np.savetxt(
+        tmp_path / "odometry.csv", np.column_stack([wheels.times, speed, rate]), delimiter=",",
+        header="time,velocity,yaw_rate", comments="",
+    )  # fmt: skip
+    np.savetxt(
+        tmp_path / "landmarks.csv", np.column_stack([seen.times[rows], seen.ranges, seen.bearings, seen.ids]),
+        delimiter=",", header="time,range,bearing,id", comments="",
+    )  # fmt: skip
+    run = gs.run(tmp_path, out=tmp_path / "run", progress=False)
+    same(run, tmp_path / "run")
+
+
+def test_on_recorded_data(data_dir: Path, tmp_path: Path) -> None:
+    run = gs.run("mrclam", out=tmp_path / "run", progress=False)
+    same(run, tmp_path / "run")
