@@ -392,6 +392,38 @@ class Compass:
         return replace(self, times=self.times[index], headings=self.headings[index], sigma=self.sigma[index])
 
 
+@plain_record("barometer")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Barometer:
+    """Heights of the body by air pressure, over a level that is not known.
+
+    Parameters
+    ----------
+    times : (n,)
+    heights : (n,)
+        [m], upwards.
+    sigma : (n,)
+        Standard deviation [m]; the level is constant within a log, so what the weather changes is part of it.
+    """
+
+    times: Array
+    heights: Array
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        object.__setattr__(self, "times", check_times(self.times))
+        object.__setattr__(self, "heights", _finite(_array(self.heights, (n,), "heights"), "height"))
+        object.__setattr__(self, "sigma", _finite(_array(self.sigma, (n,), "sigma"), "sigma"))
+        if np.any(self.sigma <= 0):
+            k = int(np.flatnonzero(self.sigma <= 0)[0])
+            raise DataError(f"sigma of barometer reading {k} is not positive", got=self.sigma[k], wanted="> 0 m")
+
+    def take(self, index: Any) -> Barometer:
+        """See :class:`Stream`."""
+        return replace(self, times=self.times[index], heights=self.heights[index], sigma=self.sigma[index])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkObservations:
     """Range-bearing or range-only observations of point landmarks, several per scan (ragged).
