@@ -26,7 +26,7 @@ from graphslam.app.studies import find_study as find_study
 from graphslam.app.studies import open_study as open_study
 from graphslam.app.studies import study as study
 from graphslam.app.submap_sources import submap_source
-from graphslam.app.worlds import CAMPUS, GROUP, MESH_WORLDS, WORLDS
+from graphslam.app.worlds import GROUP, MESH_WORLDS, WORLDS
 from graphslam.app.worlds import simulate as simulate
 from graphslam.core.config import build_config
 from graphslam.core.errors import DataError, MissingDataError
@@ -92,7 +92,7 @@ def worlds() -> list[str]:
     >>> "garage" in gs.worlds()
     True
     """
-    return sorted({*WORLDS, *MESH_WORLDS, CAMPUS, *plugins(GROUP)})
+    return sorted({*WORLDS, *MESH_WORLDS, *plugins(GROUP)})
 
 
 def open_run(path: str | Path) -> Run:

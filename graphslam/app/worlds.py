@@ -22,21 +22,24 @@ if TYPE_CHECKING:
 
 
 GROUP = "graphslam.worlds"
-"""Entry points of worlds: a :class:`~graphslam.sim.mesh_worlds.MeshWorld`, or a function as in :data:`WORLDS`."""
-CAMPUS = "campus"
-"""Streets and buildings, with a robot of their own (:mod:`graphslam.sim.campus`)."""
+"""Entry points of worlds: a :class:`~graphslam.sim.mesh_worlds.MeshWorld`, or a function as in :data:`WORLDS`; one
+whose logs have a mesh also has ``world_of(log)``."""
 
 
 def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
     from graphslam.sim.landmark_field import landmark_field_preset, simulate_landmark_field
 
-    return simulate_landmark_field(landmark_field_preset(preset or "A", **changes), seed)
+    return simulate_landmark_field(landmark_field_preset(preset or "A", **_with_layout_seed(changes)), seed)
 
 
 def _mixed(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
     from graphslam.sim.mixed import mixed_preset, simulate_mixed
 
-    return simulate_mixed(mixed_preset(preset or "full", **changes), seed)
+    return simulate_mixed(mixed_preset(preset or "full", **_with_layout_seed(changes)), seed)
+
+
+def _with_layout_seed(changes: dict[str, Any]) -> dict[str, Any]:
+    return {("layout_seed" if name == "world_seed" else name): value for name, value in changes.items()}
 
 
 # name -> what simulates it from a preset, a seed and changed figures
@@ -61,8 +64,9 @@ def simulate(
     Parameters
     ----------
     world : str
-        ``landmark-field``; ``point-field``, landmarks in space; ``garage``, ``mine``, ``building``; ``court``, the
-        small one; ``campus``; ``mixed``, a building in a park, in the plane, with every kind of sensor.
+        ``mixed``, a building in a park, in the plane, with every kind of sensor; ``landmark-field``; ``garage``;
+        ``court``, the small one. Of the studies: ``point-field``, landmarks in space; ``mine``, ``building``;
+        ``campus``.
     seed : int
         Of every error, and of what can be moved in the world.
     preset : str, optional
@@ -74,7 +78,7 @@ def simulate(
         Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. ``drawn-17``: a plan
         of the garage, or walls of the mine or of the building, drawn by that number.
     world_seed : int, optional
-        Of what can be moved in a world of triangles, and of the campus, where it shall not be ``seed``.
+        Of the layout, or of what can be moved, where it shall not be ``seed``.
     progress : bool
         Show a progress bar on stderr.
     **changes
@@ -94,37 +98,25 @@ def simulate(
     >>> gs.simulate("landmark-field", preset="quick", seed=1)
     SensorLog('landmark-field': controls (2080), landmarks (260); truth known)
     """
-    made: Any = WORLDS.get(world)
-    if made is None and world not in MESH_WORLDS and world != CAMPUS:
-        made = load_plugin(GROUP, "world", world, [*WORLDS, *MESH_WORLDS, CAMPUS])
-    if made is not None and not isinstance(made, MeshWorld):
-        if layout is not None or world_seed is not None:
-            raise ConfigError(f"world {world!r} has neither layout nor world_seed")
-        log: SensorLog = made(preset, seed, changes)
-        return log
-    moved = seed if world_seed is None else world_seed
-    for name, value in (("seed", seed), ("world_seed", moved)):
-        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+    for name, value in (("seed", seed), ("world_seed", world_seed)):
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 0):
             raise ConfigError(f"{name} = {value}; wanted a whole number ≥ 0")
-    if world == CAMPUS:
-        return _campus(preset, seed, moved, changes, layout=layout, progress=progress)
+    made = _made_by(world)
+    if not isinstance(made, MeshWorld):
+        if layout is not None:
+            raise ConfigError(f"world {world!r} has no layouts: leave {layout!r} out")
+        log: SensorLog = made(preset, seed, changes if world_seed is None else {**changes, "world_seed": world_seed})
+        return log
     from graphslam.sim.crawler import crawler_preset, simulate_crawler
 
+    moved = seed if world_seed is None else world_seed
     config = crawler_preset(preset or "light", **changes)
     log = simulate_crawler(mesh_world(world, layout=layout, seed=moved), seed, config, progress=progress)
     return replace(log, meta={**log.meta, "made_with": {"name": world, "layout": layout, "seed": moved}})
 
 
-def _campus(
-    preset: str | None, seed: int, world_seed: int, changes: dict[str, Any], *, layout: str | None, progress: bool
-) -> SensorLog:
-    from graphslam.sim.campus import simulate_campus
-    from graphslam.sim.campus_config import campus_preset
-
-    if layout is not None:
-        raise ConfigError(f"world {CAMPUS!r} has no layouts: leave {layout!r} out, and choose a size by its preset")
-    log = simulate_campus(campus_preset(preset or "full", **changes), seed, world_seed=world_seed, progress=progress)
-    return replace(log, meta={**log.meta, "made_with": {"name": CAMPUS, "seed": world_seed}})
+def _made_by(world: str) -> Any:
+    return WORLDS.get(world) or MESH_WORLDS.get(world) or load_plugin(GROUP, "world", world, [*WORLDS, *MESH_WORLDS])
 
 
 def world_of(log: SensorLog) -> World:
@@ -132,11 +124,10 @@ def world_of(log: SensorLog) -> World:
     made = log.meta.get("made_with")
     if not isinstance(made, dict):
         raise ConfigError(f"log {log.name!r} does not say which world it was recorded in")
-    if made.get("name") == CAMPUS:
-        from graphslam.sim.campus_config import campus_preset
-        from graphslam.sim.campus_world import campus
-
-        return campus(campus_preset(**log.meta["config"]), seed=int(made.get("seed", 0)))
+    by = _made_by(str(made.get("name")))
+    if not isinstance(by, MeshWorld):
+        world: World = by.world_of(log)
+        return world
     return mesh_world(str(made.get("name")), layout=made.get("layout"), seed=int(made.get("seed", 0)))
 
 

@@ -17,7 +17,7 @@ from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.backend.ambiguous_maps import AmbiguousMaps, ambiguous_maps
 from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
-from graphslam.backend.streams import GpsSource, ImuSource, repreintegrate_until_converged
+from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, repreintegrate_until_converged
 from graphslam.core.errors import DataError
 from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.core.submap import Submap
@@ -98,6 +98,8 @@ class BackEnd:
     """IMUs of the log; None where there is no log."""
     fixes: GpsSource | None = None
     """Fixes of the log, where they are to be used as they come."""
+    others: OtherSources | None = None
+    """Sensors of the log that have no options."""
     observers: Sequence[Observer] = ()
     two_maps: AmbiguousMaps | None = None
     """Once it is finished: the graph with either of two groups of loops that cannot both be right, if nothing told."""
@@ -195,6 +197,8 @@ class BackEnd:
         gps = None if self.fixes is None else self.fixes.next(until)
         if gps is not None and self.fixes is not None:
             self.add_gps(gps, self.fixes.config)
+        if self.others is not None:
+            self.others.give(self.graph, until)
 
     def _add_matches(self, submap: Submap) -> None:
         """Re-entries that the front end found, as far as enough particles took them; the others stay in the events."""

@@ -16,6 +16,7 @@ from graphslam.core.records import Compass, Gps, LandmarkObservations
 from graphslam.evaluate.gps_repeatability import fix_segments
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.ledger import EXCLUSIVE
+from graphslam.graph.sensors import sensor_kinds
 from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.registry import Solver
 
@@ -77,6 +78,27 @@ class GpsSource:
         last = int(np.searchsorted(used.times, until, side="right"))
         first, self._given = self._given, max(self._given, last)
         return used.take(slice(first, last)) if last > first else None
+
+
+class OtherSources:
+    """Sensors of a log that have no options: the graph is given their readings submap by submap, as they come."""
+
+    def __init__(self, feed: RecordSource) -> None:
+        self.feed = feed
+        self._given: dict[str, int] = {}
+
+    def give(self, graph: FactorGraph, until: float) -> None:
+        """Readings up to a time [s] that were not given before."""
+        for kind in sensor_kinds().values():
+            if kind.options is not None or graph.dim not in kind.dims:
+                continue
+            for name in self.feed.names(kind.readings):
+                first = self._given.get(name, 0)
+                part = self.feed.part(name, first)
+                count = int(np.searchsorted(part.times, until, side="right"))
+                if count:
+                    kind.of(graph).add(part.take(slice(0, count)), stream=name)
+                    self._given[name] = first + count
 
 
 def imus_of(feed: RecordSource) -> dict[str, Imu]:

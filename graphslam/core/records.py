@@ -33,6 +33,20 @@ class Stream(Protocol):
         ...
 
 
+PLAIN: dict[str, type[Any]] = {}
+"""Records whose fields are all numbers ``(n,)``, by the name of their kind in a stored log."""
+
+
+def plain_record(kind: str) -> Any:
+    """Enter a class of such records: logs store it, and runs keep it with their inputs."""
+
+    def enter(cls: type[Any]) -> type[Any]:
+        PLAIN[kind] = cls
+        return cls
+
+    return enter
+
+
 def check_times(times: Any, n: int | None = None, *, where: str | None = None) -> Array:
     """Validate stamps ``(n,)``: finite, strictly increasing."""
     t = np.ascontiguousarray(times, dtype=np.float64)
@@ -179,6 +193,7 @@ class SteeringControls:
         return replace(self, times=self.times[index], speed=self.speed[index], steering=self.steering[index])
 
 
+@plain_record("velocity-controls")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityControls:
     """Speed and yaw rate of a base that moves along its own x axis, held from each stamp to the next (zero-order hold).
@@ -344,6 +359,7 @@ class Gps:
         return np.asarray(self.sigma[:, None, None] ** 2 * np.eye(self.positions.shape[1]))
 
 
+@plain_record("compass")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compass:
     """Headings of a magnetic compass.
@@ -374,6 +390,38 @@ class Compass:
     def take(self, index: Any) -> Compass:
         """See :class:`Stream`."""
         return replace(self, times=self.times[index], headings=self.headings[index], sigma=self.sigma[index])
+
+
+@plain_record("barometer")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Barometer:
+    """Heights of the body by air pressure, over a level that is not known.
+
+    Parameters
+    ----------
+    times : (n,)
+    heights : (n,)
+        [m], upwards.
+    sigma : (n,)
+        Standard deviation [m]; the level is constant within a log, so what the weather changes is part of it.
+    """
+
+    times: Array
+    heights: Array
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        object.__setattr__(self, "times", check_times(self.times))
+        object.__setattr__(self, "heights", _finite(_array(self.heights, (n,), "heights"), "height"))
+        object.__setattr__(self, "sigma", _finite(_array(self.sigma, (n,), "sigma"), "sigma"))
+        if np.any(self.sigma <= 0):
+            k = int(np.flatnonzero(self.sigma <= 0)[0])
+            raise DataError(f"sigma of barometer reading {k} is not positive", got=self.sigma[k], wanted="> 0 m")
+
+    def take(self, index: Any) -> Barometer:
+        """See :class:`Stream`."""
+        return replace(self, times=self.times[index], heights=self.heights[index], sigma=self.sigma[index])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,7 +18,6 @@ from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import FactorRecord, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
-from graphslam.graph.factors.gps import AntennaRecord
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.ledger import Ledger
@@ -449,10 +448,10 @@ class FactorGraphState:
             self._retired.add(i)
 
     def start_tilt(self) -> None:
-        """Bring in the variable ``tilt``; fixes that took the z axis of the first base for up are turned by it."""
+        """Bring in the variable ``tilt``; factors that took the z axis of the first base for up are turned by it."""
         if not self.structure.count("tilt"):
             self.structure.append("tilt", np.zeros(2))
             for fid, r in self.records.items():
-                if isinstance(r, AntennaRecord) and self.dim == 3:
+                if getattr(r, "tilt", None) is False and self.dim == 3:
                     self.records[fid] = replace(cast(Any, r), tilt=True)  # a new object: solvers see that it changed
             self.revision += 1

@@ -16,14 +16,13 @@ from graphslam.core.npz import Field, check_arrays, floats, ints, texts
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import (
+    PLAIN,
     AckermannGeometry,
-    Compass,
     Gps,
     LandmarkObservations,
     LaserScans,
     Odometry,
     SteeringControls,
-    VelocityControls,
 )
 from graphslam.core.trajectory import Trajectory
 
@@ -176,8 +175,7 @@ KINDS: dict[str, StreamKind] = {
         _unpack_steering,
         {"wheelbase": floats(), "encoder_offset": floats(), "model": texts()},
     ),
-    "compass": StreamKind(Compass, {**_TIMES, "headings": floats("n"), "sigma": floats("n")}),
-    "velocity-controls": StreamKind(VelocityControls, {**_TIMES, "speed": floats("n"), "yaw_rate": floats("n")}),
+    **{kind: StreamKind(cls, {f.name: floats("n") for f in dataclasses.fields(cls)}) for kind, cls in PLAIN.items()},
     "odometry": StreamKind(Odometry, {**_TIMES, "increments": floats("n", "p"), "covariances": floats("n", "d", "d")}),
     "gps": StreamKind(
         Gps,

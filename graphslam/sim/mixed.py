@@ -36,8 +36,6 @@ from graphslam.core.random import SeedTree
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import Gps, LaserScans, Odometry, Stream
 from graphslam.core.trajectory import Trajectory
-from graphslam.sim.campus import true_intervals
-from graphslam.sim.campus_config import Range, draw_log_uniform
 from graphslam.sim.clutter import KeepClear, scatter_obstacles
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import cast_scans, measure_imu
@@ -47,6 +45,8 @@ from graphslam.sim.landmark_field import observe_landmarks
 from graphslam.sim.mesh import MeshBuilder, Rectangle
 from graphslam.sim.raycast import RayCaster
 from graphslam.sim.route import Route, plan_route
+
+Range = tuple[float, float]
 
 _HALF = 1.5  # m, half the width of a corridor
 _DOOR = 0.9  # m, half the width of a door
@@ -138,6 +138,19 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 """Sizes by name: ``full`` is the default, ``quick`` is for tests."""
+
+
+def draw_log_uniform(ranges: Mapping[str, Range], tree: SeedTree) -> dict[str, float]:
+    """A figure out of every range, each from the branch of its name: logarithms are uniform."""
+    return {
+        name: float(np.exp(tree.child(name).generator().uniform(*np.log(limits)))) for name, limits in ranges.items()
+    }
+
+
+def true_intervals(times: Array, inside: Array) -> list[list[float]]:
+    """Stretches of time ``[from, to]`` in which a condition holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(int), [0]])))
+    return [[float(times[a]), float(times[b - 1])] for a, b in zip(edges[::2], edges[1::2])]
 
 
 def mixed_preset(name: str = "full", **changes: Any) -> MixedConfig:

@@ -76,7 +76,7 @@ def test_seed_layout_and_world_seed(log: SensorLog) -> None:
         ({"world": "garag"}, UnknownNameError, "did you mean garage"),
         ({"world": "garage", "layout": "Z"}, UnknownNameError, "known: A, B, C, D, drawn-N"),
         ({"world": "building", "layout": "A"}, UnknownNameError, "drawn-N, usual"),
-        ({"world": "landmark-field", "layout": "A"}, ConfigError, "neither layout"),
+        ({"world": "landmark-field", "layout": "A"}, ConfigError, "no layouts"),
         ({"world": "garage", "seed": -1}, ConfigError, "seed = -1"),
         ({"world": "garage", "world_seed": 1.5}, ConfigError, "world_seed = 1.5"),
         ({"world": "garage", "preset": "fuller"}, UnknownNameError, "full"),

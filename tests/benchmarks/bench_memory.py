@@ -31,8 +31,8 @@ from graphslam.backend import refining
 from graphslam.backend.back_end import BackEnd
 from graphslam.core.spill_cache import SPILL_CACHE
 from graphslam.maps import run_map
-from graphslam.sim.campus_config import campus_preset
-from graphslam.sim.campus_world import campus
+from graphslam_studies.sim.campus_config import campus_preset
+from graphslam_studies.sim.campus_world import campus
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 STAGES: list[tuple[Any, str, str]] = [

@@ -14,7 +14,6 @@ from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
 from graphslam.core.random import SeedTree
 from graphslam.core.trajectory import Trajectory
-from graphslam.sim.campus import simulate_campus
 from graphslam_frontends.scan_window.front_end import ScanWindow
 from graphslam_studies.campus import MOVING, QUICK_WORLDS, SESSIONS, STUDY, mean_table, nees_table, pair_table
 from graphslam_studies.campus_moving import moving_figures
@@ -22,6 +21,7 @@ from graphslam_studies.campus_sessions import seam, start_of
 from graphslam_studies.campus_trial import BLOCKS, KINDS, PAIRS, angle_errors, campus_figures, submap_lift
 from graphslam_studies.montecarlo.definition import find_study
 from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.campus import simulate_campus
 
 
 @pytest.fixture(scope="module")

@@ -230,7 +230,7 @@ def demo_command(
 def simulate_command(
     world: str = typer.Argument(
         ...,
-        help="Name of the world: mixed, landmark-field, garage, court or campus; of the studies: point-field, mine or "
+        help="Name of the world: mixed, landmark-field, garage or court; of the studies: campus, point-field, mine or "
         "building.",
     ),
     out: Path = typer.Option(..., help="Folder for the log, with the true path and map."),

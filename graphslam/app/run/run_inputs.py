@@ -22,12 +22,11 @@ from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
 from graphslam.core.log import SensorLog
 from graphslam.core.records import (
-    Compass,
+    PLAIN,
     Gps,
     LandmarkObservations,
     Odometry,
     SteeringControls,
-    VelocityControls,
     check_times,
 )
 from graphslam.evaluate.stream_checks import StreamFinding
@@ -37,7 +36,7 @@ from graphslam.refine.scans import Scans
 TAKEN_FORMAT = "graphslam.taken/1"
 INPUTS = "inputs"
 SCANS = "scans.npz"
-KEPT = (Compass, Gps, Imu, LandmarkObservations, Odometry, SteeringControls, VelocityControls)
+KEPT = (Gps, Imu, LandmarkObservations, Odometry, SteeringControls, *PLAIN.values())
 
 
 @dataclass(frozen=True, slots=True)

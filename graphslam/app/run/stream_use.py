@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from graphslam.core.records import Compass, Gps
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord
 from graphslam.graph.sensors import sensor_kinds
-
-Role = Literal["input", "gps", "imu", "compass", "beacons", "unused"]
+from graphslam.graph.sensors.base import SensorFactors
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +24,8 @@ class StreamUse:
 
     Parameters
     ----------
-    role : {"input", "gps", "imu", "compass", "beacons", "unused"}
-        ``input`` of the front end, a stream of the graph, or not used in this run.
+    role : str
+        ``input`` of the front end, the kind of a sensor of the graph, or ``unused``.
     offered : int
         Records that the log holds.
     used : int
@@ -38,7 +37,7 @@ class StreamUse:
     """
 
     name: str
-    role: Role
+    role: str
     offered: int
     used: int
     asked: bool
@@ -80,7 +79,7 @@ def stream_use(
             i, j = np.searchsorted(times, a, "left"), np.searchsorted(times, b, "right")
             spent[i:j] = True
         used = int(spent.sum())
-        role: Role = "unused"
+        role = "unused"
         asked, why = False, ""
         if name in streams_used:
             role = "input"
@@ -106,6 +105,9 @@ def stream_use(
             role, why = "compass", "" if asked else "compass.use is none"
         elif settings.beacons.use == name:
             asked, role = True, "beacons"
+        elif (kind := next((k for k in sensor_kinds().values() if _always(k, stream)), None)) is not None:
+            role, asked = kind.name, graph.dim in kind.dims
+            why = "" if asked else f"a graph of {graph.dim} dimensions cannot use it"
         if asked and role in ("compass", "beacons") and 0 < used < len(times):
             every = (settings.compass if role == "compass" else settings.beacons).every
             why = f"limited to one every {every:g} s and to the time of the path" if every else ""
@@ -119,6 +121,11 @@ def stream_use(
     for option, why in _idle_options(log, settings, out):
         graph.log_event("no-effect", option=option, why=why)
     return out
+
+
+def _always(kind: type[SensorFactors], stream: Any) -> bool:
+    """Does a run use every such stream, without an option?"""
+    return kind.options is None and isinstance(stream, kind.readings)
 
 
 def _idle_options(log: SensorLog, settings: RunConfig, streams: list[StreamUse]) -> list[tuple[str, str]]:

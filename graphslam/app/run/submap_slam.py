@@ -17,7 +17,7 @@ from graphslam.app.run.options import RunOptions
 from graphslam.app.run.run_bar import RunBar
 from graphslam.app.run.run_inputs import RunInputs, collect_inputs
 from graphslam.backend.back_end import BackEnd, Observer
-from graphslam.backend.streams import GpsSource, ImuSource, beacons_of, compasses_of
+from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, beacons_of, compasses_of
 from graphslam.core.geometry import Array
 from graphslam.core.heap import trim_heap
 from graphslam.core.log import DropCounter, SensorLog
@@ -107,7 +107,8 @@ class SubmapSlam:
         """A back end that has its IMUs, and the fixes that are to be used."""
         feed, settings = self.feed, options.settings
         imu, fixes = ImuSource(feed, settings.imu), GpsSource(feed, settings.gps)
-        back = BackEnd(settings.backend, options.solver, imu=imu, observers=observers, fixes=fixes)
+        others = OtherSources(feed)
+        back = BackEnd(settings.backend, options.solver, imu=imu, observers=observers, fixes=fixes, others=others)
         if feed.ended:  # compasses and beacons are given whole
             for name, compass in compasses_of(feed.log, settings.compass).items():
                 back.add_compass(name, compass, settings.compass)

@@ -1,7 +1,10 @@
-"""Kinds of factors, one file each, and their registration: a new kind is a file and an entry here.
+"""Kinds of factors, one file each, and their registration: a new kind is a file, which may register its own batch.
 
 The order of the entries is the order of the blocks in a graph's arrays.
 """
+
+from importlib import import_module
+from pkgutil import iter_modules
 
 from graphslam.graph.factors.attitude import AttitudeBatch
 from graphslam.graph.factors.batch import register_factor
@@ -22,3 +25,6 @@ for _batch in (
     *(RangeBatch, BeaconRangeBatch, SightingBatch),
 ):
     register_factor(_batch)
+
+for _module in iter_modules(__path__):  # the other files
+    import_module(f"{__name__}.{_module.name}")

@@ -25,13 +25,16 @@ class SensorFactors(ABC):
     readings : type
         Record type of its streams.
     options : type or None
-        Configuration; None: it has none.
+        Configuration; None: it has none, and a run uses every stream of the kind.
+    dims : tuple of int
+        Of graphs that can use it.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     readings: ClassVar[type]
     options: ClassVar[type | None] = None
+    dims: ClassVar[tuple[int, ...]] = (2, 3)
     kinds: ClassVar[list[type[SensorFactors]]] = []
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

@@ -27,13 +27,13 @@ import pandas as pd
 from scipy import stats
 
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.sim.campus_config import campus_preset
 from graphslam_studies import segslam_report as tables
 from graphslam_studies.campus_moving import run_moving_trial
 from graphslam_studies.campus_sessions import run_sessions_trial
 from graphslam_studies.campus_trial import BLOCKS, KINDS, PAIRS, CampusTrialConfig, run_campus_trial
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
+from graphslam_studies.sim.campus_config import campus_preset
 
 _THIN = {"every": 3, "every_beam": 3}
 _WIDE = {"size": (310.0, 310.0), "block": 90.0, "open_share": 0.7, "visits": 3, "round": False, "movers": 12, **_THIN}

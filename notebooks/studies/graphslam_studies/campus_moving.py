@@ -23,12 +23,12 @@ from graphslam.core.se3 import se3_transform
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.maps.moving import seen_through_voxels
-from graphslam.sim.campus import simulate_campus
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.front_end import ScanWindow
 from graphslam_studies.campus_trial import CampusTrialConfig
 from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.campus import simulate_campus
 
 ALL = 1_000_000
 """Beams of a step: every one of them is scored."""

@@ -22,9 +22,9 @@ from graphslam.core.errors import DataError, SolverError
 from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE3
-from graphslam.sim.campus import simulate_campus
 from graphslam_studies.campus_trial import CampusTrialConfig, Judge, submap_lift
 from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.campus import simulate_campus
 
 NAMES = ("first", "overlap", "far")
 THREE_SIGMA = float(stats.chi2.cdf(9.0, 1))

@@ -28,13 +28,13 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import fit_alignment
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import GpsRecord, level_datum_pose
-from graphslam.sim.campus import simulate_campus
-from graphslam.sim.campus_config import CampusConfig
 from graphslam.solve.solution import Solution
 from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.front_end import ScanWindow, ScanWindowFrontEndConfig, WindowSubmapConfig
 from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.campus import simulate_campus
+from graphslam_studies.sim.campus_config import CampusConfig
 
 KINDS = ("odometry", "odometry-fixes", "alone", "joint-white", "joint")
 PAIRS = {"odometry-fixes": "odometry", "joint-white": "alone", "joint": "alone"}

@@ -21,12 +21,12 @@ from graphslam.evidence.layout import UNKNOWN
 from graphslam.maps.surface.layer import SurfaceLayer
 from graphslam.maps.surface.mesh import Mesh, zero_set
 from graphslam.maps.surface.piece import Scan, SurfaceConfig, normals_of
-from graphslam.sim.campus_config import CampusConfig
-from graphslam.sim.campus_world import campus
 from graphslam.sim.garage import garage
 from graphslam.sim.raycast import RayCaster
 from graphslam.sim.world import World
 from graphslam_studies.montecarlo.trials import Measurement
+from graphslam_studies.sim.campus_config import CampusConfig
+from graphslam_studies.sim.campus_world import campus
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 SAMPLES = 60_000

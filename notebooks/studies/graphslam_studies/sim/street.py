@@ -25,12 +25,12 @@ from graphslam.core.random import SeedTree
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
-from graphslam.sim.campus import PANNING_MOUNT, Balancing
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import cast_scans, ornstein_uhlenbeck
 from graphslam.sim.drive import DriveConfig, SampledRoute
 from graphslam.sim.mesh import MeshBuilder
 from graphslam.sim.raycast import RayCaster
+from graphslam_studies.sim.campus import PANNING_MOUNT, Balancing
 
 HALF_WIDTH = 5.0
 """From the middle of the lane to the walls [m]."""

@@ -18,17 +18,18 @@ from graphslam.core.random import SeedTree
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import Gps, Stream, VelocityControls
 from graphslam.core.se3 import se3_inverse
-from graphslam.sim.campus_config import CampusConfig
-from graphslam.sim.campus_plan import plan_campus
-from graphslam.sim.campus_world import campus
 from graphslam.sim.crawler import start_frame
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.crawler_sensors import cast_scans, measure_imu, measure_wheels, ornstein_uhlenbeck
 from graphslam.sim.drive import DriveConfig, RouteMotion, SampledRoute, sample_route, smooth_route
-from graphslam.sim.gps_shadowing import measure_gps
-from graphslam.sim.movers import Mover, MovingObjects, draw_movers
+from graphslam.sim.mixed import true_intervals
 from graphslam.sim.raycast import RayCaster
 from graphslam.sim.world import World
+from graphslam_studies.sim.campus_config import CampusConfig
+from graphslam_studies.sim.campus_plan import plan_campus
+from graphslam_studies.sim.campus_world import campus
+from graphslam_studies.sim.gps_shadowing import measure_gps
+from graphslam_studies.sim.movers import Mover, MovingObjects, draw_movers
 
 _LEANS = 4  # waves that the pitch is made of
 PANNING_MOUNT = (0.25, 0.0, 0.9, -0.5, -0.5, -0.5, 0.5)
@@ -261,12 +262,6 @@ def simulate_campus(
     read = {name: len(s.times) for name, s in streams.items()}
     path = truth.transformed(se3_inverse(frame))
     return SensorLog(name=world.name, streams=streams, truth=Truth(path, moving=moving), read=read, meta=meta)
-
-
-def true_intervals(times: Array, inside: Array) -> list[list[float]]:
-    """Stretches of time ``[from, to]`` in which a condition holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(int), [0]])))
-    return [[float(times[a]), float(times[b - 1])] for a, b in zip(edges[::2], edges[1::2])]
 
 
 def legs_of(corridor: dict[str, Any], times: Array, poses: Array) -> list[list[list[float]]]:

@@ -17,10 +17,10 @@ from scipy.special import ndtri
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 from graphslam.core.se3 import se3_transform
-from graphslam.sim.campus_config import CampusConfig
 from graphslam.sim.crawler_sensors import ornstein_uhlenbeck
 from graphslam.sim.drive import RouteMotion
 from graphslam.sim.raycast import RayCaster
+from graphslam_studies.sim.campus_config import CampusConfig
 
 Mask = npt.NDArray[np.bool_]
 _ROUND = 24  # directions in which the nearest wall is looked for

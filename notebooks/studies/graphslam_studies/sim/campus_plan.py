@@ -15,8 +15,8 @@ import numpy as np
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.sim.campus_config import CampusConfig
 from graphslam.sim.mesh import Rectangle
+from graphslam_studies.sim.campus_config import CampusConfig
 
 MARGIN = 10.0
 """From the edge of a block to its building [m]."""

@@ -9,8 +9,12 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
-from graphslam.sim.campus_config import CampusConfig
-from graphslam.sim.campus_plan import (
+from graphslam.sim.clutter import KeepClear, park_cars
+from graphslam.sim.mesh import MeshBuilder, Rectangle
+from graphslam.sim.route import plan_route
+from graphslam.sim.world import World, describe_route
+from graphslam_studies.sim.campus_config import CampusConfig
+from graphslam_studies.sim.campus_plan import (
     CORRIDOR,
     DEPTH,
     LANDING,
@@ -21,10 +25,6 @@ from graphslam.sim.campus_plan import (
     plan_campus,
     plan_session,
 )
-from graphslam.sim.clutter import KeepClear, park_cars
-from graphslam.sim.mesh import MeshBuilder, Rectangle
-from graphslam.sim.route import plan_route
-from graphslam.sim.world import World, describe_route
 
 CORNER_RADIUS = 1.2
 CEILING = 2.8

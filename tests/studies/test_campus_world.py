@@ -19,14 +19,20 @@ from graphslam.core.records import VelocityControls
 from graphslam.core.se3 import quat_multiply, quat_rotate, se3_compose, se3_transform, so3_exp
 from graphslam.io.log_digest import log_digest
 from graphslam.io.log_folder import read_log_folder
-from graphslam.sim.campus import campus_motion, empty_scans, movers_of, pan_angle, slip_wheels
-from graphslam.sim.campus_config import CampusConfig, campus_preset
-from graphslam.sim.campus_plan import plan_campus
-from graphslam.sim.campus_world import CEILING, campus
 from graphslam.sim.crawler_sensors import scan_rays, true_inertia
-from graphslam.sim.gps_shadowing import GpsFixSeries, draw_satellites, measure_gps, nearest_wall, satellites_in_view
-from graphslam.sim.movers import Mover, clear_of
 from graphslam.sim.raycast import RayCaster
+from graphslam_studies.sim.campus import campus_motion, empty_scans, movers_of, pan_angle, slip_wheels
+from graphslam_studies.sim.campus_config import CampusConfig, campus_preset
+from graphslam_studies.sim.campus_plan import plan_campus
+from graphslam_studies.sim.campus_world import CEILING, campus
+from graphslam_studies.sim.gps_shadowing import (
+    GpsFixSeries,
+    draw_satellites,
+    measure_gps,
+    nearest_wall,
+    satellites_in_view,
+)
+from graphslam_studies.sim.movers import Mover, clear_of
 from tests.reference.plain_mesh import box, merge, plain_ranges, quad
 
 QUICK = campus_preset("quick")

@@ -8,12 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.random import SeedTree
-
-Range = tuple[float, float]
+from graphslam.sim.mixed import Range, draw_log_uniform
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,13 +177,6 @@ class CampusConfig:
         """A figure out of every range: logarithms uniform."""
         ranges = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if isinstance(f.default, tuple)}
         return draw_log_uniform({k: v for k, v in ranges.items() if k not in ("size", "lever")}, tree)
-
-
-def draw_log_uniform(ranges: Mapping[str, Range], tree: SeedTree) -> dict[str, float]:
-    """A figure out of every range, each from the branch of its name: logarithms are uniform."""
-    return {
-        name: float(np.exp(tree.child(name).generator().uniform(*np.log(limits)))) for name, limits in ranges.items()
-    }
 
 
 _MAY_BE_NONE = (
