@@ -10,6 +10,7 @@ import pytest
 
 import graphslam as gs
 from graphslam.app.run.run import Run
+from graphslam.core.poses import compose_increments
 
 
 def same(run: Run, folder: Path) -> None:
@@ -50,22 +51,22 @@ def test_on_a_simulated_run(
 
 def test_on_a_plain_table_of_landmarks_that_was_calibrated(tmp_path: Path) -> None:
     """A log of CSV files; calibration adds constant errors of wheels and sensor to the graph."""
-    log = gs.simulate("landmark-field", preset="quick", seed=4)
+    log = gs.simulate("mixed", preset="quick", seed=4)
     wheels, seen = log["wheels"], log["landmarks"]
-    speed, rate = wheels.values.T if hasattr(wheels, "values") else (wheels.speed, wheels.yaw_rate)
+    path = compose_increments(wheels.increments[1:])
     rows = np.repeat(np.arange(len(seen.times)), np.diff(seen.offsets))
-    np.savetxt(
-        tmp_path / "odometry.csv", np.column_stack([wheels.times, speed, rate]), delimiter=",",
-        header="time,velocity,yaw_rate", comments="",
-    )  # fmt: skip
-    np.savetxt(
-        tmp_path / "landmarks.csv", np.column_stack([seen.times[rows], seen.ranges, seen.bearings, seen.ids]),
-        delimiter=",", header="time,range,bearing,id", comments="",
-    )  # fmt: skip
+    tables = {
+        "odometry": ("t,x,y,theta", np.column_stack([wheels.times, path])),
+        "sightings": ("t,range,bearing,id", np.column_stack([seen.times[rows], seen.ranges, seen.bearings, seen.ids])),
+    }
+    for name, (header, table) in tables.items():
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=header, comments="", fmt="%.9g")
     run = gs.run(tmp_path, out=tmp_path / "run", progress=False)
+    assert run.graph is not None
+    assert "lasting" in {r.group for r in run.graph.records.values()}
     same(run, tmp_path / "run")
 
 
 def test_on_recorded_data(data_dir: Path, tmp_path: Path) -> None:
-    run = gs.run("mrclam", out=tmp_path / "run", progress=False)
+    run = gs.run("mrclam-dataset7/robot1", out=tmp_path / "run", progress=False)
     same(run, tmp_path / "run")
