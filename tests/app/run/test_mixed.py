@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
@@ -159,3 +160,25 @@ def test_what_does_not_go_together_is_refused(log):
         gs.run(log, frontend=BOTH, config={"frontend": {"particles": 3}}, progress=False)
     with pytest.raises(ConfigError, match="each once"):
         gs.run(log, frontend=["segslam", "segslam"], progress=False)
+
+
+def test_a_folder_gives_back_every_factor(tmp_path):
+    """Both kinds of submaps, GPS, IMU and sensor biases: the graph of the folder has the objective of the run."""
+    options = {
+        "preset": "none",
+        "frontend": {
+            "segslam": {"steps": {"period": "none", "motion": ["wheels"]}, "filter": {"particles": 8}},
+            "rbpf-ekf": {"particles": 10},
+        },
+        "imu": {"use": "auto"},
+        "gps": {"use": "all"},
+        "calibrate": {"use": "always"},
+    }
+    world = gs.simulate("mixed", seed=2, preset="quick")
+    made = gs.run(world, frontend=BOTH, config=options, progress=False, out=tmp_path / "run")
+    opened = gs.open_run(tmp_path / "run")
+    kinds = [Counter(type(r).__name__ for r in g.records.values()) for g in (made.graph, opened.graph)]
+    assert kinds[0] == kinds[1]
+    assert {"BetweenRecord", "GpsRecord", "ImuRecord", "SensorBiasRecord", "SubmapRecord"} <= set(kinds[0])
+    assert opened.solution.objective == pytest.approx(made.solution.objective, abs=1e-9)
+    assert made.graph.objective().total == pytest.approx(made.solution.objective, abs=1e-9)
