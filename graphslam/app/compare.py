@@ -18,7 +18,6 @@ from graphslam.core.progress import Bar
 from graphslam.evaluate.consistency import consistency_index, joint_nees, pose_error
 from graphslam.evaluate.map_error import match_ids
 from graphslam.join.association import MapAssociationConfig
-from graphslam.join.frames import lever_matrix, rotation_of
 from graphslam.join.registry import (
     Material,
     association_of,
@@ -94,7 +93,8 @@ def _errors(
         exits = pose_error(estimate.poses[rows], truth.exit_poses[j])
         marks = truth.landmarks[b] - estimate.landmarks[a]
         if chart != "cartesian" and len(a):
-            _turn_with_anchors(marks, estimate, a, truth.landmarks[b], dict(zip(rows.tolist(), j.tolist())), truth)
+            known = dict(zip(rows.tolist(), truth.exit_poses[j]))
+            marks = estimate.anchored_errors(a, truth.landmarks[b], known)
         columns = layout.pose_columns(rows).ravel(), layout.at("l", a).ravel()
         return np.concatenate([exits.ravel(), marks.ravel()]), np.concatenate(columns)
     m = len(estimate.poses) - 1
@@ -104,35 +104,6 @@ def _errors(
     d, n = g.dof, g.dim
     at = np.concatenate([(d * i[:, None] + np.arange(d)).ravel(), (d * m + n * a[:, None] + np.arange(n)).ravel()])
     return estimate.difference(poses, landmarks, chart=chart)[at], at
-
-
-def _turn_with_anchors(
-    error: np.ndarray,
-    estimate: GraphEstimate,
-    rows: np.ndarray,
-    true: np.ndarray,
-    known: Mapping[int, int],
-    truth: MapTruth,
-) -> None:
-    """Errors of landmarks in the frames of their anchors, in place: an error of a heading turns a submap as a whole.
-
-    A landmark hangs on the exit of the submap that saw it first, ``m = X_a⁻¹ l``; its error is ``δl = R (δm + D ξ_a)``,
-    the form in which the joiners carry it (:mod:`graphslam.join.gaussian_map`).
-
-    Parameters
-    ----------
-    known : mapping of int to int
-        Nodes with ground truth, and their rows in it.
-    """
-    g = group_of(estimate.poses)
-    for k, anchor in enumerate(estimate.problem.landmark_anchors[rows].tolist()):
-        if anchor not in known:
-            continue
-        here, there = estimate.poses[anchor], truth.exit_poses[known[anchor]]
-        m = g.transform(g.inverse(here), estimate.landmarks[rows[k]])
-        shift = g.transform(g.inverse(there), true[k]) - m
-        lever = lever_matrix(g, m[None])[0]
-        error[k] = rotation_of(g, here) @ (shift + lever @ pose_error(here, there))
 
 
 def _judge(estimate: MapEstimate, keys: Sequence[int], truth: MapTruth | None) -> dict[str, Any]:

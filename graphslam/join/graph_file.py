@@ -7,41 +7,45 @@ registered factors: nothing of the file is executed or imported.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from graphslam.core.atomic import read_npz
 from graphslam.core.errors import FormatError, GraphSlamError
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import FactorRecord, factor_kinds
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.variables import KINDS, Values
 from graphslam.linear.space_maps import SpaceMap
 
-if TYPE_CHECKING:
-    from graphslam.join.graph_problem import JoinProblem
-
 GRAPH_FORMAT = "graphslam.graph/1"
-_PARTS = ("keys", "bases", "times", "chains")
+PARTS = ("keys", "bases", "times", "chains")
 _NESTED: dict[str, type] = {"SpaceMap": SpaceMap}
 """Types of fields that are records themselves."""
 
 
-def problem_arrays(problem: JoinProblem) -> dict[str, Any]:
-    """All arrays of a graph of submaps."""
-    values = problem.graph.values
+def graph_arrays(graph: FactorGraph, parts: Mapping[str, Any]) -> dict[str, Any]:
+    """All arrays of a graph of submaps.
+
+    Parameters
+    ----------
+    parts : mapping of str to array
+        ``keys``, ``bases``, ``times`` and ``chains`` of a :class:`~graphslam.join.graph_problem.JoinProblem`.
+    """
+    values, factors = graph.values, list(graph.records.values())
     out: dict[str, Any] = {"format": GRAPH_FORMAT, "dim": values.dim, "landmark_ids": values.landmark_ids}
     out |= {f"values.{w}": values[w] for w in KINDS if values.count(w)}
-    out |= {name: getattr(problem, name) for name in _PARTS}
+    out |= {name: parts[name] for name in PARTS}
     columns: list[str] = []
     for batch in factor_kinds():
-        records = [r for r in problem.factors if type(r) is batch.record]
+        records = [r for r in factors if type(r) is batch.record]
         if records:
             _write_fields(batch.record.__name__, records, out, columns)
-    out["order"] = np.array([r.factor_id for r in problem.factors], dtype=np.int64)
+    out["order"] = np.array([r.factor_id for r in factors], dtype=np.int64)
     out["columns"] = np.array(columns, dtype=str)
     return out
 
@@ -85,8 +89,8 @@ def _plain(value: Any) -> type:
     return int if isinstance(value, (int, np.integer)) else float
 
 
-def read_problem_arrays(path: str | os.PathLike[str]) -> tuple[Values, list[FactorRecord], dict[str, Any]]:
-    """Values, factors and parts of :func:`problem_arrays`.
+def read_graph_arrays(path: str | os.PathLike[str]) -> tuple[Values, list[FactorRecord], dict[str, Any]]:
+    """Values, factors and parts of :func:`graph_arrays`.
 
     Raises
     ------
@@ -111,7 +115,7 @@ def read_problem_arrays(path: str | os.PathLike[str]) -> tuple[Values, list[Fact
                     found[r.factor_id] = r
         records = [found[i] for i in arrays["order"].tolist()]
         _check_variables(records, values)
-        return values, records, {p: arrays[p] for p in _PARTS}
+        return values, records, {p: arrays[p] for p in PARTS}
     except GraphSlamError:
         raise
     except (KeyError, ValueError, TypeError, IndexError) as error:

@@ -20,9 +20,11 @@ import scipy.sparse.linalg as spla
 from graphslam.core.errors import DataError, IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.markup import html_element, join_parts
+from graphslam.core.poses import group_of
 from graphslam.core.progress import Bar
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.variables import Values
+from graphslam.join.frames import lever_matrix, rotation_of
 from graphslam.join.gaussian_map import GaussianMap, add_maps, join_two
 from graphslam.join.graph_problem import Index, JoinProblem
 from graphslam.linear.symmetric_factor import SymmetricFactor
@@ -111,6 +113,30 @@ class GraphEstimate:
         """Joint covariance of the scalars ``indices`` of the state vector."""
         at = np.asarray(indices)
         return self.covariance[np.ix_(at, at)] if self.covariance is not None else self._factor.inverse_block(at)
+
+    def anchored_errors(self, rows: Index, true: Array, known: Mapping[int, Array]) -> Array:
+        """Errors ``(n, dim)`` of landmarks ``rows``: an error of a heading turns a submap as a whole.
+
+        A landmark hangs on the exit of the submap that saw it first, ``m = X_a⁻¹ l``, and its error is
+        ``δl = R (δm + D ξ_a)``, the form in which the joiners carry it (:mod:`graphslam.join.gaussian_map`).
+
+        Parameters
+        ----------
+        true : (n, dim)
+            Where the landmarks are.
+        known : mapping of int to (3|7,)
+            True poses of nodes; a landmark whose anchor has none keeps its plain error.
+        """
+        g, error = group_of(self.poses), true - self.landmarks[rows]
+        for k, anchor in enumerate(self.problem.landmark_anchors[rows].tolist()):
+            if anchor not in known:
+                continue
+            here, there = self.poses[anchor], known[anchor]
+            m = g.transform(g.inverse(here), self.landmarks[rows[k]])
+            moved = g.transform(g.inverse(there), true[k]) - m
+            turn = lever_matrix(g, m[None])[0] @ g.log(g.between(here, there))
+            error[k] = rotation_of(g, here) @ (moved + turn)
+        return error
 
     def map_information(self) -> sp.csc_matrix | None:
         """Information of poses and landmarks alone; everything else is marginalised out."""
@@ -202,7 +228,7 @@ def _of_root(problem: JoinProblem, root: GaussianMap, method: str, start: float)
     return _estimate(problem, root.values, method, seconds, information=sp.csc_matrix(A[d:, d:]))
 
 
-def join_sequential(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
+def join_graph_sequential(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
     """Extended information filter, submap after submap (Combined SLAM eq. 13-16).
 
     Parameters
@@ -219,13 +245,13 @@ def join_sequential(problem: JoinProblem, *, passes: int | None = None, progress
     return _of_root(problem, _finished(joined), "eif-sequential", start)
 
 
-def join_tree(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
+def join_graph_tree(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
     """Extended information filter by binary tree: submaps pairwise, then the pairs, and so on.
 
     Parameters
     ----------
     problem, passes, progress
-        As in :func:`join_sequential`.
+        As in :func:`join_graph_sequential`.
     """
     start, plan = time.perf_counter(), JoinSchedule(problem)
     with Bar(total=len(problem.keys) - 1, name="join", unit="join", shown=progress) as bar:
@@ -247,8 +273,8 @@ def join_tree(problem: JoinProblem, *, passes: int | None = None, progress: bool
 # ---------------------------------------------------------------- the dense filter
 
 
-def join_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEstimate:
-    """Extended Kalman filter, submap after submap, in covariance form: the plain twin of :func:`join_sequential`.
+def join_graph_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEstimate:
+    """Extended Kalman filter, submap after submap, in covariance form: the plain twin of :func:`join_graph_sequential`.
 
     A submap and the factors that enter with it measure old and new variables together. What they say of the old ones
     alone is a measurement update; the new ones follow, with their correlations.
@@ -384,7 +410,7 @@ def optimise_estimate(problem: JoinProblem, joined: GraphEstimate) -> GraphEstim
     )  # fmt: skip
 
 
-def solve_batch(problem: JoinProblem, *, polish: bool = True, progress: bool = False) -> GraphEstimate:
+def solve_graph_batch(problem: JoinProblem, *, polish: bool = True, progress: bool = False) -> GraphEstimate:
     """Least squares of everything at once, from the chain alone: at its optimum whatever ``polish`` is."""
     start = time.perf_counter()
     begun = _estimate(problem, _start_values(problem), "batch", 0.0)
@@ -394,7 +420,7 @@ def solve_batch(problem: JoinProblem, *, polish: bool = True, progress: bool = F
     return replace(best, objective=best.objective_polished)
 
 
-def solve_isam2(problem: JoinProblem, *, polish: bool = True, progress: bool = False) -> GraphEstimate:
+def solve_graph_isam2(problem: JoinProblem, *, polish: bool = True, progress: bool = False) -> GraphEstimate:
     """Add submap after submap with its factors, updating iSAM2 after each, then go to the optimum.
 
     Returns
@@ -429,9 +455,9 @@ def solve_isam2(problem: JoinProblem, *, polish: bool = True, progress: bool = F
 
 
 GRAPH_JOINERS: dict[str, Callable[..., GraphEstimate]] = {
-    "eif-tree": join_tree,
-    "eif-sequential": join_sequential,
-    "ekf": join_ekf,
+    "eif-tree": join_graph_tree,
+    "eif-sequential": join_graph_sequential,
+    "ekf": join_graph_ekf,
 }
 
-GRAPH_SOLVERS: dict[str, Callable[..., GraphEstimate]] = {"batch": solve_batch, "isam2": solve_isam2}
+GRAPH_SOLVERS: dict[str, Callable[..., GraphEstimate]] = {"batch": solve_graph_batch, "isam2": solve_graph_isam2}

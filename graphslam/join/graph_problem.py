@@ -38,7 +38,7 @@ from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.landmark_submap import PathRecord
 from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
 from graphslam.join.frames import Rule, rows_in_frame, rule_of
-from graphslam.join.graph_file import problem_arrays, read_problem_arrays
+from graphslam.join.graph_file import PARTS, graph_arrays, read_graph_arrays
 from graphslam.join.submap_blocks import check_identified
 
 Index = npt.NDArray[np.int64]
@@ -157,12 +157,12 @@ class JoinProblem:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the graph, all values and factors, as an archive of arrays."""
-        write_npz(path, problem_arrays(self))
+        write_npz(path, graph_arrays(self.graph, {name: getattr(self, name) for name in PARTS}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> JoinProblem:
         """Inverse of :meth:`save`."""
-        values, records, parts = read_problem_arrays(path)
+        values, records, parts = read_graph_arrays(path)
         graph = FactorGraph.with_values(values)
         for r in records:
             graph.insert(r)

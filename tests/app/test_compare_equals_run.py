@@ -1,4 +1,4 @@
-"""`compare` of a run solves the graph of the run: the same factors, the same objective, in memory and from the folder."""
+"""`compare` of a run solves the graph of the run: the same factors and objective, in memory and from the folder."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MIXED: dict[str, Any] = {"imu": {"use": "all"}, "gps": {"use": "all"}}
     ("world", "preset", "frontend", "config", "groups"),
     [
         ("landmark-field", "quick", "rbpf-ekf", {}, {"submap"}),
-        ("garage", "quick", "segslam", {"refine": {"use": False}}, {"dense-submap", "levelled"}),
+        ("garage", "light", "segslam", {"refine": {"use": False}}, {"dense-submap", "levelled"}),
         ("mixed", "quick", ["segslam", "rbpf-ekf"], MIXED, {"submap", "dense-submap", "gps", "imu", "imu-bias"}),
         ("mixed", "quick", ["segslam", "rbpf-ekf"], {"gps": {"use": "none"}}, {"submap", "dense-submap"}),
     ],

@@ -22,12 +22,12 @@ import numpy as np
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.evaluate.consistency import joint_nees, pose_error
 from graphslam.io.network_file import read_network
-from graphslam.join.graph_join import GraphEstimate, join_sequential, join_tree, optimise_estimate
+from graphslam.join.graph_join import GraphEstimate, join_graph_sequential, join_graph_tree, optimise_estimate
 from graphslam.join.graph_problem import JoinProblem
 from tests.reference.best_known import BEST_KNOWN
 from tests.reference.pose_ramp import pose_ramp
 
-WAYS: dict[str, Callable[..., GraphEstimate]] = {"sequence": join_sequential, "tree": join_tree}
+WAYS: dict[str, Callable[..., GraphEstimate]] = {"sequence": join_graph_sequential, "tree": join_graph_tree}
 TARGETS = {"parking-garage": (34, 1.70), "sphere2500": (50, 1800.0)}
 NOISES = ((0.05, 0.6), (0.05, 1.7))
 """Of a step [m], [deg]; of a loop twice as much."""
@@ -68,7 +68,7 @@ def ramps(trials: int, noises: tuple[tuple[float, float], ...]) -> None:
             problem, truth = pose_ramp(
                 seed, submaps=24, steps=15, around=90, loops=45, metres=metres, radians=np.radians(degrees)
             )
-            best = optimise_estimate(problem, join_sequential(problem))
+            best = optimise_estimate(problem, join_graph_sequential(problem))
             assert best.objective_polished is not None
             n = best.states
             for row in rows:

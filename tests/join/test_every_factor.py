@@ -15,7 +15,7 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.noise import RobustKernel
 from graphslam.join.gaussian_map import GaussianMap, add_maps, join_two
-from graphslam.join.graph_join import JoinSchedule, join_ekf, join_sequential
+from graphslam.join.graph_join import JoinSchedule, join_graph_ekf, join_graph_sequential
 from graphslam.join.graph_problem import JoinProblem
 from graphslam.solve.batch import BatchSolver
 from tests.agreement.test_graph_solvers import build
@@ -103,7 +103,7 @@ def test_a_join_equals_its_slow_twin(problem: JoinProblem) -> None:
 
 
 def test_the_dense_filter_is_the_information_filter_in_sequence(problem: JoinProblem) -> None:
-    dense, sparse = join_ekf(problem), join_sequential(problem, passes=1)
+    dense, sparse = join_graph_ekf(problem), join_graph_sequential(problem, passes=1)
     for word in problem.words:
         np.testing.assert_allclose(dense.values[word], sparse.values[word], atol=1e-6, err_msg=word)
     P = np.linalg.inv(sparse.information.toarray())
@@ -126,5 +126,5 @@ def test_a_map_that_factors_do_not_determine_is_named() -> None:
     with pytest.raises(
         IndeterminateError, match=r"submaps \d+ to \d+ do not determine bias2: .*set bias_sigma"
     ) as error:
-        join_sequential(problem)
+        join_graph_sequential(problem)
     assert error.value.variables == ("bias2",)

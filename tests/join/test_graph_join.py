@@ -21,13 +21,13 @@ from graphslam.evaluate.consistency import joint_nees, pose_error
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.noise import RobustKernel
 from graphslam.io.network_file import read_network
-from graphslam.join.graph_file import problem_arrays
+from graphslam.join.graph_file import PARTS, graph_arrays
 from graphslam.join.graph_join import (
     GRAPH_JOINERS,
     MOST_STATES,
     GraphEstimate,
-    join_sequential,
-    join_tree,
+    join_graph_sequential,
+    join_graph_tree,
     optimise_estimate,
 )
 from graphslam.join.graph_problem import JoinProblem
@@ -68,7 +68,7 @@ def test_five_methods_one_optimum_and_the_price_of_filtering_before_it(case: dic
 @pytest.mark.parametrize("case", CASES)
 def test_the_filter_in_sequence_is_the_dense_filter(case: dict) -> None:
     problem, _ = pose_ramp(6, submaps=5, radians=0.05, **case)
-    sparse, dense = join_sequential(problem, passes=1), join_by_method(problem, "ekf")
+    sparse, dense = join_graph_sequential(problem, passes=1), join_by_method(problem, "ekf")
     np.testing.assert_allclose(dense.poses, sparse.poses, atol=1e-9)
     assert sparse.information.shape == (problem.states, problem.states) == (sparse.states, dense.states)
     if "levelled" in problem.factor_counts():
@@ -83,7 +83,7 @@ def test_the_filter_in_sequence_is_the_dense_filter(case: dict) -> None:
 
 def test_more_passes_come_nearer_to_the_optimum() -> None:
     problem, _ = pose_ramp(3, submaps=8, loops=40, radians=0.03)
-    for way in (join_tree, join_sequential):
+    for way in (join_graph_tree, join_graph_sequential):
         once, thrice = way(problem), way(problem, passes=3)
         best = optimise_estimate(problem, once).objective_polished
         assert once.objective - best > 3 * (thrice.objective - best) > 0
@@ -91,7 +91,7 @@ def test_more_passes_come_nearer_to_the_optimum() -> None:
 
 def test_where_loops_bend_each_submap_only_the_refinement_helps() -> None:
     problem, _ = pose_ramp(7, submaps=10, loops=60, radians=0.1)
-    tree = join_tree(problem, passes=1)
+    tree = join_graph_tree(problem, passes=1)
     best = optimise_estimate(problem, tree)
     assert tree.objective > 1.2 * best.objective_polished
     assert best.objective_polished == pytest.approx(join_by_method(problem, "batch").objective, rel=1e-8)
@@ -248,7 +248,7 @@ def test_a_problem_on_disk_is_the_same_problem(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["dim", "values.x", "order", "columns", "BetweenRecord.T_ij", "BetweenRecord.i"])
 def test_a_damaged_graph_file_is_refused(tmp_path: Path, name: str) -> None:
     problem, _ = pose_ramp(5, submaps=2)
-    arrays = problem_arrays(problem)
+    arrays = graph_arrays(problem.graph, {p: getattr(problem, p) for p in PARTS})
     assert name in arrays
     write_npz(tmp_path / "missing.npz", {k: v for k, v in arrays.items() if k != name})
     with pytest.raises(FormatError, match="graph cannot be read"):
@@ -257,7 +257,7 @@ def test_a_damaged_graph_file_is_refused(tmp_path: Path, name: str) -> None:
 
 def test_a_graph_file_of_variables_that_are_not_there_is_refused(tmp_path: Path) -> None:
     problem, _ = pose_ramp(5, submaps=2)
-    arrays = problem_arrays(problem)
+    arrays = graph_arrays(problem.graph, {p: getattr(problem, p) for p in PARTS})
     write_npz(tmp_path / "short.npz", arrays | {"values.x": arrays["values.x"][:-1]})
     with pytest.raises(FormatError, match="has no value"):
         JoinProblem.load(tmp_path / "short.npz")
@@ -274,7 +274,7 @@ def test_published_graphs_cut_into_submaps(
     assert len(problem.keys) == submaps
     own = GRAPH_JOINERS["eif-tree"](problem)
     assert own.objective < tree
-    assert join_sequential(problem).objective < sequence
+    assert join_graph_sequential(problem).objective < sequence
     best = optimise_estimate(problem, own)
     assert best.converged
     assert best.objective_polished == pytest.approx(BEST_KNOWN[file], rel=1e-6)

@@ -15,7 +15,7 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.se3 import se3_between, se3_inverse, se3_transform
 from graphslam.core.submap import Submap
 from graphslam.io.submap_store import read_submaps, write_submaps
-from graphslam.join.graph_join import join_sequential
+from graphslam.join.graph_join import join_graph_sequential
 from graphslam.join.registry import join_by_method, prepare_submaps
 
 METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
@@ -63,7 +63,7 @@ def test_the_filters_in_both_forms_are_one_algebra(drifting) -> None:
     """The Kalman filter and the classical information filter in sequence are linearised at the same places."""
     submaps = drifting[0][:3]
     covariance = join_by_method(submaps, "ekf")
-    information = join_sequential(prepare_submaps(submaps), passes=1)
+    information = join_graph_sequential(prepare_submaps(submaps), passes=1)
     np.testing.assert_allclose(covariance.poses, information.poses, atol=1e-7)
     np.testing.assert_allclose(covariance.landmarks, information.landmarks, atol=1e-7)
     np.testing.assert_allclose(
