@@ -108,10 +108,14 @@ class GaussianMap:
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
-        """Which columns move: not the base; not constants, but in a map from the first base on."""
-        rules, width = self.problem.rules, self.problem.width[self.variables]
-        held = [v == self.base or (self.first > 0 and rules[v] == "constant") for v in self.variables.tolist()]
-        return np.repeat(~np.array(held), width)
+        """Which columns move: not the base; not constants whose prior is in another map."""
+        problem, rules = self.problem, self.problem.rules
+        held = [
+            v == self.base
+            or (self.first > 0 and rules[v] == "constant" and not problem.has_prior(v, self.first, self.stop))
+            for v in self.variables.tolist()
+        ]
+        return np.repeat(~np.array(held), problem.width[self.variables])
 
     @property
     def _at(self) -> Index:
@@ -383,7 +387,7 @@ def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tu
     """
     seen = b.moved(a.end if values is None else values["x"][a.problem.bases[a.stop]])
     common = np.intersect1d(a.variables, b.variables, assume_unique=True)
-    news = len(common) > 1 or (a.first == 0 and b.first > 0 and bool(np.any(b.gradient)))
+    news = len(common) > 1
     if values is None:
         values = a.values.copy()
         for word, _, places, rows, _ in seen.kinds():
@@ -402,10 +406,10 @@ def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tu
         wide_a, stop=b.stop, information=sp.csc_matrix(wide_a.information + wide_b.information),
         gradient=wide_a.gradient + wide_b.gradient, waiting=np.concatenate([a.waiting, b.waiting]),
     )  # fmt: skip
-    return joined, news
+    return joined, news or bool(np.any(joined.gradient[joined.free]))
 
 
-def join_two(a: GaussianMap, b: GaussianMap, factors: Index, *, passes: int | None = None) -> GaussianMap:
+def join_gaussian_maps(a: GaussianMap, b: GaussianMap, factors: Index, *, passes: int | None = None) -> GaussianMap:
     """Join B, whose base is the end of A, and the factors that need both.
 
     Parameters

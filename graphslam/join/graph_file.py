@@ -23,7 +23,7 @@ from graphslam.graph.variables import KINDS, Values
 from graphslam.linear.space_maps import SpaceMap
 
 GRAPH_FORMAT = "graphslam.graph/1"
-PARTS = ("keys", "bases", "times", "chains")
+PARTS = ("keys", "bases", "times", "chains", "offset")
 _NESTED: dict[str, type] = {"SpaceMap": SpaceMap}
 """Types of fields that are records themselves."""
 
@@ -34,7 +34,7 @@ def graph_arrays(graph: FactorGraph, parts: Mapping[str, Any]) -> dict[str, Any]
     Parameters
     ----------
     parts : mapping of str to array
-        ``keys``, ``bases``, ``times`` and ``chains`` of a :class:`~graphslam.join.graph_problem.JoinProblem`.
+        Those of :data:`PARTS`, of a :class:`~graphslam.join.graph_problem.JoinProblem`.
     """
     values, factors = graph.values, list(graph.records.values())
     out: dict[str, Any] = {"format": GRAPH_FORMAT, "dim": values.dim, "landmark_ids": values.landmark_ids}
@@ -115,7 +115,7 @@ def read_graph_arrays(path: str | os.PathLike[str]) -> tuple[Values, list[Factor
                     found[r.factor_id] = r
         records = [found[i] for i in arrays["order"].tolist()]
         _check_variables(records, values)
-        return values, records, {p: arrays[p] for p in PARTS}
+        return values, records, {p: arrays[p] for p in PARTS} | {"offset": float(arrays["offset"])}
     except GraphSlamError:
         raise
     except (KeyError, ValueError, TypeError, IndexError) as error:

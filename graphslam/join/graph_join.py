@@ -25,7 +25,7 @@ from graphslam.core.progress import Bar
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.variables import Values
 from graphslam.join.frames import lever_matrix, rotation_of
-from graphslam.join.gaussian_map import GaussianMap, add_maps, join_two
+from graphslam.join.gaussian_map import GaussianMap, add_maps, join_gaussian_maps
 from graphslam.join.graph_problem import Index, JoinProblem
 from graphslam.linear.symmetric_factor import SymmetricFactor
 from graphslam.solve.batch import LevenbergConfig, optimise_problem
@@ -187,7 +187,7 @@ def _estimate(
     covariance: Array | None = None,
     iterations: int = 0,
 ) -> GraphEstimate:
-    objective = problem.graph.flat().objective(values)
+    objective = problem.objective(values)
     return GraphEstimate(
         problem, values, information, objective, method, seconds, covariance=covariance, iterations=iterations
     )
@@ -234,14 +234,16 @@ def join_graph_sequential(problem: JoinProblem, *, passes: int | None = None, pr
     Parameters
     ----------
     passes : int, optional
-        How often a join is linearised (:func:`~graphslam.join.gaussian_map.join_two`).
+        How often a join is linearised (:func:`~graphslam.join.gaussian_map.join_gaussian_maps`).
     progress : bool
         Show a progress bar.
     """
     start, plan = time.perf_counter(), JoinSchedule(problem)
     joined = GaussianMap.leaf(problem, 0, plan.inside[0])
     for k in Bar(range(1, len(problem.keys)), name="join", unit="submap", shown=progress):
-        joined = join_two(joined, GaussianMap.leaf(problem, k, plan.inside[k]), plan.at_last[k], passes=passes)
+        joined = join_gaussian_maps(
+            joined, GaussianMap.leaf(problem, k, plan.inside[k]), plan.at_last[k], passes=passes
+        )
     return _of_root(problem, _finished(joined), "eif-sequential", start)
 
 
@@ -264,7 +266,7 @@ def join_graph_tree(problem: JoinProblem, *, passes: int | None = None, progress
             left, right = plan.high[factors] < middle, plan.low[factors] >= middle
             A, B = joined(a, middle, factors[left]), joined(middle, b, factors[right])
             bar.update()
-            return join_two(A, B, factors[~left & ~right], passes=passes)
+            return join_gaussian_maps(A, B, factors[~left & ~right], passes=passes)
 
         root = joined(0, len(problem.keys), plan.across)
     return _of_root(problem, _finished(root), "eif-tree", start)
@@ -405,7 +407,7 @@ def optimise_estimate(problem: JoinProblem, joined: GraphEstimate) -> GraphEstim
     system = flat.evaluate(best.values, dense=False)
     return replace(
         joined, values=best.values, information=sp.csc_matrix(system.A), covariance=None,
-        objective_polished=best.objective, iterations=best.iterations, converged=best.converged,
+        objective_polished=best.objective + problem.offset, iterations=best.iterations, converged=best.converged,
         seconds=joined.seconds + time.perf_counter() - start,
     )  # fmt: skip
 

@@ -4,8 +4,7 @@ A factor belongs to the submaps of its nodes. It enters a join at the lowest nod
 and can linearise it. Three kinds of variables need care there (:data:`~graphslam.join.frames.RULES`):
 
 * A *small constant* (scale of wheels, bias of an IMU or of GPS fixes) is about zero. Its factors enter at once. In a
-  map that does not begin at the first base it is held at zero, and its information is kept, because its prior enters
-  elsewhere.
+  map without its prior, or the walk that leads to it, it is held at zero, and its information is kept.
 * The datum, gravity, velocities, beacons and the zero of a compass can be anywhere. Their factors wait until they
   determine the variable, given the nodes. It then starts at the least-squares optimum of these factors alone.
 * A kind whose values in another frame are not known here waits for the frame of the first base.
@@ -39,6 +38,7 @@ from graphslam.graph.factors.landmark_submap import PathRecord
 from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
 from graphslam.join.frames import Rule, rows_in_frame, rule_of
 from graphslam.join.graph_file import PARTS, graph_arrays, read_graph_arrays
+from graphslam.join.kernel_weights import without_kernels
 from graphslam.join.submap_blocks import check_identified
 
 Index = npt.NDArray[np.int64]
@@ -67,6 +67,8 @@ class JoinProblem:
         Of the nodes [s]; their numbers where there is no clock.
     chains : (n + m - 1, 3|7)
         Nodes of every submap in the frame of its base, from base to exit, as the submap states them.
+    offset : float
+        To be added to the sum of squares: what robust kernels take off it (:meth:`of_graph`).
     """
 
     graph: FactorGraph
@@ -74,12 +76,17 @@ class JoinProblem:
     bases: Index
     times: Array
     chains: Array
+    offset: float = 0.0
 
     # ---------------------------------------------------------------- where it comes from
 
     @classmethod
     def of_graph(cls, graph: FactorGraph) -> JoinProblem:
         """All factors of a graph of submaps.
+
+        Filters carry Gaussians, so a factor with a robust kernel has the weight that the kernel gives it at the values
+        of the graph. The weighted sum and a constant (:attr:`offset`) have the value and the gradient of the robust
+        sum there: its optimum is that of the graph.
 
         Raises
         ------
@@ -91,12 +98,14 @@ class JoinProblem:
             raise DataError("there are no submaps", got=0, wanted="at least one")
         if any(a.nodes[-1] != b.node for a, b in pairwise(chain)) or chain[0].node:
             raise DataError("submaps do not follow each other in one chain", wanted="one session")
+        weighted, offset = without_kernels(graph)
         return cls(
-            graph,
+            weighted,
             np.array([s.key for s in chain], dtype=np.int64),
             np.array([*(s.node for s in chain), chain[-1].nodes[-1]], dtype=np.int64),
             np.concatenate([*(s.times[:-1] for s in chain), chain[-1].times[-1:]]),
             np.concatenate([s.T_base_node for s in chain]),
+            offset,
         )
 
     @classmethod
@@ -167,6 +176,10 @@ class JoinProblem:
         for r in records:
             graph.insert(r)
         return cls(graph, **parts)
+
+    def objective(self, values: Values) -> float:
+        """``Σ rᵀ Λ r`` of all factors (``2 ρ`` at the values of the graph where a kernel acts)."""
+        return self.graph.flat().objective(values) + self.offset
 
     # ---------------------------------------------------------------- what it is
 
@@ -284,6 +297,20 @@ class JoinProblem:
                 at = np.array([len(self.keys) - 1])
             low[f], high[f] = at.min(), at.max()
         return low, high
+
+    @cached_property
+    def priors(self) -> dict[int, list[tuple[int, int]]]:
+        """First and last submap of the factors that give a small constant from others before it, or by itself."""
+        low, high = self.spans
+        out: dict[int, list[tuple[int, int]]] = {}
+        for f, v in enumerate(self.variables):
+            if all(self.rules[k] == "constant" for k in v.tolist()):
+                out.setdefault(int(v.max()), []).append((int(low[f]), int(high[f])))
+        return out
+
+    def has_prior(self, variable: int, first: int, stop: int) -> bool:
+        """Whether a small constant has a prior among the factors of submaps ``first … stop - 1``."""
+        return any(first <= low and high < stop for low, high in self.priors.get(variable, ()))
 
     @cached_property
     def landmark_anchors(self) -> Index:

@@ -27,7 +27,7 @@ def same(run: Run, folder: Path) -> None:
         assert set(table["factors"]) == {text}
 
 
-MIXED: dict[str, Any] = {"imu": {"use": "all"}, "gps": {"use": "all"}}
+MIXED: dict[str, Any] = {"imu": {"use": "auto"}, "gps": {"use": "all"}}
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from graphslam.core.errors import IndeterminateError
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.noise import RobustKernel
-from graphslam.join.gaussian_map import GaussianMap, add_maps, join_two
+from graphslam.join.gaussian_map import GaussianMap, add_maps, join_gaussian_maps
 from graphslam.join.graph_join import JoinSchedule, join_graph_ekf, join_graph_sequential
 from graphslam.join.graph_problem import JoinProblem
 from graphslam.solve.batch import BatchSolver
@@ -81,15 +81,15 @@ def test_a_join_equals_its_slow_twin(problem: JoinProblem) -> None:
     plan, slow = JoinSchedule(problem), SlowJoin(problem)
     leaves = [GaussianMap.leaf(problem, k, plan.inside[k]) for k in range(min(4, len(problem.keys)))]
     joins = [(leaves[0], leaves[1], plan.at_last[1])]
-    a = join_two(*joins[0], passes=1)
+    a = join_gaussian_maps(*joins[0], passes=1)
     if len(leaves) == 4:
         low, high = plan.low, plan.high
         meet = [f for f in plan.across if low[f] == 2 and high[f] == 3]
-        b = join_two(leaves[2], leaves[3], np.array(meet, dtype=np.int64), passes=1)
+        b = join_gaussian_maps(leaves[2], leaves[3], np.array(meet, dtype=np.int64), passes=1)
         later = np.array([f for f in plan.across if low[f] < 2 <= high[f] < 4], dtype=np.int64)
         joins.append((a, b, later))
     for one, other, factors in joins:
-        fast = join_two(one, other, factors, passes=1)
+        fast = join_gaussian_maps(one, other, factors, passes=1)
         begin, enter = add_maps(one, other)[0].admitted(factors)
         twin = slow.joined(one, other, begin, enter.tolist())
         assert twin.names == [problem.names[v] for v in fast.variables.tolist()]

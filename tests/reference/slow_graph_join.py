@@ -127,18 +127,31 @@ class SlowJoin:
         slope = m.information @ r + (0.0 if m.gradient is None else m.gradient)
         return J.T @ m.information @ J, J.T @ slope
 
+    def has_prior(self, name: str, submaps: range) -> bool:
+        """Is there a factor of these submaps on constants alone, of which this is the last?"""
+        low, high = self.problem.spans
+        for f, r in enumerate(self.problem.factors):
+            rules = [rule_of(split_name(n)[0].word, self.problem.dim) for n in r.variables()]
+            last = max(r.variables(), key=self.problem.number.__getitem__)
+            if set(rules) == {"constant"} and last == name and low[f] in submaps and high[f] in submaps:
+                return True
+        return False
+
     def plain_map(self, m: GaussianMap) -> SlowMap:
         """A map as it is carried, as names and a dense matrix."""
         names = [self.problem.names[v] for v in m.variables.tolist()]
         anchors = {n: int(a) for n, a in zip(names, m.anchors.tolist()) if a >= 0}
         return SlowMap(names, m.values, anchors, m.information.toarray(), m.gradient)
 
-    def solved(self, at: SlowMap, maps: Sequence[SlowMap], factors: Sequence[int], base: str) -> SlowMap:
+    def solved(
+        self, at: SlowMap, maps: Sequence[SlowMap], factors: Sequence[int], base: str, submaps: range
+    ) -> SlowMap:
         """One Gauss-Newton step on maps and factors; the base is held, and constants where it is not the first."""
         values, first = at.values, np.concatenate([[0], np.cumsum(self.widths(at.names))])
         free = np.ones(first[-1], dtype=bool)
         for k, name in enumerate(at.names):
-            held = name == base or (base != "x0" and rule_of(split_name(name)[0].word, self.problem.dim) == "constant")
+            constant = rule_of(split_name(name)[0].word, self.problem.dim) == "constant"
+            held = name == base or (base != "x0" and constant and not self.has_prior(name, submaps))
             free[first[k] : first[k + 1]] = not held
         here = SlowMap(at.names, values, at.anchors, at.information)
         H, g = self.factor_information(factors, here)
@@ -159,11 +172,11 @@ class SlowJoin:
 
     def joined(self, a: GaussianMap, b: GaussianMap, begin: GaussianMap, factors: Sequence[int]) -> SlowMap:
         """B, whose base is the end of A, joined to A, with factors that enter; variables start as in ``begin``."""
-        base, T = self.problem.names[a.base], a.end
+        base, T, submaps = self.problem.names[a.base], a.end, range(a.first, b.stop)
         a, b = self.plain_map(a), self.plain_map(b)
         seen = SlowMap(b.names, b.values, b.anchors, b.information, b.gradient, frame=T)
         names = [self.problem.names[v] for v in begin.variables.tolist()]
         anchors = {n: int(a) for n, a in zip(names, begin.anchors.tolist()) if a >= 0}
         n = sum(self.widths(names))
         at = SlowMap(names, begin.values, anchors, np.zeros((n, n)))
-        return self.solved(at, [a, seen], factors, base)
+        return self.solved(at, [a, seen], factors, base, submaps)

@@ -19,7 +19,8 @@ from graphslam.io.tum import read_tum
 
 FILES = {
     *("config.toml", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
-    *("association.npz", "graph.g2o", "nodes.tum", "trajectory.tum", "truth.npz", "truth.tum", "dead_reckoning.tum"),
+    *("association.npz", "graph.g2o", "graph.npz", "nodes.tum", "trajectory.tum"),
+    *("truth.npz", "truth.tum", "dead_reckoning.tum"),
     *("submaps", "figures", "gps_all.npz", "report.html", "timings.json", "taken.npz", "inputs"),
     *("generations", "current", ".lock"),
 }
