@@ -35,6 +35,7 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.plugins import plugins
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.graph.factor_graph import FactorGraph
 from graphslam.join import registry as joining
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import Refinement, refine_by_scans
@@ -222,18 +223,20 @@ def refine_path(
 
 
 def compare(
-    source: Run | str | Path | Sequence[Submap],
+    source: Run | FactorGraph | str | Path | Sequence[Submap],
     methods: Sequence[str] | None = None,
     *,
     truth: MapTruth | None = None,
     submap_poses: int | None = None,
     **options: Any,
 ) -> pd.DataFrame:
-    """Join the same submaps by several methods: objective, time, memory, non-zeros, and NEES with ground truth.
+    """Solve the same graph by several methods: objective, time, memory, non-zeros, and NEES with ground truth.
+
+    All factors of a run or a graph are in every row (column ``factors``).
 
     Parameters
     ----------
-    source : Run, run folder, submap store, data set of submaps, pose-graph file, or sequence of Submap
+    source : Run, run folder, FactorGraph, submap store, data set of submaps, pose-graph file, or sequence of Submap
     methods : sequence of str
         By default ``isam2``, ``batch``, ``eif-tree``, ``eif-sequential``, ``ekf``.
     truth : MapTruth, optional
@@ -269,7 +272,7 @@ def compare(
 
 
 def join_submaps(
-    source: Run | str | Path | Sequence[Submap],
+    source: Run | FactorGraph | str | Path | Sequence[Submap],
     method: str = "eif-tree",
     *,
     polish: bool = True,
@@ -280,7 +283,7 @@ def join_submaps(
 
     Parameters
     ----------
-    source : Run, run folder, submap store, data set of submaps, pose-graph file, or sequence of Submap
+    source : Run, run folder, FactorGraph, submap store, data set of submaps, pose-graph file, or sequence of Submap
     method : str
         One of :func:`joiners`.
     polish : bool
