@@ -145,6 +145,8 @@ def _run_facts(root: Path) -> tuple[float, str]:
     values = read_options(root)
     if not values:
         return 1.0, "truth"
-    known = values.get("frontend", {}).get("association") == "known"
+    stated = values.get("frontend", {})
+    sections = [stated, *(v for v in stated.values() if isinstance(v, dict))]  # of several front ends
+    known = any(x.get("association") == "known" for x in sections)
     backend = check_json(values.get("backend", {}), {"covariance_scale?": float}, str(root / "config.toml"))
     return float(backend.get("covariance_scale", 1.0)), "truth" if known else "run"

@@ -30,7 +30,7 @@ IN_STUDIES: dict[str, tuple[str, ...]] = {
         *("slsjf-observations", "smartloc", "tuc", "ufastslam-detections", "victoria-park"),
     ),
     "graphslam.verbs": ("find_study", "open_study", "study"),
-    "graphslam.worlds": ("building", "mine", "point-field"),
+    "graphslam.worlds": ("building", "campus", "mine", "point-field"),
 }
 """What the distribution of the studies brings, by group, so that an error can say what to install."""
 

@@ -10,7 +10,7 @@ variables. Then the factors enter that need both, by a Gauss-Newton step with th
 
     ξ = -(I + Jᵀ J)⁻¹ (g + Jᵀ r),   X ← X ⊕ ξ,   I ← Tᵀ (I + Jᵀ J) T,   T = blkdiag(J_r⁻¹(ξ_i)).
 
-The map keeps the gradient g too: it is zero but for constants that are held at zero until the map has their prior.
+The map keeps the gradient g too: it is zero but in maps with constants whose prior is in another map.
 Nothing is marginalised out, so the matrix is exactly sparse.
 """
 
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -108,14 +109,36 @@ class GaussianMap:
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
-        """Which columns move: not the base; not constants whose prior is in another map."""
-        problem, rules = self.problem, self.problem.rules
+        """Which columns move: not the base; not constants of which nothing is known."""
+        problem, known = self.problem, self.problem.constant_priors
         held = [
-            v == self.base
-            or (self.first > 0 and rules[v] == "constant" and not problem.has_prior(v, self.first, self.stop))
+            v == self.base or (v in self.without_prior and split_name(problem.names[v])[0].word not in known)
             for v in self.variables.tolist()
         ]
         return np.repeat(~np.array(held), problem.width[self.variables])
+
+    @cached_property
+    def without_prior(self) -> frozenset[int]:
+        """Small constants whose prior is in another map."""
+        problem = self.problem
+        if self.first == 0:
+            return frozenset()
+        constants = [v for v in self.variables.tolist() if problem.rules[v] == "constant"]
+        return frozenset(v for v in constants if not problem.has_prior(v, self.first, self.stop))
+
+    def _guided(self, H: sp.csc_matrix, g: Array) -> tuple[sp.csc_matrix, Array]:
+        """Information and gradient with the priors of constants whose own is in another map: for a step alone."""
+        problem, blocks, slope = self.problem, [], g.copy()
+        for word, _, places, rows, columns in self.kinds():
+            prior = problem.constant_priors.get(word)
+            if prior is None:
+                continue
+            mine = np.isin(self.variables[places], list(self.without_prior))
+            if np.any(mine):
+                c = columns[mine]
+                blocks.append(self._entries(c, c, np.broadcast_to(prior, (len(c), *prior.shape))))
+                slope[c] += self.values[word][rows[mine]] @ prior.T
+        return (sp.csc_matrix(H + sum(blocks)), slope) if blocks else (H, g)
 
     @property
     def _at(self) -> Index:
@@ -321,12 +344,13 @@ class GaussianMap:
             if len(factors):
                 A, b = at.measured(factors)
                 H, g = sp.csc_matrix(H + A), g + b
-            step = np.zeros(len(g))
-            step[free] = -self._solve(H, g, free)
+            step, (A, slope) = np.zeros(len(g)), at._guided(H, g)
+            step[free] = -self._solve(A, slope, free)
             done = replace(at, information=H, gradient=g).carried(step)
-            if -(g @ step) < _STEP * len(g):
+            if -(slope @ step) < _STEP * len(g):
                 break
-        gradient = np.where(free, 0.0, done.gradient)
+        gradient = done.gradient if self.without_prior else np.where(free, 0.0, done.gradient)
+        gradient = gradient.copy()
         gradient[np.repeat(self.variables == self.base, self.problem.width[self.variables])] = 0.0
         return replace(done, gradient=gradient)
 

@@ -3,8 +3,9 @@
 A factor belongs to the submaps of its nodes. It enters a join at the lowest node of the tree that holds all of them
 and can linearise it. Three kinds of variables need care there (:data:`~graphslam.join.frames.RULES`):
 
-* A *small constant* (scale of wheels, bias of an IMU or of GPS fixes) is about zero. Its factors enter at once. In a
-  map without its prior, or the walk that leads to it, it is held at zero, and its information is kept.
+* A *small constant* (scale of wheels, bias of an IMU or of GPS fixes) is about zero. Its factors enter at once. A map
+  without its prior, or the walk that leads to it, is linearised where the prior of the kind puts it. That prior is not
+  kept as information.
 * The datum, gravity, velocities, beacons and the zero of a compass can be anywhere. Their factors wait until they
   determine the variable, given the nodes. It then starts at the least-squares optimum of these factors alone.
 * A kind whose values in another frame are not known here waits for the frame of the first base.
@@ -311,6 +312,22 @@ class JoinProblem:
     def has_prior(self, variable: int, first: int, stop: int) -> bool:
         """Whether a small constant has a prior among the factors of submaps ``first … stop - 1``."""
         return any(first <= low and high < stop for low, high in self.priors.get(variable, ()))
+
+    @cached_property
+    def constant_priors(self) -> dict[str, Array]:
+        """By kind of small constant, the information ``(dof, dof)`` that the graph has of the first one beforehand."""
+        out: dict[str, Array] = {}
+        for f, v in enumerate(self.variables):
+            if not all(self.rules[k] == "constant" for k in v.tolist()):
+                continue
+            words = [split_name(self.names[k])[0].word for k in v.tolist()]
+            alone = [k for k, w in zip(v.tolist(), words) if words.count(w) == 1 and w not in out]
+            if alone:
+                A = sp.csc_matrix(self.arrays([f]).evaluate(self.graph.values, dense=False).A)
+                for k in alone:
+                    c = self.columns(np.array([k]))
+                    out[split_name(self.names[k])[0].word] = A[c][:, c].toarray()
+        return out
 
     @cached_property
     def landmark_anchors(self) -> Index:

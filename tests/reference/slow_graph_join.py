@@ -150,16 +150,21 @@ class SlowJoin:
         values, first = at.values, np.concatenate([[0], np.cumsum(self.widths(at.names))])
         free = np.ones(first[-1], dtype=bool)
         for k, name in enumerate(at.names):
-            constant = rule_of(split_name(name)[0].word, self.problem.dim) == "constant"
-            held = name == base or (base != "x0" and constant and not self.has_prior(name, submaps))
-            free[first[k] : first[k + 1]] = not held
+            free[first[k] : first[k + 1]] = name != base
         here = SlowMap(at.names, values, at.anchors, at.information)
         H, g = self.factor_information(factors, here)
         for m in maps:
             A, b = self.prior(m, values, at.anchors, at.names)
             H, g = H + A, g + b
+        A, slope = H.copy(), g.copy()
+        for k, name in enumerate(at.names):  # constants whose prior is elsewhere: it leads the step and is not kept
+            word = split_name(name)[0].word
+            if base != "x0" and rule_of(word, self.problem.dim) == "constant" and not self.has_prior(name, submaps):
+                c, prior = slice(first[k], first[k + 1]), self.problem.constant_priors[word]
+                A[c, c] += prior
+                slope[c] += prior @ self.row(values, name)
         step = np.zeros(len(g))
-        step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
+        step[free] = -np.linalg.solve(A[np.ix_(free, free)], slope[free])
         end = self.moved(values, at.anchors, at.names, step)
         # the Gaussian about the new mean: how coordinates about it change those about the old one
         T = np.zeros((len(step), len(step)))
