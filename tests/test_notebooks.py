@@ -126,6 +126,7 @@ def test_there_are_notebooks() -> None:
         "10_where_to_drive",
         "11_your_lidar",
         "12_is_this_map_to_be_trusted",
+        "13_everything_in_one_graph",
     } <= {p.stem for p in NOTEBOOKS}
 
 

@@ -3,6 +3,7 @@
 from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
+    "back_end": "Observer",
     "config": "BackEndConfig",
     "hypotheses": "choices_of_matches solve_choice",
 }

@@ -3,7 +3,7 @@
 from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
-    "consistency": "Consistency",
+    "consistency": "Consistency nees pose_error",
     "association": "match_observations",
     "gps": "gps_residuals move_to_gps_frame",
     "gps_repeatability": "fix_segments",
