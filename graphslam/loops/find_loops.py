@@ -141,6 +141,9 @@ class LoopSearch:
         closer.extend_chain(ours, *chain_of_graph(graph))
         measurer.extend_chain(submaps, p)
         bare = [k for k, s in enumerate(submaps) if not has_dense_view(s)]
+        lost = [submaps[k].key for k in bare if submaps[k].landmarks is None]
+        if lost:
+            raise DataError(f"submap {lost[0]} has no map", got="none", wanted="an evidence grid or a cloud")
         shared = pairs_sharing_scans(submaps) | {(min(a, b), max(a, b)) for a in bare for b in range(len(submaps))}
         since = 0 if last else self._seen
 
