@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -218,7 +217,7 @@ def test_runs_without_grids_are_as_before_and_say_so(tmp_path: Path) -> None:
 def test_what_does_not_belong_together_is_refused(finished: Run) -> None:
     with pytest.raises(DataError, match="not those of the submaps"):
         nodes_by_submap(finished.submaps[:-1], finished.map)
-    with pytest.raises(MissingDataError, match=re.escape(f"{len(finished.submaps)} of {len(finished.submaps)}")):
+    with pytest.raises(MissingDataError, match=f"got {len(finished.submaps)} submaps without"):
         make_run_map([replace(s, grid=None) for s in finished.submaps], finished.map)
     with pytest.raises(ConfigError, match="low < high"):
         build_config(cfg.RunConfig, {"map": {"low": 2.0}})
