@@ -73,6 +73,8 @@ ADVICE: dict[str, str] = {
     # then what the run did with it
     "sightings-not-used": "check units, signs and ids of the observations",
     "*-not-used": "correct the cause for which a stream was not used",
+    "no-effect": "leave the option out, or give a log that has its sensor",
+    "front-end-idle": "leave the front end out, or check the stream that it needs",
     "state": "solve it again from this graph (`graphslam solve RUN/graph.g2o --solver lm`)",
     "refine-motion": "look for a false loop closure, or leave the refinement out (--set refine.use=false)",
     "input-better": "use the odometry path, or reduce the assumed odometry noise",
