@@ -36,11 +36,13 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.ledger import Ledger
 from graphslam.graph.score import ClassScore, GraphScore
 from graphslam.io.cards import list_cards
+from graphslam.join.graph_join import solve_graph_batch
 from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.maps.global_map import GlobalMap
 from graphslam.solve.batch import BatchSolver
 from graphslam_studies.montecarlo.folder import StudyFolder
 from graphslam_studies.montecarlo.study import Study
+from tests.reference.pose_ramp import pose_ramp
 
 EVIL = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&"
 NOTHING = np.zeros(0, dtype=np.int64)
@@ -180,6 +182,7 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
     "graphslam.join.submap_solver.SubmapEstimate": lambda _: SubmapEstimate(
         np.zeros((1, 3)), NOTHING, np.zeros((0, 2)), None, 0.0, None, 1, True, 0.0, np.zeros((0, 0))
     ),
+    "graphslam.join.graph_join.GraphEstimate": lambda _: solve_graph_batch(pose_ramp(1, submaps=2)[0]),
     "graphslam.solve.solution.Solution": a_solution,
     "graphslam.evidence.grid.EvidenceGrid": lambda _: EvidenceGrid(0.1),
     "graphslam.app.run.residual_consistency.ResidualConsistency": lambda _: ResidualConsistency(
@@ -194,6 +197,7 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
 OWN_WORDS = {
     "graphslam.graph.factor_graph_state.FactorGraphState",
     "graphslam.join.submap_solver.SubmapEstimate",
+    "graphslam.join.graph_join.GraphEstimate",
     "graphslam.evidence.grid.EvidenceGrid",
 }
 FOUND = classes()
