@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from graphslam.core.errors import CovarianceError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.poses import Group
 from graphslam.core.reading import finite_mask
 
 Index = npt.NDArray[np.intp]
@@ -363,6 +364,20 @@ class PoseNetwork:
             if landmarks is not None
             else self.has_landmark,
         )
+
+    def steps_along_numbers(self, group: Group) -> Array:
+        """Relative pose ``(n - 1, 3|7)`` from each vertex to the next, by the first edge between them."""
+        near = np.flatnonzero(np.abs(np.diff(self.edges, axis=1).ravel()) == 1)
+        node, at = np.unique(self.edges[near].min(axis=1), return_index=True)
+        bare = np.setdiff1d(np.arange(len(self) - 1), node)
+        if len(bare):
+            raise DataError(
+                f"nodes {bare[0]} and {bare[0] + 1} are not tied to each other, and submaps are chains",
+                where=self.source, got=f"{len(bare)} gaps", wanted="a relative pose between any two neighbours",
+            )  # fmt: skip
+        edge = near[at]
+        T = self.measurements[edge]
+        return np.where((self.edges[edge, 0] > self.edges[edge, 1])[:, None], group.inverse(T), T)
 
     def only(self, used: Mask) -> PoseNetwork:
         """The network with only the edges and observations of ``used`` ``(m + k,)``."""

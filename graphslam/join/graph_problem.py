@@ -142,7 +142,7 @@ class JoinProblem:
             poses=group.between(np.broadcast_to(x[0], x[1:].shape), x[1:]), streams=["file"], interval=(0.0, 0.0),
         )  # fmt: skip
         bases = np.append(np.arange(0, n - 1, poses), n - 1)
-        steps = _steps_of_network(network, group)
+        steps = network.steps_along_numbers(group)
         chains = np.concatenate([compose_increments(steps[a:b]) for a, b in pairwise(bases.tolist())])
         return cls(graph, np.arange(len(bases) - 1), bases, np.arange(n, dtype=np.float64), chains)
 
@@ -470,23 +470,6 @@ class JoinProblem:
                 break
         sigma = np.sqrt(np.diag(np.linalg.inv(A)))
         return not np.any(sigma[angle] > VAGUE_ANGLE)
-
-
-def _steps_of_network(network: PoseNetwork, group: Group) -> Array:
-    """Relative pose ``(n - 1, 3|7)`` from each vertex to the next, by the first edge between them."""
-    n, ends = len(network), network.edges
-    low = ends.min(axis=1)
-    near = np.flatnonzero(np.abs(ends[:, 1] - ends[:, 0]) == 1)
-    node, at = np.unique(low[near], return_index=True)
-    bare = np.setdiff1d(np.arange(n - 1), node)
-    if len(bare):
-        raise DataError(
-            f"nodes {bare[0]} and {bare[0] + 1} are not tied to each other, and submaps are chains",
-            where=network.source, got=f"{len(bare)} gaps", wanted="a relative pose between any two neighbours",
-        )  # fmt: skip
-    edge = near[at]
-    T = network.measurements[edge]
-    return np.where((ends[edge, 0] > ends[edge, 1])[:, None], group.inverse(T), T)
 
 
 def move_rows(problem: JoinProblem, values: Values, variables: Index, step: Array) -> None:

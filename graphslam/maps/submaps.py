@@ -89,6 +89,9 @@ def divide_submaps(
     """
     if not submaps:
         raise DataError("there are no submaps to make a map of", wanted="one at least")
+    lost = [s.key for s in submaps if s.landmarks is None and not has_dense_view(s)]
+    if lost:
+        raise DataError(f"submap {lost[0]} has no map", wanted="an evidence grid or a cloud")
     dense = [s for s in submaps if has_dense_view(s)]
     if grids is None and own:
         grids, _ = own_evidence(dense)

@@ -10,7 +10,7 @@ from graphslam.core.errors import DataError, GeometryError, IndeterminateError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
-from graphslam.core.submap import LandmarkMap, Match, Submap
+from graphslam.core.submap import Match, Submap
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factor_graph import FactorGraph
@@ -287,9 +287,6 @@ def test_what_a_graph_in_space_refuses(rng):
     g = FactorGraph(dim=3)
     with pytest.raises(GeometryError, match="wrong dimension"):
         g.add_submap(Submap(key=0, interval=(0, 1), exit_pose=np.zeros(3), exit_covariance=np.eye(3)))
-    lm = LandmarkMap(ids=[3], exit_pose=SE3.identity, positions=np.ones((1, 3)), covariance=np.eye(9))
-    with pytest.raises(GeometryError, match="landmarks in space"):
-        g.add_submap(Submap.from_landmarks(0, lm))
     g.add_submap(Submap(key=0, interval=(0, 1), exit_pose=SE3.exp([0, 0, 0, 1.0, 0, 0]), exit_covariance=C))
     with pytest.raises(GeometryError, match="seven finite numbers"):
         g.add_between(0, 1, np.zeros(3), C, evidence="shared-scan")
