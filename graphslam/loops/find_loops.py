@@ -140,10 +140,7 @@ class LoopSearch:
         closer, measurer = self.closer, self._measurer
         closer.extend_chain(ours, *chain_of_graph(graph))
         measurer.extend_chain(submaps, p)
-        bare = [k for k, s in enumerate(submaps) if not has_dense_view(s)]
-        lost = [submaps[k].key for k in bare if submaps[k].landmarks is None]
-        if lost:
-            raise DataError(f"submap {lost[0]} has no map", got="none", wanted="an evidence grid or a cloud")
+        bare = [k for k, s in enumerate(submaps) if s.landmarks is not None and not has_dense_view(s)]
         shared = pairs_sharing_scans(submaps) | {(min(a, b), max(a, b)) for a in bare for b in range(len(submaps))}
         since = 0 if last else self._seen
 
@@ -184,7 +181,8 @@ class LoopSearch:
             return
         parts = []
         for k, s in enumerate(measurer.submaps):
-            view = measurer.prepared(k).view if has_dense_view(s) else None
+            # a dense submap without a map is refused there; landmark submaps have none
+            view = None if s.landmarks is not None and not has_dense_view(s) else measurer.prepared(k).view
             parts.append(describe_places(view, p.T_base_node[p.of_submap(k)], c.descriptors))
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
         alike = appearance_candidates(p, concatenate_descriptors(parts), c.appearance, exclude=shared)
