@@ -122,6 +122,10 @@ def submap_source(source: Source, *, submap_poses: int | None = None) -> SubmapS
             truth = read_truth(files)
             truth = truth if identities != "run" else poses_only(truth)
             if not (files / GRAPH).is_file():
+                if (files / "graph.g2o").is_file():  # submaps alone would lack GPS, IMU and loop closures
+                    raise MissingDataError(
+                        f"the graph of the run is not in its folder: {root / GRAPH}", wanted="a run of this version"
+                    )
                 return SubmapSource(submaps, truth, scale)
             return source_of_graph(JoinProblem.load(files / GRAPH), submaps, truth, scale)
 

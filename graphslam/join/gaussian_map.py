@@ -349,8 +349,7 @@ class GaussianMap:
             done = replace(at, information=H, gradient=g).carried(step)
             if -(slope @ step) < _STEP * len(g):
                 break
-        gradient = done.gradient if self.without_prior else np.where(free, 0.0, done.gradient)
-        gradient = gradient.copy()
+        gradient = np.where(free & (not self.without_prior), 0.0, done.gradient)
         gradient[np.repeat(self.variables == self.base, self.problem.width[self.variables])] = 0.0
         return replace(done, gradient=gradient)
 

@@ -216,8 +216,6 @@ def _by_step(factors: Index, step: Index, m: int) -> list[Index]:
 
 def _finished(joined: GaussianMap) -> GaussianMap:
     """The root of a join; factors that still wait must enter now."""
-    if not len(joined.waiting):
-        return joined
     return joined.updated(np.zeros(0, dtype=np.int64), force=True)
 
 

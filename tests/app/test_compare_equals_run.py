@@ -10,6 +10,7 @@ import pytest
 
 import graphslam as gs
 from graphslam.app.run.run import Run
+from graphslam.core.errors import MissingDataError
 from graphslam.core.poses import compose_increments
 
 
@@ -70,3 +71,12 @@ def test_on_a_plain_table_of_landmarks_that_was_calibrated(tmp_path: Path) -> No
 def test_on_recorded_data(data_dir: Path, tmp_path: Path) -> None:
     run = gs.run("mrclam-dataset7/robot1", out=tmp_path / "run", progress=False)
     same(run, tmp_path / "run")
+
+
+def test_a_run_folder_without_its_graph_is_refused(tmp_path: Path) -> None:
+    """Its submaps alone would be compared without GPS, IMU and loop closures."""
+    gs.run(gs.simulate("landmark-field", preset="quick", seed=2), out=tmp_path / "run", progress=False)
+    for file in (tmp_path / "run").rglob("graph.npz"):
+        file.unlink()
+    with pytest.raises(MissingDataError, match="graph of the run is not in its folder"):
+        gs.compare(tmp_path / "run", memory=False)

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 def best_map(inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequence[int | LoopDecision] = ()) -> Run:
     """The run whose fused map contradicts itself least.
 
-    Where the passes of its map deny each other, as they do when the particles lost their way, particles are drawn anew
+    Where the passes of its map contradict each other, as they do after particles diverged, particles are drawn again
     and the better map is kept. A folder that settled on a draw before, or of which loops were taken out by hand, keeps
     its own.
     """
@@ -45,7 +45,7 @@ def best_map(inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequenc
 def _solved(
     inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequence[int | LoopDecision]
 ) -> Iterator[_MapCandidate]:
-    """The graph of the submaps; where its passes deny each other a second one with loops.
+    """The graph of the submaps; where its passes contradict each other, a second one with loops.
 
     A graph without a loop and one with a wrong loop both show in the fused map: walls of one pass stand in what another
     one saw to be free. So the front end's matches alone are tried first, then loops that the back end looks for.
@@ -82,11 +82,11 @@ class _MapCandidate:
 
     @property
     def denied(self) -> bool:
-        """Do passes of its map deny each other?"""
+        """Do passes of its map contradict each other?"""
         return self.passes is not None and self.passes.is_contradictory
 
     def beats(self, other: _MapCandidate) -> bool:
-        """Do its passes deny each other less?"""
+        """Do its passes contradict each other less?"""
         known = self.passes is not None and other.passes is not None
         return known and self.passes.agrees_better(other.passes)  # type: ignore[union-attr, arg-type]
 

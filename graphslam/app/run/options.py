@@ -150,7 +150,7 @@ class RunOptions:
         return replace(self, settings=replace(self.settings, backend=replace(self.settings.backend, loops=True)))
 
     def calibrated(self, log: SensorLog) -> tuple[SensorLog, RunOptions, list[StreamFinding]]:
-        """The log with corrections, the options that go with it, and what is said of it."""
+        """The log with corrections, the options that go with it, and the report on them."""
         assert self.front is not None
         asked, config = self.asked or {}, self.settings.calibrate
         seed = self.named["seed"]

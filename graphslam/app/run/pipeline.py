@@ -58,7 +58,7 @@ def run(
     resume : bool
         Go on after the last finished submap of ``out``, to the same result. Loops that were undone stay so.
     progress : bool or sequence of Observer
-        Show a progress bar on stderr; or observers that are told what goes on: steps of a front end, submaps, loops,
+        Show a progress bar on stderr; or observers of what the run does: steps of a front end, submaps, loops,
         the solution (`graphslam.backend.back_end.Observer`). A `RunBar` among them is the bar.
 
     Returns

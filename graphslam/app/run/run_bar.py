@@ -22,7 +22,7 @@ STAGES = {
 
 
 def bar_among(progress: bool | Sequence[Observer]) -> tuple[RunBar, list[Observer]]:
-    """The bar of a run, shown or not, and all who are told what goes on, the bar first."""
+    """The bar of a run, shown or not, and the other observers behind it."""
     told = [] if isinstance(progress, bool) else list(progress)
     bar = next((o for o in told if isinstance(o, RunBar)), None) or RunBar(progress is True)
     return bar, [bar, *(o for o in told if o is not bar)]

@@ -149,7 +149,7 @@ class SolvedMap:
 
 
 def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clock: RunClock) -> Run:
-    """The run of a solved graph: refined, fused, evaluated, judged."""
+    """The run of a solved graph: refined, fused, evaluated, with a verdict."""
     hits, settings = slam.back.landmark_hits(slam.submaps), slam.options.settings
     graph_map = make_global_map(solution, slam.submaps, hits, settings.backend.confirmed_hits)
     made = SolvedMap(

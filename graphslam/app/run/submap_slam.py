@@ -141,7 +141,7 @@ class SubmapSlam:
         return self.back.finish(undo)
 
     def inputs(self, log: SensorLog, noticed: Sequence[StreamFinding]) -> RunInputs:
-        """What the graph and its evaluation need of the log; what making the submaps took is let go of."""
+        """What the graph and its evaluation need of the log; the memory of the front end is freed."""
         front = self.options.front
         assert front is not None
         steps = front.steps(log) if self.options.settings.refine.use else None
@@ -151,7 +151,7 @@ class SubmapSlam:
         return collect_inputs(log, self.drops.counts, reference_identities(log, front), noticed, scans)
 
     def release_memory(self) -> None:
-        """Let go of what making the submaps took."""
+        """Free the memory that making the submaps needed."""
         if self.options.front is not None:
             self.options.front.forget()
         trim_heap()
