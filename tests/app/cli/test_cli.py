@@ -34,11 +34,12 @@ def graphslam(*args: object, env: dict[str, str] | None = None) -> subprocess.Co
 
 
 def refused(*args: object, saying: str, env: dict[str, str] | None = None) -> None:
-    """Exit 1, nothing on stdout, one line on stderr that says what is wrong; before it, what was read at most."""
+    """Exit 1, nothing on stdout, one line on stderr that says what is wrong; before it, at most bars of progress."""
     done = graphslam(*args, env=env)
     assert done.returncode == 1, done
     assert done.stdout == ""
-    lines = [x for x in done.stderr.strip().splitlines() if not x.startswith(("read: ", "front end: "))]
+    bars = "read: ", "front end: ", "compiling "
+    lines = [x for x in done.stderr.splitlines() if x.strip() and not x.startswith(bars)]
     assert len(lines) == 1, done.stderr
     assert saying in lines[0]
     assert lines[0].startswith("graphslam: ")
