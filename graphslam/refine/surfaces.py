@@ -19,6 +19,9 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 
+SAME_SIDE = 0.85
+"""Least cosine between the two normals of a pair, which point to where the beams came from, so that the two sides of a
+wall or of a ceiling never meet."""
 BLOCK = 1 << 16
 """Rows that are worked on together: a matrix for each point of a long log would take gigabytes."""
 
@@ -283,7 +286,6 @@ def match_surfaces(
     distance: float,
     every: int,
     within: Array | None = None,
-    alike: float = 0.85,
     least_share: float = 0.10,
 ) -> SurfacePairs:
     """Nearest surface in each chunk for every ``every``-th point of its partner.
@@ -294,16 +296,13 @@ def match_surfaces(
         Greatest distance of a pair [m].
     within : (n, d, d), optional
         Covariance of the motion that moves the beams of each step against its pose, right tangents.
-    alike : float
-        Least cosine between the two normals, which point to where the beams came from, so that the two sides of a wall
-        or of a ceiling never meet.
     least_share : float
         Pairs of passes whose share of paired points is below it are left out.
     """
     W, O = cloud.world(poses)
     R = rotations(poses)
     N = rotate_by_step(R, cloud.step, surfaces.normals)
-    p, q, w = _nearest_surfaces(cloud, surfaces, W, N, chunks, distance, every, alike, least_share)
+    p, q, w = _nearest_surfaces(cloud, surfaces, W, N, chunks, distance, every, least_share)
     O -= W
     beam = np.linalg.norm(O, axis=1)
     beam[beam == 0] = 1.0
@@ -336,7 +335,6 @@ def _nearest_surfaces(
     chunks: ChunkPairs,
     distance: float,
     every: int,
-    alike: float,
     least_share: float,
 ) -> tuple[Index, Index, Index]:
     """Rows of source points, of the surfaces that they lie on, and the numbers of their chunk pairs ``(k,)``."""
@@ -363,7 +361,7 @@ def _nearest_surfaces(
         _, at = t.query(W[p], k=1, distance_upper_bound=distance)
         some, tried = at < len(rows), len(p)
         q, p = rows[at[some]], p[some]
-        good = np.einsum("ki,ki->k", N[surfaces.stands[p]], N[q]) > alike
+        good = np.einsum("ki,ki->k", N[surfaces.stands[p]], N[q]) > SAME_SIDE
         p, q = p[good], q[good]
         if passes[m] and len(p) < least_share * tried:
             continue

@@ -110,7 +110,6 @@ def failed_match_gates(
     sigma: float,
     margin: float,
     rise: float = 0.0,
-    T: Array | None = None,
     ask_vague: bool = True,
 ) -> list[str]:
     """The gates that a match fails, in words; empty for one that is accepted.
@@ -127,12 +126,10 @@ def failed_match_gates(
         See :func:`match_margins`.
     rise : float
         What heights may be off by besides ``limits.height`` [m].
-    T : (7,) or (3,), optional
-        The match, where something refined what the registration found.
     ask_vague : bool
         Whether the registration's own σ are asked.
     """
-    at = found.T_target_source if T is None else T
+    at = found.T_target_source
     g = group_of(at)
     if not found.converged or not np.all(np.isfinite(at)):
         return ["nothing: " + (found.why or "the result is not finite").replace("; ", ", ")]

@@ -38,16 +38,12 @@ class SearchStart:
         ``T_target_source``.
     score : float
         Mean of the field under the points, 0 … 1.
-    weight : float
-        Logarithm of what starts are ordered by: ``-½ ((1 - score) / score_sigma)²``, and less where the prior has it
-        unlikely.
     offset : tuple of float
         From the pose searched around: x, y[, z] [m] in the target's axes, heading [rad].
     """
 
     T: Array
     score: float
-    weight: float
     offset: tuple[float, ...]
 
 
@@ -61,8 +57,6 @@ class SearchConfig:
         Source points used: one a cell of the field, of these so many, evenly from first to last.
     apart : float
         Two starts nearer than this [m], and turned by less than ``turned`` [rad], are one mode.
-    score_sigma : float
-        What a score may fall short of 1 by at the true place; only matters against a prior.
     refine : bool
         Look once more around each of ``4 keep`` modes, at every cell and at quarters of the heading step, and order
         them by what is found there: the lattice misses some modes by more than others.
@@ -71,7 +65,6 @@ class SearchConfig:
     most_points: int = 300
     apart: float = 1.5
     turned: float = 0.35
-    score_sigma: float = 0.15
     refine: bool = True
     coarse_points: int = 100
     """Source points used on a coarse field, see :func:`correlative_search`."""
@@ -79,7 +72,7 @@ class SearchConfig:
     """Modes of a coarse field that are looked at in the finer one."""
 
     def __post_init__(self) -> None:
-        for name in ("most_points", "apart", "turned", "score_sigma", "coarse_points", "coarse_modes"):
+        for name in ("most_points", "apart", "turned", "coarse_points", "coarse_modes"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"search: {name} is {value}; wanted a positive number")
@@ -193,7 +186,6 @@ def correlative_search(
     steps: Sequence[float] | None = None,
     keep: int = 6,
     *,
-    prior: Sequence[float] | None = None,
     coarse: SearchField | None = None,
     config: SearchConfig | None = None,
 ) -> list[SearchStart]:
@@ -214,8 +206,6 @@ def correlative_search(
         by σ of the field. Two cells, and 0, by default.
     keep : int
         Modes wanted. There may be fewer.
-    prior : as ``half_widths``, optional
-        σ of the true pose about ``around``: starts are then ordered by score and prior together.
     coarse : SearchField, optional
         Of the same map, with larger cells and σ, made for the steps of the lattice: few points are scored on it, and
         only the best modes in ``field``. What is searched may then be some ten times as wide for the same time.
@@ -241,7 +231,6 @@ def correlative_search(
     step = (*[2.0 * (coarse or field).cell] * field.dim, 0.0) if steps is None else steps
     reach = float(np.quantile(np.hypot(p[:, 0], p[:, 1]), 0.9)) if len(p) else 1.0
     lattice = make_lattice(field, half_widths, step, reach)
-    sigmas = _prior(prior, field.dim)
     if not len(p):
         return []
     if coarse is None:
@@ -251,68 +240,44 @@ def correlative_search(
         few, modes = evenly_spaced(p, config.coarse_points), max(config.coarse_modes, keep)
         seen = make_lattice(coarse, half_widths, step, reach)
         sums = score_lattice(few, coarse, T, seen)
-    weights, scores = _weigh(sums, len(few), seen, sigmas, config)
-    top = local_maxima(weights)
-    places, best = seen.places(top), tuple(top.T)
-    weight, score = weights[best], scores[best]
+    scores = _shares(sums, len(few))
+    scores[sums == 0] = -np.inf
+    top = local_maxima(scores)
+    places, score = seen.places(top), scores[tuple(top.T)]
     if config.refine or coarse is not None:
-        first = _distinct(places, weight, modes, config)
-        places, weight, score = _refine(p, field, T, lattice, places[first], sigmas, config)
+        places, score = _refine(p, field, T, lattice, places[_distinct(places, score, modes, config)])
     starts = []
-    for s in _distinct(places, weight, keep, config):
+    for s in _distinct(places, score, keep, config):
         x, y, z, yaw = (float(v) for v in places[s])
         shown = (x, y, z, yaw) if field.dim == 3 else (x, y, yaw)
-        starts.append(SearchStart(offset_pose(T, places[s]), float(score[s]), float(weight[s]), shown))
+        starts.append(SearchStart(offset_pose(T, places[s]), float(score[s]), shown))
     return starts
 
 
-def _weigh(
-    sums: npt.NDArray[np.uint32],
-    points: int,
-    lattice: SearchLattice,
-    sigmas: tuple[float, ...] | None,
-    config: SearchConfig,
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Weights and scores of a lattice; see :class:`SearchStart`. The weight is -inf where nothing is met."""
-    scores = sums.astype(np.float32) / np.float32(255.0 * points)
-    weights = -0.5 * ((1.0 - scores) / np.float32(config.score_sigma)) ** 2
-    if sigmas is not None:
-        for axis, (offsets, sigma) in enumerate(zip((lattice.yaw, lattice.z, lattice.y, lattice.x), sigmas)):
-            term = (-0.5 * (offsets / sigma) ** 2).astype(np.float32)
-            weights += term.reshape([-1 if a == axis else 1 for a in range(4)])
-    weights[sums == 0] = -np.inf
-    return weights, scores
+def _shares(sums: npt.NDArray[np.uint32], points: int) -> npt.NDArray[np.float32]:
+    return sums.astype(np.float32) / np.float32(255.0 * points)
 
 
 def _refine(
-    points: Array,
-    field: SearchField,
-    around: Array,
-    lattice: SearchLattice,
-    places: Array,
-    sigmas: tuple[float, ...] | None,
-    config: SearchConfig,
-) -> tuple[Array, Array, Array]:
-    """The best place within half a step of each of ``places (k, 4)``: places, weights, scores."""
+    points: Array, field: SearchField, around: Array, lattice: SearchLattice, places: Array
+) -> tuple[Array, Array]:
+    """The best place within half a step of each of ``places (k, 4)``: places and scores."""
     turn = lattice.yaw[1] - lattice.yaw[0] if len(lattice.yaw) > 1 else 0.0
     half: list[Array] = [
         field.cell * np.arange(-(c // 2), c // 2 + 1.0) if wide else np.zeros(1) for c, wide in lattice.axes()
     ]
-    headings = np.arange(-2, 3) * 0.25 * turn if turn else np.zeros(1)
-    found, weight, score = places.copy(), np.empty(len(places)), np.empty(len(places))
+    near = SearchLattice(half[0], half[1], half[2], np.arange(-2, 3) * 0.25 * turn if turn else np.zeros(1))
+    found, score = places.copy(), np.empty(len(places))
     for k, at in enumerate(places):
-        near = SearchLattice(half[0], half[1], half[2], headings)
-        sums = score_lattice(points, field, offset_pose(around, at), near)
-        whole = SearchLattice(half[0] + at[0], half[1] + at[1], half[2] + at[2], headings + at[3])
-        weights, scores = _weigh(sums, len(points), whole, sigmas, config)
-        best = np.unravel_index(int(np.argmax(weights)), weights.shape)
-        found[k], weight[k], score[k] = whole.places(np.array([best]))[0], weights[best], scores[best]
-    return found, weight, score
+        scores = _shares(score_lattice(points, field, offset_pose(around, at), near), len(points))
+        best = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        found[k], score[k] = at + near.places(np.array([best]))[0], scores[best]
+    return found, score
 
 
-def _distinct(places: Array, weights: Array, keep: int, config: SearchConfig) -> list[int]:
+def _distinct(places: Array, scores: Array, keep: int, config: SearchConfig) -> list[int]:
     """Indices of the best of ``places (k, 4)``, best first, leaving out those near a better one."""
-    left = np.argsort(-weights, kind="stable")
+    left = np.argsort(-scores, kind="stable")
     chosen: list[int] = []
     while len(left) and len(chosen) < keep:
         chosen.append(int(left[0]))
@@ -320,13 +285,3 @@ def _distinct(places: Array, weights: Array, keep: int, config: SearchConfig) ->
         near = np.sum(d[:, :3] ** 2, axis=1) < config.apart**2
         left = left[~(near & (np.abs(wrap_angle(d[:, 3])) < config.turned))]
     return chosen
-
-
-def _prior(prior: Sequence[float] | None, dim: int) -> tuple[float, ...] | None:
-    """σ of heading, z, y, x."""
-    if prior is None:
-        return None
-    s = np.array(prior, dtype=np.float64)
-    if s.shape != (dim + 1,) or not np.all(s > 0):
-        raise ConfigError(f"search: prior {prior}; wanted {dim + 1} positive σ")
-    return (s[3], s[2], s[1], s[0]) if dim == 3 else (s[2], np.inf, s[1], s[0])

@@ -26,7 +26,7 @@ from graphslam.core.poses import Group, group_of
 from graphslam.registration.gates import failed_match_gates, match_margins
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.register import Registration, distinct_registrations, register_starts
-from graphslam.registration.search import SearchConfig, correlative_search
+from graphslam.registration.search import correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 
@@ -188,7 +188,7 @@ def match_pair(
     half = half_widths(T, P, c)
     fine, coarse = target.fields
     steps = [*[c.grid] * g.dim, c.yaw_step]
-    found = correlative_search(points, fine, T, half, steps, c.starts, coarse=coarse, config=SearchConfig())
+    found = correlative_search(points, fine, T, half, steps, c.starts, coarse=coarse)
     best = max((s.score for s in found), default=0.0)
     starts = [s.T for s in found if s.score >= max(c.least_score, best - c.score_margin)]
     if not starts:
@@ -200,7 +200,7 @@ def match_pair(
     results = register_starts(cloud, target.target, starts, rules, known=known)
     results = [_upright_in_known(r, cloud, target, c) for r in results]
     place = np.asarray(T_base_place, dtype=np.float64)
-    return _judge(results, points, source, place, target, T, P, c, tuple(half))
+    return replace(_judge(results, points, source, place, target, T, P, c), half_widths=tuple(half))
 
 
 def half_widths(T: Array, P: Array, config: PairConfig) -> list[float]:
@@ -234,13 +234,12 @@ def _judge(
     T: Array,
     P: Array,
     c: PairConfig,
-    half: tuple[float, ...],
 ) -> PairMatch:
     """The best of the modes that the prediction allows, and whether it is to be believed."""
     g = group_of(T)
     modes = distinct_registrations(results)
     if not modes:
-        return _nothing(T, "nothing: no start led to a result", len(points), half)
+        return _nothing(T, "nothing: no start led to a result", len(points))
     own = [_covariance(r, P, c) for r in modes]
     chi2 = np.array([prediction_chi2(r.T_target_source, C, T, P) for r, (C, _) in zip(modes, own)])
     limit = float(stats.chi2.ppf(c.chi2_level, g.dof))
@@ -253,7 +252,7 @@ def _judge(
     clash = contradiction_share(source, T_base_place, target, T_found, points)
     out = PairMatch(
         T_target_source=T_found, covariance=covariance, why="", registration=best, chi2=float(chi2[k]),
-        contradiction=clash, modes=len(allowed), points=len(points), loose=loose, half_widths=half,
+        contradiction=clash, modes=len(allowed), points=len(points), loose=loose,
     )  # fmt: skip
     if not len(allowed):
         return replace(out, why=f"prediction: χ² {chi2[k]:.1f} > {limit:.1f}")

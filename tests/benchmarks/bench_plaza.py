@@ -22,9 +22,9 @@ from graphslam.core.geometry import align_se2, se2_between, se2_compose, se2_inv
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.random import SeedTree
 from graphslam_frontends.landmarks.config import RangeBearingNoise, RbpfEkfConfig, StoppingConfig
-from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem
 from graphslam_frontends.landmarks.prepare import prepare_log
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.landmarks.summarise import SmoothingProblem
 from graphslam_frontends.odometry.motion import MotionNoise
 
 FLOORS = {"floor_position": 1e-3, "floor_heading": 1e-4}

@@ -100,7 +100,7 @@ def segment_ends(result: object, truth: Array) -> Iterator[tuple[Array, Array, A
         about = g.between(segment_base(m, s.T_entry), segment_base(m, s.T_exit))
         true = g.between(*(remove_roll_pitch(truth[k]) for k in s.interval))
         ends, weights = exits_of_interval(m, s.interval)
-        spread = exit_covariance(ends, about, s.length, lambda _: np.eye(6), weights=weights).particles
+        spread = exit_covariance(ends, about, np.eye(6), weights=weights).particles
         at = np.linspace(0, len(s.path) - 1, NODES).round().astype(int)
         yield s.path[at], g.log(g.between(about, true))[2:], spread[2:, 2:]
 

@@ -126,7 +126,7 @@ def test_true_place_and_its_aliases_are_all_found(pillars: tuple[BoxWorld, Searc
             away = np.linalg.norm(offsets - [alias, 0, 0], axis=1)
             assert np.min(away) < 0.5, (alias, offsets)
             assert scores[np.argmin(away)] > scores[0] - 0.05
-    assert np.all(np.diff([s.weight for s in starts]) <= 0)
+    assert np.all(np.diff([s.score for s in starts]) <= 0)
     assert 0.6 < scores[0] <= 1.0
 
 
@@ -160,24 +160,6 @@ def test_a_coarse_look_first_finds_what_the_whole_search_finds(
     # what is scored coarsely is not what is reported: scores are those of the fine field
     p = evenly_spaced(voxel_downsample(scan, field.cell), 300)
     assert found[0].score == pytest.approx(field.value_at(transform_points(found[0].T, p)).mean(), abs=0.01)
-
-
-def test_prior_decides_between_aliases(pillars: tuple[BoxWorld, SearchField], rng: np.random.Generator) -> None:
-    """Searched around an alias: without a prior the true place wins, with a narrow one the alias does."""
-    world, field = pillars
-    T = heading(30.0, 9.0, 1.2, 0.4)
-    scan = world.scan(T, around(rng, 2000), 0.025, 25.0, rng)
-    alias = offset_pose(T, (8.0, 0.0, 0.0, 0.0))
-    half = (12.0, 6.0, 0.4, 0.1)
-    free = correlative_search(scan, field, alias, half, keep=3)
-    held = correlative_search(scan, field, alias, half, keep=3, prior=(1.0, 1.0, 0.3, 0.05))
-    wide = correlative_search(scan, field, alias, half, keep=3, prior=(100.0, 100.0, 100.0, 10.0))
-    assert np.linalg.norm(free[0].T[:3] - T[:3]) < 0.5
-    assert np.linalg.norm(held[0].T[:3] - alias[:3]) < 1.0
-    np.testing.assert_allclose(wide[0].T, free[0].T)
-    x, y, z, yaw = held[0].offset
-    prior = -0.5 * (x**2 + y**2 + (z / 0.3) ** 2 + (yaw / 0.05) ** 2)
-    assert held[0].weight == pytest.approx(-0.5 * ((1 - held[0].score) / 0.15) ** 2 + prior, abs=1e-4)
 
 
 def test_refined_starts_are_nearer(pillars: tuple[BoxWorld, SearchField]) -> None:
@@ -228,9 +210,7 @@ def test_same_input_same_bytes(pillars: tuple[BoxWorld, SearchField], rng: np.ra
     again = SearchField(map_of(world, np.random.default_rng(5)))
     runs.append(correlative_search(scan, again, T, (4.0, 4.0, 0.4, 0.2)))
     for other in runs[1:]:
-        assert [(s.T.tobytes(), s.score, s.weight) for s in other] == [
-            (s.T.tobytes(), s.score, s.weight) for s in runs[0]
-        ]
+        assert [(s.T.tobytes(), s.score) for s in other] == [(s.T.tobytes(), s.score) for s in runs[0]]
 
 
 def test_a_search_of_a_loop_closure_takes_a_frame(pillars: tuple[BoxWorld, SearchField]) -> None:
@@ -280,8 +260,6 @@ def test_bad_input_is_refused_or_left_out(rng: np.random.Generator) -> None:
         correlative_search(points, field, T, (500.0, 500.0, 500.0, 3.0))
     with pytest.raises(ConfigError, match="half widths"):
         correlative_search(points, field, T, (np.nan, 1.0, 1.0, 1.0))
-    with pytest.raises(ConfigError, match="prior"):
-        correlative_search(points, field, T, half, prior=(1.0, 1.0, 0.0, 1.0))
     with pytest.raises(ConfigError, match="modes"):
         correlative_search(points, field, T, half, keep=0)
     with pytest.raises(ConfigError, match="apart"):

@@ -31,7 +31,7 @@ from graphslam_frontends.landmarks.fix_points import (
 )
 from graphslam_frontends.landmarks.prepare import LogPreparation, PreparedLog, known_slots
 from graphslam_frontends.landmarks.stopping import StoppingRule
-from graphslam_frontends.landmarks.summarise import SmoothingResult, smooth_submap
+from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult
 
 Ints = npt.NDArray[np.int64]
 
@@ -120,18 +120,17 @@ class EkfRun:
     def _smoothed(self, places: Array, rows: Ints, landmark: Ints, trim: float) -> SmoothingResult:
         """Gauss-Newton over the submap's poses and landmarks under the filter's association."""
         data, obs, span = self.data, self.data.observations, slice(self.first, self.next)
-        return smooth_submap(
-            np.array(self.poses),
-            places,
+        problem = SmoothingProblem(
             data.odometry.increments[span],
             data.odometry.covariances[span],
             np.searchsorted(obs.offsets, rows, side="right") - 1 - self.first,
             landmark,
             np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]]),
             obs.T_base_sensor,
-            trim=trim,
-            min_hits=self.config.min_hits,
+            trim,
+            self.config.min_hits,
         )
+        return problem.smooth(np.array(self.poses), places)
 
     def submap(self, key: int, report: dict[str, Any], feed: RecordSource | None = None) -> Submap:
         """The filter's own Gaussian as a submap; points of its path at the fixes of a feed are smoothed beside it."""

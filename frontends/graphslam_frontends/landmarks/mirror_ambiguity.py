@@ -18,62 +18,12 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array, se2_transform
 from graphslam_frontends.landmarks.config import DelayedInitialisation
 from graphslam_frontends.landmarks.range_only_kernels import FIT_LENGTH, circle_starts, trilaterate_kernel
-from graphslam_frontends.landmarks.summarise import SmoothingResult, smooth_submap
+from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 _ROUNDS = 3  # a swap moves the path, so the others are looked at again
 _APART = 1.0  # a rival this near [m] is the landmark itself
-
-
-@dataclass(frozen=True, slots=True)
-class SmoothingProblem:
-    """What :func:`graphslam_frontends.landmarks.summarise.smooth_submap` smooths, beside the start.
-
-    Parameters
-    ----------
-    increments, covariances : (T, 3), (T, 3, 3)
-    ob_pose, ob_landmark : (q,)
-    observations : (q, 4)
-    sensor : (3,)
-    """
-
-    increments: Array
-    covariances: Array
-    ob_pose: Ints
-    ob_landmark: Ints
-    observations: Array
-    sensor: Array
-    trim: float
-    min_hits: int
-
-    def smooth(self, poses: Array, landmarks: Array) -> SmoothingResult:
-        """Smooth from a start ``(T, 3)``, ``(L, 2)``."""
-        return smooth_submap(
-            poses,
-            landmarks,
-            self.increments,
-            self.covariances,
-            self.ob_pose,
-            self.ob_landmark,
-            self.observations,
-            self.sensor,
-            trim=self.trim,
-            min_hits=self.min_hits,
-        )
-
-    def restricted(self, observations: Bools, landmarks: Bools) -> SmoothingProblem:
-        """The same with some observations and landmarks, all of them inliers."""
-        rank = np.cumsum(landmarks) - 1
-        keep = observations & landmarks[self.ob_landmark]
-        return replace(
-            self,
-            ob_pose=self.ob_pose[keep],
-            ob_landmark=rank[self.ob_landmark[keep]],
-            observations=self.observations[keep],
-            trim=0.0,
-            min_hits=1,
-        )
 
 
 @dataclass(frozen=True, slots=True)

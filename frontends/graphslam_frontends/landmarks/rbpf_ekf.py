@@ -22,12 +22,12 @@ from graphslam_frontends.landmarks.bias_score import bias_score_test
 from graphslam_frontends.landmarks.config import DELAYED, RbpfEkfConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.fix_points import expects_fixes, fix_points, place_fixes
-from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem, resolve_mirror_ambiguity
+from graphslam_frontends.landmarks.mirror_ambiguity import resolve_mirror_ambiguity
 from graphslam_frontends.landmarks.moment_consistency import consistency_flag, gaussian_discrepancy, particle_gaussians
 from graphslam_frontends.landmarks.prepare import LogPreparation, known_slots, landmark_stream
 from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases
 from graphslam_frontends.landmarks.stopping import StoppingRule
-from graphslam_frontends.landmarks.summarise import SmoothingResult, winning_association
+from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult, winning_association
 
 Ints = npt.NDArray[np.int64]
 

@@ -7,7 +7,7 @@ moment-matched Gaussian stays as the paper's mode and as a figure of honesty bes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -239,26 +239,12 @@ class SmoothingResult:
         return float(step @ np.linalg.solve(self.gaussian.covariance, step))
 
 
-def smooth_submap(
-    poses: Array,
-    landmarks: Array,
-    increments: Array,
-    covariances: Array,
-    ob_pose: Ints,
-    ob_landmark: Ints,
-    observations: Array,
-    sensor: Array,
-    *,
-    trim: float = 0.0,
-    min_hits: int = 1,
-    max_iterations: int = 50,
-) -> SmoothingResult:
-    """One Gauss-Newton smoothing of a submap: all poses and landmarks, base fixed at identity.
+@dataclass(frozen=True, slots=True)
+class SmoothingProblem:
+    """Odometry and observations of a submap, to be smoothed with the base fixed at identity.
 
     Parameters
     ----------
-    poses, landmarks : (T, 3), (L, 2)
-        Starting values.
     increments, covariances : (T, 3), (T, 3, 3)
         Dead reckoning from each pose to the next, the first from the base.
     ob_pose, ob_landmark : (q,)
@@ -273,37 +259,66 @@ def smooth_submap(
     min_hits : int
         A landmark left with fewer observations after the trimming goes, with them.
     """
-    p, l = poses.copy(), landmarks.copy()
-    W = np.linalg.inv(covariances)
-    weight = np.ones(len(observations))
-    d2, parts = np.zeros(len(observations)), np.zeros(3)
-    args = (increments, W, ob_pose, ob_landmark, observations)
-    if trim > 0.0 and len(observations):
-        smooth_kernel(p, l, SmoothingMeasurements(*args, weight, sensor), 6, 1e-3)
-        for _ in range(3):  # Huber by reweighting; few passes, it only has to unmask the outliers
-            smoothing_cost(p, l, SmoothingMeasurements(*args, weight, sensor), d2, parts)
-            weight = np.minimum(1.0, np.sqrt(_HUBER2 / np.maximum(d2, 1e-12)))
-            smooth_kernel(p, l, SmoothingMeasurements(*args, weight, sensor), 3, 1e-3)
-        smoothing_cost(p, l, SmoothingMeasurements(*args, weight, sensor), d2, parts)
-        gates = np.where(np.isinf(observations[:, 3]), equal_tail_gate(trim, 2, 1), trim)
-        weight = (d2 <= gates).astype(np.float64)
-    left = np.bincount(ob_landmark, weights=weight, minlength=len(l)) >= min_hits
-    kept = (weight > 0.0) & left[ob_landmark]
-    l = l[left]
-    args = (increments, W, ob_pose[kept], (np.cumsum(left) - 1)[ob_landmark[kept]], observations[kept])
-    weight = np.ones(int(kept.sum()))
-    d2 = np.zeros(len(weight))
-    evidence = SmoothingMeasurements(*args, weight, sensor)
-    chi2, _, converged = smooth_kernel(p, l, evidence, max_iterations, 1e-9)
-    joint, marginals = smoothed_covariances(p, l, evidence)
-    smoothing_cost(p, l, evidence, d2, parts)
-    if not np.all(np.isfinite(joint)):
-        raise CovarianceError(
-            "smoothed submap is singular", got=f"{len(l)} landmarks, {int(weight.sum())} observations"
+
+    increments: Array
+    covariances: Array
+    ob_pose: Ints
+    ob_landmark: Ints
+    observations: Array
+    sensor: Array
+    trim: float = 0.0
+    min_hits: int = 1
+
+    def smooth(self, poses: Array, landmarks: Array) -> SmoothingResult:
+        """One Gauss-Newton smoothing of all poses and landmarks from a start ``(T, 3)``, ``(L, 2)``."""
+        observations = self.observations
+        p, l = poses.copy(), landmarks.copy()
+        W = np.linalg.inv(self.covariances)
+        weight = np.ones(len(observations))
+        d2, parts = np.zeros(len(observations)), np.zeros(3)
+        args = (self.increments, W, self.ob_pose, self.ob_landmark, observations)
+        if self.trim > 0.0 and len(observations):
+            smooth_kernel(p, l, SmoothingMeasurements(*args, weight, self.sensor), 6, 1e-3)
+            for _ in range(3):  # Huber by reweighting; few passes, it only has to unmask the outliers
+                smoothing_cost(p, l, SmoothingMeasurements(*args, weight, self.sensor), d2, parts)
+                weight = np.minimum(1.0, np.sqrt(_HUBER2 / np.maximum(d2, 1e-12)))
+                smooth_kernel(p, l, SmoothingMeasurements(*args, weight, self.sensor), 3, 1e-3)
+            smoothing_cost(p, l, SmoothingMeasurements(*args, weight, self.sensor), d2, parts)
+            gates = np.where(np.isinf(observations[:, 3]), equal_tail_gate(self.trim, 2, 1), self.trim)
+            weight = (d2 <= gates).astype(np.float64)
+        left = np.bincount(self.ob_landmark, weights=weight, minlength=len(l)) >= self.min_hits
+        kept = (weight > 0.0) & left[self.ob_landmark]
+        l = l[left]
+        landmark = (np.cumsum(left) - 1)[self.ob_landmark[kept]]
+        args = (self.increments, W, self.ob_pose[kept], landmark, observations[kept])
+        weight = np.ones(int(kept.sum()))
+        d2 = np.zeros(len(weight))
+        evidence = SmoothingMeasurements(*args, weight, self.sensor)
+        chi2, _, converged = smooth_kernel(p, l, evidence, 50, 1e-9)
+        joint, marginals = smoothed_covariances(p, l, evidence)
+        smoothing_cost(p, l, evidence, d2, parts)
+        if not np.all(np.isfinite(joint)):
+            raise CovarianceError(
+                "smoothed submap is singular", got=f"{len(l)} landmarks, {int(weight.sum())} observations"
+            )
+        G = np.eye(3 + 2 * len(l))
+        G[:2, :2] = rotation2(p[-1, 2])  # right tangent → plain vector of eq. 15
+        gaussian = Gaussian(np.concatenate([p[-1], l.ravel()]), G @ joint @ G.T, (2,))
+        channels = int(kept.sum() + np.isfinite(observations[kept, 3]).sum())
+        dof = channels - 2 * len(l)
+        return SmoothingResult(
+            gaussian, p, marginals, kept, left, float(chi2), dof, parts, bool(converged), l, evidence
         )
-    G = np.eye(3 + 2 * len(l))
-    G[:2, :2] = rotation2(p[-1, 2])  # right tangent → plain vector of eq. 15
-    gaussian = Gaussian(np.concatenate([p[-1], l.ravel()]), G @ joint @ G.T, (2,))
-    channels = int(kept.sum() + np.isfinite(observations[kept, 3]).sum())
-    dof = channels - 2 * len(l)
-    return SmoothingResult(gaussian, p, marginals, kept, left, float(chi2), dof, parts, bool(converged), l, evidence)
+
+    def restricted(self, observations: npt.NDArray[np.bool_], landmarks: npt.NDArray[np.bool_]) -> SmoothingProblem:
+        """The same with some observations and landmarks, all of them inliers."""
+        rank = np.cumsum(landmarks) - 1
+        keep = observations & landmarks[self.ob_landmark]
+        return replace(
+            self,
+            ob_pose=self.ob_pose[keep],
+            ob_landmark=rank[self.ob_landmark[keep]],
+            observations=self.observations[keep],
+            trim=0.0,
+            min_hits=1,
+        )

@@ -299,7 +299,8 @@ class LidarOdometry:
         points = self.points[chosen]
         if seen.bridged and bridge is not None:
             predicted = bridge
-        self._doubt(raw, points, before, predicted, even, dt, fit, seen, self._instead(seen, before, predicted, Q))
+        motion = np.asarray(se3.se3_between(before, predicted))
+        self._doubt(raw, points, motion, even, dt, fit, seen, self._instead(seen, motion, Q))
         sure = fit is not None and not seen.unheld and not self.lost and seen.state in MAPPED
         if sure and told is not None and self.reckoned is not None:
             made, guess = (np.asarray(se3.se3_between(before, x)) for x in (self.pose, even))
@@ -334,7 +335,7 @@ class LidarOdometry:
                     level.keep_since(since)
         return seen
 
-    def _instead(self, seen: ScanResult, before: Array, predicted: Array, Q: Array | None) -> Array | None:
+    def _instead(self, seen: ScanResult, motion: Array, Q: Array | None) -> Array | None:
         """Covariance ``(6, 6)`` of the motion where that of an even one is not enough: of odometry in its place."""
         return Q if seen.bridged else None
 
@@ -390,21 +391,19 @@ class LidarOdometry:
         self,
         raw: RawScan,
         points: Array,
-        before: Array,
-        predicted: Array,
+        motion: Array,
         even: Array,
         dt: float,
         fit: NormalEquations | None,
         seen: ScanResult,
-        reckoned: Array | None = None,
+        reckoned: Array | None,
     ) -> None:
-        """How far the pose of now is off, jointly with those of the window.
+        """How far the pose of now is off after an expected ``motion``, jointly with those of the window.
 
         What is expected of a motion is what an even one would miss, also where an IMU predicted it: nothing of what
         that tells is in the covariance, so that a graph may still count it. Where odometry stands for scans, what it
         may miss is: ``reckoned`` (6, 6).
         """
-        motion = se3.se3_between(before, predicted)
         if seen.state in MAPPED and seen.state != "first":
             off = np.asarray(se3.se3_log(se3.se3_between(even, self.pose)))
             self.missed.append((float(np.mean(off[:3] ** 2)), float(np.mean(off[3:] ** 2))))

@@ -7,9 +7,7 @@ So the default adds a drift model, the covariance of dead reckoning over the len
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -17,9 +15,6 @@ from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.poses import group_of, pose_mean, pose_scatter
-
-Drift = Callable[[float], Any]
-"""Covariance ``(d, d)``, right tangent, at the end of a path of a length [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +46,7 @@ class ExitCovariance:
 def exit_covariance(
     exits: ArrayLike,
     about: ArrayLike,
-    length: float,
-    drift: Drift,
+    drift: ArrayLike,
     *,
     weights: ArrayLike | None = None,
     drift_scale: float = 1.0,
@@ -67,10 +61,8 @@ def exit_covariance(
         Of all particles of the interval, each in the frame of the body's own start.
     about : (7,) or (3,)
         The exit that is handed over; need not be the mean, and how far it lies off is added.
-    length : float
-        Path length of the segment [m].
-    drift : callable
-        Path length [m] → covariance ``(d, d)``.
+    drift : (d, d)
+        Covariance of dead reckoning over the segment, right tangent.
     weights : (n,), optional
     drift_scale : float
         Factor on the drift model's covariance.
@@ -78,7 +70,7 @@ def exit_covariance(
         Standard deviations [m], [rad] added to the moment-matched covariance.
     """
     group = group_of(about)
-    D = np.array(drift(float(length)), dtype=np.float64)
+    D = np.array(drift, dtype=np.float64)
     if D.shape != (group.dof, group.dof) or not np.all(np.isfinite(D)):
         raise CovarianceError(
             "the drift model gave no covariance", got=D.tolist(), wanted=f"({group.dof}, {group.dof}) finite numbers"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -191,10 +191,9 @@ def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
 
 
 def _fails(p: Proposal, margin: float, c: ChoiceConfig, rules: RegistrationConfig) -> list[str]:
-    fails = failed_match_gates(
-        p.registration, p.T_prior, c, rules, sigma=p.sigma, margin=margin, rise=p.rise, T=p.T,
-        ask_vague=p.localisation is None,
-    )  # fmt: skip
+    found = replace(p.registration, T_target_source=p.T)
+    vague = p.localisation is None
+    fails = failed_match_gates(found, p.T_prior, c, rules, sigma=p.sigma, margin=margin, rise=p.rise, ask_vague=vague)
     if fails and fails[0].startswith("nothing"):
         return fails
     if c.method != "registration" and p.localisation is None:

@@ -321,10 +321,7 @@ class SegMap:
         if e.kind != NEW:  # a copy: what its source held is in it, also if that was pruned since
             scans |= self._scans_of(e.source)
         m = self.maps.add(grid.copy(), frozenset(scans), grid.locked)
-        return self.table.append(
-            interval, e.kind, e.source, int(self.previous[p]), e.T_entry, path, m, e.fitness, e.covariance,
-            self.links[p], self.group.identity,
-        )  # fmt: skip
+        return self.table.append(interval, e, int(self.previous[p]), path, m, self.links[p], self.group.identity)
 
     def _scans_of(self, source: int) -> frozenset[tuple[int, int]]:
         """Intervals whose scans the map of a segment holds."""

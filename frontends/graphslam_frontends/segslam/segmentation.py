@@ -24,6 +24,8 @@ from graphslam_frontends.segslam.config import SegmentationConfig
 
 Scan = tuple[Array, Array, npt.NDArray[np.bool_]]
 """Points, origins and returns of one step, in the base frame at its stamp."""
+SCORE_SIGMA, SCORE_CLIP = 0.3, 3.0
+"""σ of the ranges in the log-likelihood of the predictive score [m], and where residuals are clipped [σ]."""
 KNOWN_SCORE = 0.8
 """Predictive score from which ground is known that the path of the map itself passed: it does not count for the longest
 length of a segment, since a map that ended there would be drawn a second time beside the first. In a simulated building
@@ -113,8 +115,6 @@ def predictive_score(
     *,
     weights: ArrayLike | None = None,
     tolerance: float = 0.6,
-    sigma: float = 0.3,
-    clip: float = 3.0,
     threads: int = 1,
 ) -> WindowScore:
     """Cast the beams of a look-ahead window in the particles' maps (A8).
@@ -129,8 +129,6 @@ def predictive_score(
     weights : (P,), optional
     tolerance : float
         A beam is predicted if the map expects a range within this [m]; where it expects nothing, it is not.
-    sigma, clip : float
-        Of the log-likelihood [m], [σ].
     threads : int
         The result is the same for any number.
     """
@@ -147,7 +145,8 @@ def predictive_score(
     with np.errstate(invalid="ignore"):
         near = c.hit & (np.abs(c.ranges - measured) <= tolerance)
     shares = near.mean(axis=1)
-    log_p = CastLikelihood(exponent=1.0, sigma=sigma, clip=clip).beams(c.ranges, c.status, measured, reach).mean(axis=1)
+    likelihood = CastLikelihood(exponent=1.0, sigma=SCORE_SIGMA, clip=SCORE_CLIP)
+    log_p = likelihood.beams(c.ranges, c.status, measured, reach).mean(axis=1)
     return WindowScore(
         shares=shares,
         log_likelihoods=log_p,

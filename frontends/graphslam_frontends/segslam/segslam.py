@@ -40,8 +40,6 @@ from graphslam_frontends.segslam.segmentation import (
 from graphslam_frontends.segslam.window import LookAheadScan, gather_look_ahead
 
 Ints = npt.NDArray[np.int64]
-SCORE_SIGMA = 0.3
-"""σ of the ranges in the log-likelihood of the predictive score [m]."""
 SCORE_BEAMS = 600
 """Beams of a look-ahead window that are cast for the predictive score, at most (evenly thinned)."""
 SCORE_PARTICLES = 8
@@ -207,7 +205,7 @@ class _Run:
                 rows, weights = representative_particles(p.weights, SCORE_PARTICLES if together else n)
                 score = predictive_score(
                     [p.grids[i] for i in rows], p.poses[rows], ahead.window.thinned(SCORE_BEAMS),
-                    self.steps.max_range, weights=weights, tolerance=c.tolerance, sigma=SCORE_SIGMA,
+                    self.steps.max_range, weights=weights, tolerance=c.tolerance,
                     threads=f.config.threads,
                 )  # fmt: skip
                 share, shares[rows] = score.share, score.shares

@@ -11,7 +11,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import Group, heading_of
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam_frontends.segslam.segment import KINDS
+from graphslam_frontends.segslam.segment import KINDS, SegmentEntry
 
 Ints = npt.NDArray[np.int64]
 Scans = frozenset[tuple[int, int]]
@@ -53,14 +53,10 @@ class SegmentTable:
     def append(
         self,
         interval: tuple[int, int],
-        kind: int,
-        source: int,
+        entered: SegmentEntry,
         previous: int,
-        entry: Any,
         path: Array,
         map: int,
-        fitness: float,
-        covariance: Array | None,
         link: Array,
         T_map: Array,
     ) -> int:
@@ -71,13 +67,13 @@ class SegmentTable:
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
         self.start[i], self.end[i] = interval
-        self.kind[i], self.source[i], self.previous[i], self.map[i] = kind, source, previous, map
-        self.weight[i], self.fitness[i], self.alive[i] = 0.0, fitness, True
-        self.entry[i], self.exit[i], self.link[i], self.T_map[i] = entry, path[-1], link, T_map
-        self.headings[i] = heading_of(np.stack([entry, path[-1]]))
+        self.kind[i], self.source[i], self.previous[i], self.map[i] = entered.kind, entered.source, previous, map
+        self.weight[i], self.fitness[i], self.alive[i] = 0.0, entered.fitness, True
+        self.entry[i], self.exit[i], self.link[i], self.T_map[i] = entered.T_entry, path[-1], link, T_map
+        self.headings[i] = heading_of(np.stack([entered.T_entry, path[-1]]))
         self._fitting = None
         self.paths.append(path)
-        self.covariances.append(covariance)
+        self.covariances.append(entered.covariance)
         self.count += 1
         return i
 

@@ -148,11 +148,49 @@ def submaps_of_segments(
                 f"segment {b.index} does not follow segment {a.index}", got=b.interval, wanted=f"({a.interval[1]}, …)"
             )
     keys = {s.index: first_key + k for k, s in enumerate(segments)}
-    out = []
+    out, g, ended = [], segmap.group, reasons or {}
     for s in segments:
-        matches, considered = _matches(segmap, s, segments, keys, config)
+        matches, considered = _matches(segmap, s, segments, keys)
         considered["holds"] = _holds(segmap, s, segments, keys)
-        out.append(_submap(segmap, s, drift, config, matches, considered, keys[s.index], uses, reasons, with_grids))
+        start, end = s.interval
+        base = segment_base(segmap, s.T_entry)
+        exit_pose = g.between(base, segment_base(segmap, s.T_exit))
+        exits, weights = exits_of_interval(segmap, s.interval)
+        exit = exit_covariance(
+            exits, exit_pose, drift(start, end, level_end=True), weights=weights, drift_scale=config.drift_scale
+        )
+        report: dict[str, Any] = {
+            "ended": ended.get(end, "unknown"),
+            "segment": s.index,
+            "entered": s.kind,
+            "steps": end - start,
+            "length": round(s.length, 3),
+            "segments_of_interval": len(exits),
+            "effective_segments": round(exit.effective, 3),
+            "weight": s.weight,
+            "locked": s.locked,
+            "exit_sigma_particles": np.sqrt(np.diag(exit.particles)).tolist(),
+            "exit_sigma_matched": np.sqrt(np.diag(exit.matched)).tolist(),
+            "exit_sigma_drift": np.sqrt(np.diag(exit.drift)).tolist(),
+            "covariance": "moment-matched" if config.matched_only else "particles+drift",
+            **considered,
+        }
+        poses = g.compose(g.inverse(base), s.path)
+        out.append(
+            Submap(
+                key=keys[s.index],
+                interval=(s.t_start, s.t_end),
+                exit_pose=exit_pose,
+                exit_covariance=exit.matched if config.matched_only else exit.total,
+                trajectory=Trajectory(
+                    segmap.times[start : end + 1], poses, _path_covariances(segmap, s, poses, drift, config.drift_scale)
+                ),
+                grid=_payload(segmap, s.index, base) if with_grids else None,
+                matches=matches,
+                uses=uses,
+                report=report,
+            )
+        )
     return out
 
 
@@ -182,57 +220,6 @@ def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array,
 def _shares(weights: Array) -> Array:
     """Weights that sum to one; equal where what is left of an interval weighs nothing."""
     return normalise_weights(weights if weights.sum() > 0 else None, len(weights))
-
-
-def _submap(
-    segmap: SegMap,
-    s: Segment,
-    drift: Drift,
-    config: HandoverConfig,
-    matches: tuple[Match, ...],
-    considered: dict[str, Any],
-    key: int,
-    uses: frozenset[str],
-    reasons: Mapping[int, str] | None,
-    with_grids: bool,
-) -> Submap:
-    g = segmap.group
-    start, end = s.interval
-    base = segment_base(segmap, s.T_entry)
-    exit_pose = g.between(base, segment_base(segmap, s.T_exit))
-    exits, weights = exits_of_interval(segmap, s.interval)
-    D = drift(start, end, level_end=True)
-    exit = exit_covariance(exits, exit_pose, s.length, lambda _: D, weights=weights, drift_scale=config.drift_scale)
-    report: dict[str, Any] = {
-        "ended": (reasons or {}).get(end, "unknown"),
-        "segment": s.index,
-        "entered": s.kind,
-        "steps": end - start,
-        "length": round(s.length, 3),
-        "segments_of_interval": len(exits),
-        "effective_segments": round(exit.effective, 3),
-        "weight": s.weight,
-        "locked": s.locked,
-        "exit_sigma_particles": np.sqrt(np.diag(exit.particles)).tolist(),
-        "exit_sigma_matched": np.sqrt(np.diag(exit.matched)).tolist(),
-        "exit_sigma_drift": np.sqrt(np.diag(exit.drift)).tolist(),
-        "covariance": "moment-matched" if config.matched_only else "particles+drift",
-        **considered,
-    }
-    poses = g.compose(g.inverse(base), s.path)
-    return Submap(
-        key=key,
-        interval=(s.t_start, s.t_end),
-        exit_pose=exit_pose,
-        exit_covariance=exit.matched if config.matched_only else exit.total,
-        trajectory=Trajectory(
-            segmap.times[start : end + 1], poses, _path_covariances(segmap, s, poses, drift, config.drift_scale)
-        ),
-        grid=_payload(segmap, s.index, base) if with_grids else None,
-        matches=matches,
-        uses=uses,
-        report=report,
-    )
 
 
 def _payload(segmap: SegMap, index: int, base: Array) -> EvidenceGrid:
@@ -267,7 +254,7 @@ def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, sc
 
 
 def _matches(
-    segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mapping[int, int], config: HandoverConfig
+    segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mapping[int, int]
 ) -> tuple[tuple[Match, ...], dict[str, Any]]:
     """Re-entries of all particles of an interval, one for each submap that was entered, heaviest first."""
     t = segmap.table

@@ -62,12 +62,14 @@ class _Axis:
     xyz: Array
     piece: npt.NDArray[np.int64]
     """Points of one piece are joined by a line."""
+    kind: str
 
     @classmethod
     def of(cls, path: Trajectory, rows: Rows) -> _Axis:
         """At poses of the path; where one is left out between two, the line breaks."""
         piece = np.cumsum(np.diff(rows, prepend=rows[:1]) > 1, dtype=np.int64)
-        return cls(path.times[rows] - path.times[0], arc_length(path.positions)[rows], path.positions[rows], piece)
+        t, s = path.times[rows] - path.times[0], arc_length(path.positions)[rows]
+        return cls(t, s, path.positions[rows], piece, "line")
 
     @classmethod
     def at(cls, path: Trajectory, times: Array) -> _Axis:
@@ -75,7 +77,7 @@ class _Axis:
         t = np.clip(times, path.times[0], path.times[-1])
         s = np.interp(t, path.times, arc_length(path.positions))
         xyz = path.interpolate(t)[:, : path.dim] if len(t) else np.zeros((0, path.dim))
-        return cls(times - path.times[0], s, xyz, np.arange(len(times)))
+        return cls(times - path.times[0], s, xyz, np.arange(len(times)), "dots")
 
     def panel(
         self,
@@ -84,21 +86,19 @@ class _Axis:
         values: Array,
         *,
         unit: str = "",
-        kind: str = "line",
         honest: float | None = None,
         bounds: tuple[float, float] | None = None,
         sigmas: Array | None = None,
-        log: bool = False,
     ) -> dict[str, Any]:
         keep = extreme_rows(values, MOST)
-        piece = self.piece[keep]
+        cut = np.flatnonzero(np.diff(self.piece[keep]) > 0) + 1
         out: dict[str, Any] = {
-            **{"name": name, "said": said, "unit": unit, "kind": kind, "colour": style.ESTIMATE, "log": log},
-            **{"honest": honest, "cut": [int(k) for k in np.flatnonzero(np.diff(piece) > 0) + 1]},
+            **{"name": name, "said": said, "unit": unit, "kind": self.kind, "colour": style.ESTIMATE},
+            **{"log": bounds is not None, "honest": honest, "cut": cut.tolist()},
             **{"t": base64_floats(self.t[keep]), "s": base64_floats(self.s[keep])},
             **{"xyz": packed_points(self.xyz[keep]), "value": base64_floats(values[keep])},
         }
-        if kind == "dots":
+        if self.kind == "dots":
             del out["cut"]
         if bounds is not None:
             out["bounds"] = [round(b, 6) for b in bounds]
@@ -142,7 +142,7 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     )
     if made.certain:
         said += f" Not shown: {made.certain} poses with a singular covariance, such as the first base."
-    panels = [axis.panel("NEES/dof of the path", said, ratio, honest=1.0, bounds=(low, high), log=True)]
+    panels = [axis.panel("NEES/dof of the path", said, ratio, honest=1.0, bounds=(low, high))]
     for k, name in enumerate(made.names):
         turn = name == "heading"
         scale = np.rad2deg(1.0) if turn else 1.0
@@ -175,11 +175,11 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
         if folder.part("refine"):
             said += " The prediction is that of the graph before refinement."
         name = "NIS/dof of withheld GPS"
-        out = [axis.panel(name, said, nis / d, kind="dots", honest=1.0, bounds=(low, high), log=True)]
+        out = [axis.panel(name, said, nis / d, honest=1.0, bounds=(low, high))]
         for k, of in enumerate("xyz"[:d]):
             said = f"Fix minus prediction, {of} of the GPS frame, ± {SIGMAS:g} σ of both."
             name, half = f"Withheld GPS, {of}", sigma[:, k]
-            out.append(axis.panel(name, said, v[:, k], unit="m", kind="dots", honest=0.0, sigmas=half))
+            out.append(axis.panel(name, said, v[:, k], unit="m", honest=0.0, sigmas=half))
         return out
     for name, said in (("withheld", "withheld from the graph"), ("all", "as in the metrics")):
         try:
@@ -188,7 +188,7 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
             continue
         if len(scored.times):
             text = f"Distance of fixes to the antenna on the path; {said}. No bounds available."
-            return [_Axis.at(path, scored.times).panel("Distance to GPS", text, scored.errors, unit="m", kind="dots")]
+            return [_Axis.at(path, scored.times).panel("Distance to GPS", text, scored.errors, unit="m")]
     return []
 
 

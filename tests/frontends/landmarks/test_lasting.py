@@ -14,7 +14,7 @@ from graphslam.core.geometry import se2_between, se2_compose, se2_exp, se2_log, 
 from graphslam.core.sensor_biases import SensorBiases
 from graphslam_frontends.landmarks.config import SensorBiasConfig
 from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases
-from graphslam_frontends.landmarks.summarise import SmoothingResult, smooth_submap
+from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult
 from tests.frontends.landmarks.test_smoothing import SENSOR, Q, drive
 from tests.reference.fastslam import measure
 
@@ -41,7 +41,7 @@ def measured_with(g, u, z, config):
 
 def again(s: SmoothingResult, g, u, k, j, z, config) -> SmoothingResult:
     u, z, sensor = measured_with(g, u, z, config)
-    return smooth_submap(s.poses, s.landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, sensor)
+    return SmoothingProblem(u, np.tile(Q, (len(u), 1, 1)), k, j, z, sensor).smooth(s.poses, s.landmarks)
 
 
 def nearly_exact(seed):
@@ -68,7 +68,7 @@ def test_responses_are_those_of_smoothing_again(name):
     truth, landmarks, u, k, j, z = nearly_exact(1)
     if name == "ranges alone":
         z[:, 1], z[:, 3] = 0.0, np.inf
-    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
+    s = SmoothingProblem(u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR).smooth(truth, landmarks)
     found = estimate_sensor_biases(config, s, SECONDS, None, base=False)
     step = np.full(6, 2e-4)
     # what the residuals say: the least cost for each g is a parabola, C - 2 score g + g' information g
@@ -94,7 +94,7 @@ def test_responses_are_those_of_smoothing_again(name):
 
 def test_likelihood_is_the_score_and_the_information():
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(2))
-    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
+    s = SmoothingProblem(u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR).smooth(truth, landmarks)
     found = estimate_sensor_biases(SensorBiasConfig(), s, SECONDS, None, base=True)
     R, d = found.likelihood()
     np.testing.assert_allclose(R.T @ R, found.information, rtol=1e-6, atol=1e-6 * found.information.max())
@@ -186,7 +186,7 @@ def test_lasting_errors_refuse_what_does_not_fit():
 def test_a_pose_that_errs_moves_like_its_response():
     """The trajectory of a solution has the constant errors taken out of it."""
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(3))
-    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR)
+    s = SmoothingProblem(u, np.tile(Q, (len(u), 1, 1)), k, j, z, SENSOR).smooth(truth, landmarks)
     found = estimate_sensor_biases(SensorBiasConfig(), s, SECONDS, None, base=False)
     g = np.array([0.01, 0.02, 0.05, 0.02, 0.05, -0.05])
     other = again(s, g, u, k, j, z, SensorBiasConfig())

@@ -17,7 +17,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import LandmarkObservations
 from graphslam_frontends.landmarks.config import DelayedInitialisation, RbpfEkfConfig, StoppingConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
-from graphslam_frontends.landmarks.mirror_ambiguity import SmoothingProblem, resolve_mirror_ambiguity
+from graphslam_frontends.landmarks.mirror_ambiguity import resolve_mirror_ambiguity
 from graphslam_frontends.landmarks.prepare import prepare_log
 from graphslam_frontends.landmarks.range_only import WaitingRanges
 from graphslam_frontends.landmarks.range_only_kernels import (
@@ -33,6 +33,7 @@ from graphslam_frontends.landmarks.range_only_kernels import (
     trilaterate_kernel,
 )
 from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
+from graphslam_frontends.landmarks.summarise import SmoothingProblem
 from graphslam_frontends.odometry.motion import MotionNoise
 from graphslam_studies.evaluate.submap_consistency import submap_nees
 from graphslam_studies.frontends.rbpf_slam import RbpfSlamConfig, rbpf_snapshots

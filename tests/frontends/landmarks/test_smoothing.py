@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from graphslam.core.geometry import se2_between, se2_compose, se2_inverse, wrap_angle
 from graphslam.evaluate.covariance_assessment import MAX_NONLINEARITY
 from graphslam_frontends.landmarks.smoothing_kernels import second_order_bias
-from graphslam_frontends.landmarks.summarise import smooth_submap
+from graphslam_frontends.landmarks.summarise import SmoothingProblem
 from tests.reference.fastslam import measure
 
 SENSOR = np.array([0.5, 0.2, 0.1])
@@ -51,7 +51,7 @@ def test_smoother_equals_dense_least_squares(seed, ranges_only):
         z[blind, 1], z[blind, 3] = 0.0, np.inf
     T, L = len(truth), len(landmarks)
     start_p, start_l = truth + 0.05 * rng.normal(size=truth.shape), landmarks + 0.2 * rng.normal(size=landmarks.shape)
-    s = smooth_submap(start_p, start_l, u, np.tile(Q, (T, 1, 1)), k, j, z, SENSOR)
+    s = SmoothingProblem(u, np.tile(Q, (T, 1, 1)), k, j, z, SENSOR).smooth(start_p, start_l)
     assert s.converged
     p, l = s.poses, s.gaussian.mean[3:].reshape(-1, 2)
     f = lambda v: dense_residual(v, p, l, u, k, j, z)  # noqa: E731
@@ -82,9 +82,9 @@ def test_a_landmark_under_the_sensor_is_not_placed_by_its_bearing(off):
     exact = np.array([measure(truth[a], SENSOR, landmarks[b]) for a, b in zip(k, j)])
     z[:, :2] = exact
     args = (u, np.tile(Q, (len(truth), 1, 1)))
-    with_it = smooth_submap(truth, landmarks, *args, k, j, z, SENSOR)
+    with_it = SmoothingProblem(*args, k, j, z, SENSOR).smooth(truth, landmarks)
     rest = (k != 6) | (j != 3)
-    without = smooth_submap(truth, landmarks, *args, k[rest], j[rest], z[rest], SENSOR)
+    without = SmoothingProblem(*args, k[rest], j[rest], z[rest], SENSOR).smooth(truth, landmarks)
     a, b = (np.sqrt(np.diag(x.gaussian.covariance)[9:11]) for x in (with_it, without))
     assert np.all(np.linalg.eigvalsh(with_it.gaussian.covariance) > 0.0)
     assert np.all(a <= 1.05 * b)  # each where its own optimum is
@@ -95,7 +95,7 @@ def test_a_landmark_under_the_sensor_is_not_placed_by_its_bearing(off):
 def test_bends_are_what_samples_of_the_relative_place_show():
     """Twin: the relative place of each sighting is drawn from its dense covariance, and seen."""
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(4), T=8, L=4)
-    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR)
+    s = SmoothingProblem(u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR).smooth(truth, landmarks)
     p, l, T = s.poses, s.landmarks, len(truth)
     n = 3 * T + 2 * len(l)
     f = lambda v: dense_residual(v, p, l, u, k, j, z)  # noqa: E731
@@ -128,7 +128,7 @@ def test_maps_bend_where_bearings_are_vague_beside_ranges():
     exact = np.array([measure(truth[a], SENSOR, landmarks[b]) for a, b in zip(k, j)])
     vague = np.column_stack([exact, np.tile([0.02**2, 0.1**2], (len(k), 1))])
     sure = np.column_stack([exact, np.tile([0.3**2, 0.01**2], (len(k), 1))])
-    maps = [smooth_submap(truth, landmarks, *args, v, SENSOR) for v in (vague, sure)]
+    maps = [SmoothingProblem(*args, v, SENSOR).smooth(truth, landmarks) for v in (vague, sure)]
     per = [s.nonlinearity() / len(s.gaussian.mean) for s in maps]
     assert per[0] > MAX_NONLINEARITY
     assert per[1] < 0.01 * per[0]
@@ -138,7 +138,7 @@ def test_covariance_is_confirmed_by_monte_carlo():
     nees, chi2, dof = [], [], 0
     for trial in range(300):
         truth, landmarks, u, k, j, z = drive(np.random.default_rng(1000 + trial))
-        s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR)
+        s = SmoothingProblem(u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR).smooth(truth, landmarks)
         x = np.concatenate([truth[-1], landmarks.ravel()])
         nees.append(s.gaussian.mahalanobis2(x))
         chi2.append(s.chi2)
@@ -154,7 +154,7 @@ def test_trimming_removes_planted_outliers_and_counts_them():
     truth, landmarks, u, k, j, z = drive(rng, T=15)
     bad = rng.choice(len(z), 5, replace=False)
     z[bad, 1] += 0.5
-    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR, trim=16.0)
+    s = SmoothingProblem(u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR, trim=16.0).smooth(truth, landmarks)
     assert set(bad) <= set(np.flatnonzero(~s.kept))
     assert (~s.kept).sum() <= 7
     assert 0.7 < s.chi2 / s.dof < 1.3
@@ -164,7 +164,9 @@ def test_landmark_left_without_sightings_goes():
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(2))
     last = j == j.max()
     z[last, 0] += np.linspace(5, 25, last.sum())  # nonsense ranges, none agreeing with another
-    s = smooth_submap(truth, landmarks, u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR, trim=16.0, min_hits=3)
+    s = SmoothingProblem(u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR, trim=16.0, min_hits=3).smooth(
+        truth, landmarks
+    )
     assert not s.landmark_kept[j.max()]
     assert len(s.gaussian.mean) == 3 + 2 * s.landmark_kept.sum()
     assert not s.kept[last].any()

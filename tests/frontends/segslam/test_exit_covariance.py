@@ -108,23 +108,17 @@ def test_impossible_poses_and_weights_are_refused() -> None:
 
 def test_an_exit_has_the_particles_and_the_drift() -> None:
     exits = np.array([[10.0, 0.1, 0.0], [10.0, -0.1, 0.0]])
-    seen: list[float] = []
-
-    def drift(length: float) -> np.ndarray:
-        seen.append(length)
-        return np.diag([0.04, 0.09, 1e-4])
-
-    c = exit_covariance(exits, [10.0, 0.0, 0.0], 12.5, drift, drift_scale=2.0)
-    assert seen == [12.5]
+    drift = np.diag([0.04, 0.09, 1e-4])
+    c = exit_covariance(exits, [10.0, 0.0, 0.0], drift, drift_scale=2.0)
     np.testing.assert_allclose(c.total, np.diag([0.08, 0.18 + 0.01, 2e-4]))
     np.testing.assert_allclose(c.particles, np.diag([0.0, 0.01, 0.0]), atol=1e-15)
     np.testing.assert_allclose(c.matched, np.diag([1e-4, 0.01 + 1e-4, 1e-6]))
     assert c.effective == 2.0
     # handed over is another pose than the mean: its offset is part of the covariance, not of the moments
-    c = exit_covariance(exits, exits[0], 12.5, drift)
+    c = exit_covariance(exits, exits[0], drift)
     np.testing.assert_allclose(c.particles[1, 1], 0.02)
     np.testing.assert_allclose(c.matched[1, 1], 0.01 + 1e-4)
-    one = exit_covariance(exits[:1], exits[0], 12.5, drift)
+    one = exit_covariance(exits[:1], exits[0], drift)
     np.testing.assert_allclose(one.total, one.drift)
     assert one.effective == 1.0
 
@@ -132,7 +126,7 @@ def test_an_exit_has_the_particles_and_the_drift() -> None:
 def test_a_drift_model_that_gives_none_is_refused() -> None:
     for bad in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.eye(6), -np.eye(3)):
         with pytest.raises(CovarianceError):
-            exit_covariance(np.zeros((2, 3)), np.zeros(3), 1.0, lambda _, b=bad: b)
+            exit_covariance(np.zeros((2, 3)), np.zeros(3), bad)
 
 
 @pytest.mark.parametrize("g", GROUPS, ids=["SE2", "SE3"])
@@ -148,7 +142,7 @@ def test_particles_with_a_common_error_are_honest_with_drift_and_not_without(g: 
         own = g.exp(rng.multivariate_normal(np.zeros(g.dof), S, n + 1))
         bodies = g.compose(np.broadcast_to(centre, own.shape), own)
         truth = g.compose(bodies[n], g.exp(rng.multivariate_normal(np.zeros(g.dof), D)))
-        c = exit_covariance(bodies[:n], pose_mean(bodies[:n]), 1.0, lambda _: D, floor_position=1e-6, floor_angle=1e-6)
+        c = exit_covariance(bodies[:n], pose_mean(bodies[:n]), D, floor_position=1e-6, floor_angle=1e-6)
         rows.append((c.pose, c.total, c.matched, truth))
     T, P, M, X = (np.stack(r) for r in zip(*rows))
     honest = exit_nees(T, P, X)

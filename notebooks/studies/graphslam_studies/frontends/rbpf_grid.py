@@ -8,7 +8,7 @@ covariance of dead reckoning over the path.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -38,7 +38,7 @@ from graphslam_frontends.odometry.scan_use import (
 )
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.segslam.covariance import Drift, exit_covariance
+from graphslam_frontends.segslam.covariance import exit_covariance
 from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 KNOTS = 33
@@ -97,7 +97,7 @@ class RbpfResult:
         """Wall time of all parts together [s]."""
         return float(sum(self.tally.seconds.values()))
 
-    def trajectory(self, drift: Drift | None = None) -> Trajectory:
+    def trajectory(self, drift: Callable[[float], Array] | None = None) -> Trajectory:
         """Path of the best particle, ``T_map_body``.
 
         Parameters
@@ -189,7 +189,7 @@ def run_rbpf(
 
 def rbpf_submap(
     result: RbpfResult,
-    drift: Drift,
+    drift: Callable[[float], Array],
     *,
     key: int = 0,
     drift_scale: float = 1.0,
@@ -215,7 +215,7 @@ def rbpf_submap(
         raise DataError("one step makes no submap", where=result.name, got=len(times), wanted="at least 2 steps")
     w = result.particles.weights
     exit = exit_covariance(
-        result.poses, result.final_pose, float(result.path_length[-1]), drift, weights=w, drift_scale=drift_scale
+        result.poses, result.final_pose, drift(float(result.path_length[-1])), weights=w, drift_scale=drift_scale
     )
     report = result.report() | {
         "ended": "end-of-log",
