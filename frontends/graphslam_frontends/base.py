@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 from graphslam.core.log import DropCounter, SensorLog
@@ -32,6 +32,8 @@ class FrontEnd(Protocol):
     name: ClassVar[str]
     draws: ClassVar[bool] = False
     """Are its submaps drawn, so that another branch of the seed tree gives others?"""
+    calibrates: ClassVar[str] = ""
+    """What calibration uses beside the motion: ``sightings`` of landmarks, ``scans``, or nothing (no calibration)."""
     config: Any
 
     def submaps(
@@ -84,12 +86,27 @@ class FrontEnd(Protocol):
         """Does it make submaps while records come?"""
         return cls.follow is not FrontEnd.follow
 
+    def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
+        """The front end for a log whose noise was estimated.
+
+        Parameters
+        ----------
+        asked : mapping
+            Options of this front end that the user set: they stay.
+        corrected : bool
+            Systematic errors were estimated and removed, and nothing contradicts the estimates.
+        drift : bool
+            The errors of the odometry by the metre were estimated from scans.
+        """
+        return self
+
     def steps(self, log: SensorLog) -> Steps | None:
         """The steps that it made of the log, for a refinement by scans; None where it works on no scans."""
         return None
 
     def forget(self) -> None:
-        """Let go of what it keeps of the last log; it is made again where it is asked for."""
+        """Free the memory of what it keeps of the last log; it is made again where it is asked for."""
+        return
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations] | None:
         """Name of the stream of landmarks that it reads, and the observations in it; None where it tells none.

@@ -6,7 +6,7 @@ interval begins where the last one ended, and every record is used once.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -78,6 +78,17 @@ class MixedFrontEnd(FrontEnd):
     def config(self) -> dict[str, Any]:  # type: ignore[override]
         """Configuration of each front end by its name."""
         return {p.name: p.config for p in self.parts}
+
+    @property
+    def calibrated_part(self) -> FrontEnd:
+        """The front end whose data are calibrated: the motion is that of both, and landmarks show its errors better."""
+        return min(self.parts, key=lambda p: p.calibrates != "sightings")
+
+    def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
+        """See :class:`~graphslam_frontends.base.FrontEnd`: of each front end."""
+        return MixedFrontEnd(
+            tuple(p.with_calibration(log, asked.get(p.name, {}), corrected=corrected, drift=drift) for p in self.parts)
+        )
 
     def split(self, log: SensorLog) -> tuple[FrontEnd, StepwiseFrontEnd]:
         """The front end of landmarks and that of scans.

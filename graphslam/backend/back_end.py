@@ -15,11 +15,11 @@ from graphslam.association.identity import find_association_outliers
 from graphslam.association.landmarks import AssociationConfig, associate_landmarks
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.backend.ambiguous_maps import AmbiguousMaps, ambiguous_maps
-from graphslam.backend.config import BackEndConfig, BeaconOptions, CompassOptions, GpsOptions
+from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
 from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, repreintegrate_until_converged
 from graphslam.core.errors import DataError
-from graphslam.core.records import Compass, Gps, LandmarkObservations
+from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
@@ -129,13 +129,9 @@ class BackEnd:
             gps = replace(gps, positions=gps.positions[:, :want], lever=gps.lever[:want])
         self.graph.add_sensor(gps, config=config)
 
-    def add_compass(self, name: str, compass: Compass, config: CompassOptions) -> None:
-        """Give the graph the headings of a compass; they wait for the submaps that hold them."""
-        self._later.append(lambda graph: graph.add_sensor(compass, stream=name, config=config))
-
-    def add_beacons(self, name: str, ranges: LandmarkObservations, config: BeaconOptions) -> None:
-        """Give the graph distances to beacons; they wait for the submaps that hold them."""
-        self._later.append(lambda graph: graph.add_sensor(ranges, stream=name, config=config))
+    def add_sensor(self, name: str, readings: Any, config: Any) -> None:
+        """Give the graph the readings of a sensor; they wait for the submaps that hold them."""
+        self._later.append(lambda graph: graph.add_sensor(readings, stream=name, config=config))
 
     def add(self, submap: Submap) -> None:
         """Associate, add, solve; now and then merge landmarks that turned out to be one."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -106,34 +108,23 @@ def imus_of(feed: RecordSource) -> dict[str, Imu]:
     return {name: feed.part(name) for name in feed.names(Imu)}  # type: ignore[misc]
 
 
-def compasses_of(log: SensorLog, config: CompassOptions) -> dict[str, Compass]:
-    """The compasses of a log that are to be used, by name."""
-    found = {name: s for name, s in log.streams.items() if isinstance(s, Compass)}
-    if config.use == "none":
-        return {}
-    if config.use == "auto":
-        return found
-    if config.use not in found:
-        raise MissingDataError(
-            "compass.use names no compass of the log",
-            got=config.use,
-            wanted=f"none, auto, {', '.join(found) or '(it has none)'}",
-        )
-    return {config.use: found[config.use]}
-
-
-def beacons_of(log: SensorLog, config: BeaconOptions) -> dict[str, LandmarkObservations]:
-    """The stream of distances to beacons that is to be used, by name."""
-    if config.use == "none":
-        return {}
-    found = {name: s for name, s in log.streams.items() if isinstance(s, LandmarkObservations)}
-    if config.use not in found:
-        raise MissingDataError(
-            "beacons.use names no stream of landmark observations of the log",
-            got=config.use,
-            wanted=f"none, {', '.join(found) or '(it has none)'}",
-        )
-    return {config.use: found[config.use]}
+def optional_sensors(
+    log: SensorLog, compass: CompassOptions, beacons: BeaconOptions
+) -> Iterator[tuple[str, Any, CompassOptions | BeaconOptions]]:
+    """Compasses and distances to beacons that are to be used: name of the stream, readings, options."""
+    for kind, config, option in ((Compass, compass, "compass.use"), (LandmarkObservations, beacons, "beacons.use")):
+        found = {name: s for name, s in log.streams.items() if isinstance(s, kind)}
+        words = ("none", "auto") if kind is Compass else ("none",)
+        if config.use in words:
+            yield from ((name, s, config) for name, s in found.items() if config.use == "auto")
+        elif config.use in found:
+            yield config.use, found[config.use], config
+        else:
+            raise MissingDataError(
+                f"{option} names no stream of {kind.__name__} of the log",
+                got=config.use,
+                wanted=", ".join([*words, *(found or ["(it has none)"])]),
+            )
 
 
 class ImuSource:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from graphslam.calibrate.estimate import Calibration
-from graphslam.calibrate.landmark_calibration import QUICK, CalibrationBudget, calibrate_sightings
+from graphslam.calibrate.landmark_calibration import CalibrationBudget, calibrate_sightings
 from graphslam.calibrate.scans import POINTS, calibrate_scans
 from graphslam.calibrate.windows import SightingLog
 from graphslam.core.errors import DataError
@@ -17,21 +18,12 @@ from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import RecordedErrors
 
 
-def calibrate_streams(
-    log: SensorLog, kind: str, effort: CalibrationBudget = QUICK, config: Any = None, *, seed: int = 0
-) -> Calibration:
-    """What a log says of its own noise and lasting errors, without truth.
+def _of_sightings(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int) -> Calibration:
+    seen = SightingLog.of(log, *landmark_stream(log, config.detector))
+    return calibrate_sightings(seen, effort, seed=seed, noise=getattr(config, "motion", None))
 
-    Parameters
-    ----------
-    kind : {"sightings", "scans"}
-        What is looked at beside the motion.
-    config : object
-        Of a front end that reads them: how landmarks are detected, how scans become steps.
-    """
-    if kind == "sightings":
-        seen = SightingLog.of(log, *landmark_stream(log, config.detector))
-        return calibrate_sightings(seen, effort, seed=seed, noise=getattr(config, "motion", None))
+
+def _of_scans(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int) -> Calibration:
     wanted = replace(config.steps, match_scans=False, yaw_per_metre=0.0)
     if log.of_type(LaserScans) is None:
         wanted = replace(wanted, most_points=max(wanted.most_points, POINTS))
@@ -39,3 +31,14 @@ def calibrate_streams(
     if not isinstance(steps.errors, RecordedErrors):
         raise DataError("an IMU with wheels is not calibrated: its front end estimates their errors", where=log.name)
     return calibrate_scans(steps, effort)
+
+
+CALIBRATIONS: dict[str, Callable[[SensorLog, Any, CalibrationBudget, int], Calibration]] = {
+    "sightings": _of_sightings,
+    "scans": _of_scans,
+}
+"""How noise and systematic errors are estimated from a log without ground truth, by what is used beside the motion.
+
+The arguments are the log, the configuration of a front end (how landmarks are detected, how scans become steps), the
+effort, and the seed.
+"""

@@ -6,6 +6,7 @@ A distribution registers what it brings under one of these groups; names are tho
 * ``graphslam.worlds``: simulated worlds (:func:`graphslam.simulate`);
 * ``graphslam.readers``: readers of data sets (:func:`graphslam.load`);
 * ``graphslam.frontends``: front ends (:func:`graphslam.run`);
+* ``graphslam.identities``: published identities of the landmarks of a log, by its name: a function of the observations;
 * ``graphslam.presets``: packages of recommended settings, ``SOURCE.FRONTEND.toml``;
 * ``graphslam.commands``: commands of ``graphslam``, functions as Typer takes them;
 * ``graphslam.verbs``: what ``graphslam.study``, ``open_study`` and ``find_study`` call.

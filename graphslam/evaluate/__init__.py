@@ -4,7 +4,6 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "consistency": "Consistency nees pose_error",
-    "association": "match_observations",
     "gps": "gps_residuals move_to_gps_frame",
     "gps_repeatability": "fix_segments",
     "dead_reckoning_baseline": "dead_reckoned_path",

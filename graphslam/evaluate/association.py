@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array, wrap_angle
 
 Ints = npt.NDArray[np.int64]
 
@@ -89,39 +88,3 @@ def paired_labels(labels: npt.ArrayLike, reference: npt.ArrayLike) -> tuple[Ints
     if a.shape != b.shape or a.ndim != 1:
         raise DataError("labellings differ in shape", got=a.shape, wanted=b.shape)
     return a, b
-
-
-def match_observations(
-    times: Array,
-    ranges: Array,
-    bearings: Array,
-    reference_times: Array,
-    reference_ranges: Array,
-    reference_bearings: Array,
-    *,
-    max_range_difference: float = 0.3,
-    max_bearing_difference: float = float(np.deg2rad(0.5)),
-    max_time_difference: float = 0.005,
-) -> Ints:
-    """Row of the reference for every observation ``(n,)``, -1 where there is none.
-
-    Both lists are in time order. Within one scan the nearest pairs (each difference divided by its gate) are taken
-    first, every row at most once.
-    """
-    out = np.full(len(times), -1, dtype=np.int64)
-    lo = np.searchsorted(reference_times, times - max_time_difference, "left")
-    hi = np.searchsorted(reference_times, times + max_time_difference, "right")
-    span = hi - lo
-    i = np.repeat(np.arange(len(times)), span)
-    j = np.arange(span.sum()) - np.repeat(np.cumsum(span) - span, span) + np.repeat(lo, span)
-    dr = np.abs(ranges[i] - reference_ranges[j]) / max_range_difference
-    db = np.abs(wrap_angle(bearings[i] - reference_bearings[j])) / max_bearing_difference
-    ok = (dr <= 1) & (db <= 1)
-    i, j, cost = i[ok], j[ok], np.hypot(dr[ok], db[ok])
-    taken: set[int] = set()
-    for k in np.argsort(cost, kind="stable"):
-        a, b = int(i[k]), int(j[k])
-        if out[a] < 0 and b not in taken:
-            out[a] = b
-            taken.add(b)
-    return out

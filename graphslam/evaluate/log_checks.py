@@ -22,7 +22,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry, VelocityControls
 from graphslam.evaluate.stream_checks import StreamFinding, check_streams
 from graphslam.evaluate.stream_checks_clock import check_clocks
-from graphslam.evaluate.stream_checks_imu import check_turns
+from graphslam.evaluate.stream_checks_imu import compare_turns
 from graphslam.evaluate.stream_checks_motion import check_odometry, check_sighted_motion
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_check import check_motion, motion_findings
@@ -106,7 +106,7 @@ def _gyro(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
     dt = np.diff(odometry.times)
     turn = np.asarray(g.log(odometry.increments))[1:, g.heading] / dt
     middle = odometry.times[1:] - 0.5 * dt
-    return check_turns(imu, VelocityControls(times=middle, speed=np.zeros(len(turn)), yaw_rate=turn), name)
+    return compare_turns(imu, VelocityControls(times=middle, speed=np.zeros(len(turn)), yaw_rate=turn), name)
 
 
 def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding]:

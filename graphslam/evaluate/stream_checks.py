@@ -6,7 +6,9 @@ line of the verdict; nothing is changed and nothing is dropped here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
@@ -34,12 +36,24 @@ class StreamFinding:
     finding: Finding
 
 
-def check_speeds(wheels: VelocityControls, name: str) -> list[Finding]:
+def check_speeds(wheels: VelocityControls, name: str, log: SensorLog) -> list[Finding]:
     """Wheels that never turn: a robot that is to map something moves."""
     if len(wheels.times) < 2 or wheels.speed.any():
         return []
     text = f"speed of {name}: 0 in all {len(wheels.times)} records — the robot never moves. Check that it is connected."
     return [Finding("bad", "wheels-still", text)]
+
+
+STREAM_CHECKS: tuple[tuple[tuple[type, ...], Callable[[Any, str, SensorLog], list[Finding]]], ...] = (
+    ((LaserScans, RangeScans, PointClouds), check_beams),
+    ((LandmarkObservations,), check_sightings),
+    ((SteeringControls,), check_steering),
+    ((Gps,), check_gps),
+    ((Imu,), check_imu),
+    ((Imu,), check_turns),
+    ((VelocityControls,), check_speeds),
+)
+"""Kinds of streams, and what is checked in each of them: ``check(stream, name, log)``."""
 
 
 def check_streams(log: SensorLog) -> list[StreamFinding]:
@@ -50,23 +64,10 @@ def check_streams(log: SensorLog) -> list[StreamFinding]:
     list of StreamFinding
         In the order of the streams.
     """
-    out: list[StreamFinding] = []
-    wheels = next((s for s in log.streams.values() if isinstance(s, VelocityControls)), None)
-    for name, stream in log.streams.items():
-        found: list[Finding] = []
-        if isinstance(stream, LaserScans | RangeScans | PointClouds):
-            found = check_beams(stream, name)
-        elif isinstance(stream, LandmarkObservations):
-            found = check_sightings(stream, name, log)
-        elif isinstance(stream, SteeringControls):
-            found = check_steering(stream, name)
-        elif isinstance(stream, Gps):
-            found = check_gps(stream, name, log)
-        elif isinstance(stream, Imu):
-            found = check_imu(stream, name)
-            if wheels is not None:
-                found += check_turns(stream, wheels, name)
-        elif isinstance(stream, VelocityControls):
-            found = check_speeds(stream, name)
-        out += [StreamFinding(name, f) for f in found]
-    return out
+    return [
+        StreamFinding(name, finding)
+        for name, stream in log.streams.items()
+        for kinds, check in STREAM_CHECKS
+        if isinstance(stream, kinds)
+        for finding in check(stream, name, log)
+    ]

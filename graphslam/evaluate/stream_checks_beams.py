@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
+from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import LaserScans
@@ -31,7 +32,7 @@ SOME = 0.01
 """Share of the scans above which a fault that no sound scanner has is said."""
 
 
-def check_beams(stream: Scanner, name: str) -> list[Finding]:
+def check_beams(stream: Scanner, name: str, log: SensorLog) -> list[Finding]:
     """Look at the scans of one scanner.
 
     Parameters

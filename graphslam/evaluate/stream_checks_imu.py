@@ -11,6 +11,7 @@ from graphslam.core import se3
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
+from graphslam.core.log import SensorLog
 from graphslam.core.records import VelocityControls
 
 GRAVITY_OFF = 0.1
@@ -33,7 +34,7 @@ MOST_LAG = 2.0
 """Lags that are looked for [s]."""
 
 
-def check_imu(imu: Imu, name: str) -> list[Finding]:
+def check_imu(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
     """Look at the readings of one IMU by themselves.
 
     Parameters
@@ -175,8 +176,14 @@ def _correlation(x: Array, y: Array) -> float:
     return float(np.corrcoef(x[ok], y[ok])[0, 1])
 
 
-def check_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding]:
-    """Hold the gyro's turns about the base's z axis against those of the wheels.
+def check_turns(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
+    """Compare the turns of the gyro with those of the wheels, where the log has any."""
+    wheels = next((s for s in log.streams.values() if isinstance(s, VelocityControls)), None)
+    return [] if wheels is None else compare_turns(imu, wheels, name)
+
+
+def compare_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding]:
+    """Compare the turns of the gyro about the base's z axis with those of the wheels.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ def check_sightings(z: LandmarkObservations, name: str, log: SensorLog) -> list[
     return out + _ranges_and_way(z, name, log)
 
 
-def check_steering(controls: SteeringControls, name: str) -> list[Finding]:
+def check_steering(controls: SteeringControls, name: str, log: SensorLog) -> list[Finding]:
     """Lines on the steering of a car."""
     beyond = int(np.sum(np.abs(controls.steering) > 0.5 * np.pi))
     if not beyond:

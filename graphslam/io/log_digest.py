@@ -27,11 +27,11 @@ def log_digest(log: SensorLog) -> dict[str, str]:
     dict of str to str
         ``{"controls": "7249 records, blake2b 0123…", …}``; ``truth`` and ``meta`` where there are any.
     """
-    out = {}
+    out, held = {}, {name: _arrays(stream) for name, stream in log.streams.items()}
     for name, stream in log.streams.items():
         d = Digest()
         d.add("kind", type(stream).__name__)
-        d.add_all(_arrays(stream))
+        d.add_all(held[name])
         out[name] = f"{len(stream.times)} records, blake2b {d.text()}"
     if log.truth is not None:
         d, t = Digest(), log.truth

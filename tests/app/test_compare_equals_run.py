@@ -12,6 +12,8 @@ import graphslam as gs
 from graphslam.app.run.run import Run
 from graphslam.core.errors import MissingDataError
 from graphslam.core.poses import compose_increments
+from tests.io import small_sources
+from tests.io.bag_worlds import Messages, write_ros2
 
 
 def same(run: Run, folder: Path) -> None:
@@ -65,6 +67,19 @@ def test_on_a_plain_table_of_landmarks_that_was_calibrated(tmp_path: Path) -> No
     run = gs.run(tmp_path, out=tmp_path / "run", progress=False)
     assert run.graph is not None
     assert "lasting" in {r.group for r in run.graph.records.values()}
+    same(run, tmp_path / "run")
+
+
+def test_on_a_ros2_bag(tmp_path: Path) -> None:
+    """Clouds and odometry of a bag; refinement is left out, for it does not change the graph."""
+    m, messages = Messages(), []
+    for t, pose, xyz in zip(small_sources.stamps(), small_sources.poses(), small_sources.clouds(spacing=0.5)):
+        messages.append(("/points", "sensor_msgs/msg/PointCloud2", t, m.cloud(t, xyz, frame="lidar")))
+        messages.append(("/odom", "nav_msgs/msg/Odometry", t, m.odometry(t, pose, child="base")))
+    place = m.transforms(0.0, [("base", "lidar", np.array([0.1, 0, 0.5, 0, 0, 0, 1.0]))])
+    messages.append(("/tf_static", "tf2_msgs/msg/TFMessage", small_sources.T0, place))
+    bag = write_ros2(tmp_path / "bag", messages)
+    run = gs.run(bag, config={"refine": {"use": False}}, out=tmp_path / "run", progress=False)
     same(run, tmp_path / "run")
 
 

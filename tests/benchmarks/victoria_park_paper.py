@@ -22,7 +22,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from graphslam.app.run import config as cfg
-from graphslam.app.run.audit import reference_labels
+from graphslam.app.run.audit import reference_identities
 from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.backend.back_end import BackEnd
 from graphslam.core.config import build_config, merge_options
@@ -180,7 +180,7 @@ def paper(log: SensorLog, *, seeds: int, figures: Path | None) -> None:
 def judge_of(log: SensorLog, front: Any) -> Judge:
     """GPS and published identities of a log; none of the latter leaves the pair columns empty."""
     observations = front.observations(log)[1]
-    reference = reference_labels(log, observations)
+    reference = reference_identities(log, front)
     gps = log["gps"]
     assert isinstance(gps, Gps)
     return Judge(gps, np.full(len(observations.ranges), -1, dtype=np.int64) if reference is None else reference)

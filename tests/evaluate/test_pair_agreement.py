@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphslam.core.errors import DataError
-from graphslam.evaluate.association import match_observations, pair_agreement
+from graphslam.evaluate.association import pair_agreement
 from graphslam_studies.evaluate.association import AssociationErrors, association_errors, majority_identity
 
 labels = st.lists(st.integers(-1, 4), min_size=2, max_size=14)
@@ -43,14 +43,6 @@ def test_identical_up_to_names_is_perfect():
 def test_shapes_must_agree():
     with pytest.raises(DataError):
         pair_agreement([0, 1], [0])
-
-
-def test_observations_are_matched_by_scan_and_each_row_once():
-    t = np.array([1.0, 1.0, 2.0])
-    rt = np.array([1.001, 1.001, 3.0])
-    got = match_observations(t, np.array([5.0, 5.1, 7.0]), np.zeros(3), rt, np.array([5.09, 5.25, 7.0]), np.zeros(3))
-    # row 0 of the reference is nearest to observation 1; observation 0 then takes the other; 3.0 s is another scan
-    assert got.tolist() == [1, 0, -1]
 
 
 @given(st.data())

@@ -13,10 +13,12 @@ from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.records import VelocityControls
 from graphslam.evaluate.stream_checks import check_streams
 from graphslam.evaluate.stream_checks_beams import check_beams
-from graphslam.evaluate.stream_checks_imu import check_imu, check_turns
+from graphslam.evaluate.stream_checks_imu import check_imu, compare_turns
 from tests.faults import inject_grid as put
 from tests.faults.grid_worlds import ring_log
 from tests.reference.imu_drive import drive
+
+ALONE = SensorLog(name="one stream", streams={})
 
 
 @pytest.fixture(scope="module")
@@ -64,23 +66,23 @@ def test_imu_units_limits_and_axes(robot: SensorLog) -> None:
     imu, wheels = robot["imu"], robot["wheels"]
     # gravity belongs to a unit that stands level; the reference drive is rolled and pitched widely
     level = replace(imu, specific_force=np.tile([0.0, 0.0, GRAVITY], (len(imu.times), 1)))
-    assert check_imu(level, "imu") == []
-    in_g = check_imu(replace(level, specific_force=level.specific_force / GRAVITY), "imu")
+    assert check_imu(level, "imu", ALONE) == []
+    in_g = check_imu(replace(level, specific_force=level.specific_force / GRAVITY), "imu", ALONE)
     assert [f.code for f in in_g] == ["imu-gravity"]
     assert "in g" in in_g[0].text
     limit = 0.6 * np.abs(imu.angular_rate[:, 2]).max()
-    cut = check_imu(replace(level, angular_rate=np.clip(imu.angular_rate, -limit, limit)), "imu")
+    cut = check_imu(replace(level, angular_rate=np.clip(imu.angular_rate, -limit, limit)), "imu", ALONE)
     assert {f.code for f in cut} == {"imu-saturated"}
     rows = np.arange(len(imu.times))
     rows[(imu.times > 10.0) & (imu.times < 12.0)] = int(np.searchsorted(imu.times, 10.0))
     held = replace(level, angular_rate=imu.angular_rate[rows])
-    assert [f.code for f in check_imu(held, "imu")] == ["imu-stuck"]
-    degrees = check_turns(replace(imu, angular_rate=np.rad2deg(imu.angular_rate)), wheels, "imu")
+    assert [f.code for f in check_imu(held, "imu", ALONE)] == ["imu-stuck"]
+    degrees = compare_turns(replace(imu, angular_rate=np.rad2deg(imu.angular_rate)), wheels, "imu")
     assert "57." in degrees[0].text
     assert "degrees" in degrees[0].text
-    late = check_turns(replace(imu, times=imu.times + 0.5), wheels, "imu")
+    late = compare_turns(replace(imu, times=imu.times + 0.5), wheels, "imu")
     assert "s after those of the wheels" in late[0].text
-    other = check_turns(imu, replace(wheels, yaw_rate=-wheels.yaw_rate), "imu")
+    other = compare_turns(imu, replace(wheels, yaw_rate=-wheels.yaw_rate), "imu")
     assert "swapped" in other[0].text
 
 
@@ -89,10 +91,10 @@ def test_clouds() -> None:
     points = 5.0 * rng.standard_normal((400, 3))
     offsets = np.arange(0, 401, 100)
     times = np.arange(4.0)
-    assert check_beams(PointClouds(times=times, source=ArrayClouds(points, offsets)), "lidar") == []
+    assert check_beams(PointClouds(times=times, source=ArrayClouds(points, offsets)), "lidar", ALONE) == []
     again = np.concatenate([points[:100]] * 4)
-    assert [f.code for f in check_beams(PointClouds(times=times, source=ArrayClouds(again, offsets)), "lidar")] == [
-        "scans-repeated"
-    ]
+    assert [
+        f.code for f in check_beams(PointClouds(times=times, source=ArrayClouds(again, offsets)), "lidar", ALONE)
+    ] == ["scans-repeated"]
     empty = PointClouds(times=times, source=ArrayClouds(points[:0], np.zeros(5, dtype=np.int64)))
-    assert [f.code for f in check_beams(empty, "lidar")] == ["scans-silent"]
+    assert [f.code for f in check_beams(empty, "lidar", ALONE)] == ["scans-silent"]

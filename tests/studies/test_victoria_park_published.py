@@ -11,9 +11,11 @@ import scipy.io
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.log import DropCounter
+from graphslam.core.records import LandmarkObservations
 from graphslam_studies.io.victoria_park import LASER_POSITION, read_victoria_park
 from graphslam_studies.io.victoria_park_published import (
     SLSJF_LANDMARK_OFFSET,
+    match_observations,
     read_slsjf_network,
     read_slsjf_observations,
     read_ufastslam_detections,
@@ -164,3 +166,16 @@ def test_bad_slsjf_files(tmp_path: Path) -> None:
     scipy.io.savemat(net, {"VicPark_clean_data": odometry})
     with pytest.raises(FormatError, match="row 1 is neither"):
         read_slsjf_network(tmp_path)
+
+
+def test_observations_are_matched_by_scan_and_each_row_once():
+    def seen(times: list[float], counts: list[int], ranges: list[float]) -> LandmarkObservations:
+        zeros, offsets = np.zeros(len(ranges)), np.concatenate([[0], np.cumsum(counts)])
+        return LandmarkObservations(
+            times=np.array(times), offsets=offsets, ranges=np.array(ranges), bearings=zeros,
+            sigmas=np.tile([0.1, 0.01], (len(ranges), 1)),
+        )  # fmt: skip
+
+    got = match_observations(seen([1.0, 2.0], [2, 1], [5.0, 5.1, 7.0]), seen([1.001, 3.0], [2, 1], [5.09, 5.25, 7.0]))
+    # row 0 of the reference is nearest to observation 1; observation 0 then takes the other; 3.0 s is another scan
+    assert got.tolist() == [1, 0, -1]

@@ -231,6 +231,7 @@ class Ekf(FrontEnd):
 
     config: EkfConfig = field(default_factory=EkfConfig)
     name: ClassVar[str] = "ekf"
+    calibrates: ClassVar[str] = "sightings"
 
     def follow(
         self,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,7 +25,7 @@ from graphslam_frontends.landmarks.fix_points import expects_fixes, fix_points, 
 from graphslam_frontends.landmarks.mirror_ambiguity import resolve_mirror_ambiguity
 from graphslam_frontends.landmarks.moment_consistency import consistency_flag, gaussian_discrepancy, particle_gaussians
 from graphslam_frontends.landmarks.prepare import LogPreparation, known_slots, landmark_stream
-from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases
+from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases, possible_biases
 from graphslam_frontends.landmarks.stopping import StoppingRule
 from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult, winning_association
 
@@ -41,6 +41,16 @@ class RbpfEkf(FrontEnd):
 
     config: RbpfEkfConfig = field(default_factory=RbpfEkfConfig)
     name: ClassVar[str] = "rbpf-ekf"
+    calibrates: ClassVar[str] = "sightings"
+
+    def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
+        """See :class:`~graphslam_frontends.base.FrontEnd`.
+
+        What a calibration leaves of systematic errors, or removed wrongly, the graph estimates with the map.
+        """
+        if not corrected or self.config.lasting is not None or "lasting" in asked:
+            return self
+        return RbpfEkf(replace(self.config, lasting=possible_biases(log, self.config.detector)))
 
     def follow(
         self,

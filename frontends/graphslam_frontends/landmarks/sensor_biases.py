@@ -11,14 +11,43 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.core.geometry import Array, rotation2, se2_between
+from graphslam.core.log import SensorLog
+from graphslam.core.records import SteeringControls
 from graphslam.core.sensor_biases import CONSTANTS, SensorBiases
+from graphslam_frontends.detectors.trees import TreeDetectorConfig
 from graphslam_frontends.landmarks.config import SensorBiasConfig
 from graphslam_frontends.landmarks.fix_points import FixPlacement
+from graphslam_frontends.landmarks.prepare import landmark_stream
 from graphslam_frontends.landmarks.smoothing_kernels import bias_sensitivities
 from graphslam_frontends.landmarks.summarise import SmoothingResult
+from graphslam_frontends.odometry.motion import motion_stream
 
 MOVING = 1e-6
 """An increment of the odometry that is shorter and turns less is rest [m, rad]."""
+
+STEERING = float(np.deg2rad(1.0))
+"""σ of the turn of a steered vehicle that is systematic beside its calibration [rad/m]: a degree of the wheel at 1 m
+wheelbase."""
+TYRES, RANGE_SCALE = 0.01, 0.05
+"""σ of the logarithm of the scale of distances by wheels, and of ranges measured by radio."""
+MOUNT = 0.3
+"""σ of the position of a sensor whose position is not given [m]."""
+
+
+def possible_biases(log: SensorLog, detector: TreeDetectorConfig) -> SensorBiasConfig:
+    """Which systematic errors a log of landmarks may have.
+
+    A steered vehicle turns too much by the metre, a robot with a gyro or two driven wheels by the second. Ranges
+    without bearings have no direction, but may have a scale; the scale of the map is then that of the wheels, within
+    what load and pressure of the tyres leave open.
+    """
+    steers = isinstance(motion_stream(log)[1], SteeringControls)
+    turn = {"yaw_bias": 0.0, "turn_per_metre": STEERING} if steers else {}
+    seen = landmark_stream(log, detector)[1]
+    blind = not np.any(seen.has_bearing)
+    ranges = {"distance_scale": TYRES, "range_scale": RANGE_SCALE, "sensor_yaw": 0.0, "mount": 0.0} if blind else {}
+    place = {} if blind or np.any(seen.T_base_sensor[:2] != 0.0) else {"mount": MOUNT}
+    return SensorBiasConfig(**turn, **ranges, **place)
 
 
 def estimate_sensor_biases(

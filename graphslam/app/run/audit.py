@@ -9,47 +9,32 @@ import numpy.typing as npt
 
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.log import SensorLog
-from graphslam.core.records import LandmarkObservations
-from graphslam.evaluate.association import match_observations, pair_agreement
+from graphslam.core.plugins import plugins
+from graphslam.evaluate.association import pair_agreement
 from graphslam.evaluate.metrics import Metrics
-from graphslam.io.catalog import load_recording
 from graphslam_frontends.base import FrontEnd
 
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 
-# log name -> (card that holds published identities, name of their reader)
-PUBLISHED = {"victoria-park": ("victoria-park-detections", "slsjf-observations")}
 
+def reference_identities(log: SensorLog, front: FrontEnd) -> Ints | None:
+    """Identity of every observation of a front end ``(q,)`` that it never saw; -1 = none; None = there is no reference.
 
-def reference_labels(log: SensorLog, observations: LandmarkObservations) -> Ints | None:
-    """Identity of every observation ``(q,)`` from the log itself or from published data; -1 = none; None = nowhere."""
+    From the log itself, or published for the log of that name (plug-ins ``graphslam.identities``).
+    """
+    seen = front.observations(log)
+    if seen is None:
+        return None
+    observations = seen[1]
     if observations.ids is not None and np.any(observations.ids >= 0):
         return observations.ids
-    if log.name not in PUBLISHED:
-        return None
-    card, reader = PUBLISHED[log.name]
+    published = plugins("graphslam.identities").get(log.name)
     try:
-        published: LandmarkObservations = load_recording(card, reader=reader)
+        return None if published is None else published.load()(observations)
     except GraphSlamError as error:
         logger.info("association is not audited: %s", error)
         return None
-    assert published.ids is not None
-    rows = match_observations(
-        np.repeat(observations.times, np.diff(observations.offsets)),
-        observations.ranges,
-        observations.bearings,
-        np.repeat(published.times, np.diff(published.offsets)),
-        published.ranges,
-        published.bearings,
-    )
-    return np.where(rows >= 0, published.ids[rows], -1)
-
-
-def reference_identities(log: SensorLog, front: FrontEnd) -> Ints | None:
-    """Identity of every observation of a front end ``(q,)``, by a reference that it never saw; None = nowhere."""
-    seen = front.observations(log)
-    return None if seen is None else reference_labels(log, seen[1])
 
 
 def audit_association(out: Metrics, reference: Ints, observation: Ints, landmark: Ints) -> None:

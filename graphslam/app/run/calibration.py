@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.source import load_log_source
-from graphslam.calibrate.calibrate import calibrate_streams
+from graphslam.calibrate.calibrate import CALIBRATIONS
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections
 from graphslam.calibrate.estimate import NAMES, SURE, Calibration, estimate_text
 from graphslam.calibrate.landmark_calibration import FULL, QUICK, CalibrationBudget, calibrate_sightings
@@ -22,23 +21,14 @@ from graphslam.core.config import merge_options
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.log import SensorLog
-from graphslam.core.records import LandmarkObservations, SteeringControls
+from graphslam.core.records import LandmarkObservations
 from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam_frontends.base import FrontEnd
-from graphslam_frontends.landmarks.config import RbpfEkfConfig, SensorBiasConfig
-from graphslam_frontends.landmarks.prepare import landmark_stream
 from graphslam_frontends.mixed import MixedFrontEnd
-from graphslam_frontends.odometry.motion import motion_stream
 
 LANDMARKS, SCANS = "rbpf-ekf", "segslam"
 """Front ends whose settings are used to read a log of landmarks, or of scans, where none is named."""
-STEERING = float(np.deg2rad(1.0))
-"""σ of what a steered vehicle turns too much beside its calibration [rad/m]: a degree of the wheel at 1 m wheelbase."""
-TYRES, SCALE = 0.01, 0.05
-"""σ of the logarithm of the distances by wheels whose metre is taken, and of ranges measured by radio."""
-UNSAID = 0.3
-"""σ of where a sensor stands whose place nobody stated [m]."""
 CERTAIN, DISAGREE = 0.999, 1.5
 """Submaps whose join has a χ² by degree of freedom above both limits disagree, and the cause is looked for."""
 OWN = "noise and calibration: preset of this data set — not estimated from the log."
@@ -56,24 +46,22 @@ def apply_calibration(
     own : bool
         Is there a preset for this very set?
     """
-    if isinstance(front, MixedFrontEnd):  # the motion is that of both; landmarks show its errors better
-        part = min(front.parts, key=lambda p: front_kind(p) != "sightings")
-        front, options = part, {"frontend": options.get("frontend", {}).get(part.name, {})}
+    if isinstance(front, MixedFrontEnd):
+        front = front.calibrated_part
+        options = {"frontend": options.get("frontend", {}).get(front.name, {})}
+    said, found = [], None
     if config.given is not None:  # what a user wrote down stands before what would be estimated
         said = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
-        return apply_corrections(log, config.given), config, said, None
-    if config.use == "none" or not can_calibrate(front):
-        return log, config, [], None
-    if config.use == "auto" and own:
-        return log, config, [Finding("", "calibrated", OWN)], None
-    effort = replace(QUICK, poses=max(int(QUICK.poses * config.budget), 100))
-    try:
-        found = calibrate_for_front_end(log, front, effort, seed=seed)
-        given = keep_user_settings(found.corrections, front, options)
-        return apply_corrections(log, given), replace(config, given=given), found.findings(), found
-    except GraphSlamError as error:
-        said = [Finding("", "calibrated", f"noise: default values — not estimated from the log: {error}.")]
-        return log, config, said, None
+    elif config.use == "auto" and own and front.calibrates:
+        said = [Finding("", "calibrated", OWN)]
+    elif config.use != "none" and front.calibrates:
+        effort = replace(QUICK, poses=max(int(QUICK.poses * config.budget), 100))
+        try:
+            found = calibrate_for_front_end(log, front, effort, seed=seed)
+            config, said = replace(config, given=keep_user_settings(found.corrections, options)), found.findings()
+        except GraphSlamError as error:
+            said = [Finding("", "calibrated", f"noise: default values — not estimated from the log: {error}.")]
+    return log if config.given is None else apply_corrections(log, config.given), config, said, found
 
 
 def calibrate_log(
@@ -151,72 +139,13 @@ def _without_front_noise(options: Mapping[str, Any]) -> dict[str, Any]:
     return front
 
 
-def can_calibrate(front: FrontEnd) -> bool:
-    """Does the front end read what can be calibrated: sightings of landmarks?"""
-    return front_kind(front) is not None
-
-
-def front_kind(front: FrontEnd) -> str | None:
-    """``sightings`` or ``scans``, whichever the front end reads."""
-    hints = typing.get_type_hints(type(front.config))
-    if {"noise", "association"} <= set(hints):
-        return "sightings"
-    return "scans" if "steps" in hints else None
-
-
 def calibrate_for_front_end(
     log: SensorLog, front: FrontEnd, effort: CalibrationBudget, *, seed: int = 0
 ) -> Calibration:
-    """What the log says of its noise, of the streams that the front end reads."""
-    kind = front_kind(front)
-    if kind is None:
+    """Estimate noise and systematic errors of the streams that a front end uses."""
+    if front.calibrates not in CALIBRATIONS:
         raise DataError(f"front end {front.name} has no data to calibrate", where=log.name)
-    return calibrate_streams(log, kind, effort, front.config, seed=seed)
-
-
-def configure_for_calibration(
-    front: FrontEnd, log: SensorLog, given: Corrections | None, found: Calibration | None, options: Mapping[str, Any]
-) -> FrontEnd:
-    """The front end with settings that go with noise which was estimated, where the user has not set them.
-
-    What a calibration leaves of constant errors, or took out wrongly, the graph estimates with the map.
-
-    The walks of a grid filter stand for errors of poor odometry that last. In space they would shake odometry by
-    lidar and IMU, which is better than they are; what scans say of it at several distances holds what lasts.
-    """
-    if isinstance(front, MixedFrontEnd):
-        own = options.get("frontend", {})
-        parts = [
-            configure_for_calibration(p, log, given, found, {"frontend": own.get(p.name, {})}) for p in front.parts
-        ]
-        return MixedFrontEnd(tuple(parts))
-    contradicted = found is not None and bool(found.contradictions())
-    config: Any = front.config
-    if given is not None and not contradicted and isinstance(config, RbpfEkfConfig):
-        unset = config.lasting is None and "lasting" not in options.get("frontend", {})
-        return type(front)(config=replace(config, lasting=sensor_bias_config(log, config))) if unset else front  # type: ignore[call-arg]
-    if found is None or found.kind != "clouds" or found.corrections.along_metre is None:
-        return front
-    own = options.get("frontend", {})
-    if "filter" not in typing.get_type_hints(type(front.config)) or "walk_scale" in own.get("filter", {}):
-        return front
-    return type(front)(config=replace(front.config, filter=replace(front.config.filter, walk_scale=0.0)))  # type: ignore[call-arg]
-
-
-def sensor_bias_config(log: SensorLog, config: RbpfEkfConfig) -> SensorBiasConfig:
-    """Which constant errors a log of landmarks may have.
-
-    A vehicle that steers turns too much by the metre, a robot with a gyro or two driven wheels by the second. Ranges
-    without bearings have no direction, but may have a scale; the metre is then the wheels', to what load and pressure
-    of tyres leave open.
-    """
-    steers = isinstance(motion_stream(log)[1], SteeringControls)
-    turn = {"yaw_bias": 0.0, "turn_per_metre": STEERING} if steers else {}
-    seen = landmark_stream(log, config.detector)[1]
-    blind = not np.any(seen.has_bearing)
-    ranges = {"distance_scale": TYRES, "range_scale": SCALE, "sensor_yaw": 0.0, "mount": 0.0} if blind else {}
-    place = {} if blind or np.any(seen.T_base_sensor[:2] != 0.0) else {"mount": UNSAID}
-    return SensorBiasConfig(**turn, **ranges, **place)
+    return CALIBRATIONS[front.calibrates](log, front.config, effort, seed)
 
 
 def explain_disagreement(
@@ -292,7 +221,7 @@ def _sigma_in_words(row: Mapping[str, Any]) -> str:
     return f"{s:.3f} m of the ranges" if name == "range_offset" else f"{100 * s:.2f} % of {NAMES[name]}"
 
 
-def keep_user_settings(c: Corrections, front: FrontEnd, options: Mapping[str, Any]) -> Corrections:
+def keep_user_settings(c: Corrections, options: Mapping[str, Any]) -> Corrections:
     """What of a calibration is used where the user has set noise by hand."""
     own = options.get("frontend", {})
     if "motion" in own:

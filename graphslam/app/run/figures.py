@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,22 +40,40 @@ def _as_solved(run: Run) -> list[Submap]:
     return out
 
 
-def save_figures(run: Run, folder: Path) -> list[Path]:
-    """Map, submap chain, and GPS residuals, innovations and loops where there are any, as PNG files."""
-    made = [save_figure(run.plot(), folder / "map.png")]
+def _submap_chain(run: Run) -> Any:
     submaps, bases = _as_solved(run), run.map.base_poses
     if run.map.dim == 3:
-        made.append(save_figure(run.plot(plane="xz"), folder / "side.png"))
         submaps, bases = [plan_submap(s) for s in submaps], plan_pose(bases)
-    chain = plot_submap_chain(None, submaps, bases, title=f"{run.name}: submaps at their solved poses")
-    made.append(save_figure(chain, folder / "submaps.png"))
-    if run.graph_path is not None:
-        ax = plot_before_after(None, run.graph_path, run.map.trajectory, truth=run.truth_path)
-        made.append(save_figure(ax, folder / "refined.png"))
-    if run.gps:
-        made.append(save_figure(plot_gps_residuals(None, dict(run.gps)), folder / "gps_residuals.png"))
-    if run.checks is not None and run.checks.gps is not None:
-        made.append(save_figure(plot_innovations(None, run.checks.gps), folder / "gps_innovations.png"))
-    if run.checks is not None and run.checks.loops is not None:
-        made.append(save_figure(plot_loop_matrix(None, run.checks.loops), folder / "loops.png"))
-    return made
+    return plot_submap_chain(None, submaps, bases, title=f"{run.name}: submaps at their solved poses")
+
+
+def _refined(run: Run) -> Any:
+    if run.graph_path is None:
+        return None
+    return plot_before_after(None, run.graph_path, run.map.trajectory, truth=run.truth_path)
+
+
+def _innovations(run: Run) -> Any:
+    return None if run.checks is None or run.checks.gps is None else plot_innovations(None, run.checks.gps)
+
+
+def _loops(run: Run) -> Any:
+    return None if run.checks is None or run.checks.loops is None else plot_loop_matrix(None, run.checks.loops)
+
+
+FIGURES: dict[str, Callable[[Run], Any]] = {
+    "map.png": lambda run: run.plot(),
+    "side.png": lambda run: run.plot(plane="xz") if run.map.dim == 3 else None,
+    "submaps.png": _submap_chain,
+    "refined.png": _refined,
+    "gps_residuals.png": lambda run: plot_gps_residuals(None, dict(run.gps)) if run.gps else None,
+    "gps_innovations.png": _innovations,
+    "loops.png": _loops,
+}
+"""Figures of a run by the name of their file: axes, or None where the run has nothing to draw."""
+
+
+def save_figures(run: Run, folder: Path) -> list[Path]:
+    """Every figure of :data:`FIGURES` for which the run has something to draw, as PNG files."""
+    drawn = ((name, draw(run)) for name, draw in FIGURES.items())
+    return [save_figure(ax, folder / name) for name, ax in drawn if ax is not None]

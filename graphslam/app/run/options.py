@@ -11,8 +11,6 @@ from typing import Any
 
 from graphslam.app.run.calibration import (
     apply_calibration,
-    can_calibrate,
-    configure_for_calibration,
     uses_preset_noise,
     without_noise,
 )
@@ -118,7 +116,7 @@ class RunOptions:
         options = merge_options(named_preset(frontend, asked.pop("preset", None)), asked)
         settings: RunConfig = build_config(RunConfig, options)
         front = make_front_end(frontend, settings.frontend)
-        if can_calibrate(front) and settings.calibrate.given is None and settings.calibrate.use == "auto":
+        if front.calibrates and settings.calibrate.given is None and settings.calibrate.use == "auto":
             settings = replace(settings, calibrate=replace(settings.calibrate, use="none"))
         return cls(settings, {"source": name, "frontend": frontend, "solver": solver, "seed": seed}, front, asked)
 
@@ -152,10 +150,16 @@ class RunOptions:
     def calibrated(self, log: SensorLog) -> tuple[SensorLog, RunOptions, list[StreamFinding]]:
         """The log with corrections, the options that go with it, and the report on them."""
         assert self.front is not None
-        asked, config = self.asked or {}, self.settings.calibrate
-        seed = self.named["seed"]
-        log, applied, said, found = apply_calibration(log, self.front, config, asked, own=self.own, seed=seed)
-        front = configure_for_calibration(self.front, log, applied.given, found, asked)
+        asked = self.asked or {}
+        log, applied, said, found = apply_calibration(
+            log, self.front, self.settings.calibrate, asked, own=self.own, seed=self.named["seed"]
+        )
+        front = self.front.with_calibration(
+            log,
+            asked.get("frontend", {}),
+            corrected=applied.given is not None and not (found and found.contradictions()),
+            drift=found is not None and found.kind == "clouds" and found.corrections.along_metre is not None,
+        )
         options = replace(self, settings=replace(self.settings, calibrate=applied), front=front)
         return log, options, [StreamFinding("", f) for f in said]
 

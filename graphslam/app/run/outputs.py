@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import filecmp
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -111,73 +111,110 @@ def write_outputs(folder: Path, run: Run) -> Run:
     """
     run = replace(run, folder=folder, report={**run.report, "generation": generation_id(run)})
     with new_generation(folder) as new:
-        _write_files(new, run)
-        before = new.before
-        if before is not None and _same_file(before / "map.npz", new.path / "map.npz"):
-            for pattern in _MADE_OF_MAP:
-                new.adopt(only=pattern)
-        add_report(new)  # made from the files, so they come first
+        for write in WRITERS:
+            write(new, run)
     return run
 
 
-def _write_files(new: FolderTransaction, run: Run) -> None:
-    m, root = run.map, new.path
-    mark = {"generation": run.report["generation"]}
-    write_tum(root / "trajectory.tum", m.trajectory)
-    write_tum(root / "nodes.tum", Trajectory(m.node_times, m.node_poses))
-    new.write_text("landmarks.csv", landmarks_csv(m))
-    write_npz(root / "map.npz", _map_arrays(m) | mark)
-    write_npz(root / "association.npz", _association_arrays(run.submaps) | mark)
-    if run.graph is not None:
-        write_g2o(root / "graph.g2o", to_network(run.graph))
-        JoinProblem.of_graph(run.graph).save(root / GRAPH)
-    if run.truth is not None:
-        write_truth(root, run.truth)
-    paths = {"truth": run.truth_path, "dead_reckoning": run.dead_reckoning, "trajectory_graph": run.graph_path}
+def _write_paths(new: FolderTransaction, run: Run) -> None:
+    """The solved path and what it is compared with; of two maps that contradict each other, the path of either.
+
+    The ledger of each of the two accepts the loops that only it holds.
+    """
+    m = run.map
+    paths = {"trajectory": m.trajectory, "nodes": Trajectory(m.node_times, m.node_poses), "truth": run.truth_path}
+    paths |= {"dead_reckoning": run.dead_reckoning, "trajectory_graph": run.graph_path}
     for name, path in paths.items():
         if path is not None:
-            write_tum(root / f"{name}.tum", path)
-    if run.two_maps is not None:
-        _write_two_maps(new, run)
-    if run.refined is not None:
-        store = SubmapStore(root / REFINED)
-        for s in run.refined.submaps:
-            store.append(s)
-    for name, r in run.gps.items():
-        arrays = {f.name: np.asarray(getattr(r, f.name)) for f in dataclasses.fields(r)}
-        write_npz(root / f"gps_{name}.npz", {"format": GPS_FORMAT, **arrays, **mark})
-    if run.fixes is not None:
-        g = run.fixes
-        arrays = {"times": g.times, "positions": g.positions, "sigma": g.sigma, "lever": g.lever}
-        write_npz(root / "fixes.npz", {"format": FIXES_FORMAT, **arrays, **mark})
-    if run.taken is not None:
-        try:
-            write_inputs(root, run.taken, mark["generation"])
-        except FormatError as error:
-            logger.warning(
-                "no loop closure of this run can be undone: the inputs of its graph are not stored (%s)", error
-            )
-    new.write_lines("events.jsonl", [{"event": GENERATION_EVENT, **mark}, *run.events])
-    if run.ledger is not None:
-        new.write_text("ledger.csv", run.ledger.to_csv(index=False))
-    new.write_json("metrics.json", metric_rows(run))
-    new.write_json("timings.json", timing_rows(run))
-    save_figures(run, new.figures)
-    if run.fused is not None:
-        write_run_map(new, run.fused, mark["generation"])
-        draw_run_map(run.fused, m.trajectory, new.figures, name=run.name, truth=run.truth_path)
-    new.write_json("run.json", {k: v for k, v in run.report.items() if k not in OF_THE_CLOCK})
-
-
-def _write_two_maps(new: FolderTransaction, run: Run) -> None:
-    """The path of either map, and its ledger: what was in dispute is accepted in one of them."""
-    assert run.two_maps is not None
+            write_tum(new.path / f"{name}.tum", path)
+    if run.truth is not None:
+        write_truth(new.path, run.truth)
+    if run.two_maps is None:
+        return
     current = ledger_of_events(run.events).current()
     for name, path, loops in zip(TWO_MAPS, run.two_maps, run.report["two_maps"]["loops"]):
         (new.path / name).parent.mkdir(exist_ok=True)
         write_tum(new.path / f"{name}.tum", path)
         inside = [replace(d, verdict="accepted") if d.loop in loops else d for d in current]
         new.write_text(f"{name}.csv", LoopLedger(inside).table().to_csv(index=False))
+
+
+def _write_map(new: FolderTransaction, run: Run) -> None:
+    new.write_text("landmarks.csv", landmarks_csv(run.map))
+    _write_marked(new, run, "map.npz", _map_arrays(run.map))
+    _write_marked(new, run, "association.npz", _association_arrays(run.submaps))
+
+
+def _write_graph(new: FolderTransaction, run: Run) -> None:
+    if run.graph is not None:
+        write_g2o(new.path / "graph.g2o", to_network(run.graph))
+        JoinProblem.of_graph(run.graph).save(new.path / GRAPH)
+
+
+def _write_refined(new: FolderTransaction, run: Run) -> None:
+    if run.refined is not None:
+        store = SubmapStore(new.path / REFINED)
+        for s in run.refined.submaps:
+            store.append(s)
+
+
+def _write_gps(new: FolderTransaction, run: Run) -> None:
+    for name, r in run.gps.items():
+        arrays = {f.name: np.asarray(getattr(r, f.name)) for f in dataclasses.fields(r)}
+        _write_marked(new, run, f"gps_{name}.npz", {"format": GPS_FORMAT, **arrays})
+    if run.fixes is not None:
+        g = run.fixes
+        arrays = {"times": g.times, "positions": g.positions, "sigma": g.sigma, "lever": g.lever}
+        _write_marked(new, run, "fixes.npz", {"format": FIXES_FORMAT, **arrays})
+
+
+def _write_inputs(new: FolderTransaction, run: Run) -> None:
+    if run.taken is None:
+        return
+    try:
+        write_inputs(new.path, run.taken, run.report["generation"])
+    except FormatError as error:
+        logger.warning("no loop closure of this run can be undone: the inputs of its graph are not stored (%s)", error)
+
+
+def _write_tables(new: FolderTransaction, run: Run) -> None:
+    new.write_lines("events.jsonl", [{"event": GENERATION_EVENT, "generation": run.report["generation"]}, *run.events])
+    if run.ledger is not None:
+        new.write_text("ledger.csv", run.ledger.to_csv(index=False))
+    new.write_json("metrics.json", metric_rows(run))
+    new.write_json("timings.json", timing_rows(run))
+    new.write_json("run.json", {k: v for k, v in run.report.items() if k not in OF_THE_CLOCK})
+
+
+def _write_figures(new: FolderTransaction, run: Run) -> None:
+    save_figures(run, new.figures)
+
+
+def _write_fused_map(new: FolderTransaction, run: Run) -> None:
+    if run.fused is not None:
+        write_run_map(new, run.fused, run.report["generation"])
+        draw_run_map(run.fused, run.map.trajectory, new.figures, name=run.name, truth=run.truth_path)
+
+
+def _write_report(new: FolderTransaction, run: Run) -> None:
+    """The page. It is made of the files; those that other verbs made of the same map are kept before."""
+    before = new.before
+    if before is not None and _same_file(before / "map.npz", new.path / "map.npz"):
+        for pattern in _MADE_OF_MAP:
+            new.adopt(only=pattern)
+    add_report(new)
+
+
+WRITERS: tuple[Callable[[FolderTransaction, Run], None], ...] = (
+    *(_write_paths, _write_map, _write_graph, _write_refined, _write_gps, _write_inputs, _write_tables),
+    *(_write_figures, _write_fused_map, _write_report),
+)
+"""What writes a part of a run folder each, in this order."""
+
+
+def _write_marked(new: FolderTransaction, run: Run, name: str, arrays: dict[str, Any]) -> None:
+    """Arrays with the id of the generation that they belong to."""
+    write_npz(new.path / name, {**arrays, "generation": run.report["generation"]})
 
 
 def metric_rows(run: Run) -> list[dict[str, Any]]:
@@ -193,11 +230,12 @@ def timing_rows(run: Run) -> list[dict[str, Any]]:
 
 def generation_id(run: Run) -> str:
     """Digest of what a run found: the same map, events and figures have the same id."""
+    parts: list[tuple[str, Any]] = sorted(_map_arrays(run.map).items())
+    parts += sorted(_association_arrays(run.submaps).items())
+    parts += [(n, json_lines(rows).encode()) for n, rows in (("events", run.events), ("metrics", metric_rows(run)))]
     d = Digest()
-    d.add_all(_map_arrays(run.map))
-    d.add_all(_association_arrays(run.submaps))
-    d.add("events", json_lines(run.events).encode())
-    d.add("metrics", json_lines(metric_rows(run)).encode())
+    for name, value in parts:
+        d.add(name, value)
     return d.text()
 
 

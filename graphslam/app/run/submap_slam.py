@@ -17,7 +17,7 @@ from graphslam.app.run.options import RunOptions
 from graphslam.app.run.run_bar import RunBar
 from graphslam.app.run.run_inputs import RunInputs, collect_inputs
 from graphslam.backend.back_end import BackEnd, Observer
-from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, beacons_of, compasses_of
+from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, optional_sensors
 from graphslam.core.geometry import Array
 from graphslam.core.heap import trim_heap
 from graphslam.core.log import DropCounter, SensorLog
@@ -62,8 +62,6 @@ class SubmapSlam:
         Told what goes on.
     folder : RunFolder, optional
         Where submaps are stored; those that are there already are not made again.
-    draw : int, optional
-        Which draw of random numbers it is; by default the first one, or that which the folder settled on.
     """
 
     def __init__(
@@ -72,27 +70,29 @@ class SubmapSlam:
         feed: RecordSource,
         observers: Sequence[Observer] = (),
         folder: RunFolder | None = None,
-        draw: int | None = None,
     ) -> None:
         self.options, self.feed, self.folder = options, feed, folder
-        self.back = self._back_end(options, observers)
-        self.drops = DropCounter()
         self.settled = None if folder is None else folder.settled()
         """What earlier draws of the folder came to, where that is decided."""
-        settled = 0 if self.settled is None else self.settled.draw
-        self.draw = settled if draw is None else draw
-        self._resumed, self._seconds, self._since, self._cost = 0, 0.0, 0.0, list[float]()
+        self._begin(0 if self.settled is None else self.settled.draw, observers)
+
+    def _begin(self, draw: int, observers: Sequence[Observer]) -> None:
+        """Begin with a draw of random numbers: the submaps of it that the folder holds are added, the rest follows."""
+        self.draw, self.drops = draw, DropCounter()
+        self.back = self._back_end(self.options, observers)
+        self._seconds, self._since, self._cost = 0.0, 0.0, list[float]()
         self.store = None
-        if folder is not None:
-            load = load_spilled if options.with_grids else None
-            self.store = folder.submaps_with(load, draw=None if self.draw == settled else self.draw)
+        if self.folder is not None:
+            load = load_spilled if self.options.with_grids else None
+            settled = 0 if self.settled is None else self.settled.draw
+            self.store = self.folder.submaps_with(load, draw=None if draw == settled else draw)
         self.submaps: list[Submap] = [] if self.store is None else self.store.complete_prefix()
-        if self.store is not None and options.front is not None:
+        if self.store is not None and self.options.front is not None:
             self.store.truncate(len(self.submaps))
         self._resumed = len(self.submaps)
         for s in self.submaps:
             self.back.add(s)
-        self._stream: Iterator[Submap | None] = iter(()) if options.front is None else self._follow()
+        self._stream: Iterator[Submap | None] = iter(()) if self.options.front is None else self._follow()
 
     def _follow(self) -> Iterator[Submap | None]:
         assert self.options.front is not None
@@ -110,10 +110,8 @@ class SubmapSlam:
         others = OtherSources(feed)
         back = BackEnd(settings.backend, options.solver, imu=imu, observers=observers, fixes=fixes, others=others)
         if feed.ended:  # compasses and beacons are given whole
-            for name, compass in compasses_of(feed.log, settings.compass).items():
-                back.add_compass(name, compass, settings.compass)
-            for name, ranges in beacons_of(feed.log, settings.beacons).items():
-                back.add_beacons(name, ranges, settings.beacons)
+            for name, readings, config in optional_sensors(feed.log, settings.compass, settings.beacons):
+                back.add_sensor(name, readings, config)
         return back
 
     def step(self) -> None:
@@ -160,7 +158,9 @@ class SubmapSlam:
         """The same log with the next draw of random numbers: all submaps made anew."""
         bars = self._bars()
         tell_stage(bars, "front end")
-        made = SubmapSlam(self.options, RecordSource(self.feed.log), bars, self.folder, self.draw + 1)
+        made = copy.copy(self)
+        made.feed = RecordSource(self.feed.log)
+        made._begin(self.draw + 1, bars)
         made.step()
         made.release_memory()
         return made

@@ -133,6 +133,7 @@ class RbpfSlam(FrontEnd):
 
     config: RbpfSlamConfig = field(default_factory=RbpfSlamConfig)
     name: ClassVar[str] = "rbpf-slam"
+    calibrates: ClassVar[str] = "sightings"
 
     def submaps(
         self,

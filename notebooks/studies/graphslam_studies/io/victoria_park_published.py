@@ -16,11 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, FormatError
-from graphslam.core.geometry import Array, vector_to_tangent_covariance
+from graphslam.core.geometry import Array, vector_to_tangent_covariance, wrap_angle
 from graphslam.core.log import DropCounter
 from graphslam.core.network import PoseNetwork
 from graphslam.core.reading import integer_mask
 from graphslam.core.records import LandmarkObservations
+from graphslam.io.catalog import load_recording
 from graphslam.io.clock import MAX_DROPPED, usable_records
 from graphslam_studies.evaluate.information import information_matrices
 from graphslam_studies.io.mat import read_mat
@@ -30,6 +31,8 @@ SLSJF_LANDMARK_OFFSET = 1_000_000
 """Added to feature ids in :func:`read_slsjf_network`, whose poses and landmarks share one space of ids."""
 _UFASTSLAM_SLOTS = 18  # columns of the padded tables
 _MAX_RANGE = 80.0
+SAME_RANGE, SAME_BEARING, SAME_TIME = 0.3, float(np.deg2rad(0.5)), 0.005
+"""Largest differences between two detections of one trunk in one scan [m, rad, s]."""
 
 
 def read_ufastslam_detections(
@@ -216,3 +219,35 @@ def _observations(
         field_of_view=(-np.pi / 2, np.pi / 2),
         T_base_sensor=np.array([*LASER_POSITION, 0.0]),
     )
+
+
+def published_identities(observations: LandmarkObservations) -> npt.NDArray[np.int64]:
+    """Identity in the input of I-SLSJF of every observation of a detector on this log ``(n,)``; -1 = none."""
+    published: LandmarkObservations = load_recording("victoria-park-detections", reader="slsjf-observations")
+    assert published.ids is not None
+    rows = match_observations(observations, published)
+    return np.where(rows >= 0, published.ids[rows], -1)
+
+
+def match_observations(observations: LandmarkObservations, reference: LandmarkObservations) -> npt.NDArray[np.int64]:
+    """Row of the reference for every observation ``(n,)``, -1 where there is none.
+
+    Within one scan the nearest pairs (each difference divided by its gate) are taken first, every row at most once.
+    """
+    times, reference_times = (np.repeat(z.times, np.diff(z.offsets)) for z in (observations, reference))
+    out = np.full(len(times), -1, dtype=np.int64)
+    lo = np.searchsorted(reference_times, times - SAME_TIME, "left")
+    span = np.searchsorted(reference_times, times + SAME_TIME, "right") - lo
+    i = np.repeat(np.arange(len(times)), span)
+    j = np.arange(span.sum()) - np.repeat(np.cumsum(span) - span, span) + np.repeat(lo, span)
+    dr = np.abs(observations.ranges[i] - reference.ranges[j]) / SAME_RANGE
+    db = np.abs(wrap_angle(observations.bearings[i] - reference.bearings[j])) / SAME_BEARING
+    ok = (dr <= 1) & (db <= 1)
+    i, j, cost = i[ok], j[ok], np.hypot(dr[ok], db[ok])
+    used: set[int] = set()
+    for k in np.argsort(cost, kind="stable"):
+        a, b = int(i[k]), int(j[k])
+        if out[a] < 0 and b not in used:
+            out[a] = b
+            used.add(b)
+    return out
