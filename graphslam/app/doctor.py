@@ -1,4 +1,4 @@
-"""Is this machine ready? Every package is imported for real, in a process of its own."""
+"""Is this machine ready? Every package is imported for real, in another process."""
 
 from __future__ import annotations
 
@@ -42,16 +42,17 @@ class InstallCheck:
 def examine_installation() -> list[InstallCheck]:
     """Python, packages, extras and what each buys, front ends, folders; "absent" is an optional part."""
     found = [InstallCheck("python", "ok", f"{platform.python_version()}, {os.cpu_count()} cores, {platform.system()}")]
-    for name, module in REQUIRED.items():
-        problem = _import_error(f"import {module}")
-        found.append(_finding(name, problem))
+    there = {name: all(find_spec(m) for m in e.modules) for name, e in EXTRAS.items()}
+    codes = {name: f"import {module}" for name, module in REQUIRED.items()}
+    for extra in (name for name, is_there in there.items() if is_there):
+        lines = [f"import_extra({module!r}, {extra!r})" for module in EXTRAS[extra].modules]
+        codes[f"extra {extra}"] = "\n".join(["from graphslam.core.extras import import_extra", *lines])
+    problems = dict(zip(codes, import_errors([*codes.values()])))
+    found += [_finding(name, problems[name]) for name in REQUIRED]
     for extra, e in EXTRAS.items():
-        code = "from graphslam.core.extras import import_extra\n"
-        code += "\n".join(f"import_extra({module!r}, {extra!r})" for module in e.modules)
-        there = all(find_spec(module) for module in e.modules)
-        problem = _import_error(code) if there else "not installed"
+        problem = problems.get(f"extra {extra}", "not installed")
         advice = f"{e.buys}: pip install 'graphslam-submaps[{extra}]' (about {e.size} MB)"
-        detail = e.buys if not problem else advice if not there else f"{problem} ({e.buys})"
+        detail = e.buys if not problem else advice if not there[extra] else f"{problem} ({e.buys})"
         found.append(InstallCheck(f"extra {extra}", "absent" if problem else "ok", detail))
     found += [*other_distributions(), *remains(site_packages())]
     names = front_end_names()
@@ -127,10 +128,30 @@ def _finding(name: str, problem: str) -> InstallCheck:
     )
 
 
-def _import_error(code: str) -> str:
-    """Last line of what an import says when it fails; a crash of the interpreter counts as well."""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
-    if done.returncode == 0:
-        return ""
-    lines = done.stderr.strip().splitlines()
-    return lines[-1] if lines else f"import ended the interpreter with code {done.returncode}"
+_TRIES = """
+import os, sys, traceback
+answers = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)
+for code in sys.argv[1:]:
+    said = ""
+    try:
+        exec(code)
+    except BaseException as error:
+        said = traceback.format_exception_only(error)[-1].strip().splitlines()[-1]
+    print(said, file=answers, flush=True)
+"""
+
+
+def import_errors(codes: list[str]) -> list[str]:
+    """Of each piece of code, run one after the other in one process, the last line of its error; empty without one.
+
+    A piece that ends the interpreter is an error as well; those after it are run by another process.
+    """
+    found: list[str] = []
+    while len(found) < len(codes):
+        command = [sys.executable, "-c", _TRIES, *codes[len(found) :]]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        found += done.stdout.splitlines()
+        if len(found) < len(codes):
+            found.append(f"import ended the interpreter with code {done.returncode}")
+    return found

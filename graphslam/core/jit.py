@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import hashlib
 import logging
 import multiprocessing
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -52,6 +54,7 @@ MOST_BYTES = 1_000_000_000
 """Largest size of the compiled code of all versions."""
 UNUSED_SECONDS = 30 * 86_400.0
 """Compiled code of another version of numba or Python is deleted when it has not been used for this long."""
+_IMPORTED = re.compile(r"^from (graphslam[\w.]*) import", re.MULTILINE)
 
 
 class _Compilations(event.Listener):
@@ -189,8 +192,32 @@ class _InMemory(caching.NullCache):
         _warn_not_kept(self.why)
 
 
+@cache
+def _digest_with_imports(file: str) -> str:
+    """SHA-256 of a source file and of all files of the package that it imports, directly or not.
+
+    Their functions and constants are compiled into its own, so code of an older state of any of them is of no use.
+    """
+    texts: dict[str, str] = {}
+    todo = [file]
+    while todo:
+        name = todo.pop()
+        texts[name] = Path(name).read_text(encoding="utf-8")
+        modules = {sys.modules.get(m) for m in _IMPORTED.findall(texts[name]) if m != __name__}
+        todo += {str(m.__file__) for m in modules if m} - texts.keys()
+    return hashlib.sha256("\0".join(sorted(texts.values())).encode()).hexdigest()[:40]
+
+
+class _BySource(caching.UserProvidedCacheLocator):
+    """Compiled code under a digest of its source: copies of the package, wherever they are, have it in common."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        super().__init__(function, file)
+        self._cache_path = str(compiled_folder() / f"{function.__module__}-{_digest_with_imports(file)}")
+
+
 class _ChosenFolder(caching.CompileResultCacheImpl):
-    _locator_classes: list[type[object]] = [caching.UserProvidedCacheLocator]  # noqa: RUF012 - never beside the source
+    _locator_classes: list[type[object]] = [_BySource]  # noqa: RUF012 - never beside the source
 
 
 class _OnDisk(caching.FunctionCache):

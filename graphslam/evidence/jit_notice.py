@@ -21,17 +21,11 @@ _state = {"checked": False}
 
 
 def is_compiled(kernel: Any) -> bool:
-    """Whether compiled code of a kernel lies on disk that is not older than its source; true also where nothing is
-    compiled, or no compiled code can be kept.
-    """
+    """Whether compiled code of a kernel lies on disk; true also where nothing is compiled, or none can be kept."""
     if not hasattr(kernel, "stats") or kernel.stats.cache_path is None:  # NUMBA_DISABLE_JIT; see graphslam.core.jit
         return True
     source = Path(inspect.getsourcefile(kernel.py_func) or "")
-    found = Path(kernel.stats.cache_path).glob(f"{source.stem}.{kernel.py_func.__name__}-*.nbi")
-    try:
-        return max((f.stat().st_mtime for f in found), default=0.0) >= source.stat().st_mtime
-    except OSError:  # another process is replacing them
-        return True
+    return any(Path(kernel.stats.cache_path).glob(f"{source.stem}.{kernel.py_func.__name__}-*.nbi"))
 
 
 def announce_compilation() -> None:

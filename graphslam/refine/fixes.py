@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
 
 from graphslam.core import se3
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
@@ -237,7 +237,7 @@ class FixModel:
         w = np.einsum("kij,kj->ki", self.whiteners, e)
         d2 = np.sum(w**2, axis=1)
         # a wild fix says nothing of how the others follow each other
-        limit = chi2.ppf(RARE, self.group.dim)
+        limit = chi2_quantile(RARE, self.group.dim)
         w = w / np.sqrt(np.maximum(d2 / limit, 1.0))[:, None]
         near = d2 <= limit if np.any(d2 <= limit) else np.ones(len(d2), bool)
         T = np.array(states[-2], dtype=np.float64)
@@ -245,7 +245,7 @@ class FixModel:
         return FixReport(
             len(self.k),
             self.left,
-            float(np.median(d2) / chi2.ppf(0.5, self.group.dim)),
+            float(np.median(d2) / chi2_quantile(0.5, self.group.dim)),
             int(np.count_nonzero(d2 > limit)),
             float(np.sum(w[1:] * w[:-1]) / max(np.sum(w**2), 1e-12)),
             float(np.sqrt(np.mean(np.sum(e[near] ** 2, axis=1)))),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from graphslam.core.geometry import Array
 from graphslam.skeleton import correspondence_kernels, landmark_kernels
@@ -68,7 +68,7 @@ def split_false_correspondences(network: Network, false_alarm: float = 1e-10, ga
     scale = max(1.0, float(np.median(value / freedom)))
     kinds, which = np.unique(freedom, return_inverse=True)
     ratio, worst = np.zeros(L), np.zeros(L)
-    ratio[several] = value / (scale * chi2.isf(false_alarm, kinds)[which])
+    ratio[several] = value / (scale * chdtri(kinds, false_alarm)[which])
     ratio[ratio < 1.0] = 0.0
     if not ratio.any():
         return problem.landmark, 0

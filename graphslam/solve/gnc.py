@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from graphslam.core.errors import ConfigError, IndeterminateError
 from graphslam.core.geometry import Array
@@ -109,7 +109,7 @@ def find_outliers(
         return []
     plain = [replace(r, robust=NO_KERNEL) if d and hasattr(r, "robust") else r for r, d in zip(records, doubtful)]
     flat, values = FactorArrays(plain, graph.values.layout()), graph.values
-    limit = chi2.ppf(cfg.confidence, [r.rows for r in records])
+    limit = 2.0 * gammaincinv(0.5 * np.array([r.rows for r in records]), cfg.confidence)
     w = np.ones(len(records))
     d2 = flat.evaluate(values, hessian=False).chi2
     worst = float(np.max(d2[doubtful] / limit[doubtful]))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from graphslam.app import doctor
 
@@ -40,19 +39,33 @@ def test_what_an_old_install_left_is_found(tmp_path: Path) -> None:
     assert f"rm -r {tmp_path / 'graphslam'}" in finding.detail
 
 
-def command(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"XDG_CACHE_HOME": str(home)}
-    return subprocess.run([sys.executable, "-m", "graphslam", *arguments], capture_output=True, text=True, env=env)
+def test_what_fails_is_said_and_what_comes_after_it_is_tried() -> None:
+    codes = ["import json", "print('noise'); import no_such_module", "import os; os._exit(7)", "raise SystemExit", ""]
+    assert doctor.import_errors(codes) == [
+        "",
+        "ModuleNotFoundError: No module named 'no_such_module'",
+        "import ended the interpreter with code 7",
+        "SystemExit",
+        "",
+    ]
 
 
-def test_compiled_code_is_shown_and_cleared(tmp_path: Path) -> None:
+def test_compiled_code_is_shown_and_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Packages are not imported for it."""
+    from graphslam.app.cli import app
+    from graphslam.core import jit
+
+    monkeypatch.setattr(doctor, "import_errors", lambda codes: [""] * len(codes))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     file = tmp_path / "graphslam" / "compiled" / "numba-0-python-3" / "core_1" / "f.1.nbc"
     file.parent.mkdir(parents=True)
     file.write_bytes(bytes(3_000_000))
+    jit.unwritable.cache_clear()
 
     def line(*options: str) -> str:
-        done = command(tmp_path, "doctor", "--json", *options)
-        assert done.returncode == 0, done.stderr
+        done = CliRunner().invoke(app, ["doctor", "--json", *options])
+        assert done.exit_code == 0, done.output
         (row,) = [c for c in json.loads(done.stdout)["checks"] if c["check"] == "compiled code"]
         return row["detail"]
 

@@ -64,6 +64,38 @@ def test_code_is_compiled_once_and_kept_below_the_users_cache_folder(tmp_path: P
     assert not (tmp_path / "__pycache__").exists()
 
 
+def test_copies_of_a_module_have_their_code_in_common(tmp_path: Path) -> None:
+    for name, hits in (("one", 0), ("two", 1)):
+        (tmp_path / name).mkdir()
+        home = {"XDG_CACHE_HOME": str(tmp_path / "home")}
+        assert compile_kernel(tmp_path / name, **home) == (f"4 4.5 {hits} 2", "")
+
+
+def test_code_that_calls_what_has_changed_is_compiled_again(tmp_path: Path) -> None:
+    """The called function, and a constant that it takes from a third file, are compiled into the code of the caller."""
+    package = tmp_path / "graphslam_other"
+    package.mkdir()
+    callee = "from graphslam.core.jit import njit\nfrom graphslam_other.constant import C\n\n\n@njit\ndef plus(x):\n"
+    (tmp_path / "caller.py").write_text(
+        "from graphslam.core.jit import njit\nfrom graphslam_other.callee import plus\n\n\n"
+        "@njit\ndef twice(x):\n    return 2 * plus(x)\n\n\nprint(twice(1), len(twice.stats.cache_hits))\n"
+    )
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"XDG_CACHE_HOME": str(tmp_path / "home")}
+
+    def said(constant: int, body: str) -> str:
+        (package / "constant.py").write_text(f"C = {constant}\n")
+        (package / "callee.py").write_text(f"{callee}    return {body}\n")
+        done = subprocess.run(
+            [sys.executable, "-B", "caller.py"], cwd=tmp_path, env=env, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    assert [said(1, "x + C"), said(1, "x + C"), said(1, "x + 2 * C"), said(55, "x + 2 * C"), said(1, "x + C")] == [
+        "4 0", "4 1", "6 0", "222 0", "4 1",
+    ]  # fmt: skip
+
+
 def test_the_folder_that_numba_is_given_wins(tmp_path: Path) -> None:
     assert compile_kernel(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "chosen")) == ("4 4.5 0 2", "")
     assert not (tmp_path / "home").exists()

@@ -68,24 +68,16 @@ def test_nothing_is_said_where_the_kernels_are_compiled(capfd: pytest.CaptureFix
     assert capfd.readouterr().err == ""
 
 
-def test_code_older_than_its_source_is_compiled_again_and_announced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source, code = tmp_path / "mark_kernels.py", tmp_path / "cache" / "mark_kernels.mark_grids-1.nbi"
-    code.parent.mkdir()
-    for file, seconds in ((source, 100), (code, 200)):
-        file.touch()
-        os.utime(file, (seconds, seconds))
-
+def test_code_that_is_not_there_is_compiled_and_announced_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def mark_grids() -> None: ...
 
-    kernel = SimpleNamespace(py_func=mark_grids, stats=SimpleNamespace(cache_path=str(code.parent)))
+    kernel = SimpleNamespace(py_func=mark_grids, stats=SimpleNamespace(cache_path=str(tmp_path)))
     started: list[str] = []
     monkeypatch.setattr(jit_notice, "mark_grids", kernel)
     monkeypatch.setattr(jit_notice, "start_compiling", lambda part, start: started.append(part))
-    monkeypatch.setattr(jit_notice.inspect, "getsourcefile", lambda function: str(source))
-    for seconds, wanted in ((100, []), (300, ["all"])):
-        os.utime(source, (seconds, seconds))
+    monkeypatch.setattr(jit_notice.inspect, "getsourcefile", lambda function: "mark_kernels.py")
+    for name, wanted in (("other_kernels.mark_grids-1.nbi", ["all"]), ("mark_kernels.mark_grids-1.nbi", ["all"])):
+        (tmp_path / name).touch()
         jit_notice._state["checked"] = False
         GridPool()
         GridPool()
