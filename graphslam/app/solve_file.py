@@ -24,10 +24,8 @@ def solve_network_file(
     *,
     noise: Noise = "auto",
     create_missing: bool = False,
-    max_size: int | None = None,
     starts: str | Sequence[str] | None = None,
     certificate: bool = False,
-    progress: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
     """Solve a g2o, TORO or iSAM file.
@@ -46,8 +44,6 @@ def solve_network_file(
         Meaning of TORO/iSAM noise columns.
     create_missing : bool
         Make vertices that only edges name, instead of refusing the file.
-    max_size : int, optional
-        Bytes of the file that are read at most, after decompression; default 2 GB.
     starts : "all", name or sequence of names, optional
         Where the descent begins; several on doubt only if not given
         (:func:`graphslam.solve.network.solve.solve_network`).
@@ -63,8 +59,8 @@ def solve_network_file(
         Ready for JSON. ``objective`` is ``Σ rᵀ Ω r`` without ½ and with GTSAM's residual; ``objective_g2o`` is the
         same answer under g2o's residual.
     """
-    network = read_network(path, noise=noise, repair=repair, create_missing=create_missing, max_size=max_size)
-    solution = solve_network(network, solver, starts=starts, certificate=certificate, progress=progress, **options)
+    network = read_network(path, noise=noise, repair=repair, create_missing=create_missing)
+    solution = solve_network(network, solver, starts=starts, certificate=certificate, **options)
     if out is not None:
         write_g2o(out, solution.to_network())
     report = solution_json(solution)

@@ -18,8 +18,7 @@ def study(
     out: str | Path | None = None,
     worlds: Sequence[str] | None = None,
     seed: int = 0,
-    workers: int | None = None,
-    cluster: str | None = None,
+    workers: int | str | None = None,
     quick: bool = False,
     progress: bool = True,
 ) -> Any:
@@ -37,10 +36,8 @@ def study(
         Some of the study's worlds; default all.
     seed : int
         Root of the seed tree. Trial k has the same seed in every world, so worlds of one layout share it.
-    workers : int, optional
-        Processes; default none, the trials run here.
-    cluster : str, optional
-        Address of a Dask scheduler, instead of processes.
+    workers : int or str, optional
+        Processes, or the address of a Dask scheduler; default none, the trials run here.
     quick : bool
         The study's small version.
     progress : bool
@@ -73,7 +70,6 @@ def study(
         worlds=worlds,
         seed=seed,
         workers=workers,
-        cluster=cluster,
         quick=quick,
         progress=progress,
     )

@@ -18,6 +18,7 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
 from graphslam.loops.graph_loops import GraphRelativePoses
@@ -113,15 +114,13 @@ def _inverse(information: Array) -> Array:
     return 0.5 * (P + P.T)
 
 
-def add_session(graph: FactorGraph, session: DenseSession, start: Array | None = None, *, use_gps: bool = True) -> int:
-    """Add the chain of a session and its own ties to a graph; where it hangs is another matter.
+def add_session(graph: FactorGraph, session: DenseSession, start: Array | None = None) -> int:
+    """Add the chain of a session, its own ties and its fixes to a graph; where it hangs is another matter.
 
     Parameters
     ----------
     start : (7,) or (3,), optional
         Where it is thought to begin; None for the first session, which begins at the origin.
-    use_gps : bool
-        With its fixes, if it has any.
 
     Returns
     -------
@@ -139,10 +138,10 @@ def add_session(graph: FactorGraph, session: DenseSession, start: Array | None =
         )
     for t in session.inner:
         graph.add_between(
-            node + t.i, node + t.j, t.T_ij, t.covariance, streams=[f"{session.name}/scan"], evidence="shared-scan",
-            robust=t.robust, group="match",
+            node + t.i, node + t.j, t.T_ij, t.covariance, robust=t.robust, group="match",
+            evidence=EvidenceUse([f"{session.name}/scan"], (0.0, 0.0), "shared-scan"),
         )  # fmt: skip
-    if use_gps and session.fixes is not None:
+    if session.fixes is not None:
         graph.add_sensor(session.fixes, config=session.gps)
         graph.finish_sensors()
     return node
@@ -183,12 +182,11 @@ def connect_session(
     known_node: int,
     new: DenseSession,
     *,
-    config: InterSessionConfig | None = None,
     found: tuple[TwoSessions, InterSessionLoops] | None = None,
-    use_gps: bool = True,
+    config: InterSessionConfig | None = None,
     progress: bool = False,
 ) -> ConnectedSession:
-    """Tie a session to one that is in the graph, and solve.
+    """Tie a session to one that is in the graph, and solve; with its fixes, if it has any.
 
     First by places that look alike and agree; then, when it is known where it lies, by places that are near each other,
     each of which the graph has to expect.
@@ -203,8 +201,6 @@ def connect_session(
         Node of its first base.
     found : (TwoSessions, Ties), optional
         What was found already.
-    use_gps : bool
-        With the new session's fixes, if it has any.
     """
     c = InterSessionConfig() if config is None else config
     if found is None:
@@ -214,7 +210,7 @@ def connect_session(
     if ties.why:
         raise DataError(f"no tie to {known.name}: {ties.why}", where=new.name)
     start = session_start(ties.chosen, graph.values.poses[known_node:], new.chain)
-    node = add_session(graph, new, start, use_gps=use_gps)
+    node = add_session(graph, new, start)
     apart = two.thinned(ties.chosen, CandidateConfig().stretch)
     here = [replace(x, i=known_node + x.i, j=node + x.j) for x in apart]
     factors = {_add(graph, x, known, new): x for x in here}
@@ -278,7 +274,8 @@ def connect_by_gps(
 
 def _add(graph: FactorGraph, x: Loop, known: DenseSession, new: DenseSession) -> int:
     return graph.add_between(
-        x.i, x.j, x.T_ij, x.covariance, streams=[f"{known.name}/scan", f"{new.name}/scan"], evidence="shared-scan",
+        x.i, x.j, x.T_ij, x.covariance,
+        evidence=EvidenceUse([f"{known.name}/scan", f"{new.name}/scan"], (0.0, 0.0), "shared-scan"),
         robust=RobustKernel("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
     )  # fmt: skip
 

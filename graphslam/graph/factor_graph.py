@@ -48,7 +48,7 @@ from graphslam.graph.factors.range import RangeRecord
 from graphslam.graph.factors.sensor_biases import SIZE, SensorBiasRecord, bias_variable_names, sensor_biases_at
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.inner_nodes import cut_submap
-from graphslam.graph.ledger import EXCLUSIVE
+from graphslam.graph.ledger import EXCLUSIVE, EvidenceUse
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, covariance_whiteners, whitener
 from graphslam.graph.sensors import kind_of
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
@@ -320,9 +320,8 @@ class FactorGraph(FactorGraphState):
 
     def _level(self, node: int, sigma: float, time: float) -> int:
         """A base that was levelled: a declared exception of the ledger, see :meth:`FactorGraph.add_submap`."""
-        return self.add_attitude(
-            node, DOWN, sigma, streams=["gravity"], interval=(time, time), evidence=LEVELLED, group=LEVELLED
-        )
+        used = EvidenceUse(["gravity"], (time, time), LEVELLED)
+        return self.add_attitude(node, DOWN, sigma, evidence=used, group=LEVELLED)
 
     def _append(
         self, submap: Submap, records: Sequence[FactorRecord], times: Array, T_base_node: Array, *covariances: Array
@@ -392,9 +391,7 @@ class FactorGraph(FactorGraphState):
         direction: ArrayLike,
         sigma: float,
         *,
-        streams: Iterable[str] = (),
-        interval: tuple[float, float] | None = None,
-        evidence: str = EXCLUSIVE,
+        evidence: EvidenceUse | str = EXCLUSIVE,
         robust: RobustKernel = NO_KERNEL,
         group: str = "attitude",
     ) -> int:
@@ -410,10 +407,8 @@ class FactorGraph(FactorGraphState):
             Of gravity (down) in the node's frame; any length but zero. ``(0, 0, -1)`` if the node is level.
         sigma : float
             Standard deviation of roll and of pitch [rad].
-        streams, interval
-            Streams and interval that it uses; an exclusive measurement needs both.
-        evidence : str
-            ``"measurement"``, or a kind declared in the ledger.
+        evidence : EvidenceUse or str
+            What it uses of the log, or a kind declared in the ledger.
         robust : RobustKernel
         group : str
             Class under which :meth:`objective` reports it.
@@ -441,14 +436,11 @@ class FactorGraph(FactorGraphState):
             raise GeometryError(f"direction of gravity at x{node} is not usable", got=direction, wanted="three numbers")
         if not (np.isfinite(sigma) and sigma > 0):
             raise ConfigError(f"attitude of x{node} needs a positive sigma, got {sigma}")
-        names = list(streams)
-        if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"attitude of x{node} must name the streams and the interval that it uses")
         record = AttitudeRecord(self.next_factor(), node, d / length, np.eye(2) / sigma, robust, group)
-        self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
+        kind = self.ledger.enter(record.factor_id, record.label(), evidence)
         self.start_tilt()
         self.insert(record)
-        self._event("attitude", factor_id=record.factor_id, node=node, sigma=sigma, evidence=evidence, group=group)
+        self._event("attitude", factor_id=record.factor_id, node=node, sigma=sigma, evidence=kind, group=group)
         return record.factor_id
 
     def add_range(
@@ -460,31 +452,19 @@ class FactorGraph(FactorGraphState):
         *,
         arm_i: ArrayLike | None = None,
         arm_j: ArrayLike | None = None,
-        streams: Iterable[str] = (),
-        interval: tuple[float, float] | None = None,
-        evidence: str = EXCLUSIVE,
-        robust: RobustKernel = NO_KERNEL,
+        evidence: EvidenceUse | str = EXCLUSIVE,
     ) -> int:
-        """A distance between two nodes, antennas ``(dim,)`` in their frames [m].
-
-        Parameters
-        ----------
-        streams, interval
-            Streams and interval that it uses; an exclusive measurement needs both.
-        """
+        """A distance between two nodes, antennas ``(dim,)`` in their frames [m]; ``evidence`` as in `add_between`."""
         last = self.structure.count("x") - 1
         if i == j or not (0 <= i <= last and 0 <= j <= last):
             raise DataError("a distance joins nodes that are not there", got=(i, j), wanted=f"two of x0 … x{last}")
         if not (np.isfinite(distance) and distance >= 0 and np.isfinite(sigma) and sigma > 0):
             raise DataError(f"distance x{i} – x{j} is not usable", got=(distance, sigma), wanted="≥ 0 m, sigma > 0 m")
-        names = list(streams)
-        if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"distance x{i} – x{j} must name the streams and the interval that it uses")
         arms = [np.zeros(self.dim) if a is None else np.asarray(a, dtype=np.float64) for a in (arm_i, arm_j)]
-        record = RangeRecord(self.next_factor(), i, j, arms[0], arms[1], float(distance), float(sigma), robust)
-        self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
+        record = RangeRecord(self.next_factor(), i, j, arms[0], arms[1], float(distance), float(sigma))
+        kind = self.ledger.enter(record.factor_id, record.label(), evidence)
         self.insert(record)
-        self._event("range", factor_id=record.factor_id, i=i, j=j, evidence=evidence)
+        self._event("range", factor_id=record.factor_id, i=i, j=j, evidence=kind)
         return record.factor_id
 
     def start_session(self, T_world_base: ArrayLike) -> int:
@@ -518,9 +498,7 @@ class FactorGraph(FactorGraphState):
         T_ij: ArrayLike,
         covariance: ArrayLike,
         *,
-        streams: Iterable[str] = (),
-        interval: tuple[float, float] | None = None,
-        evidence: str = EXCLUSIVE,
+        evidence: EvidenceUse | str = EXCLUSIVE,
         robust: RobustKernel = NO_KERNEL,
         group: str = "between",
     ) -> int:
@@ -528,10 +506,8 @@ class FactorGraph(FactorGraphState):
 
         Parameters
         ----------
-        streams, interval
-            Streams and interval that it uses; an exclusive measurement needs both.
-        evidence : str
-            ``"measurement"``, or a kind declared in the ledger (``"shared-scan"``).
+        evidence : EvidenceUse or str
+            What it uses of the log, or a kind declared in the ledger (``"shared-scan"``).
         robust : RobustKernel
         group : str
             Class under which :meth:`objective` reports it.
@@ -540,14 +516,11 @@ class FactorGraph(FactorGraphState):
         if i == j or not (0 <= i <= last and 0 <= j <= last):
             raise DataError("between-factor joins nodes that are not there", got=(i, j), wanted=f"two of x0 … x{last}")
         T = self._pose(T_ij, f"relative pose x{i} → x{j}")
-        names = list(streams)
-        if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"between-factor x{i} → x{j} must name the streams and the interval that it uses")
         W = whitener(covariance, what=f"covariance of x{i} → x{j}", dim=self.structure.group.dof)
         record = BetweenRecord(self._next_factor, i, j, T, W, robust, group)
-        self.ledger.spend(record.factor_id, record.label(), names or ["-"], interval or (0.0, 0.0), evidence)
+        kind = self.ledger.enter(record.factor_id, record.label(), evidence)
         self.insert(record)
-        self._event("between", factor_id=record.factor_id, i=i, j=j, evidence=evidence, group=group)
+        self._event("between", factor_id=record.factor_id, i=i, j=j, evidence=kind, group=group)
         return record.factor_id
 
     def add_betweens(
@@ -557,9 +530,7 @@ class FactorGraph(FactorGraphState):
         covariance: ArrayLike,
         *,
         poses: ArrayLike | None = None,
-        streams: Iterable[str] = (),
-        interval: tuple[float, float] | None = None,
-        evidence: str = EXCLUSIVE,
+        evidence: EvidenceUse | str = EXCLUSIVE,
         group: str = "between",
     ) -> range:
         """Many relative poses in one call, without an object for each: a million of them in seconds.
@@ -573,7 +544,7 @@ class FactorGraph(FactorGraphState):
             In the right tangent; one for each, or one that all share.
         poses : (k, 3|7), optional
             ``T_world_node`` of new nodes behind those that are there.
-        streams, interval, evidence, group
+        evidence, group
             Of all of them together (:meth:`add_between`).
 
         Returns
@@ -586,7 +557,7 @@ class FactorGraph(FactorGraphState):
         DataError, GeometryError, CovarianceError, ConfigError, EvidenceReusedError
             Nothing is changed then.
         """
-        e, names = np.asarray(ends, dtype=np.int64).reshape(-1, 2), list(streams)
+        e = np.asarray(ends, dtype=np.int64).reshape(-1, 2)
         T = self._poses(T_ij, "relative pose")
         new = self._poses(np.zeros((0, self.structure.group.size)) if poses is None else poses, "pose of a new node")
         last = self.structure.count("x") + len(new) - 1
@@ -599,17 +570,15 @@ class FactorGraph(FactorGraphState):
             )
         if len(T) != len(e):
             raise DataError("relative poses do not fit their ends", got=len(T), wanted=len(e))
-        if evidence == EXCLUSIVE and (not names or interval is None):
-            raise ConfigError(f"{len(e)} between-factors must name the streams and the interval that they use")
         W = covariance_whiteners(covariance, len(e), self.structure.group.dof, what="between-factor")
         first, label = self._next_factor, f"{len(e)} × {group}"
-        self.ledger.spend(first, label, names or ["-"], interval or (0.0, 0.0), evidence)
+        kind = self.ledger.enter(first, label, evidence)
         # from here on nothing fails
         self.structure.append("x", new)
         self.records.add_block(BetweenBlock(first, e.copy(), T, W, group, np.ones(len(e), dtype=np.bool_)))
         self._next_factor += len(e)
         self.revision += 1
-        self._event("betweens", factor_id=first, count=len(e), nodes=len(new), evidence=evidence, group=group)
+        self._event("betweens", factor_id=first, count=len(e), nodes=len(new), evidence=kind, group=group)
         return range(first, first + len(e))
 
     def _poses(self, T: ArrayLike, what: str) -> Array:
@@ -639,17 +608,8 @@ class FactorGraph(FactorGraphState):
         """
         here, target = self.node_of(submap_key), self.submap(match.target)
         node, T, P = self._into(target, self._pose(match.T_target_here, "match"), np.asarray(match.covariance))
-        fid = self.add_between(
-            node,
-            here,
-            T,
-            P,
-            streams=["match"],
-            interval=self.submap(submap_key).interval,
-            evidence="shared-scan",
-            robust=robust,
-            group="match",
-        )
+        used = EvidenceUse(["match"], self.submap(submap_key).interval, "shared-scan")
+        fid = self.add_between(node, here, T, P, evidence=used, robust=robust, group="match")
         self.events[-1] |= {
             "submap": submap_key,
             "target": match.target,

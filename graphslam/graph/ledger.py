@@ -9,7 +9,7 @@ instant (``t_start == t_end``) belongs to the interval that starts there.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,25 @@ DECLARED = {
     "aid": "used for initial guesses of matches and for deskewing only; in no covariance of the path",
     "start": "initial guess of the refinement; in no factor of the refined path",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceUse:
+    """What a factor uses of the log.
+
+    Parameters
+    ----------
+    streams : sequence of str
+        Names of streams.
+    interval : (float, float)
+        Of time, ``[t_start, t_end)`` [s].
+    kind : str
+        ``"measurement"``, which nothing else may use, or a kind declared in the ledger (``"shared-scan"``).
+    """
+
+    streams: Sequence[str]
+    interval: tuple[float, float]
+    kind: str = EXCLUSIVE
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -121,6 +140,21 @@ second time: submap 0 spent it over [0.000, 10.000) s
             if kind == EXCLUSIVE:
                 insort(self._exclusive.setdefault(stream, []), e)
             self._by_factor.setdefault(factor_id, []).append(e)
+
+    def enter(self, factor_id: int, factor: str, evidence: EvidenceUse | str) -> str:
+        """Enter what one factor uses, or a declared kind without streams; returns the kind.
+
+        Raises
+        ------
+        ConfigError
+            A measurement without streams.
+        DataError, EvidenceReusedError
+        """
+        use = EvidenceUse((), (0.0, 0.0), evidence) if isinstance(evidence, str) else evidence
+        if use.kind == EXCLUSIVE and not use.streams:
+            raise ConfigError(f"{factor} must name the streams and the interval that it uses")
+        self.spend(factor_id, factor, use.streams or ["-"], use.interval, use.kind)
+        return use.kind
 
     def release(self, factor_id: int) -> None:
         """Take a factor's spendings back (the factor was removed)."""

@@ -18,7 +18,7 @@ not dropped: the nearest stamps that rise (isotonic regression), if none has to 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +29,10 @@ from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDa
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_inverse
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.reading import finite_mask, read_text
-from graphslam.core.records import LaserScans, Odometry, Stream
+from graphslam.core.records import LaserScans, Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import MAX_DROPPED
+from graphslam.io.odometry_noise import DEFAULT_NOISE, OdometryNoise
 from graphslam.io.planar_scans import unify_layout
 from graphslam.io.recognise import CARMEN_SCANS
 from graphslam.io.source_probe import SourceProbe
@@ -56,12 +57,8 @@ def read_carmen(
     *,
     max_range: float | None = None,
     laser: str | None = None,
-    floor: tuple[float, float] = (0.01, 0.005),
-    per_metre: tuple[float, float] = (0.1, 0.15),
-    per_radian: float = 0.2,
+    noise: OdometryNoise = DEFAULT_NOISE,
     most_mended: float = 3.0,
-    name: str | None = None,
-    drops: DropCounter | None = None,
 ) -> SensorLog:
     """Read a CARMEN log, and the corrected one beside it.
 
@@ -75,13 +72,8 @@ def read_carmen(
         81.8 m and more.
     laser : str, optional
         Lines that are read, for instance ``ROBOTLASER1``; by default those of the tag that occurs most.
-    floor : (float, float)
-        σ that one motion of the odometry has at least: metres, radians. The logs state none; with the defaults motions
-        of a metre differ from those of corrected logs about as stated (median).
-    per_metre : (float, float)
-        σ per metre driven: of position [m/m] and heading [rad/m].
-    per_radian : float
-        σ of the heading per radian turned.
+    noise : OdometryNoise
+        Of the odometry; the logs state none.
     most_mended : float
         Farthest that a stamp may be moved [s].
 
@@ -91,11 +83,9 @@ def read_carmen(
         Streams ``laser``, ``odometry`` (one motion a scan; none if the log tells no pose) and, with a corrected log,
         ``reference``: a Trajectory of the base. It is the output of another SLAM, not truth.
     """
-    for what, values in (("max_range", [max_range or 1.0]), ("floor", floor), ("most_mended", [most_mended])):
+    for what, values in (("max_range", [max_range or 1.0]), ("most_mended", [most_mended])):
         if not all(np.isfinite(v) and v > 0 for v in values) or max_range == 0:
             raise ConfigError(f"carmen: {what} is {values}; wanted positive numbers")
-    if not all(np.isfinite(v) and v >= 0 for v in (*per_metre, per_radian)):
-        raise ConfigError(f"carmen: per_metre {per_metre}, per_radian {per_radian}; wanted numbers ≥ 0")
     raw, corrected = _files(Path(path))
     where = str(raw)
     counter = DropCounter()
@@ -117,13 +107,7 @@ def read_carmen(
     streams: dict[str, Stream] = {}
     if poses is not None:
         T_base_sensor = np.median(se2_between(poses[:, 3:], poses[:, :3]), axis=0)
-        motions = np.zeros((len(poses), 3))
-        motions[1:] = se2_between(poses[:-1, 3:], poses[1:, 3:])
-        driven, turned = np.linalg.norm(motions[:, :2], axis=1), np.abs(motions[:, 2])
-        covariances = np.zeros((len(poses), 3, 3))
-        covariances[:, 0, 0] = covariances[:, 1, 1] = floor[0] ** 2 + (per_metre[0] * driven) ** 2
-        covariances[:, 2, 2] = floor[1] ** 2 + (per_metre[1] * driven) ** 2 + (per_radian * turned) ** 2
-        streams["odometry"] = Odometry(times=times, increments=motions, covariances=covariances)
+        streams["odometry"] = noise.odometry(times, poses[:, 3:])
     scan_stream = LaserScans(
         times=times, ranges=ranges, bearings=scans.bearings, max_range=reach, T_base_sensor=T_base_sensor
     )
@@ -134,17 +118,15 @@ def read_carmen(
         base = se2_compose(theirs, np.broadcast_to(se2_inverse(T_base_sensor), theirs.shape))
         streams["reference"] = Trajectory(times[index], base)
         says = f"{corrected.name}: another SLAM's output, matched by ranges; not surveyed"
-    if drops is not None:
-        drops.counts.update(counter.counts)
     return SensorLog(
-        name=name or raw.name.split(".")[0],
+        name=raw.name.split(".")[0],
         streams=streams,
         read={k: len(times) for k in streams if k != "reference"},
         dropped=dict(counter.counts),
         meta={
             "source": raw.name,
             "reference": says,
-            "odometry_sigmas": {"floor": list(floor), "per_metre": list(per_metre), "per_radian": per_radian},
+            "odometry_sigmas": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(noise).items()},
         },
     )
 

@@ -170,11 +170,11 @@ def _read(
 ) -> Any:
     """What a reader gives; a log remembers who read it."""
     r = find_reader(name)
-    if not r.takes_name():
-        named = {}
-    value = r(path, **named, **options)
+    value = r(path, **(named if r.takes_name() else {}), **options)
     if not isinstance(value, SensorLog):
         return value
+    if not r.takes_name():
+        value = replace(value, **named)
     said = {"name": name, "found": found, "options": {k: _plain(v) for k, v in options.items()}, "also": list(also)}
     return replace(value, meta={**value.meta, "reader": said})
 

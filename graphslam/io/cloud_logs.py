@@ -1,7 +1,7 @@
-"""Logs of 3-D lidar scans, one file each: folders of clouds with or without poses, and the layouts of KITTI.
+"""Logs of 3-D lidar scans, one file each: folders of clouds with or without poses.
 
-The log has the stream ``clouds``; ``odometry`` where there are poses (they are then also ``reference``); and ``imu``
-and ``gps`` of KITTI raw. Without stamps scans are ``period`` apart. Clouds are decoded when they are asked for.
+The log has the stream ``clouds``, and ``odometry`` where there are poses (they are then also ``reference``). Without
+stamps scans are ``period`` apart. Clouds are decoded when they are asked for.
 
 Times of points (fields ``t``, ``time``, ``timestamp``, ``offset_time``, ``gps_time``) are taken in the unit that makes
 a scan last between 5 ms and 2 s, and for offsets from the stamp of the scan, or stamps on its clock.
@@ -14,7 +14,7 @@ import os
 import re
 import threading
 from collections import OrderedDict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,25 +22,29 @@ import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, FormatError, GraphSlamError, MissingDataError
-from graphslam.core.geodesy import geodetic_to_ecef
 from graphslam.core.geometry import Array
-from graphslam.core.gnss import TangentPlane
-from graphslam.core.imu import Imu, ImuNoise
+from graphslam.core.imu import ImuNoise
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.reading import finite_mask, read_text
-from graphslam.core.records import Gps, Odometry, Stream
+from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
 from graphslam.io.cloud_files import BIN_COLUMNS, CloudData, bin_columns, count_points, read_cloud
+from graphslam.io.odometry_noise import constant_noise
 from graphslam.io.recognise import cloud_folder, is_kitti_poses, parse_numbers, pose_file
 from graphslam.io.source_probe import SourceProbe, file_ending
 from graphslam.io.text_records import read_table
 
+Index = npt.NDArray[np.intp]
 PERIOD = 0.1
 """Seconds from scan to scan where nothing says it: lidars turn ten times a second."""
 ODOMETRY_SIGMAS = (0.03, 0.005)
 """Stated σ of one motion between scans, per axis: metres, radians. Tables of poses state none."""
+IMU_NOISE = ImuNoise(
+    gyro=2e-3, gyro_bias=0.02, gyro_walk=1e-4, accelerometer=2e-2, accelerometer_bias=0.2, accelerometer_walk=1e-3
+)
+"""Of an IMU whose log states no noise: a MEMS unit of middle price."""
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 _SWEEP = (0.005, 2.0)  # how long a scan lasts [s]
 _TIMED = {"none": "points without times", "constant": "times of points say nothing: as good as one time for all"}
@@ -123,8 +127,6 @@ def read_clouds(
     poses: str | None = None,
     point_times: bool = True,
     odometry_sigmas: tuple[float, float] = ODOMETRY_SIGMAS,
-    name: str | None = None,
-    drops: DropCounter | None = None,
 ) -> SensorLog:
     """Read a folder of clouds, one file a scan, in the order of the numbers in their names.
 
@@ -163,121 +165,149 @@ def read_clouds(
         table = pose_file(look)
     elif poses != "none":
         table = root / poses
-    log = _cloud_log(
-        root, look, files, table, None, period, columns, point_times, odometry_sigmas, name, drops, {}, DropCounter()
-    )
+    folder = CloudFolder(look, sorted(files, key=number_in_name), columns, point_times)
+    counter = DropCounter()
+    beside = None if table is None else PoseTable.read(look, table, counter)
+    log = folder.log(beside, scan_stamps(folder, beside, period), odometry_sigmas, {}, counter)
     return replace(log, meta={**log.meta, "notes": [told, *log.meta["notes"]]}) if told else log
 
 
-def _cloud_log(
-    root: Path,
-    look: SourceProbe,
-    files: list[Path],
-    table: Path | None,
-    stamps: Array | None,
-    period: float | None,
-    columns: int,
-    point_times: bool,
-    sigmas: tuple[float, float],
-    name: str | None,
-    drops: DropCounter | None,
-    extra: dict[str, Stream],
-    counter: DropCounter,
-    calibration: Array | None = None,
-) -> SensorLog:
-    for what, values in (("period", [period]), ("odometry_sigmas", sigmas)):
-        if any(v is not None and not (np.isfinite(v) and v > 0) for v in values):
-            raise ConfigError(f"clouds: {what} is {values}; wanted positive numbers")
-    files = sorted(files, key=_number_in_name)
-    if len(files) < 2:
-        raise MissingDataError(
-            "fewer than two clouds", where=str(root), got=str(look), wanted="a folder with one file a scan"
-        )
-    notes = []
-    path_poses: Trajectory | None = None
-    matrices: Array | None = None
-    if table is not None:
-        if is_kitti_poses(look, table):
-            matrices = _kitti_poses(table)
-        else:
-            path_poses = _tum(table, counter)
-    beside = look.named("times.txt", "timestamps.txt")
-    n = len(files)
-    if stamps is None and period is None and beside is not None and (t := _times(beside, n)) is not None:
-        stamps, by = t, f"stamps of {beside.name}"
-    elif stamps is not None:
-        by = "stamps of the files"
-    elif period is None and path_poses is not None and len(path_poses) == n:
-        stamps, by = path_poses.times, "stamps of the poses"
-    elif period is None and (t := _stamps_in_names(files)) is not None:
-        stamps, by = t, "stamps in the names"
-    else:
-        stamps = np.asarray((period or PERIOD) * np.arange(n, dtype=np.float64))
-        by = f"no stamps: scans {period or PERIOD:g} s apart"
-        if path_poses is not None:
+@dataclass(frozen=True, slots=True)
+class PoseTable:
+    """A table of poses beside clouds: one pose a cloud (KITTI), or a trajectory (TUM).
+
+    Parameters
+    ----------
+    matrices : (n, 3, 4) or None
+    path : Trajectory or None
+    T_camera_lidar : (7,) or None
+        Where the poses are those of a camera.
+    """
+
+    file: Path
+    matrices: Array | None
+    path: Trajectory | None
+    T_camera_lidar: Array | None = None
+
+    @classmethod
+    def read(
+        cls, look: SourceProbe, file: Path, counter: DropCounter, T_camera_lidar: Array | None = None
+    ) -> PoseTable:
+        if is_kitti_poses(look, file):
+            return cls(file, read_table(file, 12)[0].reshape(-1, 3, 4), None, T_camera_lidar)
+        return cls(file, None, _tum(file, counter))
+
+    def missing(self, n: int) -> dict[str, npt.NDArray[np.bool_]]:
+        """Which of ``n`` clouds have no pose, by reason."""
+        if self.matrices is None:
+            return {}
+        if len(self.matrices) != n:
             raise DataError(
-                "poses and clouds cannot be put together",
-                where=str(table),
-                got=f"{len(path_poses)} poses, {n} clouds without stamps",
-                wanted="one pose a cloud, stamps in times.txt or in the names, or option poses=none",
-            )
-    assert stamps is not None
-    notes.append(by)
-    good, empty = _good_files(files, columns, counter)
-    bad: dict[str, npt.NDArray[np.bool_]] = {"file is damaged": ~good, "no point in it": empty}
-    if matrices is not None:
-        if len(matrices) != n:
-            raise DataError(
-                "poses and clouds differ in number",
-                where=str(table),
-                got=f"{len(matrices)} poses, {n} clouds",
-                wanted="one pose a cloud, or option poses=none",
-            )
-        bad["pose is not finite"] = ~np.asarray(finite_mask(matrices).all(axis=(1, 2)))
-    keep = np.flatnonzero(usable_records(stamps, bad, stream="clouds", where=str(root), drops=counter))
-    if path_poses is not None:
-        slack = 0.5 * float(np.median(np.diff(path_poses.times)))
-        inside = (stamps[keep] >= path_poses.times[0] - slack) & (stamps[keep] <= path_poses.times[-1] + slack)
+                "poses and clouds differ in number", where=str(self.file),
+                got=f"{len(self.matrices)} poses, {n} clouds", wanted="one pose a cloud, or option poses=none",
+            )  # fmt: skip
+        return {"pose is not finite": ~np.asarray(finite_mask(self.matrices).all(axis=(1, 2)))}
+
+    def within(self, stamps: Array, keep: Index, counter: DropCounter) -> Index:
+        """Those of the clouds ``keep`` in the time of the poses."""
+        if self.path is None:
+            return keep
+        t = self.path.times
+        slack = 0.5 * float(np.median(np.diff(t)))
+        inside = (stamps[keep] >= t[0] - slack) & (stamps[keep] <= t[-1] + slack)
         if inside.sum() < 2:
             raise DataError(
-                "poses and clouds have no time in common",
-                where=str(table),
-                got=f"poses {path_poses.times[0]:.3f} to {path_poses.times[-1]:.3f} s, clouds {stamps[0]:.3f} to "
-                f"{stamps[-1]:.3f} s",
+                "poses and clouds have no time in common", where=str(self.file),
                 wanted="one clock, or option poses=none",
-            )
+                got=f"poses {t[0]:.3f} to {t[-1]:.3f} s, clouds {stamps[0]:.3f} to {stamps[-1]:.3f} s",
+            )  # fmt: skip
         counter.drop("clouds", "outside the time of the poses", int((~inside).sum()))
-        keep = keep[inside]
-    times = np.ascontiguousarray(stamps[keep])
-    kept = [files[k] for k in keep]
-    source = FileClouds(kept, columns, times, point_times)
-    streams: dict[str, Stream] = {"clouds": PointClouds(times=times, source=source)}
-    if matrices is not None or path_poses is not None:
-        if matrices is not None:
-            T = np.column_stack([matrices[keep][:, :, 3], se3.matrix_to_quat(matrices[keep][:, :, :3])])
-            if calibration is not None:  # poses are those of the camera
-                T = se3.se3_compose(T, np.broadcast_to(calibration, T.shape))
-        else:
-            assert path_poses is not None
-            T = path_poses.interpolate(np.clip(times, path_poses.times[0], path_poses.times[-1]))
-            T = embed_poses(T)
-        streams["odometry"] = _odometry(times, T, sigmas)
-        streams["reference"] = Trajectory(times, T)
-        assert table is not None
-        notes.append(f"odometry from {look.relative(table)}")
-    else:
-        notes.append("no poses")
-    streams |= extra
-    first = source.ages(0)
-    timed = "used" if first is not None else "none"
-    if first is None and point_times and read_cloud(kept[0], columns=columns).times is not None:
-        timed = "constant"  # or in no unit that makes a scan last as long as scans do
-    notes.append(_TIMED[timed] if first is None else f"points of a scan over {np.ptp(first):.3f} s")
-    if drops is not None:
-        drops.counts.update(counter.counts)
-    read = {k: len(s.times) for k, s in streams.items() if k != "reference"} | {"clouds": n}
-    meta = {"source": root.name, "notes": notes, "point_times": timed}
-    return SensorLog(name=name or root.name, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
+        return keep[inside]
+
+    def at(self, times: Array, keep: Index) -> Array:
+        """Poses ``(k, 7)`` of the clouds ``keep``."""
+        if self.path is not None:
+            return embed_poses(self.path.interpolate(np.clip(times, self.path.times[0], self.path.times[-1])))
+        assert self.matrices is not None
+        M = self.matrices[keep]
+        T = np.column_stack([M[:, :, 3], se3.matrix_to_quat(M[:, :, :3])])
+        if self.T_camera_lidar is not None:
+            T = se3.se3_compose(T, np.broadcast_to(self.T_camera_lidar, T.shape))
+        return T
+
+
+@dataclass(frozen=True, slots=True)
+class CloudFolder:
+    """Files of clouds in the order of the numbers in their names, and how they are read."""
+
+    look: SourceProbe
+    files: list[Path]
+    columns: int
+    point_times: bool
+
+    def __post_init__(self) -> None:
+        if len(self.files) < 2:
+            raise MissingDataError(
+                "fewer than two clouds", where=str(self.look.path), got=str(self.look),
+                wanted="a folder with one file a scan",
+            )  # fmt: skip
+
+    def log(
+        self,
+        poses: PoseTable | None,
+        stamped: tuple[Array, str],
+        sigmas: tuple[float, float],
+        extra: dict[str, Stream],
+        counter: DropCounter,
+    ) -> SensorLog:
+        """The log of the clouds, with stamps ``(n,)`` and where they are from, and with streams beside them."""
+        noise = constant_noise(sigmas)
+        root, n, (stamps, by) = self.look.path, len(self.files), stamped
+        good, empty = _good_files(self.files, self.columns, counter)
+        bad = {"file is damaged": ~good, "no point in it": empty, **({} if poses is None else poses.missing(n))}
+        keep = np.flatnonzero(usable_records(stamps, bad, stream="clouds", where=str(root), drops=counter))
+        if poses is not None:
+            keep = poses.within(stamps, keep, counter)
+        times = np.ascontiguousarray(stamps[keep])
+        kept = [self.files[k] for k in keep]
+        source = FileClouds(kept, self.columns, times, self.point_times)
+        streams: dict[str, Stream] = {"clouds": PointClouds(times=times, source=source)}
+        notes = [by, "no poses" if poses is None else f"odometry from {self.look.relative(poses.file)}"]
+        if poses is not None:
+            T = poses.at(times, keep)
+            streams |= {"odometry": noise.odometry(times, T), "reference": Trajectory(times, T)}
+        streams |= extra
+        first = source.ages(0)
+        timed = "used" if first is not None else "none"
+        if first is None and self.point_times and read_cloud(kept[0], columns=self.columns).times is not None:
+            timed = "constant"  # or in no unit that makes a scan last as long as scans do
+        notes.append(_TIMED[timed] if first is None else f"points of a scan over {np.ptp(first):.3f} s")
+        read = {k: len(s.times) for k, s in streams.items() if k != "reference"} | {"clouds": n}
+        meta = {"source": root.name, "notes": notes, "point_times": timed}
+        return SensorLog(name=root.name, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
+
+
+def scan_stamps(folder: CloudFolder, poses: PoseTable | None, period: float | None = None) -> tuple[Array, str]:
+    """Stamps of the scans ``(n,)`` [s], and where they are from."""
+    if period is not None and not (np.isfinite(period) and period > 0):
+        raise ConfigError(f"clouds: period is {period}; wanted a positive number")
+    n, path = len(folder.files), None if poses is None else poses.path
+    if period is None:
+        beside = folder.look.named("times.txt", "timestamps.txt")
+        if beside is not None and (t := stamps_of_file(beside, n)) is not None:
+            return t, f"stamps of {beside.name}"
+        if path is not None and len(path) == n:
+            return path.times, "stamps of the poses"
+        if (t := _stamps_in_names(folder.files)) is not None:
+            return t, "stamps in the names"
+    if poses is not None and path is not None:
+        raise DataError(
+            "poses and clouds cannot be put together", where=str(poses.file),
+            got=f"{len(path)} poses, {n} clouds without stamps",
+            wanted="one pose a cloud, stamps in times.txt or in the names, or option poses=none",
+        )  # fmt: skip
+    every = period or PERIOD
+    return np.asarray(every * np.arange(n, dtype=np.float64)), f"no stamps: scans {every:g} s apart"
 
 
 def embed_poses(poses: Array) -> Array:
@@ -289,14 +319,7 @@ def embed_poses(poses: Array) -> Array:
     return out
 
 
-def _odometry(times: Array, poses: Array, sigmas: tuple[float, float]) -> Odometry:
-    steps = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(poses), 1))
-    steps[1:] = se3.se3_between(poses[:-1], poses[1:])
-    variance = np.diag(np.repeat([sigmas[1] ** 2, sigmas[0] ** 2], 3))  # rotation first
-    return Odometry(times=times, increments=steps, covariances=np.tile(variance, (len(poses), 1, 1)))
-
-
-def _number_in_name(path: Path) -> tuple[list[tuple[int, int, str]], str]:
+def number_in_name(path: Path) -> tuple[list[tuple[int, int, str]], str]:
     """Numbers count as numbers: cloud_10 is after cloud_9."""
     words = re.split(r"(\d+)", path.name)
     return [(1, int(w), "") if w.isdigit() else (0, 0, w) for w in words], str(path)
@@ -318,7 +341,7 @@ def _stamps_in_names(files: list[Path]) -> Array | None:
     return t if np.all(np.diff(t) > 0) else None
 
 
-def _times(path: Path, n: int) -> Array | None:
+def stamps_of_file(path: Path, n: int) -> Array | None:
     """Stamps of ``times.txt`` (seconds) or ``timestamps.txt`` (seconds, or date and time as in KITTI raw)."""
     out = []
     for line in read_text(path).splitlines():
@@ -340,10 +363,6 @@ def _times(path: Path, n: int) -> Array | None:
         raise DataError("stamps and clouds differ in number", where=str(path), got=len(out), wanted=n)
     t = np.array(out)
     return t * 1e-9 if n and np.nanmedian(np.abs(t)) > 1e17 else t
-
-
-def _kitti_poses(path: Path) -> Array:
-    return read_table(path, 12)[0].reshape(-1, 3, 4)
 
 
 def _tum(path: Path, counter: DropCounter) -> Trajectory:
@@ -401,97 +420,3 @@ def _good_files(
     counter.drop("clouds", f"point not finite{some}", lost)
     counter.drop("clouds", f"point at the origin (no return){some}", zero)
     return good, empty
-
-
-def read_kitti(
-    path: str | os.PathLike[str],
-    *,
-    poses: str | None = None,
-    odometry_sigmas: tuple[float, float] = ODOMETRY_SIGMAS,
-    name: str | None = None,
-    drops: DropCounter | None = None,
-) -> SensorLog:
-    """Read a sequence of KITTI odometry, or a drive of KITTI raw.
-
-    Parameters
-    ----------
-    path : path
-        Holds ``velodyne/*.bin``, perhaps ``times.txt``, ``calib.txt`` and ``poses.txt``; or
-        ``velodyne_points/data/*.bin`` and ``timestamps.txt``, perhaps ``oxts``.
-    poses : str, optional
-        Table of poses, seen from the folder; ``none``: none. Poses of the camera are brought to the lidar by ``Tr`` of
-        ``calib.txt``.
-    odometry_sigmas : (float, float)
-        σ of one motion from scan to scan, per axis: metres, radians.
-    """
-    root = Path(path)
-    if not root.is_dir():
-        raise MissingDataError("no such folder", where=str(root), wanted="a sequence or drive of KITTI")
-    look = SourceProbe(root)
-    files = [p for p in look.by_ending.get(".bin", []) if p.parent.name in ("velodyne", "data")]
-    counter = DropCounter()
-    stamps: Array | None = None
-    extra: dict[str, Stream] = {}
-    notes: list[str] = []
-    if files and files[0].parent.name == "data":
-        beside = files[0].parent.parent / "timestamps.txt"
-        stamps = _times(beside, len(files)) if beside.is_file() else None
-        extra = _oxts(root, look, counter)
-    table: Path | None = None
-    if poses is None:
-        found = [p for p in look.texts if is_kitti_poses(look, p) and "calib" not in p.name]
-        table = found[0] if found else None
-    elif poses != "none":
-        table = root / poses
-    calibration = _calibration(look) if table is not None else None
-    if table is not None and calibration is None:
-        notes.append("poses taken as those of the lidar: no calib.txt with Tr")
-    log = _cloud_log(
-        root, look, files, table, stamps, None, 4, True, odometry_sigmas, name, drops, extra, counter, calibration
-    )
-    return replace(log, meta={**log.meta, "notes": [*log.meta["notes"], *notes]})
-
-
-def _calibration(look: SourceProbe) -> Array | None:
-    """``T_camera_lidar`` ``(7,)`` of the line ``Tr``."""
-    path = look.named("calib.txt")
-    row = next((s for s in look.lines(path) if s.startswith(("Tr:", "Tr ", "Tr_velo"))), None) if path else None
-    v = parse_numbers(row.partition(":")[2] or row[2:]) if row else None
-    if v is None or len(v) != 12 or not np.all(finite_mask(v)):
-        return None
-    m = np.array(v).reshape(3, 4)
-    if np.abs(m[:, :3] @ m[:, :3].T - np.eye(3)).max() > 1e-2:
-        return None
-    return np.concatenate([m[:, 3], se3.matrix_to_quat(m[None, :, :3])[0]])
-
-
-def _oxts(root: Path, look: SourceProbe, counter: DropCounter) -> dict[str, Stream]:
-    """``gps`` and ``imu`` of the records of oxts: 30 numbers each, in files of their own."""
-    files = [p for p in look.by_ending.get(".txt", []) if p.parent.name == "data" and p.parent.parent.name == "oxts"]
-    files = sorted(files, key=_number_in_name)
-    if len(files) < 2:
-        return {}
-    beside = files[0].parent.parent / "timestamps.txt"
-    if not beside.is_file():
-        counter.drop("oxts", "records without timestamps.txt", len(files))
-        return {}
-    times = _times(beside, len(files))
-    assert times is not None
-    rows = [parse_numbers(read_text(p)) or [] for p in files]
-    a = np.array([r[:30] if len(r) >= 30 else [np.nan] * 30 for r in rows])
-    place = finite_mask(a[:, :3]).all(axis=1) & (np.abs(a[:, 0]) <= 90) & (np.abs(a[:, 1]) <= 360)
-    bad = {"record is not whole": np.asarray(~(place & finite_mask(a[:, 8:26]).all(axis=1)))}
-    keep = usable_records(times, bad, stream="oxts", where=str(files[0].parent), drops=counter)
-    a, t = a[keep], times[keep]
-    plane = TangentPlane(*a[0, :3].tolist())
-    enu = plane.from_ecef(geodetic_to_ecef(a[:, :3]))
-    accuracy = np.clip(np.where(finite_mask(a[:, 23]), a[:, 23], 1.0), 0.05, 100.0)
-    gps = Gps.upright(times=t, positions=enu, horizontal=accuracy, vertical=2 * accuracy, lever=np.zeros(3))
-    imu = Imu(times=t, angular_rate=a[:, 17:20], specific_force=a[:, 11:14], noise=IMU_NOISE)
-    return {"gps": gps, "imu": imu}
-
-
-IMU_NOISE = ImuNoise(
-    gyro=2e-3, gyro_bias=0.02, gyro_walk=1e-4, accelerometer=2e-2, accelerometer_bias=0.2, accelerometer_walk=1e-3
-)
-"""Of an IMU whose log states no noise: a MEMS unit of middle price."""

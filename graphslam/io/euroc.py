@@ -46,8 +46,6 @@ def read_euroc(
     sigma: float = 0.01,
     late: float = 0.0,
     noise_scale: float = 1.0,
-    name: str = "euroc",
-    drops: DropCounter | None = None,
 ) -> SensorLog:
     """Read the log.
 
@@ -63,10 +61,6 @@ def read_euroc(
         Taken off the stamps of the positions [s].
     noise_scale : float
         Factor on the noise densities of the data sheet.
-    name : str
-        Of the log.
-    drops : DropCounter, optional
-        Counts into this one, besides ``SensorLog.dropped``.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -108,10 +102,8 @@ def read_euroc(
             quat = se3.quat_normalize(rows[:, [5, 6, 7, 4]])
             streams["reference"] = Trajectory(1e-9 * (rows[:, 0] - start), np.column_stack([rows[:, 1:4], quat]))
             read["reference"] = n
-    if drops is not None:
-        drops.counts.update(counter.counts)
     return SensorLog(
-        name=name,
+        name="euroc",
         streams=streams,
         read=read,
         dropped=dict(counter.counts),

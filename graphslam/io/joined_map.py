@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +17,13 @@ import scipy.sparse as sp
 
 from graphslam.core.atomic import check_format, write_npz
 from graphslam.core.errors import FormatError
-from graphslam.core.geometry import Array
 from graphslam.core.npz import check_arrays, floats, ints, read_arrays, texts
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.tum import write_tum
+
+if TYPE_CHECKING:
+    from graphslam.join.graph_join import GraphEstimate
+    from graphslam.join.submap_solver import SubmapEstimate
 
 FORMAT_1, JOINED_FORMAT = "graphslam.joined/1", "graphslam.joined/2"
 STATES = ("vector", "tangent")
@@ -41,31 +45,20 @@ JOINED = {
 def write_joined(
     folder: str | os.PathLike[str],
     times: npt.ArrayLike,
-    poses: Array,
-    landmark_ids: npt.NDArray[np.int64],
-    landmarks: Array,
-    *,
-    information: sp.csc_matrix | None = None,
-    covariance: Array | None = None,
-    state: str = "vector",
-    chart: str = "cartesian",
-    anchors: npt.NDArray[np.int64] | None = None,
+    estimate: SubmapEstimate | GraphEstimate,
+    state: str,
 ) -> None:
     """Write a joined map, in the frame of the first base.
 
     Parameters
     ----------
     times : (m + 1,)
-    poses : (m + 1, 3|7)
-    landmark_ids : (n,)
-    landmarks : (n, dim)
-    information, covariance : (s, s), optional
-        Of the state without the first base.
+        Of its poses [s].
+    estimate : SubmapEstimate or GraphEstimate
+        With its uncertainty; a vector also says in which chart it is Gaussian (:mod:`graphslam.core.charts`), and in
+        the group chart the end pose that each landmark hangs on.
     state : {"vector", "tangent"}
-    chart : str
-        In which a vector is Gaussian (:mod:`graphslam.core.charts`).
-    anchors : (n,), optional
-        In the group chart, the end pose that each landmark hangs on.
+        Coordinates of the uncertainty.
     """
     root = Path(folder)
     root.mkdir(parents=True, exist_ok=True)
@@ -73,22 +66,23 @@ def write_joined(
     arrays = {
         "format": JOINED_FORMAT,
         "times": stamps,
-        "poses": poses,
-        "landmark_ids": landmark_ids,
-        "landmarks": landmarks,
+        "poses": estimate.poses,
+        "landmark_ids": estimate.landmark_ids,
+        "landmarks": estimate.landmarks,
         "state": state,
     }
     if state == "vector":
-        arrays["chart"] = chart
-        if anchors is not None:
+        arrays["chart"] = getattr(estimate, "chart", "cartesian")
+        if (anchors := getattr(estimate, "anchors", None)) is not None:
             arrays["anchors"] = anchors
+    information, covariance = estimate.map_information(), estimate.map_covariance()
     if information is not None:
         A = sp.csc_matrix(information)
         arrays |= {f"information_{part}": getattr(A, part) for part in ("data", "indices", "indptr")}
     elif covariance is not None:
         arrays["covariance"] = covariance
     write_npz(root / "joined.npz", arrays)
-    write_tum(root / "nodes.tum", Trajectory(stamps, poses))
+    write_tum(root / "nodes.tum", Trajectory(stamps, estimate.poses))
 
 
 def read_joined(folder: str | os.PathLike[str]) -> dict[str, np.ndarray]:

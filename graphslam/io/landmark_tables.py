@@ -21,11 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
-from graphslam.core.geometry import Array, se2_between
+from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import LandmarkObservations, Odometry, VelocityControls
 from graphslam.io.clock import usable_records
+from graphslam.io.odometry_noise import OdometryNoise
 from graphslam.io.source_probe import ReaderMatch, SourceProbe
 
 NAMES = {
@@ -52,6 +53,8 @@ ODOMETRY_HEADER = "t, v, w or t, x, y, theta"
 SIGHTINGS_HEADER = "t, range, and bearing or id or both"
 RANGE_SIGMA, BEARING_SIGMA = 0.3, float(np.deg2rad(3.0))
 """Stated σ of a range [m] and of a bearing [rad]; the tables state none."""
+NOISE = OdometryNoise((0.01, 0.005), (0.05, 0.02), 0.05)
+"""Of motions between the poses of a table."""
 TABLE_ENDINGS = (".csv", ".txt", ".tsv", ".dat")
 Ints = npt.NDArray[np.int64]
 
@@ -176,11 +179,7 @@ def read_landmark_tables(
     range_sigma: float = RANGE_SIGMA,
     bearing_sigma: float = BEARING_SIGMA,
     max_range: float | None = None,
-    floor: tuple[float, float] = (0.01, 0.005),
-    per_metre: tuple[float, float] = (0.05, 0.02),
-    per_radian: float = 0.05,
-    name: str | None = None,
-    drops: DropCounter | None = None,
+    noise: OdometryNoise = NOISE,
 ) -> SensorLog:
     """Read the two tables.
 
@@ -192,16 +191,15 @@ def read_landmark_tables(
         σ of a range [m] and of a bearing [rad].
     max_range : float, optional
         Of the sensor [m]; by default the longest range that there is.
-    floor, per_metre, per_radian : float
-        σ of one motion between poses: at least metres, radians; per metre driven; of the heading per radian turned.
-        Velocities carry none, it is an option of the front end.
+    noise : OdometryNoise
+        Of motions between poses. Velocities carry none, it is an option of the front end.
     """
     root = Path(path)
     if not root.exists():
         raise MissingDataError("no such folder", where=str(root), wanted="a folder with odometry.csv and sightings.csv")
-    numbers = [range_sigma, bearing_sigma, *floor, 1.0 if max_range is None else max_range]
-    if not (all(np.isfinite(v) and v > 0 for v in numbers) and min(*per_metre, per_radian) >= 0):
-        raise ConfigError(f"landmark tables: σ {numbers}, {per_metre}, {per_radian}; wanted positive numbers")
+    numbers = [range_sigma, bearing_sigma, 1.0 if max_range is None else max_range]
+    if not all(np.isfinite(v) and v > 0 for v in numbers):
+        raise ConfigError(f"landmark tables: σ and range {numbers}; wanted positive numbers")
     look = SourceProbe(root if root.is_dir() else root.parent)
     motion, seen = _tables(look)
     if not (motion and seen):
@@ -213,7 +211,7 @@ def read_landmark_tables(
             wanted=f"odometry.csv with the header {ODOMETRY_HEADER}, sightings.csv with {SIGHTINGS_HEADER}",
         )
     counter = DropCounter()
-    controls, n_controls = _motion(motion[0], floor, per_metre, per_radian, counter)
+    controls, n_controls = _motion(motion[0], noise, counter)
     landmarks, n_seen = _sightings(
         seen[0], (float(controls.times[0]), float(controls.times[-1])), range_sigma, bearing_sigma, max_range, counter
     )
@@ -221,10 +219,8 @@ def read_landmark_tables(
     lost = {
         k if k.startswith("landmarks: ") else f"{stream}: {k.partition(': ')[2]}": v for k, v in counter.counts.items()
     }
-    if drops is not None:
-        drops.counts.update(lost)
     return SensorLog(
-        name=name or root.name,
+        name=root.name,
         streams={stream: controls, "landmarks": landmarks},
         read={stream: n_controls, "landmarks": n_seen},
         dropped=lost,
@@ -285,9 +281,7 @@ def _in_order(a: dict[str, Array], stream: str, counter: DropCounter) -> dict[st
     return {k: v[order] for k, v in a.items()}
 
 
-def _motion(
-    path: Path, floor: tuple[float, float], per_metre: tuple[float, float], per_radian: float, counter: DropCounter
-) -> tuple[VelocityControls | Odometry, int]:
+def _motion(path: Path, noise: OdometryNoise, counter: DropCounter) -> tuple[VelocityControls | Odometry, int]:
     a, header = _read(path, "odometry", counter)
     n = len(a["t"])
     kind = header.odometry
@@ -304,14 +298,7 @@ def _motion(
     t = a["t"][keep]
     if kind == "velocity":
         return VelocityControls(times=t, speed=a["v"][keep], yaw_rate=a["w"][keep]), n
-    poses = np.column_stack([a[k][keep] for k in names])
-    motion = np.zeros_like(poses)
-    motion[1:] = se2_between(poses[:-1], poses[1:])
-    driven, turned = np.linalg.norm(motion[:, :2], axis=1), np.abs(motion[:, 2])
-    P = np.zeros((len(t), 3, 3))
-    P[:, 0, 0] = P[:, 1, 1] = floor[0] ** 2 + (per_metre[0] * driven) ** 2
-    P[:, 2, 2] = floor[1] ** 2 + (per_metre[1] * driven) ** 2 + (per_radian * turned) ** 2
-    return Odometry(times=t, increments=motion, covariances=P), n
+    return noise.odometry(t, np.column_stack([a[k][keep] for k in names])), n
 
 
 def _sightings(

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +51,19 @@ class Reader:
         return typing.cast(Callable[..., Any], getattr(importlib.import_module(module), function))
 
     def options(self) -> dict[str, inspect.Parameter]:
-        """Options of the function by name, with their defaults and annotations."""
-        parameters = list(inspect.signature(self.function()).parameters.values())[1:]
-        return {p.name: p for p in parameters if p.name not in _NOT_OPTIONS and p.kind is p.KEYWORD_ONLY}
+        """Options by name, with their defaults and annotations: keyword arguments, of a dataclass its fields."""
+        function = self.function()
+        hints, out = typing.get_type_hints(function), dict[str, inspect.Parameter]()
+        for p in list(inspect.signature(function).parameters.values())[1:]:
+            if p.name in _NOT_OPTIONS or p.kind is not p.KEYWORD_ONLY:
+                continue
+            if not is_dataclass(hints.get(p.name)):
+                out[p.name] = p
+                continue
+            for f in fields(p.default):
+                value = getattr(p.default, f.name)
+                out[f.name] = inspect.Parameter(f.name, p.KEYWORD_ONLY, default=value, annotation=f.type)
+        return out
 
     def takes_name(self) -> bool:
         """Does the function take ``name``, the name of the log?"""
@@ -63,12 +73,19 @@ class Reader:
         """Read."""
         function = self.function()
         known, hints = self.options(), typing.get_type_hints(function)
+        if unknown := sorted(set(given) - set(known) - ({"name"} if self.takes_name() else set())):
+            raise ConfigError(f"unknown reader option {unknown[0]!r}; known: {', '.join(sorted(known)) or 'none'}")
         values = {}
-        for key, value in given.items():
-            if key == "drops" or (key == "name" and self.takes_name()):
-                values[key] = value
-            elif key not in known:
-                raise ConfigError(f"unknown reader option {key!r}; known: {', '.join(sorted(known)) or 'none'}")
-            else:
-                values[key] = convert_option(hints.get(key, Any), value, f"reader option {key}")
+        for name, p in inspect.signature(function).parameters.items():
+            hint = hints.get(name, Any)
+            if p.kind is p.KEYWORD_ONLY and is_dataclass(hint):
+                types = typing.get_type_hints(hint)
+                part = {k: _convert(types[k], given[k], k) for k in types if k in given}
+                values[name] = replace(p.default, **part)
+            elif name in given:
+                values[name] = _convert(hint, given[name], name)
         return function(path, **values)
+
+
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    return convert_option(hint, value, f"reader option {name}")

@@ -250,7 +250,7 @@ BUILT_IN: dict[str, Reader] = {
     ),
     "kitti": Reader(
         "KITTI odometry (velodyne/, times.txt, poses) and raw (velodyne_points/, oxts/)",
-        f"{_IO}.cloud_logs:read_kitti",
+        f"{_IO}.kitti:read_kitti",
         _kitti,
     ),
     "carmen": Reader("CARMEN log: FLASER, ROBOTLASER1 or RAWLASER1, with ODOM", f"{_IO}.carmen:read_carmen", _carmen),

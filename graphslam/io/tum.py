@@ -12,12 +12,12 @@ import numpy as np
 
 from graphslam.core import se3
 from graphslam.core.atomic import atomic_open
-from graphslam.core.errors import ConfigError, FormatError
-from graphslam.core.geometry import Array, se2_between, wrap_angle
+from graphslam.core.errors import FormatError
+from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.reading import finite_mask, read_text
-from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
+from graphslam.io.odometry_noise import constant_noise
 from graphslam.io.recognise import is_tum
 from graphslam.io.source_probe import SourceProbe
 
@@ -104,7 +104,6 @@ def read_tum_log(
     path: str | os.PathLike[str],
     *,
     odometry_sigmas: tuple[float, float] = (0.03, 0.005),
-    name: str | None = None,
 ) -> SensorLog:
     """A trajectory as a log with one stream, ``odometry``.
 
@@ -115,8 +114,6 @@ def read_tum_log(
     odometry_sigmas : (float, float)
         σ of one motion, per axis: metres, radians; the table states none.
     """
-    if not all(np.isfinite(v) and v > 0 for v in odometry_sigmas):
-        raise ConfigError(f"tum: odometry_sigmas are {odometry_sigmas}; wanted positive numbers")
     file = Path(path)
     if file.is_dir():
         look = SourceProbe(file)
@@ -124,18 +121,9 @@ def read_tum_log(
     found = read_tum(file)
     if len(found) < 2:
         raise FormatError("holds fewer than two poses", where=str(file), got=len(found))
-    metres, radians = odometry_sigmas
-    if found.dim == 2:
-        steps = np.zeros_like(found.poses)
-        steps[1:] = se2_between(found.poses[:-1], found.poses[1:])
-        variance = np.diag([metres**2, metres**2, radians**2])
-    else:
-        steps = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(found), 1))
-        steps[1:] = se3.se3_between(found.poses[:-1], found.poses[1:])
-        variance = np.diag(np.repeat([radians**2, metres**2], 3))
-    odometry = Odometry(times=found.times, increments=steps, covariances=np.tile(variance, (len(found), 1, 1)))
+    odometry = constant_noise(odometry_sigmas).odometry(found.times, found.poses)
     return SensorLog(
-        name=name or file.stem,
+        name=file.stem,
         streams={"odometry": odometry},
         read={"odometry": len(found)},
         meta={"source": file.name},

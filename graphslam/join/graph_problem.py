@@ -36,6 +36,7 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factor_graph_state import LANDMARK_SUBMAPS
 from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.landmark_submap import PathRecord
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
 from graphslam.join.frames import Rule, rows_in_frame, rule_of
 from graphslam.join.graph_file import PARTS, graph_arrays, read_graph_arrays
@@ -139,7 +140,7 @@ class JoinProblem:
         group, x = graph.structure.group, network.poses
         graph.add_betweens(
             network.edges, network.measurements, 0.5 * (P + np.swapaxes(P, 1, 2)),
-            poses=group.between(np.broadcast_to(x[0], x[1:].shape), x[1:]), streams=["file"], interval=(0.0, 0.0),
+            poses=group.between(np.broadcast_to(x[0], x[1:].shape), x[1:]), evidence=EvidenceUse(["file"], (0.0, 0.0)),
         )  # fmt: skip
         bases = np.append(np.arange(0, n - 1, poses), n - 1)
         steps = network.steps_along_numbers(group)

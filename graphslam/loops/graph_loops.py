@@ -12,6 +12,7 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factor_graph_state import FactorGraphState
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.relative import relative_poses
 from graphslam.loops.measure import Loop
@@ -96,16 +97,9 @@ class GraphLoops:
     def add_loop(self, loop: Loop, robust: RobustKernel) -> int:
         """A between-factor of declared ``shared-scan`` evidence."""
         s = self.graph.submaps[int(self.places.submap[loop.j])]
+        used = EvidenceUse(["match"], s.interval, "shared-scan")
         return self.graph.add_between(
-            loop.i,
-            loop.j,
-            loop.T_ij,
-            loop.covariance,
-            streams=["match"],
-            interval=s.interval,
-            evidence="shared-scan",
-            robust=robust,
-            group=GROUP,
+            loop.i, loop.j, loop.T_ij, loop.covariance, evidence=used, robust=robust, group=GROUP
         )
 
     def remove_loop(self, factor_id: int) -> None:

@@ -19,6 +19,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.plots import style
 
 Path = Trajectory | npt.ArrayLike
+POSE_ELLIPSES = 12
+"""Position ellipses along the path of a map."""
 
 
 def positions_of(path: Path) -> Array:
@@ -113,9 +115,6 @@ def plot_map(
     truth: Truth | Path | None = None,
     dead_reckoning: Path | None = None,
     before: Path | None = None,
-    confidence: float = 0.95,
-    pose_ellipses: int = 0,
-    title: str | None = None,
 ) -> Axes:
     """Draw a 2-D map; everything in one frame.
 
@@ -124,7 +123,7 @@ def plot_map(
     ax : Axes, optional
         None: a new figure.
     trajectory : Trajectory or (n, ≥ 2), optional
-        Estimated path.
+        Estimated path, with 95 % ellipses of some positions if it has covariances.
     landmarks : LandmarkMap or (n, 2), optional
         Estimated landmarks; a LandmarkMap brings its covariance.
     covariances : (n, 2, 2) or (2n, 2n), optional
@@ -136,10 +135,6 @@ def plot_map(
         The path before any correction.
     before : Trajectory or (n, ≥ 2), optional
         The path of the graph, where a refinement began.
-    confidence : float
-        Of the ellipses.
-    pose_ellipses : int
-        Draw this many position ellipses along the path, if the trajectory has covariances.
     """
     ax = style.new_axes(ax)
     if dead_reckoning is not None:
@@ -154,19 +149,16 @@ def plot_map(
         g = np.asarray(gps.positions if isinstance(gps, Gps) else gps, dtype=np.float64)
         ax.plot(g[:, 0], g[:, 1], "+", color=style.GPS, ms=5, mew=0.9, alpha=0.8, label="GPS", zorder=1.5)
     if landmarks is not None:
-        _plot_landmarks(ax, landmarks, covariances, confidence)
+        _plot_landmarks(ax, landmarks, covariances)
     if trajectory is not None:
         p = positions_of(trajectory)
         ax.plot(p[:, 0], p[:, 1], color=style.ESTIMATE, lw=1.6, label="path", zorder=3)
         ax.plot(p[0, 0], p[0, 1], "o", color=style.ESTIMATE, ms=6, mec="white", mew=0.8, label="start", zorder=4)
-        if pose_ellipses and isinstance(trajectory, Trajectory) and trajectory.covariances is not None:
-            k = np.unique(np.linspace(0, len(trajectory) - 1, pose_ellipses).astype(int))
+        if isinstance(trajectory, Trajectory) and trajectory.covariances is not None:
+            k = np.unique(np.linspace(0, len(trajectory) - 1, POSE_ELLIPSES).astype(int))
             P = tangent_to_vector_covariance(trajectory.poses[k], trajectory.covariances[k])[:, :2, :2]
-            label = style.ellipses("path", confidence)
-            plot_ellipses(ax, p[k], P, confidence=confidence, colour=style.ESTIMATE, label=label)
+            plot_ellipses(ax, p[k], P, colour=style.ESTIMATE, label=style.ellipses("path"))
     style.metric_axes(ax)
-    if title:
-        ax.set_title(title)
     style.legend(ax)
     return ax
 
@@ -188,9 +180,7 @@ def _plot_truth(ax: Axes, truth: Truth | Path) -> None:
     ax.plot(p[:, 0], p[:, 1], color=style.TRUTH, lw=1.0, ls="--", label="truth", zorder=3.2)
 
 
-def _plot_landmarks(
-    ax: Axes, landmarks: LandmarkMap | npt.ArrayLike, covariances: npt.ArrayLike | None, confidence: float
-) -> None:
+def _plot_landmarks(ax: Axes, landmarks: LandmarkMap | npt.ArrayLike, covariances: npt.ArrayLike | None) -> None:
     if isinstance(landmarks, LandmarkMap):
         points = landmarks.positions[:, :2]
         blocks = landmark_blocks(landmarks.dense_covariance(), len(landmarks), offset=3) if landmarks.dim == 2 else None
@@ -199,7 +189,6 @@ def _plot_landmarks(
     if covariances is not None:
         blocks = landmark_blocks(covariances, len(points))
     if blocks is not None and len(points):
-        label = style.ellipses("landmarks", confidence)
-        plot_ellipses(ax, points, blocks, confidence=confidence, colour=style.LANDMARK, label=label)
+        plot_ellipses(ax, points, blocks, colour=style.LANDMARK, label=style.ellipses("landmarks"))
     name: dict[str, Any] = {} if blocks is not None else {"label": "landmarks"}
     ax.plot(points[:, 0], points[:, 1], ".", color=style.LANDMARK, ms=3, zorder=3.4, **name)

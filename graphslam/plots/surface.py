@@ -11,6 +11,8 @@ from matplotlib.colors import Normalize, to_rgba
 from graphslam.core.geometry import Array
 from graphslam.plots import style
 
+WIDTH = 1400
+"""Of the picture [pixels] at most; a pixel is never smaller than a triangle."""
 _LIGHT = np.array([0.35, -0.5, 0.79])
 _EDGE = 0.6
 """Cosine between neighbouring normals below which an edge is drawn dark."""
@@ -43,7 +45,6 @@ def plot_surface(
     label: str = "",
     title: str = "",
     slant: float = 40.0,
-    width: int = 1400,
     edges: bool = False,
 ) -> Axes:
     """Draw triangles in parallel projection from the south, the nearest in front; back sides are left out.
@@ -59,8 +60,6 @@ def plot_surface(
         That the colours show; grey where they are not finite.
     slant : float
         Of the view below the vertical [deg]: 0 is from above.
-    width : int
-        Of the picture [pixels] at most; a pixel is never smaller than a triangle.
     edges : bool
         Only lines, where the surface folds or ends, on white; of the values nothing is shown.
     """
@@ -75,7 +74,7 @@ def plot_surface(
     front = (normal @ towards > 0.0) & (size > 0.0)
     u, v, depth = middle[front] @ right, middle[front] @ up, middle[front] @ towards
     span = max(float(np.ptp(u)), float(np.ptp(v)), 1e-6)
-    pixel = max(span / width, 1.2 * float(np.median(np.sqrt(size))))
+    pixel = max(span / WIDTH, 1.2 * float(np.median(np.sqrt(size))))
     ix, iy = ((x - x.min()) // pixel for x in (u, v))
     ix, iy = ix.astype(np.int64), iy.astype(np.int64)
     order = np.lexsort((-depth, ix, iy))

@@ -10,6 +10,7 @@ from graphslam.core.geometry import se2_between
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.gtsam_values import to_gtsam
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.variables import gtsam_key
@@ -33,7 +34,7 @@ def build(rng, *, gps: bool, robust: RobustKernel, update=lambda g: None) -> Fac
         update(g)
     C = np.diag([1e-3, 1e-3, 1e-4])
     T = se2_between(chain.poses[2], chain.poses[11])
-    g.add_between(2, 11, T, C, streams=["wheel"], interval=(20, 110), robust=robust)
+    g.add_between(2, 11, T, C, evidence=EvidenceUse(["wheel"], (20, 110)), robust=robust)
     g.add_between(6, 0, se2_between(chain.poses[6], chain.poses[0]), C, evidence="shared-scan")
     return g
 

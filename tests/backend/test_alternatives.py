@@ -17,6 +17,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.poses import SE3
 from graphslam.core.records import Gps
 from graphslam.core.submap import Match, Submap
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.loops.ledger import LoopDecision, ledger_of_events
 from graphslam.maps.alternatives import Alternative, chi2_of, noise_scale, rank_alternatives
@@ -52,7 +53,7 @@ def fold(back: BackEnd, robust: RobustKernel) -> None:
     first, second = back.graph.submaps[:2]
     for j in (first.nodes[6], second.nodes[0]):
         back.graph.add_between(
-            0, j, SE3.identity, 0.05**2 * np.eye(6), evidence="shared-scan", streams=["match"], interval=(0.0, 1.0),
+            0, j, SE3.identity, 0.05**2 * np.eye(6), evidence=EvidenceUse(["match"], (0.0, 1.0), "shared-scan"),
             group="loop", robust=robust,
         )  # fmt: skip
 
@@ -127,8 +128,8 @@ def _folded_more(submaps: list[Submap], robust: RobustKernel) -> BackEnd:
     fold(back, robust)
     last = back.graph.submaps[-1].exit_node
     back.graph.add_between(
-        0, last, np.array([0, 0, 30.0, 0, 0, 0, 1]), 0.01**2 * np.eye(6), evidence="shared-scan", streams=["match"],
-        interval=(0.0, 1.0), group="loop",
+        0, last, np.array([0, 0, 30.0, 0, 0, 0, 1]), 0.01**2 * np.eye(6),
+        evidence=EvidenceUse(["match"], (0.0, 1.0), "shared-scan"), group="loop",
     )  # fmt: skip
     return back
 

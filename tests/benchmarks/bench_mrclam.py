@@ -96,7 +96,9 @@ def picture(r: Run, path: Path) -> None:
     T = se2_inverse(fit.T_ref_est)
     truth = Truth(r.truth_path.transformed(T), r.truth.landmark_ids, se2_transform(T, r.truth.landmarks))
     title = f"{r.name}: path RMSE {fit.statistics.rmse:.3f} m; truth aligned"
-    save_figure(plot_map(trajectory=r.map.trajectory, landmarks=r.map.landmarks, truth=truth, title=title), path)
+    ax = plot_map(trajectory=r.map.trajectory, landmarks=r.map.landmarks, truth=truth)
+    ax.set_title(title)
+    save_figure(ax, path)
 
 
 def together(runs: Sequence[Run], by: Any, out: Path | None) -> None:

@@ -54,10 +54,11 @@ from graphslam.io.bags import read_bag
 from graphslam.io.cards import read_card
 from graphslam.io.carmen import read_carmen
 from graphslam.io.catalog import load_recording
-from graphslam.io.cloud_logs import read_clouds, read_kitti
+from graphslam.io.cloud_logs import read_clouds
 from graphslam.io.euroc import read_euroc
 from graphslam.io.g2o import read_g2o
 from graphslam.io.joined_map import read_joined, write_joined
+from graphslam.io.kitti import read_kitti
 from graphslam.io.landmark_tables import read_landmark_tables
 from graphslam.io.log_folder import read_log_mesh, write_log_folder
 from graphslam.io.log_store import load_log, save_log
@@ -65,6 +66,7 @@ from graphslam.io.mesh_file import read_mesh, write_mesh
 from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, read_tum_log, write_tum
+from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
 from graphslam_frontends.odometry.bias_sigmas import LEAST
@@ -412,7 +414,8 @@ def study_folder(root: Path) -> None:
 
 def joined(root: Path) -> None:
     A = sp.csc_matrix(np.diag(np.arange(1.0, 24.0)))  # 5 free poses, 4 landmarks
-    write_joined(root, TIMES, np.zeros((6, 3)), np.arange(4), rng().normal(size=(4, 2)), information=A)
+    estimate = SubmapEstimate(np.zeros((6, 3)), np.arange(4), rng().normal(size=(4, 2)), A, 0.0, None, 1, True, 0.0)
+    write_joined(root, TIMES, estimate, "vector")
 
 
 def network(lines: str, name: str, pack: Callable[[bytes], bytes] | None = None) -> Callable[[Path], None]:

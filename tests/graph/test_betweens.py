@@ -13,6 +13,7 @@ from graphslam.core.errors import ConfigError, CovarianceError, DataError, Evide
 from graphslam.core.poses import SE2, SE3
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.network import network_values, problem_of_network
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.gnc import GncSolver
@@ -32,7 +33,7 @@ def arrays(rng, dim, n=300):
 def in_one_call(net, P, **more):
     graph = FactorGraph(net.dim)
     ids = graph.add_betweens(
-        net.edges, net.measurements, P, poses=net.poses[1:], streams=["odometry"], interval=(0, 9), **more
+        net.edges, net.measurements, P, poses=net.poses[1:], evidence=EvidenceUse(["odometry"], (0, 9)), **more
     )
     assert ids == range(len(net.edges))
     return graph
@@ -150,7 +151,7 @@ def test_bad_ones_are_named_and_nothing_is_changed(rng):
     with pytest.raises(ConfigError, match="must name the streams"):
         add(evidence="measurement")
     with pytest.raises(EvidenceReusedError):
-        add(evidence="measurement", streams=["odometry"], interval=(5, 6))
+        add(evidence=EvidenceUse(["odometry"], (5, 6)))
     assert (len(graph.events), len(graph.records)) == (events, count)
 
 

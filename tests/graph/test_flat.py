@@ -13,6 +13,7 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
 from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
@@ -32,7 +33,7 @@ def rich_graph(rng) -> FactorGraph:
     C = np.diag([1e-2, 2e-2, 1e-3])
     rel = se2_between(chain.poses[0], chain.poses[4])
     g.add_between(0, 4, rel + [0.3, 0, 0], C, evidence="shared-scan", robust=RobustKernel("huber", 1.0))
-    g.add_between(5, 0, se2_between(chain.poses[5], chain.poses[0]), C, streams=["wheel"], interval=(0, 50))
+    g.add_between(5, 0, se2_between(chain.poses[5], chain.poses[0]), C, evidence=EvidenceUse(["wheel"], (0, 50)))
     g.add_between(2, 5, se2_between(chain.poses[2], chain.poses[5]), C, evidence="shared-scan")
     shared = [i for i in g.values.landmark_ids if len(g.sightings(int(i)) & g.sightings(int(g.values.landmark_ids[0])))]
     g.merge_landmarks(int(shared[0]), int(shared[1]))  # the id now stands twice in a submap

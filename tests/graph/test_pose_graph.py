@@ -19,6 +19,7 @@ from graphslam.core.errors import (
 from graphslam.core.geometry import se2_between
 from graphslam.core.submap import Match
 from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import anonymous, dense_submap, make_chain, make_gps
 
@@ -127,7 +128,7 @@ def test_between_factors_must_be_sound(graph):
     with pytest.raises(CovarianceError, match="x0 → x1"):
         graph.add_between(0, 1, T, np.zeros((3, 3)), evidence="shared-scan")
     with pytest.raises(EvidenceReusedError, match="odometry"):
-        graph.add_between(0, 1, T, C, streams=["odometry"], interval=(0.0, 10.0))
+        graph.add_between(0, 1, T, C, evidence=EvidenceUse(["odometry"], (0.0, 10.0)))
 
 
 def test_match_is_declared_evidence(graph, chain):
@@ -144,14 +145,14 @@ def test_removal_restores_the_graph(graph, chain):
     solver.update()
     before, poses = state(graph), graph.values.poses.copy()
     wrong = se2_between(chain.poses[0], chain.poses[5]) + [3.0, -2.0, 0.4]
-    fid = graph.add_between(0, 5, wrong, C, streams=["wheel"], interval=(0.0, 50.0))
+    fid = graph.add_between(0, 5, wrong, C, evidence=EvidenceUse(["wheel"], (0.0, 50.0)))
     solver.update()
     assert np.abs(graph.values.poses - poses).max() > 0.05
     graph.remove(fid, reason="test")
     solver.update()
     np.testing.assert_allclose(graph.values.poses, poses, atol=1e-7)
     assert len(graph.ledger) == before[1]
-    graph.add_between(0, 5, wrong, C, streams=["wheel"], interval=(0.0, 50.0))  # its evidence is free again
+    graph.add_between(0, 5, wrong, C, evidence=EvidenceUse(["wheel"], (0.0, 50.0)))  # its evidence is free again
     with pytest.raises(DataError, match="not in the graph"):
         graph.remove(fid)
     assert [e["event"] for e in graph.events].count("removed") == 1

@@ -124,12 +124,11 @@ def test_bad_lines_are_counted_or_refused(tmp_path: Path) -> None:
     words = text[laser[30]].split()
     words[5] = "nan"  # a range without a reading is no bad record
     text[laser[30]] = " ".join(words)
-    drops = DropCounter()
-    log = read_carmen(write(tmp_path, text), drops=drops)
+    log = read_carmen(write(tmp_path, text))
     assert len(log["laser"].times) == 97
-    assert drops.counts["laser: scan is truncated, or of another size"] == 1
-    assert drops.counts["laser: scan holds something that is no number"] == 1
-    assert drops.counts["laser: pose or stamp is not finite"] == 1
+    assert log.dropped["laser: scan is truncated, or of another size"] == 1
+    assert log.dropped["laser: scan holds something that is no number"] == 1
+    assert log.dropped["laser: pose or stamp is not finite"] == 1
     for k in laser[40:50]:
         text[k] = "FLASER 181 1.0"
     with pytest.raises(
@@ -148,9 +147,12 @@ def test_refusals(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="number of beams"):
         read_carmen(write(tmp_path, ["FLASER 1 3.0 0 0 0 0 0 0 1 host 1"]))
     good = write(tmp_path, lines())
-    for bad in ({"max_range": 0.0}, {"floor": (0.0, 1.0)}, {"per_radian": -1.0}, {"most_mended": np.nan}):
+    for bad in ({"max_range": 0.0}, {"most_mended": np.nan}):
         with pytest.raises(ConfigError, match="carmen"):
             read_carmen(good, **bad)
+    for bad in ({"floor": (0.0, 1.0)}, {"per_radian": -1.0}):
+        with pytest.raises(ConfigError, match="odometry"):
+            load_recording(good, **bad)
 
 
 @pytest.mark.data

@@ -194,9 +194,7 @@ def test_robust_kernels_stay_robust() -> None:
         graph.add_submap(s)
     far = problem.group.exp(np.array([0, 0, 1.0, 3, 3, 0]))
     for i, j in ((0, 6), (1, 9)):
-        graph.add_between(
-            i, j, far, 1e-2 * np.eye(6), streams=["x"], evidence="shared-scan", robust=RobustKernel("cauchy", 1.0)
-        )
+        graph.add_between(i, j, far, 1e-2 * np.eye(6), evidence="shared-scan", robust=RobustKernel("cauchy", 1.0))
     BatchSolver(graph).solve_to_optimum()
     table = compare_methods(JoinProblem.of_graph(graph), memory=False)
     np.testing.assert_allclose(table["objective_polished"], graph.objective().total, rtol=1e-9)

@@ -66,8 +66,6 @@ def test_map_draws_path_landmarks_gps_and_truth(log, tmp_path: Path) -> None:
         gps=log["gps"],
         truth=log.truth,
         dead_reckoning=t.poses - 1.0,
-        pose_ellipses=5,
-        title="quick",
     )
     rendered(ax, tmp_path)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")

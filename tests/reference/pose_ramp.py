@@ -12,6 +12,7 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.poses import SE2, SE3, compose_increments
 from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.join.graph_problem import JoinProblem
 
 
@@ -76,8 +77,8 @@ def pose_ramp(
     graph = FactorGraph(dim)
     start = compose_increments(step_ij)
     graph.add_betweens(
-        np.array(ends), measured, np.array([np.diag(s**2) for s in size]), poses=start[1:], streams=["ramp"],
-        interval=(0.0, float(n)),
+        np.array(ends), measured, np.array([np.diag(s**2) for s in size]), poses=start[1:],
+        evidence=EvidenceUse(["ramp"], (0.0, float(n))),
     )  # fmt: skip
     for node, direction in zip(level_nodes.tolist(), directions):
         graph.add_attitude(node, direction, float(level_sigma or 1.0), evidence="levelled", group="levelled")

@@ -13,6 +13,7 @@ from graphslam.core.errors import ConfigError, IndeterminateError, SolverError, 
 from graphslam.core.geometry import se2_between
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver, optimise_graph, state_of
@@ -188,7 +189,7 @@ def test_an_underconstrained_graph_is_an_error_that_names(rng):
         with pytest.raises(IndeterminateError, match="x4, x5, x6"):
             solver.update()
         np.testing.assert_array_equal(g.values.poses, before[0])
-    g.add_between(3, 4, se2_between(chain.poses[3], chain.poses[4]), C, streams=["wheel"], interval=(30, 40))
+    g.add_between(3, 4, se2_between(chain.poses[3], chain.poses[4]), C, evidence=EvidenceUse(["wheel"], (30, 40)))
     solver.update()
     assert solver.gap() < 1e-9
 
@@ -202,7 +203,7 @@ def test_removal_and_merging_follow_the_graph(rng):
     for s in chain.submaps:
         g.add_submap(s, landmark_ids=s.landmarks.ids + (100 if s.key >= 6 else 0))
         solver.update()
-    wrong = g.add_between(0, 9, [9.0, 9.0, 2.0], C, streams=["wheel"], interval=(0.0, 9.0))
+    wrong = g.add_between(0, 9, [9.0, 9.0, 2.0], C, evidence=EvidenceUse(["wheel"], (0.0, 9.0)))
     solver.update()
     g.remove(wrong)
     g.remove(ids[7])

@@ -101,7 +101,7 @@ def test_a_dask_cluster_gives_the_same_bytes(serial: Study, tmp_path: Path) -> N
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.ERROR
     ) as cluster:
-        study(SMALL, 4, out=tmp_path, seed=5, cluster=cluster.scheduler_address, progress=False)
+        study(SMALL, 4, out=tmp_path, seed=5, workers=cluster.scheduler_address, progress=False)
     assert table_bytes(tmp_path) == table_bytes(serial.folder.path)
 
 
@@ -296,8 +296,6 @@ def test_wrong_use_is_refused(tmp_path: Path) -> None:
         study(SMALL, out=tmp_path, worlds=["nar"])
     with pytest.raises(ConfigError, match="0 trials"):
         study(SMALL, 0, out=tmp_path)
-    with pytest.raises(ConfigError, match="not both"):
-        study(SMALL, 1, out=tmp_path, workers=2, cluster="tcp://127.0.0.1:1")
     with pytest.raises(ConfigError, match="0 workers"):
         study(SMALL, 1, out=tmp_path / "w", workers=0)
     assert not list(tmp_path.glob("*.csv"))

@@ -76,18 +76,7 @@ def join_command(
     value: dict[str, Any] = join_json(material, method, estimate, truth=truth, own=own if polish and filters else None)
     plain = isinstance(material, Sequence)
     if out is not None:
-        write_joined(
-            out,
-            s.times,
-            estimate.poses,
-            estimate.landmark_ids,
-            estimate.landmarks,
-            information=estimate.map_information(),
-            covariance=estimate.map_covariance(),
-            state="vector" if plain else "tangent",
-            chart=getattr(estimate, "chart", "cartesian"),
-            anchors=getattr(estimate, "anchors", None),
-        )
+        write_joined(out, s.times, estimate, "vector" if plain else "tangent")
     found = join_verdict(value["methods"][0], estimate)
     length = Trajectory(np.arange(len(estimate.poses), dtype=np.float64), estimate.poses).length()
     said = join_headline(value["methods"][0], found, submaps=len(submap_keys(material)), length=length)

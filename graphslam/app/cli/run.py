@@ -126,7 +126,7 @@ def run_command(
     if saved:
         from graphslam.app.sessions.merge import continue_runs
 
-        joined = continue_runs(saved, result, out=out / "continued")
+        joined = continue_runs(saved, result, out / "continued")
         value["continued"] = joined.report
         text += "\n".join(["", *metric_lines(joined, every), ""])
         text += f"{joined!r}, in {out / 'continued'}: report in {out / 'continued' / 'report.html'}"

@@ -205,9 +205,8 @@ class Run:
             truth=truth,
             dead_reckoning=None if reckoned is None else reckoned.transformed(T),
             before=None if self.graph_path is None else self.graph_path.transformed(T),
-            pose_ellipses=12,
-            title=title,
         )
+        axes.set_title(title)
         if scored is not None:
             axes.set_xlabel("east [m]")
             axes.set_ylabel("north [m]")

@@ -143,19 +143,18 @@ def surface_of_run(
     run: Run,
     *,
     log: str | Path | SensorLog | None = None,
-    stream: str | None = None,
     config: SurfaceConfig | None = None,
     progress: bool = True,
 ) -> RunSurface:
     """Read the log of a run once more, along its solved path; for the errors see
     :func:`graphslam.app.run.terrain.terrain_of_run`."""
-    return read_surface([scanned_path(run, log=log, stream=stream)], config=config, progress=progress)
+    return read_surface([scanned_path(run, log=log)], config=config, progress=progress)
 
 
-def scanned_path(run: Run, *, log: str | Path | SensorLog | None = None, stream: str | None = None) -> ScannedPath:
+def scanned_path(run: Run, *, log: str | Path | SensorLog | None = None) -> ScannedPath:
     """The scans of a run along its solved path; for the errors see
     :func:`graphslam.app.run.terrain.terrain_of_run`."""
-    name, scans = scans_of_run(run, log, stream, what="a surface")
+    name, scans = scans_of_run(run, log, what="a surface")
     m = run.map
     return ScannedPath(
         scans=scans, path=m.trajectory, node_times=m.node_times, node_poses=m.node_poses,

@@ -28,13 +28,14 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.io.submap_store import read_submaps
+from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.moving import MovedObjects, moving_points
 from graphslam.maps.terrain.ground import common_up, ground_plane, level_rotation
 from graphslam.maps.terrain.layer import TerrainLayer
 from graphslam.maps.terrain.lines import ScanLines, lines_of_clouds, lines_of_scans
 from graphslam.maps.terrain.plan import cost_map, save_cost_map
 from graphslam.maps.terrain.pyramid import ClassGrid, TerrainClass, TerrainMap
-from graphslam.maps.terrain.tables import TerrainWeights, read_tables
+from graphslam.maps.terrain.tables import read_tables
 from graphslam.maps.terrain.vehicle import LineSensor, Vehicle
 
 FORMAT = "graphslam.terrain/1"
@@ -109,13 +110,11 @@ def terrain_of_run(
     run: Run,
     *,
     log: str | Path | SensorLog | None = None,
-    stream: str | None = None,
     vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
-    tables: TerrainWeights | None = None,
     progress: bool = True,
 ) -> RunTerrain:
-    """Read the log of a run once more, along its solved path.
+    """Read the log of a run once more, along its solved path: its point clouds, or else the lines of a laser.
 
     Parameters
     ----------
@@ -123,25 +122,18 @@ def terrain_of_run(
         With a folder, in space.
     log : card name, folder, or SensorLog; optional
         Where the run's log is by now; default where it was.
-    stream : str, optional
-        Of point clouds or of an upright line laser; default the first of point clouds, else of lines.
     sensor_height : float, optional
         Of the scanner above the ground [m]; default found from the ground in its scans. A line laser needs it: its base
         is taken to drive on the ground.
-    tables : TerrainWeights, optional
-        Default those of the package.
     """
-    name, scans = scans_of_run(run, log, stream, what="terrain")
+    name, scans = scans_of_run(run, log, what="terrain")
     return read_terrain(
-        scans, run.map.trajectory, run.map.node_times, run.map.node_poses,
-        moved=_moved(run) if isinstance(scans, PointClouds) else None,
-        stream=name, vehicle=vehicle, sensor_height=sensor_height, tables=tables, progress=progress,
+        scans, run.map, moved=_moved(run) if isinstance(scans, PointClouds) else None,
+        stream=name, vehicle=vehicle, sensor_height=sensor_height, progress=progress,
     )  # fmt: skip
 
 
-def scans_of_run(
-    run: Run, log: str | Path | SensorLog | None, stream: str | None, *, what: str
-) -> tuple[str, PointClouds | RangeScans]:
+def scans_of_run(run: Run, log: str | Path | SensorLog | None, *, what: str) -> tuple[str, PointClouds | RangeScans]:
     """Name and records of the scans of a run in space, from its log; see :func:`terrain_of_run` for the errors."""
     if run.folder is None:
         raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
@@ -149,11 +141,11 @@ def scans_of_run(
         raise DataError(f"{what} is read along a path in space", got="a run in the plane", wanted="a run in space")
     said = read_options(run.folder)["run"]
     source = log_of_run(said, log)
-    name = stream or source.of_type(PointClouds) or source.of_type(RangeScans)
+    name = source.of_type(PointClouds) or source.of_type(RangeScans)
     scans = source.streams.get(name) if name else None
     if name is None or not isinstance(scans, PointClouds | RangeScans):
         raise MissingDataError(
-            f"no scans to read {what} from", where=source.name, got=stream or "no such stream",
+            f"no scans to read {what} from", where=source.name, got="no such stream",
             wanted="a stream of point clouds, or of lines in space",
         )  # fmt: skip
     return name, scans
@@ -161,39 +153,33 @@ def scans_of_run(
 
 def read_terrain(
     scans: PointClouds | RangeScans,
-    path: Trajectory,
-    node_times: Array,
-    node_poses: Array,
+    solved: GlobalMap,
     *,
     moved: Mapping[int, Array] | None = None,
     stream: str = "scans",
     vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
-    tables: TerrainWeights | None = None,
     progress: bool = True,
 ) -> RunTerrain:
     """Terrain of scans along a path, a piece for each node.
 
     Parameters
     ----------
-    path : Trajectory
-        ``T_world_base`` in space; the z axis of the world points upwards within 20°.
-    node_times, node_poses : (k,), (k, 7)
-        In time order; a scan goes with the last node before it.
+    solved : GlobalMap
+        In space; the z axis of the world points upwards within 20°. A scan goes with the last node before it.
     moved : mapping, optional
         By number of a node: points ``(m, 3)`` of things that moved while it was made, in the world. Clouds of that
         time are read without what stands where they are.
-    stream, vehicle, sensor_height, tables, progress
+    stream, vehicle, sensor_height, progress
         See :func:`terrain_of_run`.
     """
-    chosen = vehicle or Vehicle()
+    path, node_times, node_poses = solved.trajectory, solved.node_times, solved.node_poses
     inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
     if isinstance(scans, RangeScans):  # beams are read after the stamp of their line
         inside &= scans.times + scans.beam_times.max() <= path.times[-1]
     at: Ints = np.flatnonzero(inside).astype(np.int64)
     if not len(at):
         raise DataError("no scan lies within the solved path in time", where=stream)
-    used = tables or read_tables()
     if isinstance(scans, PointClouds):
         rotation, height, step = _ground_of_clouds(scans, at, path, sensor_height)
     else:
@@ -202,7 +188,7 @@ def read_terrain(
         step = float(np.median(np.arccos(np.clip(np.sum(rays[0, 1:] * rays[0, :-1], axis=-1), -1.0, 1.0))))
         height = float(scans.T_base_mount[2] if sensor_height is None else sensor_height)
     sensor = LineSensor(height=height, beam_step=step, sweep_time=_sweep(scans, at))
-    layer = TerrainLayer(used, chosen, sensor)
+    layer = TerrainLayer(read_tables(), vehicle or Vehicle(), sensor)
     turn = np.concatenate([np.zeros(3), se3.matrix_to_quat(rotation)])
     level = Trajectory(path.times, se3.se3_compose(np.broadcast_to(turn, path.poses.shape), path.poses))
     poses = se3.se3_compose(np.broadcast_to(turn, node_poses.shape), node_poses)

@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 IDENTITY_GATE = 25.0
 MERGE_GATE = 11.8
+TOLERANCE = 0.5
 SESSION_COLOURS = ("session", "height", "piece", "sigma")
 
 
@@ -46,9 +47,8 @@ def merge(
     by: By = "auto",
     solver: str = "batch",
     identity_gate: float = IDENTITY_GATE,
-    tolerance: float = 0.5,
+    tolerance: float = TOLERANCE,
     out: str | Path | None = None,
-    anew: bool = False,
     surface: SurfaceConfig | None = None,
     colour: str = "session",
 ) -> MergedMap | MergedSubmaps:
@@ -73,8 +73,6 @@ def merge(
         Landmarks of two maps within this distance after alignment agree [m].
     out : path, optional
         Folder for the merged map.
-    anew : bool
-        ``out`` may hold a merged map already: then this is its new state.
     surface : SurfaceConfig, optional
         Runs of dense submaps in space: write the surface of all sessions into ``out`` as well; their logs are read once
         more (:func:`graphslam.app.sessions.merge_surface.surface_of_sessions`).
@@ -101,9 +99,7 @@ def merge(
     >>> merged.metrics["key"].size > 0
     True
     """
-    opened = [r if isinstance(r, Run) else read_run_folder(r) for r in runs]
-    if len(opened) < 2:
-        raise ConfigError(f"{len(opened)} runs to merge; wanted at least two")
+    opened = _opened(runs)
     if surface is not None and (out is None or colour not in SESSION_COLOURS):
         raise ConfigError(f"a surface of sessions, out = {out}, colour = {colour!r}; wanted a folder to write it to and"
                           f" one of the colours {', '.join(SESSION_COLOURS)}")  # fmt: skip
@@ -111,7 +107,7 @@ def merge(
         return _merged(opened, by, solver, identity_gate, tolerance)
     from graphslam.app.sessions.merge_outputs import merged_folder, write_merged
 
-    with merged_folder(out, anew=anew) as folder:
+    with merged_folder(out) as folder:
         merged = _merged(opened, by, solver, identity_gate, tolerance)
         made = None
         if surface is not None:
@@ -122,7 +118,19 @@ def merge(
     return merged
 
 
-def _merged(opened: list[Run], by: By, solver: str, gate: float, tolerance: float) -> MergedMap | MergedSubmaps:
+def _opened(runs: Sequence[Run | str | Path]) -> list[Run]:
+    if len(runs) < 2:
+        raise ConfigError(f"{len(runs)} runs to merge; wanted at least two")
+    return [r if isinstance(r, Run) else read_run_folder(r) for r in runs]
+
+
+def _merged(
+    opened: list[Run],
+    by: By = "auto",
+    solver: str = "batch",
+    gate: float = IDENTITY_GATE,
+    tolerance: float = TOLERANCE,
+) -> MergedMap | MergedSubmaps:
     with one_blas_thread():
         if all(run_is_dense(r) for r in opened):
             return merge_dense(opened, _names(opened), by=cast(Any, by), solver=solver)
@@ -280,9 +288,15 @@ def _with_landmarks(m: GlobalMap, solution: Solution, P: Array, hits: Ints, keep
     )
 
 
-def continue_runs(saved: Sequence[Run | str | Path], run: Run, *, out: str | Path | None = None) -> Any:
+def continue_runs(saved: Sequence[Run | str | Path], run: Run, out: str | Path) -> MergedMap | MergedSubmaps:
     """Put a new run into the graph of saved ones, tied where it was localised in them; the first one's base is fixed.
 
     What was there before is replaced: the run itself may have been resumed.
     """
-    return merge([*saved, run], out=out, anew=True)
+    from graphslam.app.sessions.merge_outputs import merged_folder, write_merged
+
+    opened = _opened([*saved, run])
+    with merged_folder(out, anew=True) as folder:
+        merged = _merged(opened)
+        write_merged(folder, merged)
+    return merged

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -137,7 +137,7 @@ def merge_dense(
         raise DataError("runs in the plane and in space cannot be merged", got=sorted(dims))
     graph = FactorGraph(dims.pop())
     solve = make_solver(solver, graph)
-    add_session(graph, sessions[0], use_gps=by != "places")
+    add_session(graph, replace(sessions[0], fixes=None) if by == "places" else sessions[0])
     solve.solve_to_optimum()
     first: dict[int, int] = {0: 0}
     how: dict[int, ConnectedSession] = {}
@@ -183,9 +183,9 @@ def _tie(
     both = all(s.fixes is not None and s.T_gps_base is not None for s in (known, new))
     if by == "gps" or (by == "auto" and both):
         return connect_by_gps(graph, solver, known, known_node, new, places=by == "auto", progress=progress)
-    return connect_session(
-        graph, solver, known, known_node, new, config=config, use_gps=by == "auto", progress=progress
-    )
+    if by != "auto":
+        new = replace(new, fixes=None)
+    return connect_session(graph, solver, known, known_node, new, config=config, progress=progress)
 
 
 def _placed(

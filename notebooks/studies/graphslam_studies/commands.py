@@ -8,7 +8,7 @@ import typer
 
 from graphslam.app.cli.run import JSON
 from graphslam.app.cli.terminal import print_result, text_table
-from graphslam.core.errors import GraphSlamError
+from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.plugins import plugins
 
 
@@ -29,14 +29,15 @@ def study(
     """Run a Monte-Carlo study: all algorithms on the same data; a table, a report, plots. Resumes an unfinished one."""
     from graphslam_studies.montecarlo.study import study as run_study
 
+    if cluster is not None and workers is not None:
+        raise ConfigError("either workers or a cluster, not both: the cluster has workers of its own")
     result = run_study(
         name,
         trials,
         out=out,
         worlds=[w.strip() for w in worlds.split(",") if w.strip()] or None,
         seed=seed,
-        workers=workers,
-        cluster=cluster,
+        workers=cluster or workers,
         quick=quick,
         progress=not as_json,
     )

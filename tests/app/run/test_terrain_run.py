@@ -18,6 +18,7 @@ from graphslam.core.errors import ConfigError, DataError, GraphSlamError, Missin
 from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.trajectory import Trajectory
+from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.terrain.pyramid import TerrainClass
 from graphslam.plots.terrain import class_colours
 
@@ -41,6 +42,15 @@ def scan_from(x: float, rng: np.random.Generator) -> Array:
     return (r[:, None] * d)[r < 20.0]
 
 
+def solved(path: Trajectory) -> GlobalMap:
+    """A map with a node at every third pose of a path, and no landmarks."""
+    none = np.zeros(0, np.int64)
+    covariances = np.zeros((len(path.times[::3]), 6, 6))
+    return GlobalMap(
+        path, path.times[::3], path.poses[::3], covariances, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none
+    )  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def made() -> tuple[RunTerrain, PointClouds, Trajectory]:
     rng = np.random.default_rng(1)
@@ -51,7 +61,7 @@ def made() -> tuple[RunTerrain, PointClouds, Trajectory]:
     level = np.column_stack([x, np.zeros((len(x), 2)), np.tile([0.0, 0, 0, 1], (len(x), 1))])
     poses = se3.se3_compose(np.broadcast_to([0.0, 0, 0, *LEAN], level.shape), level)  # the world's z is not up
     path = Trajectory(times, poses)
-    return read_terrain(scans, path, times[::3], poses[::3], progress=False), scans, path
+    return read_terrain(scans, solved(path), progress=False), scans, path
 
 
 def classes_at(found: RunTerrain, x: float, y: float) -> set[TerrainClass]:
@@ -83,7 +93,7 @@ def test_what_moved_is_left_out_of_the_scans_that_saw_it_there(
     box = se3.se3_move(np.concatenate([np.zeros(3), se3.matrix_to_quat(still.rotation.T)]), box)  # frame of the path
     for nodes in ((0,), (0, 1, 2)):
         moved = dict.fromkeys(nodes, box)
-        found = read_terrain(scans, path, path.times[::3], path.poses[::3], moved=moved, progress=False)
+        found = read_terrain(scans, solved(path), moved=moved, progress=False)
         classes = classes_at(found, 6.0, -2.5)
         assert (TerrainClass.OBSTACLE in classes) is (len(nodes) == 1)
         assert found.moved > 0
@@ -101,7 +111,7 @@ def test_clouds_are_decoded_once_and_those_that_tell_where_up_is_twice(
     cloud = PointClouds.cloud
     monkeypatch.setattr(PointClouds, "cloud", lambda self, k: decoded.append(k) or cloud(self, k))
     monkeypatch.setattr("graphslam.app.run.terrain._SAMPLE", 3)
-    again = read_terrain(scans, path, path.times[::3], path.poses[::3], progress=False)
+    again = read_terrain(scans, solved(path), progress=False)
     assert sorted(decoded) == sorted([*range(len(scans)), 0, 3, 7])
     assert again.scans == len(scans)
 
@@ -134,7 +144,7 @@ def test_no_scan_on_the_path(made: tuple[RunTerrain, PointClouds, Trajectory]) -
     _, scans, path = made
     late = Trajectory(path.times + 100.0, path.poses)
     with pytest.raises(DataError, match="within the solved path"):
-        read_terrain(scans, late, late.times[:1], late.poses[:1], progress=False)
+        read_terrain(scans, solved(late), progress=False)
 
 
 def test_terrain_is_made_alone(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.loops.inter_session_loops import InterSessionConfig, TwoSessions
 from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
@@ -196,7 +197,7 @@ def test_the_runs_own_ties_come_along(runs: list[Any], tmp_path: Path) -> None:
     T, P = np.array([0.0, 0, 0, 0, 0, 0, 1]), 1e-2 * np.eye(6)
     n = len(graph.values.poses)
     T = se3.se3_between(graph.values.poses[2], graph.values.poses[n - 2])
-    fid = graph.add_between(2, n - 2, T, P, streams=["scanner"], evidence="shared-scan", group="loop")
+    fid = graph.add_between(2, n - 2, T, P, evidence=EvidenceUse(["scanner"], (0.0, 0.0), "shared-scan"), group="loop")
     try:
         m = graphslam.merge([runs[0], runs[1]])
         own = [r for r in m.graph.records.values() if isinstance(r, BetweenRecord) and r.group == "match"]

@@ -15,6 +15,7 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN, attitude_terms, level_turn, tangent_basis, up_turn
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.space_chain import dense_chain
@@ -155,17 +156,17 @@ def test_tilt_comes_and_goes(rng):
         g.add_submap(s)
         solver.update()
     up = quat_rotate(chain.poses[2][3:] * [-1, -1, -1, 1], [0, 0, -9.81])
-    fid = g.add_attitude(2, up, 0.01, streams=["imu"], interval=(15.0, 25.0))
+    fid = g.add_attitude(2, up, 0.01, evidence=EvidenceUse(["imu"], (15.0, 25.0)))
     assert g.values.tilt is not None
     solver.update()
     solver.solve_to_optimum()
     assert np.abs(g.values.tilt).max() < 0.05
-    first = g.add_attitude(0, DOWN, 1e-3, streams=["imu"], interval=(0.0, 1.0))
+    first = g.add_attitude(0, DOWN, 1e-3, evidence=EvidenceUse(["imu"], (0.0, 1.0)))
     solver.update()
     assert g.diagnose().ok
     assert np.sqrt(np.diag(g.covariance().marginal("tilt"))).max() < 1e-3
     with pytest.raises(EvidenceReusedError, match="imu"):
-        g.add_attitude(1, DOWN, 0.01, streams=["imu"], interval=(20.0, 21.0))
+        g.add_attitude(1, DOWN, 0.01, evidence=EvidenceUse(["imu"], (20.0, 21.0)))
     g.remove(fid)
     g.remove(first)
     assert g.values.tilt is None

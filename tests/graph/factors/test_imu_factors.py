@@ -19,6 +19,7 @@ from graphslam.graph.factors.imu.config import ImuConfig, places_on_nodes
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
 from graphslam.graph.gtsam_values import to_gtsam
+from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.graph.variables import gtsam_key, key_name
@@ -260,7 +261,7 @@ def test_and_the_other_way_round(rng):
     g = chain(made)
     g.add_sensor(made.imu)
     with pytest.raises(EvidenceReusedError, match="imu x0"):
-        g.add_between(0, 2, SE3.identity, np.eye(6), streams=["imu"], interval=(0.0, 1.0))
+        g.add_between(0, 2, SE3.identity, np.eye(6), evidence=EvidenceUse(["imu"], (0.0, 1.0)))
     node = g.start_session(SE3.identity)
     again = replace(made.submaps[0], key=7, uses=frozenset({"imu"}))
     with pytest.raises(EvidenceReusedError, match="submap 7 would use stream 'imu'"):

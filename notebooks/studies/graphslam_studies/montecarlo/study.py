@@ -140,8 +140,7 @@ def study(
     out: str | Path | None = None,
     worlds: Sequence[str] | None = None,
     seed: int = 0,
-    workers: int | None = None,
-    cluster: str | None = None,
+    workers: int | str | None = None,
     quick: bool = False,
     progress: bool = True,
 ) -> Study:
@@ -155,8 +154,6 @@ def study(
     count = definition.default_trials(quick) if trials is None else trials
     if count < 1:
         raise ConfigError(f"{count} trials; wanted at least 1")
-    if cluster is not None and workers is not None:
-        raise ConfigError("either workers or a cluster, not both: the cluster has workers of its own")
     functions = {w: definition.trial(w, quick) for w in known}
     identity = {
         "name": name,
@@ -168,7 +165,7 @@ def study(
     with StudyFolder.start(out if out is not None else f"study-{definition.name}", identity) as folder:
         # run by run through all worlds, so that a study that is stopped has as many runs of each
         wanted = [(w, k) for k in range(count) for w in chosen]
-        return _run(definition, folder, functions, wanted, seed, workers, cluster, progress)
+        return _run(definition, folder, functions, wanted, seed, workers, progress)
 
 
 def _run(
@@ -177,12 +174,12 @@ def _run(
     functions: Mapping[str, Callable[[int], Iterable[Measurement]]],
     wanted: Sequence[tuple[str, int]],
     seed: int,
-    workers: int | None,
-    cluster: str | None,
+    workers: int | str | None,
     progress: bool,
 ) -> Study:
     """Run the trials ``(world, number)`` that are not in the folder yet, and write what follows from all of them."""
-    executor: Executor = "dask" if cluster else "serial" if workers is None else "processes"
+    processes, address = (None, workers) if isinstance(workers, str) else (workers, None)
+    executor: Executor = "dask" if address else "serial" if processes is None else "processes"
     there, source = folder.finished(), source_digest()
     jobs = {
         f"{w}/{k}": (w, k, Job(f"{w}/{k}", functions[w], trial_seed(seed, k)))
@@ -192,8 +189,8 @@ def _run(
     outcomes = execute(
         [job for _, _, job in jobs.values()],
         executor=executor,
-        workers=workers,
-        address=cluster,
+        workers=processes,
+        address=address,
         prepare=None if executor == "serial" else hold_one_thread,
     )
     try:
