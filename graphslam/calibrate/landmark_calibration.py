@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.calibrate import landmarks as L
+from graphslam.calibrate.clock import profile_clock
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, round_digits
 from graphslam.calibrate.prediction_check import predict_withheld_sightings
@@ -324,47 +325,6 @@ def sightings_of_a_visit(windows: Sequence[SmoothingWindow]) -> float:
     n = np.concatenate([np.bincount(w.slots[w.slots[:, 1] >= 0, 1]) for w in windows])
     n = n[n > 0]
     return float((n**2).sum() / max(n.sum(), 1))
-
-
-def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
-    """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
-
-    Parameters
-    ----------
-    s : Smoothing
-        Fitted without an offset.
-    """
-    period = seen.period
-    scores: dict[int, float] = {}
-
-    def score(k: int) -> float:
-        if k not in scores:
-            moved = L.shift_motion(s, seen, k * 0.5 * period)
-            moved.settle(8)
-            moved.fit(budget=60, rounds=1)
-            scores[k] = moved.objective()
-        return scores[k]
-
-    best = min((0, 2, -2), key=score)
-    while True:
-        near = min((best - 2, best, best + 2), key=score)
-        if near == best or abs(near) > 40:
-            break
-        best = near
-    best = min((best - 1, best, best + 1), key=score)
-    a, b, c = score(best - 1), score(best), score(best + 1)
-    bend = max(a - 2.0 * b + c, 1e-6)
-    at = best + float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5))
-    # of a straight course every offset fits; noise of the records themselves blurs it by their spacing
-    sigma = max(0.5 * period / math.sqrt(bend), 0.1 * period)
-    return Estimate(
-        name="clock",
-        value=at * 0.5 * period,
-        sigma=sigma,
-        gain=score(0) - b,
-        other=at * 0.5 * period,
-        other_sigma=sigma,
-    ).gated()
 
 
 def _count(seen: SightingLog, seconds: float, effort: CalibrationBudget) -> int | None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import graphslam as gs
 from graphslam.app.cli import app
 from graphslam.app.cli.run import join_note
+from graphslam.calibrate.clock import profile_clock
 from graphslam.calibrate.corrections import Corrections, apply_corrections
 from graphslam.calibrate.estimate import Estimate
 from graphslam.calibrate.landmark_calibration import LONG, QUICK, RAN_AWAY, SHORT, calibrate_sightings
@@ -54,6 +55,18 @@ def test_drawn_robot_is_found_again(found) -> None:
     assert e["range_offset"].sigma < 0.05
     assert c.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.1)
     assert c.bearing_sigma == pytest.approx(ROBOT.bearing_sigma, rel=0.1)
+
+
+@pytest.mark.parametrize(("number", "rate", "scans"), [(1000, 20.0, 4.0), (1003, 20.0, 4.0), (1049, 10.0, 2.0)])
+def test_clocks_that_agree_are_left_alone(number: int, rate: float, scans: float) -> None:
+    """Records that are averaged over half a period look less noisy, whatever the clocks are."""
+    robot = dataclasses.replace(draw_robot(number), clock=0.0)
+    drawn = drive(robot, number, 90.0, rate=rate, scans=scans)
+    seen = SightingLog.of(drawn, "landmarks", drawn["landmarks"]).holding()
+    free = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
+    clock = profile_clock(fit_noise(smooth_sightings(seen, SHORT, 20, free))[0], seen)
+    assert not clock.applied
+    assert abs(clock.value) < 0.02
 
 
 def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, found) -> None:
