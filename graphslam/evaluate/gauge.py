@@ -2,8 +2,7 @@
 
 A map is known in the frame of its first base. Truth from outside knows that base only as well as it measures it, and a
 small error of its heading moves everything that is far away. Judged *up to a rigid motion*, a map answers for its
-shape alone: ``min_δ (e + G δ)ᵀ P⁻¹ (e + G δ)`` over the three numbers δ of a small motion of the truth, with as many
-degrees of freedom less.
+shape alone: ``min_T e(T)ᵀ P⁻¹ e(T)`` over the rigid motions ``T`` of the truth, with three degrees of freedom less.
 """
 
 from __future__ import annotations
@@ -13,7 +12,8 @@ import scipy.linalg as sla
 
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.gaussian import check_covariance
-from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.geometry import Array, ArrayLike, align_se2, se2_compose, se2_inverse, se2_transform
+from graphslam.evaluate.consistency import vector_pose_error
 
 
 def gauge_directions(poses: ArrayLike, points: ArrayLike) -> Array:
@@ -40,26 +40,55 @@ def gauge_directions(poses: ArrayLike, points: ArrayLike) -> Array:
     return G
 
 
-def aligned_nees(error: ArrayLike, covariance: ArrayLike, directions: ArrayLike) -> float:
-    """Least NEES over all small rigid motions of the truth; ``n - 3`` degrees of freedom. First order in the motion.
+def aligned_nees(
+    poses: ArrayLike, points: ArrayLike, truth: tuple[ArrayLike, ArrayLike], covariance: ArrayLike
+) -> float:
+    """Least NEES over all rigid motions of the truth, however large; ``3m + 2n - 3`` degrees of freedom.
+
+    Gauss-Newton on the motion, from that which brings the true positions onto the estimated ones by least squares.
 
     Parameters
     ----------
-    error : (n,)
-    covariance : (n, n)
-    directions : (n, 3)
-        :func:`gauge_directions`.
+    poses, points : (m, 3), (n, 2)
+        Estimated.
+    truth : ((m, 3), (n, 2))
+        In any frame.
+    covariance : (3m + 2n, 3m + 2n)
+        Of poses, then points.
     """
-    e, G = np.asarray(error, dtype=np.float64), np.asarray(directions, dtype=np.float64)
-    if e.ndim != 1 or G.shape != (len(e), 3) or len(e) <= 3:
-        raise DataError("error and directions do not fit", got=(e.shape, G.shape), wanted="(n,) and (n, 3) with n > 3")
-    L = np.linalg.cholesky(check_covariance(covariance, dim=len(e)))
-    y = sla.solve_triangular(L, e, lower=True)
-    Q, R = np.linalg.qr(sla.solve_triangular(L, G, lower=True))
-    size = np.abs(np.diag(R))
-    if size.min() < 1e-9 * size.max():
-        raise CovarianceError("a rigid motion is not determined", got=f"{len(e)} scalars", wanted="two points apart")
-    return float(y @ y - np.sum((Q.T @ y) ** 2))
+    x, l = np.asarray(poses, dtype=np.float64).reshape(-1, 3), np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    u, v = (np.asarray(t, dtype=np.float64).reshape(-1, w) for t, w in zip(truth, (3, 2)))
+    size = x.size + l.size
+    if (x.shape, l.shape) != (u.shape, v.shape) or size <= 3:
+        raise DataError(
+            "estimate and truth do not fit", got=(u.shape, v.shape), wanted=f"{(x.shape, l.shape)}, above 3"
+        )
+    L = np.linalg.cholesky(check_covariance(covariance, dim=size))
+    at, true = np.vstack([x[:, :2], l]), np.vstack([u[:, :2], v])
+    T = align_se2(true, at) if len(at) > 1 else se2_compose(x[0], se2_inverse(u[0]))
+
+    def whitened(T: Array) -> tuple[Array, Array, Array]:
+        moved, there = se2_compose(T, u), se2_transform(T, v)
+        e = np.concatenate([vector_pose_error(x, moved).ravel(), (there - l).ravel()])
+        return sla.solve_triangular(L, e, lower=True), moved, there
+
+    y, moved, there = whitened(T)
+    for _ in range(50):
+        Q, R = np.linalg.qr(sla.solve_triangular(L, gauge_directions(moved, there), lower=True))
+        scale = np.abs(np.diag(R))
+        if scale.min() < 1e-9 * scale.max():
+            raise CovarianceError("a rigid motion is not determined", got=f"{size} scalars", wanted="two points apart")
+        step = -sla.solve_triangular(R, Q.T @ y)
+        for _ in range(30):  # a step that is too long is halved
+            tried = whitened(se2_compose(step, T))
+            if tried[0] @ tried[0] <= y @ y:
+                break
+            step = 0.5 * step
+        gained = y @ y - tried[0] @ tried[0]
+        if not gained > 1e-12 * max(float(y @ y), 1.0):
+            break
+        T, (y, moved, there) = se2_compose(step, T), tried
+    return float(y @ y)
 
 
 def inner_covariance(covariance: ArrayLike, directions: ArrayLike) -> Array:

@@ -23,7 +23,7 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import joint_nees, vector_pose_error
-from graphslam.evaluate.gauge import aligned_nees, gauge_directions
+from graphslam.evaluate.gauge import aligned_nees
 from graphslam.evaluate.gps import GpsResiduals, gps_residuals
 from graphslam.evaluate.map_error import landmark_error, match_ids
 from graphslam.evaluate.residual_consistency import class_consistency, two_sided_bounds
@@ -308,12 +308,14 @@ def truth_metrics(
     P = P[np.ix_(ix, ix)]
     add_nees(out, "nees", joint_nees(charted if solution.chart == "group" else error, covariance=P), len(error))
     out.add("nees_plain", joint_nees(error, covariance=P))
-    gauge = gauge_directions(solution.poses[node], points)
+    true_points = truth.landmarks[theirs] if identities else points
     parts = {"": slice(None), "_poses": slice(0, n_pose), "_landmarks": slice(n_pose, None)}
     for name, part in parts.items():
-        dof = len(error[part]) - 3
+        m, n = (0 if name == "_landmarks" else len(node)), (0 if name == "_poses" else len(points))
+        dof = 3 * m + 2 * n - 3
         if dof > 0:
-            add_nees(out, f"nees_aligned{name}", aligned_nees(error[part], P[part, part], gauge[part]), dof)
+            estimate, true = (solution.poses[node][:m], points[:n]), (true_poses[:m], true_points[:n])
+            add_nees(out, f"nees_aligned{name}", aligned_nees(*estimate, true, P[part, part]), dof)
 
 
 def add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_transform
-from graphslam.evaluate.gauge import aligned_nees, gauge_directions
+from graphslam.evaluate.gauge import aligned_nees
 from graphslam.evaluate.map_error import landmark_error, match_ids
 from graphslam.evaluate.metrics import Metrics, add_nees, rms
 from graphslam.evaluate.trajectory_error import match_stamps
@@ -80,10 +80,9 @@ def _score(
     out.add("landmark_max_aligned", fit.statistics.maximum, "m", "lower")
     columns = solution.covariance.layout.columns_of([f"l{k}" for k in ids.tolist()])
     if len(ids) > 2:
-        error = (true_points[j] - points).ravel()
-        P = solution.covariance.columns(columns)
-        dof = len(error) - 3
-        add_nees(out, "nees_aligned_landmarks", aligned_nees(error, P, gauge_directions(np.zeros((0, 3)), points)), dof)
+        none = np.zeros((0, 3))
+        nees = aligned_nees(none, points, (none, true_points[j]), solution.covariance.columns(columns))
+        add_nees(out, "nees_aligned_landmarks", nees, 2 * len(ids) - 3)
     for s in sessions:
         truth, path = s.run.truth, s.run.truth_path
         if truth is None or path is None:
