@@ -14,7 +14,10 @@ A distribution registers what it brings under one of these groups; names are tho
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+import sys
+from collections.abc import Callable, Iterable
+from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -38,7 +41,16 @@ IN_STUDIES: dict[str, tuple[str, ...]] = {
 
 def plugins(group: str) -> dict[str, EntryPoint]:
     """Entry points of a group by name, sorted; nothing is imported."""
-    return {e.name: e for e in sorted(entry_points(group=group), key=lambda e: e.name)}
+    state = tuple((f, os.stat(f or ".").st_mtime_ns) for f in sys.path if os.path.isdir(f or "."))
+    return dict(_read_entry_points(entry_points, group, state))
+
+
+@lru_cache(maxsize=64)
+def _read_entry_points(
+    find: Callable[..., Iterable[EntryPoint]], group: str, state: tuple[tuple[str, int], ...]
+) -> dict[str, EntryPoint]:
+    """Read from all distributions, until one is installed or removed: ``state`` has the folders and their times."""
+    return {e.name: e for e in sorted(find(group=group), key=lambda e: e.name)}
 
 
 def load_plugin(group: str, kind: str, name: str, own: Iterable[str] = ()) -> Any:

@@ -22,6 +22,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import zlib
@@ -302,10 +303,29 @@ class Bench:
 
     def __init__(self, name: str, work: Path) -> None:
         self.name, self.verb = name, VERBS[name]
-        self.base, self.work = work / "base", work / "work"
-        self.base.mkdir(parents=True)
+        names = sorted(n for n, v in VERBS.items() if v.prepare is self.verb.prepare)
+        self.base, self.work = work / "-".join(names), work / "work"
         quick_pictures()
-        pid = os.fork()  # what prepares may start threads, which no later fork should find here
+        if not self.base.is_dir():  # another verb begins with the same
+            self.prepare()
+        self.fresh()
+        called(self.arguments())  # imports and kernels are loaded once, not in every copy of this process
+        if threading.active_count() > 1:
+            raise RuntimeError(f"{name}: threads that a copy would not have")
+        self.fresh()
+        self.old = self.state()
+        _, self.operations = forked(self.arguments(), self.out)
+        self.new = self.state()
+        if self.old == self.new or not self.new:
+            raise RuntimeError(f"{name}: its two states are the same")
+        self.news = [self.new]
+        """The new state; and as processes of their own write it, which draw real pictures."""
+        self.new_submaps = self.submap_files()
+
+    def prepare(self) -> None:
+        """What the verb begins with, made by a copy of this process: no later copy should find its threads here."""
+        self.base.mkdir(parents=True)
+        pid = os.fork()
         if pid == 0:
             code = 1
             try:
@@ -316,19 +336,7 @@ class Bench:
             finally:
                 os._exit(code)
         if os.waitpid(pid, 0)[1] != 0:
-            raise RuntimeError(f"{name}: cannot be prepared")
-        import matplotlib.pyplot
-
-        matplotlib.pyplot.close()  # imported once, not in every copy of this process
-        self.fresh()
-        self.old = self.state()
-        _, self.operations = forked(self.arguments(), self.out)
-        self.new = self.state()
-        if self.old == self.new or not self.new:
-            raise RuntimeError(f"{name}: its two states are the same")
-        self.news = [self.new]
-        """The new state; and as processes of their own write it, which draw real pictures."""
-        self.new_submaps = self.submap_files()
+            raise RuntimeError(f"{self.name}: cannot be prepared")
 
     @property
     def out(self) -> Path:
@@ -474,8 +482,8 @@ def main() -> int:
     )
     options = parser.parse_args()
     bad = 0
-    for name in options.verb or VERBS:
-        with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
+        for name in options.verb or VERBS:
             begin = time.monotonic()
             bench = Bench(name, Path(folder).resolve())
             tally = bench.kills(options.kills, options.seed, options.share)

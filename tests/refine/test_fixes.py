@@ -32,6 +32,13 @@ def fixes_along(truth, times, rng, sigma=0.05, lever=(0.2, -0.1, 0.5), **more):
     return Gps(times=times, positions=z, sigma=np.full(len(z), sigma), lever=lever, **more)
 
 
+@pytest.fixture(scope="module")
+def plain():
+    """The drive of seed 3 refined without fixes."""
+    scans, reckoned, _ = court_scans(3)
+    return refine_by_scans(scans, reckoned)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("lasting", [{}, {"bias_sigma": 0.5}, {"bias_sigma": 0.5, "bias_time": 6.0}])
 def test_jacobians(rng, dim, lasting):
@@ -64,7 +71,7 @@ def test_jacobians(rng, dim, lasting):
         np.testing.assert_allclose(J, plain, atol=3e-5 * max(1.0, np.abs(plain).max()), err_msg=terms.name)
 
 
-def test_fixes_hold_what_scans_and_motion_do_not(rng):
+def test_fixes_hold_what_scans_and_motion_do_not(rng, plain):
     """The frame of the fixes is found, and the path in it is nearer the truth and surer."""
     scans, reckoned, truth = court_scans(3)
     gps = fixes_along(truth[::3], scans.times[::3], rng, sigma=0.02)
@@ -83,7 +90,6 @@ def test_fixes_hold_what_scans_and_motion_do_not(rng):
     there = g.transform(with_fixes.fixes.T_gps_world, g.transform(with_fixes.poses, lever))
     true = g.transform(DATUM, g.transform(truth, lever))
     assert np.sqrt(np.mean(np.sum((there - true) ** 2, axis=1))) < 0.02
-    plain = refine_by_scans(scans, reckoned)
     assert plain.fixes is None
     assert np.trace(with_fixes.covariances[-1][3:, 3:]) < np.trace(plain.covariances[-1][3:, 3:])
 
@@ -91,7 +97,7 @@ def test_fixes_hold_what_scans_and_motion_do_not(rng):
 def test_the_covariance_with_fixes_is_neither_too_small_nor_too_large():
     """Anchored NEES of many draws: first position and heading held, datum solved for."""
     values = []
-    for seed in range(8):
+    for seed in range(4):
         scans, reckoned, truth = court_scans(100 + seed)
         gps = fixes_along(truth[::5], scans.times[::5], np.random.default_rng(seed))
         found = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
@@ -100,7 +106,7 @@ def test_the_covariance_with_fixes_is_neither_too_small_nor_too_large():
         k = np.arange(5, len(truth), 10)
         C = found.covariances[k] + 1e-10 * np.eye(6)
         values.append(np.mean(np.einsum("ki,kij,kj->k", e[k], np.linalg.inv(C), e[k])) / 6.0)
-    assert 0.5 < np.mean(values) < 1.6
+    assert 0.65 < np.mean(values) < 1.6  # half or twice the covariance would be outside
 
 
 def test_errors_that_last_are_no_news_fix_after_fix(rng):
@@ -126,12 +132,12 @@ def test_errors_that_last_are_no_news_fix_after_fix(rng):
     assert {f.code: f for f in refinement_findings(lasting)}["refine-fixes"].level == "good"
 
 
-def test_fixes_that_do_not_say_where_north_is_hold_nothing(rng):
+def test_fixes_that_do_not_say_where_north_is_hold_nothing(rng, plain):
     scans, reckoned, truth = court_scans(3)
     gps = fixes_along(truth[:4], scans.times[:4], rng)
     found = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=20.0)))
     assert found.fixes is None
-    np.testing.assert_array_equal(found.poses, refine_by_scans(scans, reckoned).poses)
+    np.testing.assert_array_equal(found.poses, plain.poses)
 
 
 def test_fixes_outside_the_path_are_left_out_and_counted(rng):

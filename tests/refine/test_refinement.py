@@ -23,7 +23,7 @@ from graphslam_studies.refinement import QUICK_WORLDS
 from graphslam_studies.refinement_trial import FAULTS, nees_of, run_refinement_trial
 from tests.refine.world import court_scans
 
-SEEDS = range(40, 46)
+SEEDS = range(40, 44)
 
 
 def error(times, poses, truth):
@@ -52,7 +52,7 @@ def test_the_covariance_is_neither_too_small_nor_too_large(drives):
     mean = np.mean([nees_of(found, truth)["nees"] for _, _, truth, found in drives])
     relative = np.mean([nees_of(found, truth)["nees_relative"] for _, _, truth, found in drives])
     assert 0.65 < mean < 1.9
-    assert 0.3 < relative < 2.0
+    assert 0.36 < relative < 1.3
 
 
 def test_joint_covariance_holds_that_of_each_step(drives):
@@ -135,8 +135,8 @@ def test_loops_that_the_refined_path_contradicts_are_named(drives):
     assert "refine-contradicted" not in {f.code for f in refinement_findings(found, [])}
 
 
-def test_a_scanner_that_is_mounted_askew_is_named():
-    scans, start, _ = court_scans(41)
+def test_a_scanner_that_is_mounted_askew_is_named(drives):
+    scans, start, _, straight = drives[1]
     a = np.deg2rad(1.0)
     R = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
     turned = replace(
@@ -148,7 +148,7 @@ def test_a_scanner_that_is_mounted_askew_is_named():
     assert sigma < 0.002
     named = {f.code: f.text for f in refinement_findings(found)}
     assert "to the right" in named["refine-side"]  # what is ahead seems to lie to the left
-    assert "refine-side" not in {f.code for f in refinement_findings(refine_by_scans(scans, start))}
+    assert "refine-side" not in {f.code for f in refinement_findings(straight)}
 
 
 def test_a_clock_that_is_off_is_named(drives):

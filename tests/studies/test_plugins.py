@@ -36,8 +36,21 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_names_to_install_are_those_of_the_studies() -> None:
     project = tomllib.loads((ROOT / "notebooks" / "studies" / "pyproject.toml").read_text())["project"]
     groups = {group: set(names) for group, names in project["entry-points"].items()}
-    del groups["graphslam.studies"], groups["graphslam.presets"]  # asked for through those that are listed
+    for through_others in ("graphslam.studies", "graphslam.presets", "graphslam.identities"):
+        del groups[through_others]  # asked for through those that are listed
     assert {group: set(names) for group, names in plugins.IN_STUDIES.items()} == groups
+
+
+def test_what_is_installed_or_removed_meanwhile_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "own-world" not in plugins.plugins("graphslam.worlds")
+    info = tmp_path / "own-0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 0\n")
+    (info / "entry_points.txt").write_text("[graphslam.worlds]\nown-world = own:World\n")
+    assert "own-world" in plugins.plugins("graphslam.worlds")
+    info.rename(tmp_path / "gone")
+    assert "own-world" not in plugins.plugins("graphslam.worlds")
 
 
 @pytest.mark.usefixtures("alone")

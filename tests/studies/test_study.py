@@ -6,6 +6,7 @@ import inspect
 import json
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,6 +32,8 @@ from tests.reference.trials import steady
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = "tests.reference.small_study:STUDY"
 FRAGILE = "tests.reference.small_study:FRAGILE"
+KILLED = 12
+"""Trials of a study that is killed: more than are done until the last kill."""
 
 
 def command(*args: object) -> list[str]:
@@ -110,13 +113,26 @@ def test_another_seed_gives_other_bytes(serial: Study, tmp_path: Path) -> None:
     assert table_bytes(tmp_path) != table_bytes(serial.folder.path)
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Study:
+    """One world, without an interruption."""
+    return study(SMALL, KILLED, out=tmp_path_factory.mktemp("whole"), worlds=["near"], seed=5, progress=False)
+
+
 @pytest.mark.parametrize(("workers", "kills"), [(None, 3), (2, 2)])
 def test_kills_and_a_resume_give_the_bytes_of_an_uninterrupted_study(
-    tmp_path: Path, workers: int | None, kills: int
+    whole: Study, tmp_path: Path, workers: int | None, kills: int
 ) -> None:
     """SIGKILL with trials under way, at moments that no code chose."""
-    options = ["--trials", 20, "--worlds", "near", "--seed", 5, *([] if workers is None else ["--workers", workers])]
-    whole = study(SMALL, 20, out=tmp_path / "whole", worlds=["near"], seed=5, progress=False)
+    options = [
+        "--trials",
+        KILLED,
+        "--worlds",
+        "near",
+        "--seed",
+        5,
+        *([] if workers is None else ["--workers", workers]),
+    ]
     out, counts = tmp_path / "killed", []
     rng = np.random.default_rng(3)
     for _ in range(kills):
@@ -134,13 +150,13 @@ def test_kills_and_a_resume_give_the_bytes_of_an_uninterrupted_study(
         process.wait()
         assert process.returncode == -signal.SIGKILL, "the study had ended before the kill"
         counts.append(len(trial_files(out)))
-    assert 0 < counts[0] < counts[-1] < 20
+    assert 0 < counts[0] < counts[-1] < KILLED
     assert counts == sorted(set(counts))  # every call got on
     done = subprocess.run(
         command(SMALL, *options, "--out", out, "--json"), env=environment(), capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["runs"] == {"near": 20}
+    assert json.loads(done.stdout)["runs"] == {"near": KILLED}
     assert table_bytes(out) == table_bytes(whole.folder.path)
     assert not list(out.rglob("*.part"))
 
@@ -186,7 +202,7 @@ def test_finished_trials_are_not_run_again_and_more_can_be_asked_for(serial: Stu
 
 
 def test_a_damaged_trial_is_run_again(serial: Study, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    study(SMALL, 4, out=tmp_path, seed=5, progress=False)
+    shutil.copytree(serial.folder.path, tmp_path, dirs_exist_ok=True)
     victims = trial_files(tmp_path)[:3]
     victims[0].write_bytes(victims[0].read_bytes()[:200])
     victims[1].write_bytes(b"")
