@@ -32,7 +32,7 @@ from tests.reference.trials import steady
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = "tests.reference.small_study:STUDY"
 FRAGILE = "tests.reference.small_study:FRAGILE"
-KILLED = 12
+KILLED = 16
 """Trials of a study that is killed: more than are done until the last kill."""
 
 
