@@ -120,21 +120,7 @@ def integrate_imu_and_wheels(
         Counts bridged gaps.
     """
     noise = noise or DeadReckoningNoise()
-    t = check_times(times, where=where)
-    for name, stream in (("imu", imu), ("wheels", wheels)):
-        if len(stream.times) == 0:
-            raise MissingDataError("stream is empty", where=f"{where}/{name}")
-    if len(t) == 0:
-        raise DataError("no time to dead-reckon at", where=where, wanted="at least one")
-    least = max(imu.times[0], wheels.times[0])
-    begin = float(t[0]) if since is None else float(since)
-    if not (least <= begin <= t[0] and t[-1] <= imu.times[-1]):
-        raise DataError(
-            "times outside the records",
-            where=where,
-            got=f"[{begin:.3f}, {t[-1]:.3f}] s",
-            wanted=f"[{least:.3f}, {imu.times[-1]:.3f}] s",
-        )
+    t, begin = _checked_span(imu, wheels, times, since, where)
     span = (begin, float(t[-1]))
     imu_gaps = find_gaps(imu.times, *span, longest, where=f"{where}/imu", drops=drops)
     wheel_gaps = find_gaps(wheels.times, *span, longest, where=f"{where}/wheels", drops=drops)
@@ -199,6 +185,28 @@ def integrate_imu_and_wheels(
         floor=floor,
         gaps=Gaps(np.concatenate([imu_gaps.begin, wheel_gaps.begin]), np.concatenate([imu_gaps.end, wheel_gaps.end])),
     )
+
+
+def _checked_span(
+    imu: Imu, wheels: VelocityControls, times: npt.ArrayLike, since: float | None, where: str
+) -> tuple[Array, float]:
+    """Times that lie inside the records, and where the path begins [s]."""
+    t = check_times(times, where=where)
+    for name, stream in (("imu", imu), ("wheels", wheels)):
+        if len(stream.times) == 0:
+            raise MissingDataError("stream is empty", where=f"{where}/{name}")
+    if len(t) == 0:
+        raise DataError("no time to dead-reckon at", where=where, wanted="at least one")
+    least = max(imu.times[0], wheels.times[0])
+    begin = float(t[0]) if since is None else float(since)
+    if not (least <= begin <= t[0] and t[-1] <= imu.times[-1]):
+        raise DataError(
+            "times outside the records",
+            where=where,
+            got=f"[{begin:.3f}, {t[-1]:.3f}] s",
+            wanted=f"[{least:.3f}, {imu.times[-1]:.3f}] s",
+        )
+    return t, begin
 
 
 _TURN_WINDOW = 1.0

@@ -197,109 +197,13 @@ def grow_sample_by(
     choose : callable
         Segments ``(k,)`` that fit → which of them, 0 … k - 1.
     """
-    g, t = segmap.group, segmap.table
-    L = segmap.path_length
-    frames = _Upright(segmap, root) if g.dim == 2 or segmap.gravity else _Free(segmap, root)
-    segments, via, depth = [root.segment], [-1], [0]
-    intervals, anchor, travelled = [(root.start, root.end)], [root.anchor], [0.0]
-
-    def free(begin: int, end: int) -> bool:
-        return not any(begin < e and s < end for s, e in intervals)
-
-    def fits(found: Ints) -> Ints:
-        """Those that do not overlap in time with what is there."""
-        if not len(found):
-            return found
-        ends, begins = t.end[found], t.start[found]
-        if (ends == ends[0]).all() and (begins == begins[0]).all():
-            return found if free(int(begins[0]), int(ends[0])) else found[:0]
-        return found[[free(b, e) for b, e in zip(begins.tolist(), ends.tolist())]]
-
-    def add(index: int, at: int, step_there: int, step_here: int) -> None:
-        segments.append(index)
-        via.append(at)
-        depth.append(depth[at] + 1)
-        intervals.append((int(t.start[index]), int(t.end[index])))
-        anchor.append(step_there)
-        travelled.append(travelled[at] + float(abs(L[step_here] - L[anchor[at]])))
-
-    drawn: dict[tuple[int, int], int] = {}
-
-    def draw(found: Ints) -> int:
-        """One of those that fit; the same again of an interval that was asked for before."""
-        begins, ends = t.start[found], t.end[found]
-        if (begins != begins[0]).any() or (ends != ends[0]).any():
-            return int(found[choose(found)])
-        key = int(begins[0]), int(ends[0])
-        if key not in drawn:
-            drawn[key] = int(found[choose(found)])
-        return drawn[key]
-
-    def grows(k: int) -> bool:
-        return not ((local_length and travelled[k] > local_length) or (local_depth and depth[k] >= local_depth))
-
-    def settle(k: int) -> list[int]:
-        """Places of what shares a frame with place k, and with those in turn; place k first."""
-        found = [k]
-        for k in found:  # grows as it goes
-            if not grows(k):
-                continue
-            i, begin = segments[k], intervals[k][0]
-            source, T, entry = root.source, root.link, root.entry
-            if k:
-                source, T, entry = int(t.source[i]), t.link[i], t.entry[i]
-            if source >= 0 and t.alive[source] and free(int(t.start[source]), int(t.end[source])):
-                T = cast(Array, T)
-                # the way goes on from where the body stood in the entered map
-                add(source, k, nearest_step(segmap, source, g.compose(g.inverse(T), entry)), begin)
-                frames.linked(k, T)
-                found.append(len(segments) - 1)
-            entering = segmap.entering(i)
-            for begin, end in dict.fromkeys(zip(t.start[entering].tolist(), t.end[entering].tolist())):
-                if not free(begin, end):
-                    continue
-                rivals = segmap.beginning_at(begin)
-                rivals = rivals[t.end[rivals] == end]
-                chosen = draw(rivals)
-                if t.source[chosen] != i:
-                    continue  # particles of that time that went another way
-                T = g.inverse(t.link[chosen])
-                add(chosen, k, begin, nearest_step(segmap, i, g.compose(T, t.entry[chosen])))
-                frames.linked(k, T)
-                found.append(len(segments) - 1)
-        return found
-
-    level = settle(0)
+    growing = _GrowingSample(segmap, root, choose, local_length, local_depth)
+    level = growing.settle(0)
     while level:
-        links: list[tuple[int, int]] = []
-        for k in level:
-            if grows(k):
-                links.append((k, _BEFORE))
-                if segments[k] != OPEN:
-                    links.append((k, _AFTER))
-        level = []
-        if not links:
-            break
-        for j in order(len(links)):
-            k, direction = links[j]
-            begin, end = intervals[k]
-            there = fits(segmap.ending_at(begin) if direction == _BEFORE else segmap.beginning_at(end))
-            if not len(there):
-                continue
-            chosen = draw(there)
-            at = begin if direction == _BEFORE else end
-            add(chosen, k, at, at)
-            frames.joined(k, segments[k], chosen, direction)
-            level += settle(len(segments) - 1)
-    return MapSample(
-        segments=np.array(segments, np.int64),
-        poses=frames.poses(),
-        via=np.array(via, np.int64),
-        depth=np.array(depth, np.int64),
-        intervals=np.array(intervals, np.int64),
-        anchor=np.array(anchor, np.int64),
-        travelled=np.array(travelled),
-    )
+        links = growing.links(level)
+        chosen = [links[j] for j in order(len(links))] if links else []
+        level = [place for k, direction in chosen for place in growing.join(k, direction)]
+    return growing.sample()
 
 
 _BEFORE, _AFTER = 0, 1
@@ -373,6 +277,126 @@ class _Upright:
         if self.dim == 3:
             return level_poses(p[:, :3], p[:, 3])
         return np.stack([p[:, 0], p[:, 1], wrap_angle(p[:, 3])], axis=1)
+
+
+class _GrowingSample:
+    """A sample while it grows: places in the order in which they were added, each with the one that it hangs on."""
+
+    def __init__(
+        self,
+        segmap: SegMap,
+        root: SampleRoot,
+        choose: Callable[[Ints], int],
+        local_length: float,
+        local_depth: int,
+    ) -> None:
+        self.segmap, self.root, self.t, self.choose = segmap, root, segmap.table, choose
+        self.local_length, self.local_depth = local_length, local_depth
+        self.frames = _Upright(segmap, root) if segmap.group.dim == 2 or segmap.gravity else _Free(segmap, root)
+        self.segments, self.via, self.depth = [root.segment], [-1], [0]
+        self.intervals, self.anchor, self.travelled = [(root.start, root.end)], [root.anchor], [0.0]
+        self.drawn: dict[tuple[int, int], int] = {}
+
+    def free(self, begin: int, end: int) -> bool:
+        """Does an interval overlap in time with nothing that is there?"""
+        return not any(begin < e and s < end for s, e in self.intervals)
+
+    def fits(self, found: Ints) -> Ints:
+        """Those that do not overlap in time with what is there."""
+        if not len(found):
+            return found
+        ends, begins = self.t.end[found], self.t.start[found]
+        if (ends == ends[0]).all() and (begins == begins[0]).all():
+            return found if self.free(int(begins[0]), int(ends[0])) else found[:0]
+        return found[[self.free(b, e) for b, e in zip(begins.tolist(), ends.tolist())]]
+
+    def add(self, index: int, at: int, step_there: int, step_here: int) -> int:
+        """A place more; its number."""
+        L = self.segmap.path_length
+        self.segments.append(index)
+        self.via.append(at)
+        self.depth.append(self.depth[at] + 1)
+        self.intervals.append((int(self.t.start[index]), int(self.t.end[index])))
+        self.anchor.append(step_there)
+        self.travelled.append(self.travelled[at] + float(abs(L[step_here] - L[self.anchor[at]])))
+        return len(self.segments) - 1
+
+    def draw(self, found: Ints) -> int:
+        """One of those that fit; the same again of an interval that was asked for before."""
+        begins, ends = self.t.start[found], self.t.end[found]
+        if (begins != begins[0]).any() or (ends != ends[0]).any():
+            return int(found[self.choose(found)])
+        key = int(begins[0]), int(ends[0])
+        if key not in self.drawn:
+            self.drawn[key] = int(found[self.choose(found)])
+        return self.drawn[key]
+
+    def grows(self, k: int) -> bool:
+        """Is place k near enough to the root to be gone on from?"""
+        far = self.local_length and self.travelled[k] > self.local_length
+        return not (far or (self.local_depth and self.depth[k] >= self.local_depth))
+
+    def settle(self, k: int) -> list[int]:
+        """Places of what shares a frame with place k, and with those in turn; place k first."""
+        found, g, t, segmap = [k], self.segmap.group, self.t, self.segmap
+        for k in found:  # grows as it goes
+            if not self.grows(k):
+                continue
+            i, begin = self.segments[k], self.intervals[k][0]
+            source, T, entry = self.root.source, self.root.link, self.root.entry
+            if k:
+                source, T, entry = int(t.source[i]), t.link[i], t.entry[i]
+            if source >= 0 and t.alive[source] and self.free(int(t.start[source]), int(t.end[source])):
+                T = cast(Array, T)
+                # the way goes on from where the body stood in the entered map
+                found.append(self.add(source, k, nearest_step(segmap, source, g.compose(g.inverse(T), entry)), begin))
+                self.frames.linked(k, T)
+            entering = segmap.entering(i)
+            for begin, end in dict.fromkeys(zip(t.start[entering].tolist(), t.end[entering].tolist())):
+                if not self.free(begin, end):
+                    continue
+                rivals = segmap.beginning_at(begin)
+                chosen = self.draw(rivals[t.end[rivals] == end])
+                if t.source[chosen] != i:
+                    continue  # particles of that time that went another way
+                T = g.inverse(t.link[chosen])
+                found.append(self.add(chosen, k, begin, nearest_step(segmap, i, g.compose(T, t.entry[chosen]))))
+                self.frames.linked(k, T)
+        return found
+
+    def links(self, level: list[int]) -> list[tuple[int, int]]:
+        """Where places of a level go on: place and direction in time."""
+        out = []
+        for k in level:
+            if self.grows(k):
+                out.append((k, _BEFORE))
+                if self.segments[k] != OPEN:
+                    out.append((k, _AFTER))
+        return out
+
+    def join(self, k: int, direction: int) -> list[int]:
+        """Add what comes before or after place k, if anything fits; the new places."""
+        begin, end = self.intervals[k]
+        at = begin if direction == _BEFORE else end
+        there = self.fits(self.segmap.ending_at(at) if direction == _BEFORE else self.segmap.beginning_at(at))
+        if not len(there):
+            return []
+        chosen = self.draw(there)
+        place = self.add(chosen, k, at, at)
+        self.frames.joined(k, self.segments[k], chosen, direction)
+        return self.settle(place)
+
+    def sample(self) -> MapSample:
+        """What has grown."""
+        return MapSample(
+            segments=np.array(self.segments, np.int64),
+            poses=self.frames.poses(),
+            via=np.array(self.via, np.int64),
+            depth=np.array(self.depth, np.int64),
+            intervals=np.array(self.intervals, np.int64),
+            anchor=np.array(self.anchor, np.int64),
+            travelled=np.array(self.travelled),
+        )
 
 
 def nearest_step(segmap: SegMap, index: int, T_segment_body: Array) -> int:

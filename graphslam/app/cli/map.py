@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
 from graphslam.app.cli.terminal import print_result, text_table
 from graphslam.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from graphslam.app.hypotheses import MinimumEntropyMap
 
 CANDIDATES = (
     *("verdict", "choice", "support", "withdrawn", "submaps", "matches", "loops", "objective", "chi2", "dof"),
@@ -88,29 +91,35 @@ def map_command(
     value: dict[str, Any] = made.map.facts()
     rows = [{"what": k, "value": v} for k, v in value.items() if isinstance(v, (int, float)) and k != "dim"]
     text = text_table(rows)
-    found = made.clearest
-    if found is not None:
-        rows = found.choice.rows()
-        value |= {"candidates": rows, "chosen_because": found.choice.why(), "left_out": found.left_out}
-        text += f"\n\n{text_table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {found.choice.why()}"
-        if found.choice.scale > 1.0:
-            text += (
-                f"\nevery χ² was divided by {found.choice.scale:.2f}, the smallest χ²/dof of the graphs with most "
-                "constraints"
-            )
-        if found.findings:
-            value["refinement"] = [f.as_row() for f in found.findings]
-            text += "".join(f"\nchosen map: {f.text}" for f in found.findings)
-        if found.refined_map is not None:
-            value["refined_entropy"] = found.refined_map.fused.entropy()
-            text += f"\nentropy of the refined map: {value['refined_entropy']:.1f}"
-        text += f"\npaths and graphs of all candidates: {run / 'alternatives'}"
-        if found.left_out:
-            text += f"\n{found.left_out} more candidates were not solved"
+    if made.clearest is not None:
+        chosen, said = _clearest(made.clearest)
+        value |= chosen
+        text += f"{said}\npaths and graphs of all candidates: {run / 'alternatives'}"
+        if made.clearest.left_out:
+            text += f"\n{made.clearest.left_out} more candidates were not solved"
     value |= {"out": str(run), "files": [str(p) for p in made.files], "figures": [str(p) for p in made.figures]}
     value["seconds"] = {"divide": made.map.divide_s, "fuse": made.map.fuse_s, "move": made.map.move_s}
     text += f"\n\nwritten: {', '.join(p.name for p in made.files)}; plots: {', '.join(p.name for p in made.figures)}"
     print_result(value, text, as_json=as_json)
+
+
+def _clearest(found: MinimumEntropyMap) -> tuple[dict[str, Any], str]:
+    """The candidates of a choice of maps, as values and as text."""
+    rows, why = found.choice.rows(), found.choice.why()
+    value: dict[str, Any] = {"candidates": rows, "chosen_because": why, "left_out": found.left_out}
+    text = f"\n\n{text_table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {why}"
+    if found.choice.scale > 1.0:
+        text += (
+            f"\nevery χ² was divided by {found.choice.scale:.2f}, the smallest χ²/dof of the graphs with most "
+            "constraints"
+        )
+    if found.findings:
+        value["refinement"] = [f.as_row() for f in found.findings]
+        text += "".join(f"\nchosen map: {f.text}" for f in found.findings)
+    if found.refined_map is not None:
+        value["refined_entropy"] = found.refined_map.fused.entropy()
+        text += f"\nentropy of the refined map: {value['refined_entropy']:.1f}"
+    return value, text
 
 
 def _make_terrain(run: Path, log: str | None, sensor_height: float | None, as_json: bool) -> None:
