@@ -243,7 +243,6 @@ def connect_by_gps(
     new: DenseSession,
     *,
     places: bool = True,
-    progress: bool = False,
 ) -> ConnectedSession:
     """Tie a session to one that is in the graph by the fixes that both have, and solve.
 
@@ -265,7 +264,7 @@ def connect_by_gps(
     dropped = 0
     if places:
         two = TwoSessions(known.map, new.map)
-        factors = {_add(graph, x, known, new): x for x in _near(graph, two, known_node, node, [], progress)[0]}
+        factors = {_add(graph, x, known, new): x for x in _near(graph, two, known_node, node, [], False)[0]}
         solver.solve_to_optimum()
         dropped = _winnow(graph, solver, factors)
     logger.info("%s is attached to %s by GPS and %d loop closures", new.name, known.name, len(factors))

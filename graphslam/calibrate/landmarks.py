@@ -57,26 +57,20 @@ def fit_noise(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS
     return s, value
 
 
-def fit_without(s: Smoothing, constant: str, *, budget: int = 150) -> tuple[Smoothing, float]:
+def fit_without(s: Smoothing, constant: str) -> tuple[Smoothing, float]:
     """The smoothing with a constant left out, its noise fitted anew, and its objective."""
     alone = s.copy(free=tuple(c for c in s.free if c != constant))
     alone.constants[CONSTANTS.index(constant)] = 0.0
-    return alone, alone.fit(budget=budget, rounds=3)
+    return alone, alone.fit(budget=150, rounds=3)
 
 
-def smooth_ranges(
-    seen: SightingLog, until: float, *, seed: int = 0, starts: int = 16, first: float = 150.0
-) -> tuple[Smoothing, Smoothing] | None:
-    """One window of ranges alone, from a dead start: layouts of beacons over its beginning, then ever more of it.
+def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Smoothing, Smoothing] | None:
+    """One window of ranges alone, from a dead start: 16 layouts of beacons over its beginning, then ever more of it.
 
     Parameters
     ----------
     until : float
         Seconds of the log that are used.
-    starts : int
-        Layouts that are tried.
-    first : float
-        Seconds of the log over which they are tried.
 
     Returns
     -------
@@ -90,7 +84,7 @@ def smooth_ranges(
     if whole is None:
         return None
     ends = [until]
-    while ends[0] > 1.5 * first:
+    while ends[0] > 1.5 * 150.0:
         ends.insert(0, 0.5 * ends[0])
     places: dict[int, Array] = {}
     constants, sigmas = np.zeros(K.CONSTANTS), {**START, "range": 1.0}
@@ -101,7 +95,7 @@ def smooth_ranges(
         if n < 20:
             continue
         tries: list[tuple[float, Smoothing]] = []
-        for trial in range(1 if len(poses) else starts):
+        for trial in range(1 if len(poses) else 16):
             g = constants.copy()
             if not len(poses):
                 g[K.YAW_BIAS] = rng.normal(0.0, 0.005) if trial else 0.0

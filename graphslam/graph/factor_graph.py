@@ -85,9 +85,6 @@ class FactorGraph(FactorGraphState):
         submaps: Iterable[Submap],
         *,
         covariance_scale: float = 1.0,
-        spacing: float | None = None,
-        level_sigma: float | None = None,
-        match_robust: RobustKernel = NO_KERNEL,
     ) -> FactorGraph:
         """A graph of submaps from anywhere, landmark submaps and dense ones in one chain, with all their matches.
 
@@ -95,10 +92,8 @@ class FactorGraph(FactorGraphState):
         ----------
         submaps : iterable of Submap
             Each begins where the one before it ends. Landmarks are identified by the submaps' own ids, -1 = new.
-        covariance_scale, spacing, level_sigma
-            As for :meth:`add_submap`; the last two are for dense submaps.
-        match_robust : RobustKernel
-            For the matches.
+        covariance_scale : float
+            As for :meth:`add_submap`.
 
         Raises
         ------
@@ -118,11 +113,10 @@ class FactorGraph(FactorGraphState):
             )
         graph = cls(chain[0].dim)
         for s in chain:
-            dense = {} if s.landmarks is not None else {"spacing": spacing, "level_sigma": level_sigma}
-            graph.add_submap(s, covariance_scale=covariance_scale, **dense)  # type: ignore[arg-type]
+            graph.add_submap(s, covariance_scale=covariance_scale)
         for s in chain:
             for m in s.matches:
-                graph.add_match(s.key, m, robust=match_robust)
+                graph.add_match(s.key, m)
         return graph
 
     def add_submap(

@@ -129,12 +129,11 @@ second time: submap 0 spent it over [0.000, 10.000) s
         streams: Iterable[str],
         interval: tuple[float, float],
         kind: str = EXCLUSIVE,
-        note: str = "",
     ) -> None:
         """Enter one factor; all streams or none (see :meth:`check` for the errors)."""
         names = sorted(set(streams))
         self.check(factor, names, interval, kind)
-        note = note or (self._kinds[kind] if kind != EXCLUSIVE else "")
+        note = self._kinds[kind] if kind != EXCLUSIVE else ""
         for stream in names:
             e = LedgerEntry(float(interval[0]), float(interval[1]), stream, factor_id, factor, kind, note)
             if kind == EXCLUSIVE:

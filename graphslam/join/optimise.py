@@ -14,17 +14,13 @@ from graphslam.join.submap_blocks import SubmapProblem
 from graphslam.join.submap_solver import minimise_submaps
 
 
-def optimise_from_join(
-    submaps: Sequence[Submap], joined: JoinResult, *, rtol: float = 1e-12, max_iterations: int = 50
-) -> JoinResult:
+def optimise_from_join(submaps: Sequence[Submap], joined: JoinResult) -> JoinResult:
     """Relinearise all submaps at the joined map, again and again, until the objective is at its minimum.
 
     Parameters
     ----------
     submaps : sequence of Submap
         Those that were joined; their ids are replaced by ``joined.submap_ids``.
-    rtol, max_iterations
-        See :func:`~graphslam.join.submap_solver.minimise_submaps`.
 
     Returns
     -------
@@ -36,7 +32,7 @@ def optimise_from_join(
     if problem is None or not problem.is_of(submaps):
         problem = SubmapProblem(submaps, ids=joined.submap_ids)
     x = problem.initial(joined.poses[1:], joined.landmarks)  # both in the order of first sighting
-    best = minimise_submaps(problem, x, rtol=rtol, max_iterations=max_iterations)
+    best = minimise_submaps(problem, x)
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     return replace(
         joined,

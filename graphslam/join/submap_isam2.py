@@ -22,9 +22,6 @@ from graphslam.solve.isam2 import Isam2Solver
 def solve_submaps_isam2(
     submaps: Sequence[Submap],
     *,
-    relinearize_threshold: float = 0.1,
-    relinearize_angle: float = 0.01,
-    covariance_scale: float = 1.0,
     polish: bool = True,
     progress: bool = False,
 ) -> SubmapEstimate:
@@ -34,10 +31,6 @@ def solve_submaps_isam2(
     ----------
     submaps : sequence of Submap
         In order, every landmark identified.
-    relinearize_threshold, relinearize_angle : float
-        See :class:`~graphslam.solve.isam2.Isam2Solver`.
-    covariance_scale : float
-        Factor on every submap's covariance.
     polish : bool
         End at the batch optimum; ``objective`` is always that of iSAM2 before, so the difference is its gap.
     progress : bool
@@ -51,9 +44,9 @@ def solve_submaps_isam2(
     check_identified(submaps)
     start = time.perf_counter()
     graph = FactorGraph()
-    solver = Isam2Solver(graph, relinearize_threshold=relinearize_threshold, relinearize_angle=relinearize_angle)
+    solver = Isam2Solver(graph)
     for submap in Bar(submaps, name="iSAM2", unit="submap", shown=progress):
-        graph.add_submap(submap, covariance_scale=covariance_scale)
+        graph.add_submap(submap)
         solver.update()
     objective = graph.objective().total
     polished = None

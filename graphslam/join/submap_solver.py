@@ -271,9 +271,6 @@ def solve_submaps(
     submaps: Sequence[Submap],
     *,
     initial_poses: ArrayLike | None = None,
-    initial_landmarks: ArrayLike | None = None,
-    scale: ArrayLike | None = None,
-    rtol: float = 1e-12,
     max_iterations: int = 50,
 ) -> SubmapEstimate:
     """Least-squares optimum of a chain of landmark submaps (see :class:`SubmapProblem` and :func:`minimise_submaps`).
@@ -284,18 +281,12 @@ def solve_submaps(
         With global landmark ids.
     initial_poses : (m, 3), optional
         End poses to start from; default the chain.
-    initial_landmarks : (L, 2), optional
-        In the order of first sighting; default the first sighting under the initial poses.
-    scale : (m,) or float, optional
-        Factor on the covariance of each submap.
-    rtol, max_iterations
+    max_iterations : int
         See :func:`minimise_submaps`.
     """
     start = time.perf_counter()
-    problem = SubmapProblem(submaps, scale=scale)
-    best = minimise_submaps(
-        problem, problem.initial(initial_poses, initial_landmarks), rtol=rtol, max_iterations=max_iterations
-    )
+    problem = SubmapProblem(submaps)
+    best = minimise_submaps(problem, problem.initial(initial_poses), max_iterations=max_iterations)
     return SubmapEstimate(
         poses=np.vstack([np.zeros((1, 3)), best.x[: 3 * problem.m].reshape(-1, 3)]),
         landmark_ids=problem.ids,

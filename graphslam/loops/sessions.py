@@ -77,9 +77,11 @@ def align_by_identity(
     return _fit(p, q, np.column_stack([i[agree], j[agree]]), rejected=int((~agree).sum()))
 
 
-def align_by_constellation(
-    points: ArrayLike, reference: ArrayLike, *, tolerance: float = 0.3, least: int = 4, margin: float = 0.75
-) -> Alignment:
+LEAST_COMMON, MOST_ELSEWHERE = 4, 0.75
+"""Landmarks that must come together, and the share of them that a motion elsewhere (1 m or 10° away) may bring."""
+
+
+def align_by_constellation(points: ArrayLike, reference: ArrayLike, *, tolerance: float = 0.3) -> Alignment:
     """Rigid motion of a map onto another by the pattern of their landmarks alone.
 
     Parameters
@@ -87,10 +89,6 @@ def align_by_constellation(
     points, reference : (n, 2), (m, 2)
     tolerance : float
         Landmarks nearer than this after the motion are one [m].
-    least : int
-        So many landmarks must come together.
-    margin : float
-        A motion elsewhere (1 m or 10° away) may bring at most this share of them together.
     """
     p, q = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     T = _motions(p, q, np.ones((len(p), len(q)), dtype=np.bool_), tolerance)
@@ -113,11 +111,13 @@ def align_by_constellation(
     turned = np.abs(wrap_angle(T[:, 2] - found.T_reference_map[2]))
     elsewhere = (np.linalg.norm(moved, axis=1) > 1.0) | (turned > np.deg2rad(10.0))
     runner_up = max((len(_assign(t, p, q, tolerance)) for t in T[order][elsewhere[order]][:20]), default=0)
-    if n < least or runner_up > margin * n:
+    if n < LEAST_COMMON or runner_up > MOST_ELSEWHERE * n:
         raise DataError(
-            "the landmarks do not say how the maps lie" if n < least else "two motions fit the landmarks about as well",
+            "the landmarks do not say how the maps lie"
+            if n < LEAST_COMMON
+            else "two motions fit the landmarks about as well",
             got=f"{n} together, {runner_up} elsewhere",
-            wanted=f"at least {least}, and at most {margin:.0%} of them elsewhere",
+            wanted=f"at least {LEAST_COMMON}, and at most {MOST_ELSEWHERE:.0%} of them elsewhere",
         )
     return Alignment(found.T_reference_map, found.pairs, 0, found.rms, runner_up)
 

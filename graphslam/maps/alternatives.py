@@ -162,8 +162,6 @@ def rank_alternatives(
     alternatives: Sequence[Alternative],
     *,
     model: BeamModel | None = None,
-    placements: int = 1,
-    contradiction: float = CONTRADICTION,
     progress: bool = False,
 ) -> RankedAlternatives:
     """Judge alternatives: by the χ² of their graphs, then by the entropy of their maps.
@@ -174,10 +172,6 @@ def rank_alternatives(
         Of the same submaps, or of the same log.
     model : BeamModel, optional
         Whose clamp bounds the fused maps.
-    placements : int
-        Ways in which the grid stands when entropies are taken.
-    contradiction : float
-        See :data:`CONTRADICTION`.
 
     Raises
     ------
@@ -187,12 +181,12 @@ def rank_alternatives(
     if not alternatives:
         raise DataError("there are no graphs to choose from", wanted="one at least")
     candidates = [a.candidate for a in alternatives]
-    ranking = rank_by_entropy(candidates, model=model, count=placements, progress=progress)
+    ranking = rank_by_entropy(candidates, model=model, progress=progress)
     clarity = {r.index: r.clarity for r in ranking.order}
     fits = [(chi2_of(a.graph), a.solution.score.dof) for a in alternatives]
     scale = noise_scale([a.ties for a in alternatives], fits)
     judged = [
-        ScoredMap(k, a, chi2, dof, dof > 0 and float(stats.chi2.sf(chi2 / scale, dof)) < contradiction, clarity[k])
+        ScoredMap(k, a, chi2, dof, dof > 0 and float(stats.chi2.sf(chi2 / scale, dof)) < CONTRADICTION, clarity[k])
         for k, (a, (chi2, dof)) in enumerate(zip(alternatives, fits))
     ]
     order = sorted(judged, key=lambda j: (j.contradicted, j.chi2_per_dof if j.contradicted else 0.0,

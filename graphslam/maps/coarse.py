@@ -66,12 +66,12 @@ def coarse_grid(grid: EvidenceGrid) -> EvidenceGrid:
     return out
 
 
-def drawable_map(grid: EvidenceGrid, pixels: int = PIXELS) -> EvidenceGrid:
-    """The map, or a coarser one of which no picture from above or from the side has more pixels."""
+def drawable_map(grid: EvidenceGrid) -> EvidenceGrid:
+    """The map, or a coarser one of which no picture from above or from the side has more than :data:`PIXELS`."""
     while True:
         low, high = known_bounds(grid)
         edges = np.sort(high - low)
-        if int(edges[1]) * int(edges[2]) <= pixels:
+        if int(edges[1]) * int(edges[2]) <= PIXELS:
             return grid
         grid = coarse_grid(grid)
 

@@ -89,15 +89,13 @@ def floor_plan(grid: EvidenceGrid, low: float, high: float) -> EvidenceGrid:
     return out
 
 
-def storeys(positions: Array, *, gap: float = STOREY_GAP, shortest: float = 5.0) -> list[float]:
+def storeys(positions: Array, *, shortest: float = 5.0) -> list[float]:
     """Heights that a path runs at, from below [m]: of storeys that it keeps to for ``shortest`` metres at least.
 
     Parameters
     ----------
     positions : (n, 3)
         Along the path [m].
-    gap : float
-        Between storeys at least [m].
     shortest : float
         Of level way on a storey [m].
     """
@@ -114,7 +112,7 @@ def storeys(positions: Array, *, gap: float = STOREY_GAP, shortest: float = 5.0)
     # the slope over two metres: wheels go over bumps
     slope = np.abs(np.interp(at + 1.0, arc, p[:, 2]) - np.interp(at - 1.0, arc, p[:, 2])) / 2.0
     flat = np.sort(z[slope < LEVEL_SLOPE])
-    groups = np.split(flat, np.flatnonzero(np.diff(flat) > gap) + 1)
+    groups = np.split(flat, np.flatnonzero(np.diff(flat) > STOREY_GAP) + 1)
     return [float(np.median(g)) for g in groups if 0.25 * len(g) >= shortest]
 
 

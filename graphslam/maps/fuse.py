@@ -395,13 +395,12 @@ def fuse_pieces(
     *,
     model: BeamModel | None = None,
     tolerance: float = TOLERANCE,
-    pool: GridPool | None = None,
     threads: int = 1,
 ) -> FusedMap:
     """A fused map of pieces at ``T_world_node``, from scratch."""
     if not pieces:
         raise DataError("a fused map of no pieces has no voxel size", wanted="a FusedMap, and pieces later")
     first = next(iter(pieces.values()))
-    fused = FusedMap(first.voxel_size, dim=first.dim, model=model, tolerance=tolerance, pool=pool, threads=threads)
+    fused = FusedMap(first.voxel_size, dim=first.dim, model=model, tolerance=tolerance, threads=threads)
     fused.add(pieces, {name: poses[name] for name in pieces if name in poses})
     return fused

@@ -13,7 +13,7 @@ Where every moment has one vote, they do.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -23,7 +23,6 @@ from scipy.spatial import cKDTree
 
 from graphslam.core import se3
 from graphslam.core.dense import CloudMap
-from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.submap import Submap
 from graphslam.evidence.grid import EvidenceGrid
@@ -33,38 +32,23 @@ from graphslam.evidence.spilled_grid import spill_grid
 Mask = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MovingConfig:
-    """What counts as moved."""
-
-    neighbours: int = 4
-    """Submaps before and after that are asked."""
-    free: float = -0.8
-    """Log-odds below which a voxel is known as free."""
-    least_free: int = 2
-    """Neighbours that must know a place as free."""
-    reach: float = 30.0
-    """Points farther from their sensor are left alone [m]: beams lie too wide apart there."""
-    above_ground: float = 0.3
-    """… and those not so far above the lowest point around [m]."""
-    ground_cell: float = 1.0
-    """Edge of the squares in which the lowest point is looked for, with the eight around [m]."""
-    company: int = 6
-    """Points that moved must have so many others …"""
-    company_radius: float = 0.6
-    """… so near [m]."""
-    thing: float = 2.5
-    """What belongs to a thing is looked for so far from points that moved [m]: half the length of a car."""
-
-    def __post_init__(self) -> None:
-        for name in ("reach", "ground_cell", "company_radius", "thing"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ConfigError(f"moving: {name} = {getattr(self, name)}; wanted > 0")
-        if self.neighbours < 1 or not 1 <= self.least_free <= 2 * self.neighbours or self.company < 0:
-            raise ConfigError("moving: wanted neighbours ≥ 1, least_free of them on both sides at most, company ≥ 0")
+NEIGHBOURS = 4
+"""Submaps before and after that are asked."""
+FREE = -0.8
+"""Log-odds below which a voxel is known as free."""
+LEAST_FREE = 2
+"""Neighbours that must know a place as free."""
+REACH = 30.0
+"""Points farther from their sensor are left alone [m]: beams lie too wide apart there."""
+ABOVE_GROUND, GROUND_CELL = 0.3, 1.0
+"""… and those not so far above the lowest point around, in squares of this edge with the eight around [m]."""
+COMPANY, COMPANY_RADIUS = 6, 0.6
+"""Points that moved must have so many others so near [m]."""
+THING = 2.5
+"""What belongs to a thing is looked for so far from points that moved [m]: half the length of a car."""
 
 
-def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig | None = None) -> list[Mask]:
+def moving_points(submaps: Sequence[Submap], bases: Array) -> list[Mask]:
     """Which points of the clouds of submaps are on things that moved.
 
     Parameters
@@ -80,7 +64,6 @@ def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig 
     list of (m,) bool
         Of the cloud of each submap; empty where it has none.
     """
-    c = config or MovingConfig()
     clouds = [s.cloud if s.grid is not None and s.cloud is not None and s.cloud.dim == 3 else None for s in submaps]
     out = []
     for k, cloud in enumerate(clouds):
@@ -88,22 +71,22 @@ def moving_points(submaps: Sequence[Submap], bases: Array, config: MovingConfig 
             out.append(np.zeros(0 if cloud is None else len(cloud), np.bool_))
             continue
         world = _world(bases[k], cloud.points)
-        near = np.linalg.norm(cloud.points - cloud.origins[cloud.scan], axis=1) < c.reach
-        others = [j for j in range(max(k - c.neighbours, 0), min(k + c.neighbours + 1, len(submaps))) if j != k]
+        near = np.linalg.norm(cloud.points - cloud.origins[cloud.scan], axis=1) < REACH
+        others = [j for j in range(max(k - NEIGHBOURS, 0), min(k + NEIGHBOURS + 1, len(submaps))) if j != k]
         around = [world, *(_world(bases[j], other.points) for j in others if (other := clouds[j]) is not None)]
-        asked = np.flatnonzero(near & ~_ground(world, np.concatenate(around), c))
+        asked = np.flatnonzero(near & ~_ground(world, np.concatenate(around)))
         free, supported = np.zeros(len(asked), np.int64), np.zeros(len(asked), np.int64)
         for j in others:
             grid = submaps[j].grid
             if not isinstance(grid, EvidenceGrid):
                 continue
             T = np.asarray(se3.se3_between(bases[j], bases[k]))
-            says = _says(grid, _world(T, cloud.points[asked]), c.free)
+            says = _says(grid, _world(T, cloud.points[asked]), FREE)
             free += says < 0
             supported += says > 0
         moved = np.zeros(len(cloud), np.bool_)
-        moved[asked[(free >= c.least_free) & (free > supported)]] = True
-        out.append(_in_company(world, moved, c))
+        moved[asked[(free >= LEAST_FREE) & (free > supported)]] = True
+        out.append(_in_company(world, moved))
     return out
 
 
@@ -120,19 +103,18 @@ class MovedObjects:
         Points that moved, in a frame whose z axis points upwards [m].
     """
 
-    def __init__(self, moved: Array, config: MovingConfig | None = None) -> None:
-        self.config = c = config or MovingConfig()
+    def __init__(self, moved: Array) -> None:
         self.moved = np.asarray(moved, dtype=np.float64)[:, :2]
-        self.cell = c.company_radius / 4.0
+        self.cell = COMPANY_RADIUS / 4.0
         if not len(self.moved):
             return
-        margin = c.thing + c.company_radius
+        margin = THING + COMPANY_RADIUS
         self.first = np.floor((self.moved.min(axis=0) - margin) / self.cell).astype(np.int64)
         size = np.floor((self.moved.max(axis=0) + margin) / self.cell).astype(np.int64) - self.first + 1
         away = np.ones(size, np.bool_)
         away[tuple((np.floor(self.moved / self.cell).astype(np.int64) - self.first).T)] = False
         distance = distance_transform_edt(away, sampling=self.cell)
-        self.near, self.around = distance < c.company_radius, distance < c.thing
+        self.near, self.around = distance < COMPANY_RADIUS, distance < THING
 
     def __len__(self) -> int:
         return len(self.moved)
@@ -142,7 +124,6 @@ class MovedObjects:
         out = np.zeros(len(points), np.bool_)
         if not len(self) or not len(points):
             return out
-        c = self.config
         cell = np.floor(points[:, :2] / self.cell).astype(np.int64) - self.first
         rows = np.flatnonzero(np.all((cell >= 0) & (cell < self.near.shape), axis=1))
         rows = rows[self.around[cell[rows, 0], cell[rows, 1]]]
@@ -150,7 +131,7 @@ class MovedObjects:
         out[rows[near]] = True
         if not near.any():
             return out
-        stands = cell[rows[~_ground(points[rows], points[rows], c)]]
+        stands = cell[rows[~_ground(points[rows], points[rows])]]
         raised = np.zeros(self.near.shape, np.bool_)
         raised[stands[:, 0], stands[:, 1]] = True
         things, many = label(binary_dilation(raised, np.ones((3, 3))), np.ones((3, 3)))  # over gaps of three cells
@@ -159,7 +140,7 @@ class MovedObjects:
         whole = np.argwhere(np.concatenate([[False], np.asarray(share) > 0.5])[things])
         if len(whole):
             ask = rows[~near]
-            reach = c.company_radius / self.cell
+            reach = COMPANY_RADIUS / self.cell
             out[ask] = cKDTree(whole).query(cell[ask], distance_upper_bound=reach)[0] < reach
         return out
 
@@ -183,9 +164,7 @@ def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Su
     return out
 
 
-def seen_through_voxels(
-    grid: EvidenceGrid, moments: Iterable[EvidenceGrid], config: MovingConfig | None = None
-) -> tuple[Array, Mask]:
+def seen_through_voxels(grid: EvidenceGrid, moments: Iterable[EvidenceGrid]) -> tuple[Array, Mask]:
     """Occupied voxels of a map that more moments saw through than were stopped by.
 
     Parameters
@@ -193,10 +172,8 @@ def seen_through_voxels(
     grid : EvidenceGrid
         In space, z up.
     moments : iterable of EvidenceGrid
-        Of single moments (one to a few seconds of scans each), in the lattice of the map.
-    config : MovingConfig, optional
-        ``free``, ``least_free``, ``above_ground`` and ``ground_cell`` count; a moment needs only half of ``free``,
-        since few beams pass a voxel in it.
+        Of single moments (one to a few seconds of scans each), in the lattice of the map. They need only half of
+        :data:`FREE`, since few beams pass a voxel in one.
 
     Returns
     -------
@@ -204,15 +181,14 @@ def seen_through_voxels(
         Of the occupied voxels [m].
     moved : (n,) bool
     """
-    c = config or MovingConfig()
     occupied = np.asarray(grid.occupied_cloud())
     free, stopped = np.zeros(len(occupied), np.int64), np.zeros(len(occupied), np.int64)
     for moment in moments:
-        says = _says(moment, occupied, 0.5 * c.free)
+        says = _says(moment, occupied, 0.5 * FREE)
         free += says < 0
         rows = np.flatnonzero(says > 0)
         stopped[rows[moment.occupied_at(occupied[rows])]] += 1
-    return occupied, (free >= c.least_free) & (free > stopped) & ~_ground(occupied, occupied, c)
+    return occupied, (free >= LEAST_FREE) & (free > stopped) & ~_ground(occupied, occupied)
 
 
 def _world(T: Array, points: Array) -> Array:
@@ -232,27 +208,27 @@ def _says(grid: EvidenceGrid, points: Array, free: float) -> npt.NDArray[np.int6
     return out
 
 
-def _ground(points: Array, around: Array, c: MovingConfig) -> Mask:
+def _ground(points: Array, around: Array) -> Mask:
     """Which points lie little above the lowest one around them."""
-    cell = np.floor(around[:, :2] / c.ground_cell).astype(np.int64)
+    cell = np.floor(around[:, :2] / GROUND_CELL).astype(np.int64)
     first = cell.min(axis=0) - 1
     size = cell.max(axis=0) - first + 2
     lowest = np.full(int(size[0] * size[1]), np.inf)
     at = cell - first
     np.minimum.at(lowest, at[:, 0] * size[1] + at[:, 1], around[:, 2])
-    mine = np.floor(points[:, :2] / c.ground_cell).astype(np.int64) - first
+    mine = np.floor(points[:, :2] / GROUND_CELL).astype(np.int64) - first
     low = np.full(len(points), np.inf)
     for i, j in product((-1, 0, 1), repeat=2):
         low = np.minimum(low, lowest[(mine[:, 0] + i) * size[1] + mine[:, 1] + j])
-    return np.asarray(points[:, 2] - low < c.above_ground)
+    return np.asarray(points[:, 2] - low < ABOVE_GROUND)
 
 
-def _in_company(points: Array, moved: Mask, c: MovingConfig) -> Mask:
+def _in_company(points: Array, moved: Mask) -> Mask:
     rows = np.flatnonzero(moved)
     if not len(rows):
         return moved
     tree = cKDTree(points[rows])
-    many = tree.query_ball_point(points[rows], c.company_radius, return_length=True) - 1
+    many = tree.query_ball_point(points[rows], COMPANY_RADIUS, return_length=True) - 1
     out = np.zeros_like(moved)
-    out[rows[many >= c.company]] = True
+    out[rows[many >= COMPANY]] = True
     return out

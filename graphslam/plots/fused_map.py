@@ -116,12 +116,12 @@ def plot_cut(
     path: Trajectory,
     ax: Axes | None = None,
     *,
-    thickness: float = 2.0,
-    stretch: float = 2.0,
     truth: Trajectory | None = None,
     title: str | None = None,
 ) -> Axes:
-    """A slab of the map from the side, along the longer way of the path and through where it climbs.
+    """A slab of the map of 2 m from the side, along the longer way of the path and through where it climbs.
+
+    Heights are drawn twice as large.
 
     Parameters
     ----------
@@ -129,10 +129,6 @@ def plot_cut(
         3-D.
     path : Trajectory
         ``T_world_body``.
-    thickness : float
-        Of the slab [m].
-    stretch : float
-        Of heights in the picture.
     truth : Trajectory, optional
         The true path in the same frame.
 
@@ -145,7 +141,7 @@ def plot_cut(
     if path.dim != 3:
         raise DataError("a path in the plane has no side", got=f"{path.dim}-D", wanted="3-D")
     axis, at = cut_plane(path)
-    p, extent = slab(grid, axis, at - 0.5 * thickness, at + 0.5 * thickness)
+    p, extent = slab(grid, axis, at - 1.0, at + 1.0)
     ax = style.new_axes(ax, (9.0, 3.2))
     ax.set_facecolor("0.72")
     if p.size:
@@ -159,7 +155,7 @@ def plot_cut(
     if len(rows):
         size = grid.voxel_size
         ax.set_ylim(extent[2] + size * rows[0] - 0.5, extent[2] + size * (rows[-1] + 1) + 0.5)
-    ax.set_aspect(stretch)
+    ax.set_aspect(2.0)
     names = "xy"
     ax.set(xlabel=f"{names[1 - axis]} [m]", ylabel="z [m]")
     ax.set_title(title or f"{names[axis]} = {at:.1f} m", fontsize="medium")

@@ -18,9 +18,6 @@ def plot_merged(
     landmarks: npt.ArrayLike,
     covariances: npt.ArrayLike,
     seen_by: npt.ArrayLike,
-    *,
-    confidence: float = 0.95,
-    title: str | None = None,
 ) -> Axes:
     """Paths of several sessions and their common landmarks, in the frame of the first.
 
@@ -41,15 +38,13 @@ def plot_merged(
         line = style.LINE_STYLES[(k // len(style.CYCLE)) % len(style.LINE_STYLES)]
         ax.plot(p[:, 0], p[:, 1], line, color=colour, lw=0.9, alpha=0.75, label=name, zorder=2)
         ax.plot(p[0, 0], p[0, 1], "o", color=colour, ms=6, mec="white", mew=0.8, zorder=4)
-    plot_ellipses(
-        ax, points, covariances, confidence=confidence, colour=style.BLACK, label=f"shape, {confidence:.0%} ellipse"
-    )
+    plot_ellipses(ax, points, covariances, colour=style.BLACK, label="shape, 95% ellipse")
     shared = seen > 1
     ax.plot(points[shared, 0], points[shared, 1], "k.", ms=4, zorder=3.4)
     if np.any(~shared):
         alone = points[~shared]
         ax.plot(alone[:, 0], alone[:, 1], "o", mfc="none", mec="k", ms=5, label="seen by one", zorder=3.4)
     style.metric_axes(ax)
-    ax.set_title(title or f"{len(paths)} sessions, {len(points)} landmarks, {int(shared.sum())} of them shared")
+    ax.set_title(f"{len(paths)} sessions, {len(points)} landmarks, {int(shared.sum())} of them shared")
     style.legend(ax)
     return ax

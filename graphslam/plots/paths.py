@@ -44,7 +44,6 @@ def plot_paths(
     *,
     truth: Trajectory | Array | None = None,
     ellipses: int = 8,
-    confidence: float = 0.95,
     plane: str = "xy",
     title: str | None = None,
 ) -> Axes:
@@ -57,8 +56,6 @@ def plot_paths(
     truth : Trajectory or (n, ≥ dim), optional
     ellipses : int
         Of each path that has covariances, spread over its length.
-    confidence : float
-        Of the ellipses.
     plane : {"xy", "xz", "yz"}
         Seen from above, or from the side.
 
@@ -87,7 +84,7 @@ def plot_paths(
         along = arc_length(path.positions)
         at = np.unique(np.searchsorted(along, np.linspace(0.0, along[-1], ellipses + 1)[1:]).clip(0, len(p) - 1))
         P = position_covariances(path.poses[at], path.covariances[at])[:, ij][:, :, ij]
-        plot_ellipses(ax, p[at], P, confidence=confidence, colour=colour, label=style.ellipses(label, confidence))
+        plot_ellipses(ax, p[at], P, colour=colour, label=style.ellipses(label))
     style.metric_axes(ax, *plane)
     if title:
         ax.set_title(title, fontsize="medium")

@@ -18,7 +18,6 @@ def plot_before_after(
     refined: Trajectory,
     *,
     truth: Trajectory | None = None,
-    title: str | None = None,
 ) -> Axes:
     """Errors of both paths over time, each aligned as a whole; without truth how far the refinement moved the path.
 
@@ -53,12 +52,12 @@ def plot_before_after(
     ax.set_yscale("log")
     ax.set_xlabel("time [s]")
     ax.set_ylabel("distance from ground truth [m]" if truth is not None else "distance [m]")
-    ax.set_title(title or "path before and after refinement", fontsize="medium")
+    ax.set_title("path before and after refinement", fontsize="medium")
     style.legend(ax)
     return ax
 
 
-def plot_yaw_bias(ax: Axes | None, knots: npt.ArrayLike, *, title: str | None = None) -> Axes:
+def plot_yaw_bias(ax: Axes | None, knots: npt.ArrayLike) -> Axes:
     """Bias of the yaw rate over time.
 
     Parameters
@@ -72,5 +71,5 @@ def plot_yaw_bias(ax: Axes | None, knots: npt.ArrayLike, *, title: str | None = 
     ax.axhline(0.0, color=style.GREY, lw=0.8)
     ax.set_xlabel("time [s]")
     ax.set_ylabel("yaw bias [mrad/s]")
-    ax.set_title(title or "yaw rate bias estimated by the refinement", fontsize="medium")
+    ax.set_title("yaw rate bias estimated by the refinement", fontsize="medium")
     return ax

@@ -13,7 +13,7 @@ from graphslam.evaluate.loop_consistency import LoopConsistency
 from graphslam.plots import style
 
 
-def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency, *, title: str | None = None) -> Axes:
+def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency) -> Axes:
     """``D²/3`` of every pair of loops (off the diagonal) and of every loop against the chain (on it).
 
     White is expected of a consistent map. A false loop is a dark cross, an over-confident front end a dark page, a
@@ -35,7 +35,7 @@ def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency, *, title: str | No
     ax.set_ylabel("loop (submaps)")
     t = loops.test()
     name = f"{t['loops']} loops: mean D²/3 {t['value']:.2f} [{t['low']:.2f}, {t['high']:.2f}], {t['verdict']}"
-    ax.set_title(title if title is not None else name, fontsize="medium")
+    ax.set_title(name, fontsize="medium")
     return ax
 
 

@@ -35,19 +35,16 @@ def plot_submap_chain(
     submaps: Sequence[Submap],
     node_poses: ArrayLike | None = None,
     *,
-    confidence: float = 0.95,
     landmark_ellipses: bool = False,
     ellipse_scale: float = 1.0,
     title: str | None = None,
 ) -> Axes:
-    """Draw 2-D submaps at the poses of their bases.
+    """Draw 2-D submaps at the poses of their bases; ellipses of exits are relative to the own base of each.
 
     Parameters
     ----------
     node_poses : (m, 3) or (m + 1, 3), optional
         World poses of the bases, as solved; default the chain of exits from the origin.
-    confidence : float
-        Of the ellipses; an exit's ellipse is that of one submap alone, relative to its own base.
     landmark_ellipses : bool
         Also draw each landmark's ellipse within its submap.
     ellipse_scale : float
@@ -80,9 +77,9 @@ def plot_submap_chain(
             ax.plot(q[:, 0], q[:, 1], style.MARKERS[k % len(style.MARKERS)], color=colour, ms=3, alpha=0.8, zorder=3)
             if landmark_ellipses:
                 blocks = R @ landmark_blocks(s.landmarks.dense_covariance(), len(s.landmarks), offset=3) @ R.T
-                plot_ellipses(ax, q, grow * blocks, confidence=confidence, colour=colour, alpha=0.08)
-    label = f"exit, {confidence:.0%} ellipse{enlarged}"
-    plot_ellipses(ax, exits, grow * covs, confidence=confidence, colour=style.BLACK, label=label, alpha=0.12)
+                plot_ellipses(ax, q, grow * blocks, colour=colour, alpha=0.08)
+    label = f"exit, 95% ellipse{enlarged}"
+    plot_ellipses(ax, exits, grow * covs, colour=style.BLACK, label=label, alpha=0.12)
     _plot_frames(ax, poses[: len(submaps)])
     ax.plot([], [], color=style.CYCLE[0], marker="o", ms=3, label="submap")
     style.metric_axes(ax)

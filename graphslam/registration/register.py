@@ -218,15 +218,15 @@ def distinct_registrations(
     return kept
 
 
-def fitness_margin(results: list[Registration], *, apart: float = 1.5) -> float:
-    """Fitness of the best of :func:`register_starts` less that of the next at another place, ``apart`` [m] or more.
+def fitness_margin(results: list[Registration]) -> float:
+    """Fitness of the best of :func:`register_starts` less that of the next at another place, 1.5 m or more away.
 
     1 where there is no other; NaN where there is none at all.
     """
     if not results:
         return float("nan")
     best = results[0]
-    others = [r for r in results[1:] if _moved(best.T_target_source, r.T_target_source)[0] >= apart]
+    others = [r for r in results[1:] if _moved(best.T_target_source, r.T_target_source)[0] >= 1.5]
     return best.best_fitness - max((r.best_fitness for r in others), default=best.best_fitness - 1.0)
 
 

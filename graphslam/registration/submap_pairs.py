@@ -268,10 +268,13 @@ def _judge(
     return replace(out, why="; ".join(fails), margin=margin)
 
 
+FREE, BESIDE = -1.0, 0.5
+"""Log-odds of this and less are free, unless something is occupied so near [m]."""
+
+
 def contradiction_share(
-    source: PreparedMap, T_base_place: Array, target: PreparedMap, T_target_place: Array, points: Array,
-    *, firm: float = 1.0, near: float = 0.5,
-) -> float:  # fmt: skip
+    source: PreparedMap, T_base_place: Array, target: PreparedMap, T_target_place: Array, points: Array
+) -> float:
     """Share of what one map has occupied, and the other knows, that the other has free; the greater of both ways.
 
     Parameters
@@ -280,10 +283,6 @@ def contradiction_share(
         The place in both.
     points : (m, dim)
         Of the source, around the place and in its frame [m].
-    firm : float
-        Log-odds of −this and less are free.
-    near : float
-        … unless something is occupied so near [m].
 
     Returns
     -------
@@ -297,8 +296,8 @@ def contradiction_share(
         known = ~np.isnan(values)
         if not np.any(known):
             return 0.0
-        far = ~np.isfinite(held.target.tree.query(p[known], distance_upper_bound=near)[0])
-        return float(np.mean(far & (values[known] <= -firm)))
+        far = ~np.isfinite(held.target.tree.query(p[known], distance_upper_bound=BESIDE)[0])
+        return float(np.mean(far & (values[known] <= FREE)))
 
     there = target.around(T_target_place)  # in the frame of the place
     return max(

@@ -254,8 +254,8 @@ def _walls(mesh: MeshBuilder, size: tuple[float, float], ring: Rectangle, rng: n
     (w, h), (x1, y1, x2, y2), c = size, ring, _HALF
     wall = partial(mesh.wall, low=0.0, high=_HEIGHT)
 
-    def gaps(length: float, ends: float = 1.0) -> list[Rectangle]:
-        at = np.arange(ends + rng.uniform(0.0, 2.0), length - ends - 1.2, rng.uniform(4.0, 6.0))
+    def gaps(length: float) -> list[Rectangle]:
+        at = np.arange(1.0 + rng.uniform(0.0, 2.0), length - 1.0 - 1.2, rng.uniform(4.0, 6.0))
         return [(float(a), float(a) + 1.1, 0.0, _HEIGHT) for a in at]
 
     def door(at: float) -> list[Rectangle]:

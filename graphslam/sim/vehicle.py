@@ -11,7 +11,7 @@ from graphslam.sim.kernels import follow_route_kernel
 _SPACING = 0.1
 
 
-def wavy_loop(lap_length: float, waves: int, amplitude: float, *, spacing: float = _SPACING) -> Array:
+def wavy_loop(lap_length: float, waves: int, amplitude: float) -> Array:
     """Closed curve ``r(θ) = R (1 + amplitude · sin(waves · θ))``, driven counter-clockwise.
 
     Parameters
@@ -22,8 +22,6 @@ def wavy_loop(lap_length: float, waves: int, amplitude: float, *, spacing: float
         Number of waves per lap; 0 is a circle.
     amplitude : float
         Wave height relative to R, in [0, 1).
-    spacing : float
-        Distance between neighbouring points [m].
 
     Returns
     -------
@@ -36,7 +34,7 @@ def wavy_loop(lap_length: float, waves: int, amplitude: float, *, spacing: float
     curve = np.stack([r * np.cos(theta), r * np.sin(theta)], -1)
     s = arc_length(curve)
     curve, s = curve * (lap_length / s[-1]), s * (lap_length / s[-1])
-    at = np.linspace(0.0, lap_length, max(round(lap_length / spacing), 16), endpoint=False)
+    at = np.linspace(0.0, lap_length, max(round(lap_length / _SPACING), 16), endpoint=False)
     points = np.stack([np.interp(at, s, curve[:, 0]), np.interp(at, s, curve[:, 1])], -1)
     # tangent at θ = 0: (dr/dθ, r) with r = 1
     start = np.array([*points[0], np.arctan2(1.0, amplitude * waves)])

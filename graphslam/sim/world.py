@@ -24,6 +24,7 @@ def layout_number(layout: str) -> int:
 
 
 # An earlier visit is followed while the place on it moves by no more than this from one point to the next [m].
+_STEP = 0.5  # between the points of a way that are looked at [m]
 _JUMP = 3.0
 
 Triangles = npt.NDArray[np.int32]
@@ -86,19 +87,11 @@ class World:
         return plan_route(self.waypoints, self.corner_radius, where=f"world {self.name}")
 
 
-def find_revisits(
-    route: Route, *, radius: float = 1.0, gap: float = 20.0, spacing: float = 0.5, shortest: float = 0.0
-) -> list[dict[str, Any]]:
-    """Stretches of a way that lie where it has been before.
+def find_revisits(route: Route, *, shortest: float = 0.0) -> list[dict[str, Any]]:
+    """Stretches of a way that lie where it has been before: within a metre, and 20 m of driving or more earlier.
 
     Parameters
     ----------
-    radius : float
-        Two points nearer than this are the same place [m], in three dimensions.
-    gap : float
-        Driven distance between the two [m]; less is just going on.
-    spacing : float
-        Of the points looked at [m].
     shortest : float
         Stretches shorter than this are left out (mere crossings) [m].
 
@@ -108,16 +101,16 @@ def find_revisits(
         In the order driven: ``first`` and ``again``, arc lengths ``[from, to]`` [m] of the earlier and of the later
         visit, the places of ``again[0]`` and ``first[0]`` (and of the two ends) being the same; ``same_heading``.
     """
-    s = np.linspace(0.0, route.length, max(round(route.length / spacing), 1) + 1)
+    s = np.linspace(0.0, route.length, max(round(route.length / _STEP), 1) + 1)
     p, h = route.positions(s), route.headings(s)
     match = np.full(len(s), -1)
     for k in range(len(s)):
-        d = np.linalg.norm(p[s < s[k] - gap] - p[k], axis=1)
-        near = np.flatnonzero(d < radius)
+        d = np.linalg.norm(p[s < s[k] - 20.0] - p[k], axis=1)
+        near = np.flatnonzero(d < 1.0)
         if len(near):
             before = match[k - 1]
             # of several earlier visits the one that is being followed, else one in the same direction, else the nearest
-            follows = near[np.abs(near - before) * spacing <= _JUMP] if before >= 0 else near[:0]
+            follows = near[np.abs(near - before) * _STEP <= _JUMP] if before >= 0 else near[:0]
             alike = near[np.cos(h[near] - h[k]) > 0.0]
             choice = follows if len(follows) else alike if len(alike) else near
             match[k] = choice[d[choice].argmin()]
@@ -125,9 +118,7 @@ def find_revisits(
     begin = 0
     for k in range(1, len(s) + 1):
         # a stretch ends where the place is new, or where the earlier visit is another one
-        steps_on = (
-            k < len(s) and match[k] >= 0 and match[k - 1] >= 0 and abs(match[k] - match[k - 1]) * spacing <= _JUMP
-        )
+        steps_on = k < len(s) and match[k] >= 0 and match[k - 1] >= 0 and abs(match[k] - match[k - 1]) * _STEP <= _JUMP
         if steps_on:
             continue
         if match[begin] >= 0 and s[k - 1] - s[begin] >= shortest:
@@ -145,12 +136,12 @@ def find_revisits(
     return found
 
 
-def describe_route(route: Route, *, shortest: float = 3.0) -> dict[str, Any]:
+def describe_route(route: Route) -> dict[str, Any]:
     """``length``, ``revisits`` and ``loops`` of a world's meta.
 
     A loop closes at the beginning of a revisited stretch.
     """
-    revisits = find_revisits(route, shortest=shortest)
+    revisits = find_revisits(route, shortest=3.0)
     return {
         "length": round(route.length, 3),
         "revisits": revisits,

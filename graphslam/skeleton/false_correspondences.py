@@ -34,20 +34,17 @@ def landmark_chi2(network: Network) -> Array:
     return out
 
 
-def split_false_correspondences(network: Network, false_alarm: float = 1e-10, gap: int = 20) -> tuple[Labels, int]:
+FALSE_ALARM, GAP = 1e-10, 20
+"""Chance for a right landmark to be taken for a wrong one; poses without a sighting between two passes."""
+
+
+def split_false_correspondences(network: Network) -> tuple[Labels, int]:
     """Give every pass of a landmark whose χ² is impossible a landmark of its own; two, if it sees two things at once.
 
     The poses may still be wrong, which raises the χ² of all: it is compared in units of the median over the landmarks
     of several passes (never of less than one per degree of freedom). A wrong union also bends the poses that see it,
     and so its neighbours: only those go that are among the worst of all that is in view with them. The rest is judged
     again when the poses have moved.
-
-    Parameters
-    ----------
-    false_alarm : float
-        Chance for a right landmark to be taken for a wrong one.
-    gap : int
-        Poses without a sighting between two passes.
 
     Returns
     -------
@@ -59,7 +56,7 @@ def split_false_correspondences(network: Network, false_alarm: float = 1e-10, ga
     problem, counts = network.layout.problem, network.layout.counts
     L = problem.landmarks
     passes = np.zeros(L, np.int32)
-    correspondence_kernels.count_passes(problem.landmark, problem.first, gap, np.full(L, -1, np.int32), passes)
+    correspondence_kernels.count_passes(problem.landmark, problem.first, GAP, np.full(L, -1, np.int32), passes)
     several = np.flatnonzero(passes > 1)
     if not len(several):
         return problem.landmark, 0
@@ -68,7 +65,7 @@ def split_false_correspondences(network: Network, false_alarm: float = 1e-10, ga
     scale = max(1.0, float(np.median(value / freedom)))
     kinds, which = np.unique(freedom, return_inverse=True)
     ratio, worst = np.zeros(L), np.zeros(L)
-    ratio[several] = value / (scale * chdtri(kinds, false_alarm)[which])
+    ratio[several] = value / (scale * chdtri(kinds, FALSE_ALARM)[which])
     ratio[ratio < 1.0] = 0.0
     if not ratio.any():
         return problem.landmark, 0
@@ -77,5 +74,5 @@ def split_false_correspondences(network: Network, false_alarm: float = 1e-10, ga
     bad = np.zeros(L, np.bool_)
     bad[wrong] = True
     landmark = problem.landmark.copy()
-    correspondence_kernels.split_labels(problem.sightings, network.poses, bad, (gap, 16.27), landmark, L)
+    correspondence_kernels.split_labels(problem.sightings, network.poses, bad, (GAP, 16.27), landmark, L)
     return number_by_first_sighting(landmark)[0], len(wrong)

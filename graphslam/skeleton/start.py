@@ -72,33 +72,30 @@ class ForwardPass:
     refused: int
 
 
+TURN_SIGMA, WAY_SIGMA = 2e-3, 0.03
+"""How far a pose may move from its prediction [rad, m]."""
+GATE = 16.27
+"""Chi-square of three scalars that 99.9 % pass."""
+
+
 def forward_pass(
     problem: SkeletonProblem,
     chain: Poses,
     *,
     ago: int = 50,
-    turn_sigma: float = 2e-3,
-    way_sigma: float = 0.03,
-    gate: float = 16.27,
 ) -> ForwardPass:
     """Walk once along the poses and tie each to the landmarks that were first seen more than ``ago`` poses before.
 
     A pose is predicted by the chain's increment. Where three old landmarks or more are in view, three Gauss-Newton
-    steps place it against their running means; a landmark whose misfit is above ``gate`` and above nine times the
-    median of those in view has no part in the second and third. A sighting that is then above ``gate`` is *refused*:
+    steps place it against their running means; a landmark whose misfit is above :data:`GATE` and above nine times the
+    median of those in view has no part in the second and third. A sighting that is then above the gate is *refused*:
     it is not added to the mean of its landmark, so a wrong correspondence bends neither this pose nor a later one.
 
-    Parameters
-    ----------
-    turn_sigma, way_sigma : float
-        How far a pose may move from its prediction [rad, m].
-    gate : float
-        Chi-square of three scalars; 16.27 is passed by 99.9 %.
     """
     N, L = problem.poses, problem.landmarks
     out = Poses(np.empty((N, 3, 3)), np.empty((N, 3)))
     seen, D, b = np.full(L, -1, dtype=np.int32), problem.room((L, 6)), problem.room((L, 3))
-    rules = (int(ago), float(turn_sigma) ** -2, float(way_sigma) ** -2, float(gate))
+    rules = (int(ago), TURN_SIGMA**-2, WAY_SIGMA**-2, GATE)
     tied = refused = 0
     for span in problem.chunks(0, N):
         t, r = kernels.forward_pass_kernel(problem.sightings_of(*span), chain, span, rules, seen, D, b, out)

@@ -29,21 +29,14 @@ class WeakMode:
     pose: int
 
 
-def weakest_modes(network: Network, count: int = 3, keyframes: KeyframeNetwork | None = None) -> list[WeakMode]:
+def weakest_modes(network: Network, count: int = 3) -> list[WeakMode]:
     """The modes with the largest variance of position, softest first, by Lanczos on the factored keyframe network.
 
     The keyframes bend the path only as rigid motion between them allows, so the true modes are at least as soft: the
     figures are lower bounds.
-
-    Parameters
-    ----------
-    keyframes : KeyframeNetwork, optional
-        Default: one of the size of the preconditioner's is made.
     """
-    if keyframes is None:
-        poses = network.layout.problem.poses
-        k = preconditioner_levels(poses).factored or max(1, poses // 40)
-        keyframes = KeyframeNetwork(network, k)
+    poses = network.layout.problem.poses
+    keyframes = KeyframeNetwork(network, preconditioner_levels(poses).factored or max(1, poses // 40))
     n = keyframes.frames
 
     def spread(x: Array) -> Array:

@@ -19,6 +19,7 @@ from graphslam.registration.target import Target
 from graphslam_frontends.odometry.steps import Steps
 
 _MATCHING = RegistrationConfig(radii=(1.0, 0.3), near=0.15)
+_APART = 0.5  # way between the scans of a pair [m]
 _LEAST = 20
 
 
@@ -46,25 +47,21 @@ class YawCalibration:
     pairs: int
 
 
-def yaw_per_metre(steps: Steps, *, apart: float = 0.5, pairs: int = 400) -> YawCalibration:
-    """Fit the heading error of planar odometry to matches of scans some way apart.
+def yaw_per_metre(steps: Steps) -> YawCalibration:
+    """Fit the heading error of planar odometry to matches of pairs of scans, 0.5 m of the way apart.
 
     Parameters
     ----------
     steps : Steps
         In the plane.
-    apart : float
-        Way between the scans of a pair [m].
-    pairs : int
-        Tried, spread over the path.
     """
     if steps.dim != 2:
         raise ConfigError(f"{steps.name}: the yaw of odometry in space is not calibrated here")
     way = steps.path_length
-    starts = np.unique(np.searchsorted(way, np.linspace(0.0, max(way[-1] - apart, 0.0), pairs)))
+    starts = np.unique(np.searchsorted(way, np.linspace(0.0, max(way[-1] - _APART, 0.0), 400)))
     rows, errors = [], []
     for a in starts.tolist():
-        b = int(np.searchsorted(way, way[a] + apart))
+        b = int(np.searchsorted(way, way[a] + _APART))
         if b >= len(steps) or b - a > 50:
             continue
         clouds = [_cloud(steps, k) for k in (a, b)]

@@ -28,7 +28,6 @@ from graphslam.io.submap_store import read_submaps
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
 from graphslam.maps.surface.piece import SurfaceConfig
-from graphslam.maps.terrain.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,6 @@ def remake_terrain(
     folder: str | Path,
     *,
     log: str | Path | SensorLog | None = None,
-    vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
     progress: bool = True,
 ) -> tuple[RunTerrain, list[Path], list[Path]]:
@@ -115,7 +113,7 @@ def remake_terrain(
     ----------
     folder : path
         Of a finished run in space.
-    log, vehicle, sensor_height, progress
+    log, sensor_height, progress
         See :func:`graphslam.app.run.terrain.terrain_of_run`.
 
     Returns
@@ -127,7 +125,7 @@ def remake_terrain(
         read_run_folder(home)  # says what is wrong
     with lock_folder(home):
         run = read_run_folder(home)
-        made = terrain_of_run(run, log=log, vehicle=vehicle, sensor_height=sensor_height, progress=progress)
+        made = terrain_of_run(run, log=log, sensor_height=sensor_height, progress=progress)
         with new_generation(home) as new:
             files = write_terrain(new, made, generation=run.report.get("generation"))
             figures = draw_terrain(made, new.figures, name=run.name)

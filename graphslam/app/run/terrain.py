@@ -110,7 +110,6 @@ def terrain_of_run(
     run: Run,
     *,
     log: str | Path | SensorLog | None = None,
-    vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
     progress: bool = True,
 ) -> RunTerrain:
@@ -129,7 +128,7 @@ def terrain_of_run(
     name, scans = scans_of_run(run, log, what="terrain")
     return read_terrain(
         scans, run.map, moved=_moved(run) if isinstance(scans, PointClouds) else None,
-        stream=name, vehicle=vehicle, sensor_height=sensor_height, progress=progress,
+        stream=name, sensor_height=sensor_height, progress=progress,
     )  # fmt: skip
 
 
@@ -157,7 +156,6 @@ def read_terrain(
     *,
     moved: Mapping[int, Array] | None = None,
     stream: str = "scans",
-    vehicle: Vehicle | None = None,
     sensor_height: float | None = None,
     progress: bool = True,
 ) -> RunTerrain:
@@ -170,7 +168,7 @@ def read_terrain(
     moved : mapping, optional
         By number of a node: points ``(m, 3)`` of things that moved while it was made, in the world. Clouds of that
         time are read without what stands where they are.
-    stream, vehicle, sensor_height, progress
+    stream, sensor_height, progress
         See :func:`terrain_of_run`.
     """
     path, node_times, node_poses = solved.trajectory, solved.node_times, solved.node_poses
@@ -188,7 +186,7 @@ def read_terrain(
         step = float(np.median(np.arccos(np.clip(np.sum(rays[0, 1:] * rays[0, :-1], axis=-1), -1.0, 1.0))))
         height = float(scans.T_base_mount[2] if sensor_height is None else sensor_height)
     sensor = LineSensor(height=height, beam_step=step, sweep_time=_sweep(scans, at))
-    layer = TerrainLayer(read_tables(), vehicle or Vehicle(), sensor)
+    layer = TerrainLayer(read_tables(), Vehicle(), sensor)
     turn = np.concatenate([np.zeros(3), se3.matrix_to_quat(rotation)])
     level = Trajectory(path.times, se3.se3_compose(np.broadcast_to(turn, path.poses.shape), path.poses))
     poses = se3.se3_compose(np.broadcast_to(turn, node_poses.shape), node_poses)

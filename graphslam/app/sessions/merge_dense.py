@@ -29,7 +29,6 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import Metrics, base_metrics
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.loops.inter_session_loops import InterSessionConfig
 from graphslam.plots.paths import plot_paths
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
@@ -102,8 +101,6 @@ def merge_dense(
     *,
     by: By = "auto",
     solver: str = "batch",
-    config: InterSessionConfig | None = None,
-    progress: bool = False,
 ) -> MergedSubmaps:
     """Merge runs of dense submaps into one graph, and solve it as one problem.
 
@@ -118,10 +115,6 @@ def merge_dense(
         Of the sessions, each once.
     by : {"auto", "places", "gps"}
         ``auto``: GPS where both have it, and then places that it brings together; else places.
-    config : InterSessionConfig, optional
-        When ties by places are believed.
-    progress : bool
-        Show progress bars on stderr.
     """
     if by not in ("auto", "places", "gps"):
         raise ConfigError(f"by = {by!r}; known for dense submaps: auto, places, gps")
@@ -147,7 +140,7 @@ def merge_dense(
         for k in list(waiting):
             for at in list(first):
                 try:
-                    how[k] = _tie(graph, solve, sessions[at], first[at], sessions[k], by, config, progress)
+                    how[k] = _tie(graph, solve, sessions[at], first[at], sessions[k], by)
                 except DataError as error:
                     errors.setdefault(k, []).append(error.what)
                     continue
@@ -177,15 +170,13 @@ def _tie(
     known_node: int,
     new: DenseSession,
     by: By,
-    config: InterSessionConfig | None,
-    progress: bool,
 ) -> ConnectedSession:
     both = all(s.fixes is not None and s.T_gps_base is not None for s in (known, new))
     if by == "gps" or (by == "auto" and both):
-        return connect_by_gps(graph, solver, known, known_node, new, places=by == "auto", progress=progress)
+        return connect_by_gps(graph, solver, known, known_node, new, places=by == "auto")
     if by != "auto":
         new = replace(new, fixes=None)
-    return connect_session(graph, solver, known, known_node, new, config=config, progress=progress)
+    return connect_session(graph, solver, known, known_node, new)
 
 
 def _placed(

@@ -149,7 +149,11 @@ def lines_of_scans(scans: RangeScans, path: Trajectory, height: float) -> ScanLi
     return ScanLines(points, origins, origins[:, 2] - height)
 
 
-def lines_of_clouds(points: Array, origin: Array, foot: float, *, columns: int = 900, beams: int = 64) -> ScanLines:
+COLUMNS = 900
+"""Of a turn of a spinning scanner."""
+
+
+def lines_of_clouds(points: Array, origin: Array, foot: float, *, beams: int = 64) -> ScanLines:
     """Lines of one turn of a spinning scanner: its points by azimuth, in each column from the lowest up.
 
     Parameters
@@ -160,18 +164,16 @@ def lines_of_clouds(points: Array, origin: Array, foot: float, *, columns: int =
         Of the scanner [m].
     foot : float
         Height of the ground under it [m].
-    columns : int
-        Of a turn.
     beams : int
         Most points of a column; of more, the lowest ones stay.
     """
     p = np.ascontiguousarray(points, dtype=np.float64)
-    order, filled = np.zeros((columns, beams), np.int64), np.zeros(columns, np.int64)
+    order, filled = np.zeros((COLUMNS, beams), np.int64), np.zeros(COLUMNS, np.int64)
     sort_into_columns(p, np.asarray(origin, dtype=np.float64), order, filled)
-    lines = np.full((columns, beams, 3), np.nan)
+    lines = np.full((COLUMNS, beams, 3), np.nan)
     there = np.arange(beams) < filled[:, None]
     lines[there] = p[order[there]]
-    return ScanLines(lines, np.broadcast_to(origin, (columns, 3)), np.full(columns, float(foot)))
+    return ScanLines(lines, np.broadcast_to(origin, (COLUMNS, 3)), np.full(COLUMNS, float(foot)))
 
 
 def observe_terrain(

@@ -117,10 +117,9 @@ def read_tables(path: str | Path = DEFAULT) -> TerrainWeights:
         raise FormatError(f"terrain tables that do not fit ({error})", where=str(path)) from None
 
 
-def fixed_tables(bands: int, hit: float, miss: float, *, step: int = 6, depth: int = 6) -> npt.NDArray[np.int32]:
-    """Ratios ``(2, bands, 48)`` of a plain occupancy update: ``+hit`` from a value on [cm], ``−miss`` below it."""
-    value = np.arange(BINS)
-    rows = [np.where(value >= least, hit, -miss) for least in (step, depth)]
+def fixed_tables(bands: int, hit: float, miss: float) -> npt.NDArray[np.int32]:
+    """Ratios ``(2, bands, 48)`` of a plain occupancy update: ``+hit`` from 6 cm on, ``−miss`` below."""
+    rows = [np.where(np.arange(BINS) >= 6, hit, -miss)] * 2
     return np.repeat(np.round(SCALE * np.array(rows))[:, None], bands, axis=1).astype(np.int32)
 
 

@@ -153,12 +153,12 @@ def tail_limit(D2: Array, dof: int, quantile: float = QUANTILE) -> tuple[float, 
     return limit, scale
 
 
-def groups_of(ends: npt.ArrayLike, near: int = NEAR) -> Ints:
+def groups_of(ends: npt.ArrayLike) -> Ints:
     """Number of the group of every loop ``(l,)``: neighbours of neighbours, by the nodes that they join ``(l, 2)``."""
     e = np.sort(np.asarray(ends, dtype=np.float64).reshape(-1, 2), axis=1)
     if not len(e):
         return np.zeros(0, dtype=np.int64)
-    pairs = cKDTree(e).query_pairs(near, p=1, output_type="ndarray")
+    pairs = cKDTree(e).query_pairs(NEAR, p=1, output_type="ndarray")
     links = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(e), len(e)))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 

@@ -93,27 +93,24 @@ class AxesCheck:
             )
 
 
-def check_imu_axes(
-    imu: Imu, path: Trajectory, *, window: float = 1.0, limit: float = 50.0, force_sigma: float = 0.3
-) -> AxesCheck:
+WINDOW, LIMIT, FORCE_SIGMA = 1.0, 50.0, 0.3
+"""Means are over windows [s]; a mounting is contradicted if its χ² exceeds that of the best explanation by the limit;
+accelerations leave at least this σ in the mean specific force of a window [m/s²]."""
+
+
+def check_imu_axes(imu: Imu, path: Trajectory) -> AxesCheck:
     """Compare an IMU with a path that is about right and whose frame is about level.
 
     Parameters
     ----------
     path : Trajectory
         ``T_world_base``, z up.
-    window : float
-        [s]
-    limit : float
-        The stated mounting is contradicted if its χ² exceeds that of the best explanation by this.
-    force_sigma : float
-        What accelerations leave in the mean specific force of a window at least [m/s²].
     """
     begin, end = max(imu.times[0], path.times[0]), min(imu.times[-1], path.times[-1])
-    n = int((end - begin) // window)
+    n = int((end - begin) // WINDOW)
     if n < 10:
-        raise DataError("IMU and path share too little time", got=f"{end - begin:.1f} s", wanted=f"{10 * window:g} s")
-    edges = begin + window * np.arange(n + 1)
+        raise DataError("IMU and path share too little time", got=f"{end - begin:.1f} s", wanted=f"{10 * WINDOW:g} s")
+    edges = begin + WINDOW * np.arange(n + 1)
     which = np.searchsorted(edges, imu.times, side="right") - 1
     used = (which >= 0) & (which < n)
     counts = np.bincount(which[used], minlength=n)
@@ -127,7 +124,7 @@ def check_imu_axes(
 
     q = se3.quat_multiply(path.interpolate(edges)[:, 3:], np.broadcast_to(imu.T_base_imu[3:], (n + 1, 4)))
     R = se3.quat_to_matrix(q)
-    turn = se3.so3_log(se3.quat_multiply(_conjugate(q[:-1]), q[1:]))[full] / window
+    turn = se3.so3_log(se3.quat_multiply(_conjugate(q[:-1]), q[1:]))[full] / WINDOW
     ups = R[:, 2, :] * GRAVITY
     rate, force = mean(imu.angular_rate), mean(imu.specific_force)
     ways = signed_permutations()
@@ -137,7 +134,7 @@ def check_imu_axes(
     squares = float((r**2).sum(axis=(1, 2)).min()), float(((rate - rate.mean(axis=0)) ** 2).sum())
     missed, moved = (float(np.sqrt(x / len(rate))) for x in squares)
     believed = missed**2 < 0.5 * moved**2
-    unlike = not believed and moved > max(TURNING, 5.0 * imu.noise.gyro / np.sqrt(window))
+    unlike = not believed and moved > max(TURNING, 5.0 * imu.noise.gyro / np.sqrt(WINDOW))
     turned = _turned(imu) if believed else np.zeros((len(imu.times), 3))
     ends = np.stack([np.interp(edges, imu.times, turned[:, k]) for k in range(3)], axis=1)
     since, left = mean(turned) - ends[:-1][full], ends[1:][full] - mean(turned)
@@ -147,20 +144,20 @@ def check_imu_axes(
     gyro, pull = (r**2).sum(axis=(1, 2)), (f**2).sum(axis=(1, 2))
     # what the best way of each sensor leaves is its noise, path errors and all
     rows = 3.0 * len(rate)
-    s2_gyro = max(float(gyro.min()) / rows, imu.noise.gyro**2 / window, 1e-12)
-    s2_pull = max(float(pull.min()) / rows, force_sigma**2)
+    s2_gyro = max(float(gyro.min()) / rows, imu.noise.gyro**2 / WINDOW, 1e-12)
+    s2_pull = max(float(pull.min()) / rows, FORCE_SIGMA**2)
     # forces that one way explains are a word on the mounting even where the path turns by itself
     unlike &= float(pull.min()) > 0.25 * float(pull[0])
     gyro, pull = (gyro - gyro.min()) / s2_gyro, (pull - pull.min()) / s2_pull
     chi2, sensor = gyro + pull, "both"
-    if max(gyro[np.argmin(chi2)], pull[np.argmin(chi2)]) > limit:
+    if max(gyro[np.argmin(chi2)], pull[np.argmin(chi2)]) > LIMIT:
         # no way explains both: one of them was turned, or the path was made of the very gyro; the other one is named
-        chi2, sensor = (pull, "accelerometer") if pull[0] > limit else (gyro, "gyro")
+        chi2, sensor = (pull, "accelerometer") if pull[0] > LIMIT else (gyro, "gyro")
     best = int(np.argmin(chi2))
     excess = float(chi2[0] - chi2[best])
-    alike = int(np.sum(chi2 - chi2[best] <= limit))
+    alike = int(np.sum(chi2 - chi2[best] <= LIMIT))
     turns = (moved, missed) if unlike else None
-    return AxesCheck(excess > limit and not unlike, ways[best], excess, alike, len(rate), sensor, turns)
+    return AxesCheck(excess > LIMIT and not unlike, ways[best], excess, alike, len(rate), sensor, turns)
 
 
 def _turned(imu: Imu) -> Array:
