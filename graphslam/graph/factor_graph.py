@@ -202,7 +202,7 @@ class FactorGraph(FactorGraphState):
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         ids[fresh] = top + np.arange(len(fresh))
         self._next_landmark = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
-        self._start_landmarks(ids, self.structure.group.transform(self.pose(node), lm.positions))
+        self.start_landmarks(ids, self.structure.group.transform(self.pose(node), lm.positions))
         robot, z = -1, lm.mean
         if lm.lasting is not None:
             robot = self._robots.get(submap.uses, self.structure.count("wheels"))

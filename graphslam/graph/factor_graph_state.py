@@ -200,7 +200,7 @@ class FactorGraphState:
     def with_values(cls, values: Values) -> Self:
         """A graph without factors that has variables already: factors can be inserted one by one."""
         new = cls(values.dim)
-        new.structure = values
+        new.structure, new.origin = values, values.poses[0].copy()
         new._row = {int(i): k for k, i in enumerate(values.landmark_ids)}
         new._seen_in = {i: set() for i in new._row}
         return new
@@ -316,7 +316,7 @@ class FactorGraphState:
             raise DataError(f"landmark {old} is seen nowhere else", got=(factor_id, entry), wanted="two observations")
         self._next_landmark += 1
         seen = self.values.group.transform(self.values.poses[record.start], record.landmark_positions()[entry])
-        self._start_landmarks(ids[entry : entry + 1], seen[None])
+        self.start_landmarks(ids[entry : entry + 1], seen[None])
         if old not in ids:
             self._seen_in[old].discard(factor_id)
         self.insert(replace(record, landmark_ids=ids))  # a new object: solvers see that it changed
@@ -423,7 +423,13 @@ class FactorGraphState:
     def _event(self, kind: str, **facts: Any) -> None:
         self.events.append({"event": kind, **facts})
 
-    def _start_landmarks(self, ids: npt.NDArray[np.int64], world: Array) -> None:
+    def append_node(self, pose: Array) -> int:
+        """A node ``(3|7,)`` that no factor holds yet; returns its number."""
+        self.revision += 1
+        return self.structure.append("x", pose)
+
+    def start_landmarks(self, ids: npt.NDArray[np.int64], world: Array) -> None:
+        """Landmarks ``(k,)`` that are new, at ``(k, dim)``; those that the graph has stay where they are."""
         new: dict[int, Array] = {}
         for i, p in zip(ids.tolist(), world):
             if i not in self._row and i not in new:

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, vector_to_tangent_covariance
-from graphslam.core.network import PoseNetwork
+from graphslam.core.network import Mask, PoseNetwork
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import FactorBatch
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
@@ -29,17 +29,22 @@ def network_values(network: PoseNetwork, poses: Array, landmarks: Array | None =
     return Values(network.dim, {"x": poses, "l": marks}, network.landmark_ids)
 
 
-def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FactorArrays:
+def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordered: bool = True) -> FactorArrays:
     """The measurements of a network as a least-squares problem, with no object for each.
 
     Factors count through the edges, then the observations. Fixed vertices (the first, if there are none) are held.
 
     Parameters
     ----------
+    used : (m + k,) bool, optional
+        Edges and observations that enter; all of them if not given.
     ordered : bool
         Columns come in a minimum-degree order of elimination: quicker than to order their scalars. Else in their own.
     """
-    n, l = len(network), len(network.landmark_ids)
+    n, l, m = len(network), len(network.landmark_ids), len(network.edges)
+    e = slice(None) if used is None else np.flatnonzero(used[:m])
+    o = slice(None) if used is None else np.flatnonzero(used[m:])
+    edges, seen = network.edges[e], network.observations[o]
     counts = tuple({"x": n, "l": l}.get(word, 0) for word in KINDS)
     fixed = tuple(network.anchors.tolist())
     order = None
@@ -47,17 +52,17 @@ def problem_of_network(network: PoseNetwork, *, ordered: bool = True) -> FactorA
         at = np.full(n + l, -1)
         free = np.setdiff1d(np.arange(n + l), network.anchors)
         at[free] = np.arange(len(free))
-        i, j = at[np.concatenate([network.edges, network.observations + [0, n]])].T
+        i, j = at[np.concatenate([edges, seen + [0, n]])].T
         tied = (i >= 0) & (j >= 0)
         order = free[elimination_order(i[tied], j[tied], len(free))] if len(free) else free
     layout = VariableLayout(network.dim, counts, network.landmark_ids, fixed, order)
     batches: list[FactorBatch] = [
-        BetweenBatch.of_arrays(network.edges, network.measurements, whiteners(network.information), layout)
+        BetweenBatch.of_arrays(edges, network.measurements[e], whiteners(network.information[e]), layout)
     ]
-    if len(network.observations):
+    if len(seen):
         polar = network.observation_kind == "bearing-range"
-        W = whiteners(network.observation_information)
-        batches.append(SightingBatch.of_arrays(network.observations, network.observation_values, polar, W, layout))
+        W = whiteners(network.observation_information[o])
+        batches.append(SightingBatch.of_arrays(seen, network.observation_values[o], polar, W, layout))
     return FactorArrays((), layout, batches)
 
 

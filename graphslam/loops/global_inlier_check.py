@@ -13,8 +13,8 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import compose_increments, group_of
-from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.robust import truncated_least_squares
+from graphslam.solve.network.start import network_arrays
 
 LEVEL = 0.9999
 
@@ -62,6 +62,6 @@ def truncated_least_squares_inliers(
         information=np.linalg.inv(np.concatenate([covariances, loops[2][asked]])),
         source="chain of submaps with loops",
     )
-    robust = truncated_least_squares(BatchProblem(network), None, level, noise_scale=1.0)
+    robust = truncated_least_squares(network, network_arrays(network), None, level, noise_scale=1.0)
     out[asked] = robust.inliers[n - 1 :]
     return out

@@ -10,7 +10,6 @@ import numpy as np
 from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.network import network_of
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import DescentLimits, Optimum, descend_to_minimum
 from graphslam.solve.solution import Solution, make_solution
@@ -79,36 +78,6 @@ class BatchSolver:
         self.graph.set_values(optimum.values)
         self.iterations += optimum.iterations
         self.seconds += time.perf_counter() - t0
-
-    def solve_from(self, *starts: str) -> str:
-        """Solve from the present values and from other starts, and keep the lowest objective.
-
-        Parameters
-        ----------
-        starts : str
-            Keys of :data:`graphslam.solve.network.multistart.STARTS`; if not given, those that are worth trying.
-
-        Returns
-        -------
-        str
-            Which start won; ``"present"`` are the graph's values.
-
-        Raises
-        ------
-        SolverError
-            The graph holds more than relative poses: the other starts know nothing else.
-        UnknownNameError
-        """
-        from graphslam.solve.network.multistart import best_of_starts, default_starts
-
-        t0 = time.perf_counter()
-        network = network_of(self.graph.flat(), self.graph.values)
-        names = starts or tuple(n for n in default_starts(network) if n != "file")  # the graph's values are that
-        found = best_of_starts(network, names, flat=self.graph.flat(), given={"present": self.graph.values})
-        self.graph.set_values(found.problem.unpack(found.best.values))
-        self.iterations += found.iterations
-        self.seconds += time.perf_counter() - t0
-        return found.start
 
     def gap(self) -> float:
         """Objective now less the batch optimum reached from here."""

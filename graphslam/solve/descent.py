@@ -8,22 +8,17 @@ predicted of them, if it will be by the rate at which the decrement falls.
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from graphslam.core.errors import IndeterminateError
-from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import Values
-
-log = logging.getLogger(__name__)
+from graphslam.solve.sparse import FAILED, RELATIVE, SparseProblem
 
 Status = Literal["converged", "rejected", "stalled", "out of iterations"]
-# Converged: the next step would lower the objective by less than this share of it …
-RELATIVE = 1e-9
-# … or by less than this per residual (a network without noise has objective zero).
+# Converged: the next step would lower the objective by less than RELATIVE of it, or by less than this per residual (a
+# network without noise has objective zero).
 ABSOLUTE = 1e-14
 # Two starts agree, and one beats another, at this relative difference of the objective.
 SAME = 1e-6
@@ -32,8 +27,6 @@ CLIMB, PATIENCE = 1e4, 8
 # The decrement may be foretold if the last step changed the objective by what it predicted to this share of it, and if
 # each decrement is at most this share of the one before (a third of the limit is asked for then).
 TRUE_TO_WORD, FAST = 0.1, 0.02
-FAILED = (RuntimeError, IndeterminateError)
-"""What a linear system that cannot be solved throws: GTSAM's, or ours."""
 # A start that after so many steps is still above the best of the others is given up.
 CHALLENGE = 10
 
@@ -44,8 +37,7 @@ class Optimum:
 
     Parameters
     ----------
-    values : object
-        As the problem holds them.
+    values : Values
     objective_initial, objective : float
         ``Σ rᵀ Ω r`` before and after.
     decrement : float
@@ -55,7 +47,7 @@ class Optimum:
     status : str
     """
 
-    values: Any
+    values: Values
     objective_initial: float
     objective: float
     decrement: float
@@ -89,33 +81,14 @@ class DescentLimits:
         return bool(decrement <= self.relative * objective + self.absolute)
 
 
-class LeastSquaresProblem(Protocol):
-    """A least-squares problem with a way to make its steps; ``values`` are whatever that makes of them."""
-
-    flat: FactorArrays
-    factorization: str
-
-    def pack(self, values: Values) -> Any: ...
-
-    def unpack(self, values: Any) -> Values: ...
-
-    def objective(self, values: Any) -> float: ...
-
-    def newton_step(self, values: Any) -> tuple[Any, float, float]: ...
-
-    def decrement(self, values: Any) -> float: ...
-
-    def damped(self, values: Any, objective: float, budget: int) -> tuple[Any, list[float], int]: ...
-
-
 def limits_of(measurements: int) -> DescentLimits:
     """A decrement is negligible at 1e-9 of the objective, or 1e-14 per residual."""
     return DescentLimits(RELATIVE, ABSOLUTE * measurements)
 
 
 def descend_to_minimum(
-    problem: LeastSquaresProblem,
-    values: Any,
+    problem: SparseProblem,
+    values: Values,
     *,
     best_known: float = np.inf,
     max_iterations: int = 200,
@@ -141,23 +114,7 @@ def descend_to_minimum(
     Optimum
         Never worse than ``values``.
     """
-    limits = limits or limits_of(problem.flat.measurements)
-    best = _descend(problem, values, best_known, max_iterations, foretell, limits)
-    if best.status == "stalled" and not np.isfinite(best.decrement) and problem.factorization == "CHOLESKY":
-        # the normal equations are what failed; QR squares no condition number
-        log.info("Cholesky made no progress, going on with QR")
-        problem.factorization = "QR"
-        again = _descend(problem, best.values, best_known, max_iterations, foretell, limits)
-        if again.objective <= best.objective:
-            best = replace(
-                again, objective_initial=best.objective_initial, iterations=best.iterations + again.iterations
-            )
-    return best
-
-
-def _descend(
-    problem: LeastSquaresProblem, values: Any, best_known: float, budget: int, foretell: bool, limits: DescentLimits
-) -> Optimum:
+    limits, budget = limits or limits_of(problem.flat.measurements), max_iterations
     objective, used, attempts = problem.objective(values), 0, 0
     history = [objective]
 
@@ -191,8 +148,8 @@ def _descend(
 
 
 def _newton(
-    problem: LeastSquaresProblem,
-    values: Any,
+    problem: SparseProblem,
+    values: Values,
     objective: float,
     budget: int,
     patience: int,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,8 +19,8 @@ from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import skew
 from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.factors.batch import UniformBatch
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import FAILED
 
 if TYPE_CHECKING:
     from graphslam.linear.block_cholesky import BlockFactor
@@ -29,10 +29,19 @@ if TYPE_CHECKING:
 DELAY = 10
 # Columns that SuperLU takes together: its default of 20 suits larger fronts than those of pose networks.
 PANEL = 10
-# Beyond so many poses they are eliminated as blocks, in an order by nested dissection.
-MANY = 5_000
+# Beyond so many poses, in the plane and in space, they are eliminated as blocks, in an order by nested dissection.
+MANY = {2: 5_000, 3: 1_000}
+# The trust region begins with this radius [m, rad] and is given up at the least; shrinking it costs evaluations of the
+# objective, no solves.
+FIRST_RADIUS, LEAST_RADIUS = 10.0, 1e-5
+# A damped step that lowers the objective by less than this share of it is not worth another one of its kind.
+LITTLE = 1e-3
 # A dense Cholesky factorisation beats a sparse one that has no order yet below this many columns (measured).
 DENSE_SOLVE_LIMIT = 600
+# A fall of the objective by less than this share of it counts for nothing.
+RELATIVE = 1e-9
+FAILED = (RuntimeError, IndeterminateError)
+"""What a linear system that cannot be solved throws: SuperLU's, or ours."""
 SINGULAR = "the Gauss-Newton matrix is singular to working precision"
 
 
@@ -97,25 +106,17 @@ class SparseProblem:
     ----------
     weights : (f,), optional
         Factor on the information of every factor.
+    thorough : bool
+        Where the usual steps fail, try steps in a trust region, and QR, which squares no condition number.
     """
 
-    factorization = "LU"
-
-    def __init__(self, flat: FactorArrays, weights: Array | None = None) -> None:
-        self.flat, self.weights = flat, weights
+    def __init__(self, flat: FactorArrays, weights: Array | None = None, *, thorough: bool = False) -> None:
+        self.flat, self.weights, self.thorough = flat, weights, thorough
         layout = flat.layout
         # many poses and nothing else: compiled block elimination, which begins with half a second of loading
-        self._by_block = layout.size > MANY * layout.pose_dof and layout.stop("x") == layout.size
+        self._by_block = layout.size > MANY[layout.dim] * layout.pose_dof and layout.stop("x") == layout.size
         self._dense = not layout.ordered and layout.size <= DENSE_SOLVE_LIMIT
         self._elimination: BlockElimination | None = None
-
-    def pack(self, values: Values) -> Values:
-        """Values are what they are."""
-        return values
-
-    def unpack(self, values: Values) -> Values:
-        """Values are what they are."""
-        return values
 
     def objective(self, values: Values) -> float:
         """``Σ rᵀ Ω r``."""
@@ -151,23 +152,61 @@ class SparseProblem:
 
     def newton_step(self, values: Values) -> tuple[Values, float, float]:
         """One Gauss-Newton step, the fall of the objective that it predicts, and the objective after it."""
-        H, b = self._system(values)
-        step = self.solve_linear(values, H, b)
+        H, b, step = self._full_step(values)
         moved = self.flat.layout.retract(values, step)
         return moved, float(2.0 * (b @ step) - step @ (H @ step)), self.objective(moved)
+
+    def _full_step(self, values: Values) -> tuple[sp.csc_matrix, Array, Array]:
+        """The system at ``values`` and its solution."""
+        H, b = self._system(values)
+        try:
+            return H, b, self.solve_linear(values, H, b)
+        except IndeterminateError:
+            if not self.thorough:
+                raise
+            return H, b, self._solve_by_qr(values)
+
+    def _solve_by_qr(self, values: Values) -> Array:
+        """The Gauss-Newton step from the whitened Jacobians themselves: GTSAM's elimination by QR."""
+        import gtsam
+
+        graph, first = gtsam.GaussianFactorGraph(), 0
+        for f in self.flat.batches:
+            if not isinstance(f, UniformBatch):
+                raise IndeterminateError(SINGULAR)
+            r, J = f.whitened(values)
+            root = np.ones(len(f)) if self.weights is None else np.sqrt(self.weights[first : first + len(f)])
+            r, J, first = root[:, None] * r, root[:, None, None] * J, first + len(f)
+            unit, make = gtsam.noiseModel.Unit.Create(r.shape[1]), cast(Any, gtsam.JacobianFactor)
+            places = f.first.reshape(len(f), -1).tolist()
+            for k, (at, widths) in enumerate(zip(places, f.width.reshape(len(f), -1))):
+                parts = zip(at, np.split(J[k], np.cumsum(widths)[:-1], axis=1))
+                terms = [x for v, A in parts if v >= 0 for x in (v, np.asfortranarray(A))]
+                graph.add(make(*terms, -r[k], unit))
+        out = np.zeros(self.flat.layout.size)
+        try:
+            solved = graph.optimize(gtsam.EliminateQR)
+        except RuntimeError:
+            raise IndeterminateError(SINGULAR) from None
+        for v in graph.keyVector():
+            out[v : v + len(solved.at(v))] = solved.at(v)
+        return out
 
     def decrement(self, values: Values) -> float:
         """Predicted remaining fall of the objective, always by a direct solve; infinite if that fails."""
         try:
-            H, b = self._system(values)
-            step = SparseProblem.solve_linear(self, values, H, b)
+            H, b, step = SparseProblem._full_step(self, values)
             fall = float(2.0 * (b @ step) - step @ (H @ step))
         except FAILED:
             return float("inf")
         return abs(fall) if np.isfinite(fall) else float("inf")
 
     def damped(self, values: Values, objective: float, budget: int) -> tuple[Values, list[float], int]:
-        """Up to ten LM steps, all downhill, damped by the diagonal (Marquardt)."""
+        """Up to ten LM steps damped by the diagonal (Marquardt), all downhill, and steps in a trust region if thorough.
+
+        LM gets down from far away. In a curved valley (headings off by more than the residual is linear over) it
+        creeps, with one damping for all directions, where steps in a trust region keep their full length along it.
+        """
         taken: list[float] = []
         damping, steps = 1e-6, 0
         for _ in range(min(10, budget)):
@@ -185,12 +224,57 @@ class SparseProblem:
             else:
                 break
             steps += 1
-            small = objective - now < 1e-3 * objective
+            small = objective - now < LITTLE * objective
             values, objective, damping = moved, now, damping / 10.0
             taken.append(now)
             if small:
                 break
+        if self.thorough and steps < budget:
+            values, more = self._in_trust_region(values, objective, min(20, budget - steps))
+            taken, steps = taken + more, steps + len(more)
         return values, taken, steps
+
+    def _in_trust_region(self, values: Values, objective: float, budget: int) -> tuple[Values, list[float]]:
+        """Powell's dog leg: the full step, cut back towards the steepest descent at the radius."""
+        taken: list[float] = []
+        radius = FIRST_RADIUS
+        for _ in range(budget):
+            try:
+                H, b, full = self._full_step(values)
+            except FAILED:
+                break
+            steepest = float(b @ b) / float(b @ (H @ b)) * b
+            while radius > LEAST_RADIUS:
+                step = _dog_leg(steepest, full, radius)
+                moved = self.flat.layout.retract(values, step)
+                now = self.objective(moved)
+                agreed = (objective - now) / float(2.0 * (b @ step) - step @ (H @ step))
+                if agreed > 0.75:
+                    radius = max(radius, 3.0 * float(np.linalg.norm(step)))
+                elif not agreed > 0.25:
+                    radius *= 0.5
+                if now < objective:
+                    break
+            else:
+                break
+            small = objective - now < RELATIVE * objective
+            values, objective = moved, now
+            taken.append(now)
+            if small:
+                break
+        return values, taken
+
+
+def _dog_leg(steepest: Array, full: Array, radius: float) -> Array:
+    """Where the way from the steepest descent to the full step leaves the trust region."""
+    if np.linalg.norm(full) <= radius:
+        return full
+    length = float(np.linalg.norm(steepest))
+    if length >= radius:
+        return steepest * (radius / length)
+    way = full - steepest
+    a, half, c = float(way @ way), float(steepest @ way), length**2 - radius**2
+    return np.asarray(steepest + (np.sqrt(half**2 - a * c) - half) / a * way)
 
 
 def _dense_solve(H: Array, b: Array) -> Array:
@@ -236,8 +320,6 @@ class PcgProblem(SparseProblem):
     group : int
         Poses a group.
     """
-
-    factorization = "PCG"
 
     def __init__(
         self, flat: FactorArrays, *, tolerance: float = 1e-4, max_iterations: int = 2000, group: int = 10

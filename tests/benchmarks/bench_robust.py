@@ -27,9 +27,9 @@ from graphslam.core.random import SeedTree
 from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
 from graphslam.graph.network import network_values
 from graphslam.io.network_file import read_network
-from graphslam.solve.network.factors import to_graph
 from graphslam.solve.network.solve import solve_network
 from graphslam.solve.network.start import odometry_start
+from tests.reference.gtsam_network import to_graph
 from tests.reference.plain_network import edge_costs
 from tests.reference.wrong_loops import WrongLoops, add_wrong_loops, is_odometry
 

@@ -37,7 +37,7 @@ def ours(path: str) -> dict[str, Any]:
     """Default options, from the file to the report."""
     from graphslam.app.solve_file import solve_network_file
 
-    importlib.import_module("graphslam.solve.network.batch")  # GTSAM, which is loaded when it is needed
+    importlib.import_module("graphslam.linear.block_cholesky")  # kernels, which are loaded when they are needed
     begin = time.process_time()
     report = solve_network_file(path)
     return {
@@ -102,15 +102,15 @@ def large(who: str, n: str, dim: str) -> dict[str, Any]:
 
     from graphslam.graph.gtsam_values import to_gtsam
     from graphslam.graph.network import network_values
-    from graphslam.solve.network.batch import BatchProblem
     from graphslam.solve.network.solve import solve_network
     from graphslam.solve.network.start import chordal_start
     from tests.reference.grid_world import grid_world
+    from tests.reference.gtsam_network import to_graph
 
     network = grid_world(int(n), np.random.default_rng(0), dim=int(dim))
     begin = time.process_time()
     if who == "GTSAM":
-        graph = BatchProblem(network).graph
+        graph = to_graph(network)
         if network.dim == 3:
             start = gtsam.InitializePose3.initialize(graph)
         else:  # lago leads to a minimum 37 times as high with 10⁵ poses: our chordal start, whose time counts

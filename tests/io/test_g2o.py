@@ -16,8 +16,8 @@ from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.io.isam_graph import read_isam_graph
 from graphslam.io.network_file import read_network
-from graphslam.solve.network.factors import to_graph
 from graphslam.solve.network.multistart import canonical_start
+from tests.reference.gtsam_network import to_graph
 
 SE2 = """VERTEX_SE2 0 0 0 0
 VERTEX_SE2 7 1 0.1 0.2

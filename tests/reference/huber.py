@@ -14,9 +14,9 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.network import network_values
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.solve.descent import descend_to_minimum
-from graphslam.solve.network.batch import BatchProblem
+from graphslam.solve.sparse import SparseProblem
 from tests.reference.plain_network import edge_costs
 
 
@@ -82,9 +82,8 @@ def huber_least_squares(
     for count in range(1, rounds + 1):
         weights = np.where(trusted, 1.0, np.minimum(1.0, k / np.sqrt(np.maximum(costs, 1e-300))))
         weighted = replace(network, information=weights[:, None, None] * network.information)
-        problem = BatchProblem(weighted)
-        end = descend_to_minimum(problem, problem.pack(network_values(network, now)), max_iterations=3)
-        moved = problem.unpack(end.values).poses
+        problem = SparseProblem(problem_of_network(weighted))
+        moved = descend_to_minimum(problem, network_values(network, now), max_iterations=3).values.poses
         costs = edge_costs(network, moved)
         fresh = _huber(costs, trusted, k)
         fall, cost, now = cost - fresh, min(fresh, cost), moved if fresh <= cost else now

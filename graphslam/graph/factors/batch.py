@@ -328,16 +328,6 @@ def gtsam_poses(poses: Array) -> list[Any]:
     return list(map(gtsam.Pose3, T))
 
 
-def shared_noise(whiteners: Array) -> list[Any]:
-    """A noise model for each upper triangular whitener ``(m, d, d)``; equal ones share one: most files hold few."""
-    if len(whiteners) == 0:
-        return []
-    rows = np.ascontiguousarray(whiteners).reshape(len(whiteners), -1)
-    _, first, which = np.unique(rows.view(f"V{8 * rows.shape[1]}").ravel(), return_index=True, return_inverse=True)
-    models = [gtsam.noiseModel.Gaussian.SqrtInformation(R, True) for R in whiteners[first]]
-    return [models[k] for k in which.tolist()]
-
-
 def pose_array(pose: Any) -> Array:
     """Inverse of :func:`gtsam_pose`."""
     if isinstance(pose, gtsam.Pose2):

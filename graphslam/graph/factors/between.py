@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -17,9 +16,7 @@ from graphslam.graph.factors.batch import (
     Index,
     UniformBatch,
     gtsam_pose,
-    gtsam_poses,
     safe_factor,
-    shared_noise,
     with_kernel,
 )
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
@@ -136,13 +133,6 @@ class BetweenBatch(UniformBatch):
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`UniformBatch.terms`."""
         return between_terms(self._T, *blocks)
-
-    @cached_property
-    def natives(self) -> list[gtsam.NonlinearFactor]:
-        """GTSAM's own factors, held nodes among their keys; the whiteners must be upper triangular."""
-        make = gtsam.BetweenFactorPose2 if self.dim == 2 else gtsam.BetweenFactorPose3
-        i, j = (gtsam_key("x0") + self._rows).T.tolist()
-        return list(map(make, i, j, gtsam_poses(self._T), shared_noise(self.whiteners)))
 
     @classmethod
     def gtsam(cls, record: BetweenRecord, origin: Array) -> gtsam.NonlinearFactor:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array, rotation2, wrap_angle
-from graphslam.graph.factors.batch import Index, UniformBatch, custom_factor, shared_noise, with_kernel
+from graphslam.graph.factors.batch import Index, UniformBatch, custom_factor, with_kernel
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.variables import VariableLayout, gtsam_key
 
@@ -111,18 +109,6 @@ class SightingBatch(UniformBatch):
             P[:, 1, 0], P[:, 1, 1] = seen[:, 0] / distance, seen[:, 1] / distance
             J[k] = P @ J[k]
         return r, J
-
-    @cached_property
-    def natives(self) -> list[gtsam.NonlinearFactor]:
-        """GTSAM's own factors, held nodes among their keys; the whiteners must be upper triangular."""
-        if not self._polar.all():
-            raise SolverError("GTSAM has no native factor for Cartesian landmark observations")
-        nodes, rows = self._rows.T
-        x = (gtsam_key("x0") + nodes).tolist()
-        l = (gtsam_key("l0") + self.layout.landmark_ids[rows]).tolist()
-        bearing, distance = self._z.T.tolist()
-        noise = shared_noise(self.whiteners)
-        return list(map(gtsam.BearingRangeFactor2D, x, l, map(gtsam.Rot2, bearing), distance, noise))
 
     @classmethod
     def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:

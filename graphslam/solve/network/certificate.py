@@ -32,8 +32,8 @@ from graphslam.core.geometry import Array, rotation2
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.network import network_values
 from graphslam.solve.descent import SAME, descend_to_minimum
-from graphslam.solve.network.multistart import make_problem
-from graphslam.solve.sparse import factorise_sparse
+from graphslam.solve.network.start import network_arrays
+from graphslam.solve.sparse import SparseProblem, factorise_sparse
 
 Verdict = Literal["certified", "not certified", "not known"]
 # S is taken for positive semi-definite if S + TOLERANCE · (median diagonal of Q) has no negative pivot.
@@ -112,8 +112,8 @@ def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue:
         lowest = smallest_eigenvalue(S) if negative else _least_bound(S)
     if negative:
         return Certificate("not certified", f"{negative} negative directions", lowest, value)
-    problem = make_problem(network)
-    back = descend_to_minimum(problem, problem.pack(network_values(network, _poses_of(X, network)))).objective
+    problem = SparseProblem(network_arrays(network))
+    back = descend_to_minimum(problem, network_values(network, _poses_of(X, network))).objective
     if abs(back - objective) <= SAME * abs(objective) + 1e-12 * network.residuals:
         return Certificate("certified", "", lowest, value, back)
     word = "lower" if back < objective else "higher"

@@ -1,6 +1,6 @@
 """A pose network fed to iSAM2 pose by pose, as a robot would have built it.
 
-iSAM2 (Kaess et al. 2012) keeps old linearisation points and stops solving where steps are small. With its default
+iSAM2 (Kaess et al. 2012) keeps old linearisation points and stops solving where steps are small. With GTSAM's default
 thresholds it is fast and *near* the optimum; how near is not something it knows. So its estimate is a start of the
 descent, whose end the gap is measured against.
 """
@@ -10,58 +10,30 @@ from __future__ import annotations
 import heapq
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
-from graphslam.core.errors import IndeterminateError
+from graphslam.core.errors import IndeterminateError, SolverError
 from graphslam.core.geometry import Array, se2_transform
-from graphslam.core.network import PoseNetwork
+from graphslam.core.network import Ids, PoseNetwork
 from graphslam.core.poses import group_of
 from graphslam.core.progress import Bar
-from graphslam.graph.factors.batch import gtsam_pose, pose_array
-from graphslam.graph.network import problem_of_network
-from graphslam.graph.variables import gtsam_key
-from graphslam.solve.network.factors import (
-    anchor_factors,
-    measured_factors,
-    translate_indeterminate,
-)
+from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.sighting import SightingRecord
+from graphslam.graph.network import network_values
+from graphslam.graph.noise import whiteners
+from graphslam.graph.variables import Values
+from graphslam.solve.isam2 import Isam2Solver
 from graphslam.solve.network.start import cartesian_observations, neighbours
 
 log = logging.getLogger(__name__)
-X, L = gtsam_key("x0"), gtsam_key("l0")
-
-
-@dataclass(frozen=True, slots=True)
-class Isam2Options:
-    """How iSAM2 is run.
-
-    Parameters
-    ----------
-    relinearize_threshold : float
-        A variable is relinearised when its step exceeds this (GTSAM's default 0.1).
-    relinearize_skip : int
-        Only every so many updates (GTSAM's default 10).
-    batch : int
-        Poses an update. 1 is a robot's life; more is faster and, as each update then relinearises more at once,
-        usually nearer to the optimum. 0 chooses about five hundred updates.
-    factorization : {"CHOLESKY", "QR"}
-    """
-
-    relinearize_threshold: float = 0.1
-    relinearize_skip: int = 10
-    batch: int = 0
-    factorization: str = "CHOLESKY"
-
-    def params(self) -> gtsam.ISAM2Params:
-        """GTSAM's parameter object."""
-        p = gtsam.ISAM2Params()
-        p.setRelinearizeThreshold(self.relinearize_threshold)
-        p.relinearizeSkip = self.relinearize_skip
-        p.setFactorization(self.factorization)
-        return p
+# At most so many updates by default: each then relinearises more at once and, usually, gets nearer to the optimum.
+UPDATES = 500
+# GTSAM's defaults: thresholds of positions [m] and of headings [rad], looked at in every tenth update.
+THRESHOLD, SKIP = 0.1, 10
+# Further held vertices hang on the first one with this standard deviation [m, rad].
+HELD_SIGMA = 1e-6
 
 
 def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
@@ -87,82 +59,83 @@ def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
                 heapq.heappush(heap, int(w))
 
 
-def run_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, progress: bool = False) -> gtsam.Values:
-    """:func:`feed_isam2`, with QR where Cholesky fails on the way (large or badly scaled information)."""
-    options = options or Isam2Options()
-    try:
-        return feed_isam2(network, options, progress=progress)
-    except IndeterminateError:
-        if options.factorization == "QR":
-            raise
-        log.info("%s: iSAM2 with Cholesky failed, starting again with QR", network.source)
-        return feed_isam2(network, replace(options, factorization="QR"), progress=progress)
-
-
-def feed_isam2(network: PoseNetwork, options: Isam2Options | None = None, *, progress: bool = False) -> gtsam.Values:
+def grow_with_isam2(network: PoseNetwork, *, batch: int = 0, progress: bool = False) -> Values:
     """Estimate of iSAM2 after the whole network has been fed to it in :func:`insertion_order`.
 
-    A new pose starts from the current estimate of the neighbour with the nearest id, composed with the measurement;
-    a new landmark from the pose that first sees it.
+    By Cholesky factorisations, and once more by QR where they fail on the way (large or badly scaled information).
+
+    Parameters
+    ----------
+    batch : int
+        Poses an update; 0: as many as make :data:`UPDATES`.
+
+    Raises
+    ------
+    IndeterminateError
+        Measurements so far leave a pose free at some update.
     """
-    options = options or Isam2Options()
-    isam = gtsam.ISAM2(options.params())
-    edges, sightings = measured_factors(problem_of_network(network, ordered=False))
+    batch = batch or -(-len(network) // UPDATES)
+    try:
+        return _grow(network, "CHOLESKY", batch, progress)
+    except (SolverError, IndeterminateError) as error:
+        log.info("%s: iSAM2 with Cholesky failed (%s), starting again with QR", network.source, error)
+    try:
+        return _grow(network, "QR", batch, progress)
+    except (SolverError, IndeterminateError) as error:
+        raise IndeterminateError(f"{network.source}: iSAM2 failed on the way: {error}") from None
+
+
+def _grow(network: PoseNetwork, factorization: str, batch: int, progress: bool) -> Values:
+    """The graph as it grows: its nodes are the vertices in the order in which they enter, its landmarks rows."""
+    steps = list(insertion_order(network))
+    vertices = np.array([v for v, _ in steps])
+    node = np.empty(len(network), dtype=np.int64)
+    node[vertices] = np.arange(len(vertices))
+    held = {int(a): network.poses[a] for a in network.anchors}
+    origin = network.poses[vertices[0]]
+    graph = FactorGraph.with_values(Values(network.dim, {"x": origin[None].copy()}))
+    solver = Isam2Solver(graph, relinearize_threshold=THRESHOLD, relinearize_angle=THRESHOLD, relinearize_skip=SKIP)
+    solver.factorization = factorization
+    group, W, W_seen = group_of(origin), whiteners(network.information), whiteners(network.observation_information)
+    z, ends, polar = network.measurements, node[network.edges], network.observation_kind == "bearing-range"
+    z_back = group.inverse(z)
+    local, _ = cartesian_observations(network)
     seen_from: list[list[int]] = [[] for _ in range(len(network))]
     for k, (v, _) in enumerate(network.observations.tolist()):
         seen_from[v].append(k)
-    local, _ = cartesian_observations(network)
-    z, z_inv = network.measurements, group_of(network.poses).inverse(network.measurements)
-    poses: dict[int, Array] = {}  # where each inserted vertex was thought to be when it was last looked up
-    anchors = dict(zip(network.anchors.tolist(), anchor_factors(network), strict=True))
-    known_marks: set[int] = set()
-    graph, values, fresh = gtsam.NonlinearFactorGraph(), gtsam.Values(), set[int]()
-    steps = list(insertion_order(network))
-    batch = options.batch or max(1, round(len(network) / 500))
-    for count, (v, links) in enumerate(Bar(steps, name="iSAM2", unit="pose", shown=progress), 1):
-        if v in anchors:
-            poses[v] = network.poses[v]
-            graph.push_back(anchors[v])
-        else:
-            poses[v] = _from_neighbour(network, v, links, poses, fresh, isam, z, z_inv)
-        values.insert(X + v, gtsam_pose(poses[v]))
-        fresh.add(v)
+    for count, (v, links) in enumerate(Bar(steps, name="iSAM2", unit="pose", shown=progress)):
+        if count:
+            pose = held[v] if v in held else _from_neighbour(graph, network, v, links, node, z, z_back)
+            graph.append_node(pose)
+            if v in held:
+                tie = group.between(origin, pose)
+                graph.insert(BetweenRecord(graph.next_factor(), 0, count, tie, np.eye(group.dof) / HELD_SIGMA))
         for e in links:
-            graph.push_back(edges[e])
+            i, j = ends[e].tolist()
+            graph.insert(BetweenRecord(graph.next_factor(), i, j, z[e], W[e]))
         for k in seen_from[v]:
-            graph.push_back(sightings[k])
-            mark = int(network.observations[k, 1])
-            if mark not in known_marks:
-                known_marks.add(mark)
-                values.insert(L + int(network.landmark_ids[mark]), se2_transform(poses[v], local[k]))
-        if count % batch == 0 or count == len(steps):
-            try:
-                isam.update(graph, values)
-            except RuntimeError as error:
-                raise translate_indeterminate(network, error) from None
-            graph, values, fresh = gtsam.NonlinearFactorGraph(), gtsam.Values(), set()
-    return isam.calculateEstimate()
+            mark = network.observations[k, 1:]
+            graph.start_landmarks(mark, se2_transform(graph.structure.poses[count], local[k])[None])
+            record = SightingRecord(
+                graph.next_factor(), count, int(mark[0]), network.observation_values[k], polar, W_seen[k]
+            )
+            graph.insert(record)
+        if (count + 1) % batch == 0 or count + 1 == len(steps):
+            solver.update()
+    found = graph.values
+    poses, marks = network.poses.copy(), network.landmarks.copy()
+    poses[vertices] = found.poses
+    if len(marks):
+        marks[found.landmark_ids] = found.landmarks
+    poses[network.anchors] = network.poses[network.anchors]
+    return network_values(network, poses, marks)
 
 
 def _from_neighbour(
-    network: PoseNetwork,
-    v: int,
-    links: list[int],
-    poses: dict[int, Array],
-    fresh: set[int],
-    isam: gtsam.ISAM2,
-    z: Array,
-    z_inv: Array,
+    graph: FactorGraph, network: PoseNetwork, v: int, links: list[int], node: Ids, z: Array, z_back: Array
 ) -> Array:
-    ends = network.edges[links]
-    others = np.where(ends[:, 0] == v, ends[:, 1], ends[:, 0])
-    best = int(np.argmin(np.abs(others - v)))
-    near, edge = int(others[best]), links[best]
-    if near not in fresh:
-        poses[near] = _current(network, isam, near)
-    return np.asarray(group_of(z).compose(poses[near], z[edge] if ends[best, 1] == v else z_inv[edge]))
-
-
-def _current(network: PoseNetwork, isam: gtsam.ISAM2, k: int) -> Array:
-    estimate = isam.calculateEstimatePose2 if network.dim == 2 else isam.calculateEstimatePose3
-    return pose_array(estimate(X + k))
+    """A new pose from that of the neighbour with the nearest id and the measurement between them."""
+    e = links[int(np.argmin(np.abs(network.edges[links].sum(axis=1) - 2 * v)))]
+    i, j = network.edges[e].tolist()
+    known = graph.pose(int(node[i if j == v else j]))
+    return np.asarray(group_of(known).compose(known, z[e] if j == v else z_back[e]))

@@ -25,8 +25,8 @@ of the accepted D² is followed as far as it is populated (Hill 1975).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
-import gtsam
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
@@ -35,13 +35,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graphslam.core.geometry import Array
+from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.between import BetweenBatch
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import Optimum, descend_to_minimum
-from graphslam.solve.network.batch import BatchProblem
-from graphslam.solve.sparse import factorise_sparse
+from graphslam.solve.network.start import network_arrays
+from graphslam.solve.sparse import SparseProblem, factorise_sparse
 
 Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -76,7 +77,7 @@ class RobustResult:
     ----------
     inliers : (m + k,) bool
         Edges, then observations.
-    problem : BatchProblem
+    problem : SparseProblem
         Of the inliers alone.
     end : Optimum
         Its objective is that of the inliers.
@@ -95,7 +96,7 @@ class RobustResult:
     """
 
     inliers: Mask
-    problem: BatchProblem
+    problem: SparseProblem
     end: Optimum
     limit: Array
     truncated: float = float("nan")
@@ -103,6 +104,12 @@ class RobustResult:
     rounds: int = 0
     start: str = ""
     reached: dict[str, float] = field(default_factory=dict)
+
+
+def weighted_problem(network: PoseNetwork, weights: npt.NDArray[Any]) -> SparseProblem:
+    """Least squares of edges and observations with these weights ``(m + k,)``, bool or float."""
+    used = weights > 0
+    return SparseProblem(network_arrays(network, used), weights[used].astype(np.float64), thorough=True)
 
 
 def family_quantile(probability: float, count: int) -> float:
@@ -272,8 +279,9 @@ def _chunks(label: Ints, most: int) -> list[tuple[int, int]]:
 
 
 def leave_one_out_test(
-    whole: BatchProblem,
-    values: gtsam.Values,
+    network: PoseNetwork,
+    flat: FactorArrays,
+    values: Values,
     inliers: Mask,
     limit: Array,
     *,
@@ -284,9 +292,9 @@ def leave_one_out_test(
 
     Parameters
     ----------
-    whole : BatchProblem
-        Of all measurements.
-    values : gtsam.Values
+    flat : FactorArrays
+        All measurements of the network.
+    values : Values
         Near a minimum of the inliers' objective.
     inliers : (m + k,) bool
         Believed so far.
@@ -297,7 +305,6 @@ def leave_one_out_test(
     own_tail : bool
         The limit of edges is the file's own (:func:`tail_limit`); that of ``limit`` if not.
     """
-    network, flat = whole.network, whole.flat
     m, d = len(network.edges), network.tangent_dim
     w = np.linalg.eigvalsh(network.information)
     judged = ~np.isinf(limit[:m]) & (w[:, 0] > 1e-12 * w[:, -1])
@@ -307,9 +314,9 @@ def leave_one_out_test(
     back = False
     single, worst = np.full(m, np.nan), np.full(m, np.nan)
     for rounds in range(1, ROUNDS + 1):
-        problem = BatchProblem(network, inliers, flat)
+        problem = weighted_problem(network, inliers)
         end = descend_to_minimum(problem, values, max_iterations=STEPS)
-        values, here = end.values, problem.unpack(end.values)
+        values = here = end.values
         if back:
             break
         seen.add(inliers.tobytes())

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +13,19 @@ from graphslam.core.errors import IndeterminateError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.factor_arrays import FactorArrays
-from graphslam.graph.network import network_values, problem_of_network
+from graphslam.graph.factor_graph import FactorGraph
+from graphslam.graph.network import network_of, network_values
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import SAME, LeastSquaresProblem, Optimum, descend_to_minimum
-from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start, wound_cycles
-from graphslam.solve.sparse import MANY, SparseProblem
-
-if TYPE_CHECKING:
-    from graphslam.solve.network.batch import BatchProblem
+from graphslam.solve.descent import SAME, Optimum, descend_to_minimum
+from graphslam.solve.network.start import (
+    chordal_start,
+    landmarks_from,
+    network_arrays,
+    odometry_start,
+    tree_start,
+    wound_cycles,
+)
+from graphslam.solve.sparse import SparseProblem
 
 log = logging.getLogger(__name__)
 
@@ -76,10 +81,9 @@ def _chordal(network: PoseNetwork) -> Start:
 
 
 def _incremental(network: PoseNetwork) -> Start:
-    from graphslam.graph.gtsam_values import from_gtsam
-    from graphslam.solve.network.incremental import run_isam2
+    from graphslam.solve.network.incremental import grow_with_isam2
 
-    found = from_gtsam(run_isam2(network), network_values(network, network.poses))
+    found = grow_with_isam2(network)
     return found.poses, found.landmarks
 
 
@@ -110,32 +114,6 @@ def canonical_start(network: PoseNetwork) -> Values:
     return network_values(network, *(_file(network) or _odometry(network)))
 
 
-def network_arrays(network: PoseNetwork) -> FactorArrays:
-    """The problem of a network, in an order of elimination unless it is dissected later or GTSAM orders it."""
-    return problem_of_network(
-        network, ordered=network.dim == 2 and (len(network) <= MANY or len(network.landmark_ids) > 0)
-    )
-
-
-def make_problem(network: PoseNetwork, flat: FactorArrays | None = None) -> LeastSquaresProblem:
-    """Plain numpy in 2-D and for many poses, where it beats GTSAM's factors; these for the rest of 3-D."""
-    if network.dim == 2 or len(network) > MANY:
-        return SparseProblem(flat or network_arrays(network))
-    return native_problem(network, flat)
-
-
-def has_native_factors(network: PoseNetwork) -> bool:
-    """Whether GTSAM has native factors for every measurement (it has none for Cartesian landmark observations)."""
-    return len(network.observations) == 0 or network.observation_kind == "bearing-range"
-
-
-def native_problem(network: PoseNetwork, flat: FactorArrays | None = None) -> BatchProblem:
-    """The network as a GTSAM graph."""
-    from graphslam.solve.network.batch import BatchProblem  # gtsam, which most files do not need
-
-    return BatchProblem(network, flat=flat)
-
-
 @dataclass(frozen=True, slots=True)
 class StartsResult:
     """Best of the starts that were tried.
@@ -149,7 +127,7 @@ class StartsResult:
         nothing did, or if starts were named.
     """
 
-    problem: LeastSquaresProblem
+    problem: SparseProblem
     best: Optimum
     start: str
     reports: tuple[StartReport, ...]
@@ -161,7 +139,7 @@ class StartsResult:
         return sum(r.iterations for r in self.reports)
 
 
-def suspicion_of_answer(network: PoseNetwork, problem: LeastSquaresProblem, end: Optimum) -> str:
+def suspicion_of_answer(network: PoseNetwork, end: Optimum) -> str:
     """Why an answer may not be the best one, in words; empty if nothing speaks against it.
 
     * The descent did not end at a stationary point.
@@ -174,7 +152,7 @@ def suspicion_of_answer(network: PoseNetwork, problem: LeastSquaresProblem, end:
         return f"the first start did not converge ({end.status})"
     if len(network.observations):
         return "loops by landmarks show in no cycle of edges"
-    wound, undecided, cycles = wound_cycles(network, problem.unpack(end.values).poses)
+    wound, undecided, cycles = wound_cycles(network, end.values.poses)
     if wound:
         return f"{wound} of {cycles} cycles turn once too often"
     dof = network.residuals - network.states
@@ -191,8 +169,8 @@ def best_of_starts(
     *,
     given: dict[str, Values] | None = None,
     flat: FactorArrays | None = None,
-    problem: LeastSquaresProblem | None = None,
-    certified: Callable[[PoseNetwork, LeastSquaresProblem, Optimum], bool] | None = None,
+    problem: SparseProblem | None = None,
+    certified: Callable[[PoseNetwork, Optimum], bool] | None = None,
     progress: bool = False,
 ) -> StartsResult:
     """Descend from a start, from all that can compete if there is doubt of the answer, and keep the lowest objective.
@@ -206,8 +184,8 @@ def best_of_starts(
         Further starts, tried first.
     flat : FactorArrays, optional
         The network as a problem, where it was made already.
-    problem : LeastSquaresProblem, optional
-        How it is solved; :func:`make_problem` if not given.
+    problem : SparseProblem, optional
+        How it is solved; by direct solves if not given.
     certified : callable, optional
         Whether an answer is proved to be the best, which settles a doubt for less than other starts cost.
     """
@@ -215,8 +193,7 @@ def best_of_starts(
     for name in chosen:
         if name not in STARTS:
             raise UnknownNameError("start", name, STARTS)
-    own = problem is None
-    problem = problem or make_problem(network, flat)
+    problem = problem or SparseProblem(flat or network_arrays(network))
     given = given or {}
     offered = [*given, *(n for n in chosen if n not in given)]
     best: Optimum | None = None
@@ -242,24 +219,17 @@ def best_of_starts(
             reports.append(StartReport(name, initial, twin.objective, 0, f"same as {twin.name}"))
             continue
         known = np.inf if best is None else best.objective
-        end = descend_to_minimum(problem, problem.pack(start), best_known=known, foretell=True)
-        if (
-            own
-            and end.status in ("stalled", "out of iterations")
-            and has_native_factors(network)
-            and not _is_native(problem)
-        ):
-            # GTSAM has more ways down: a trust region, and QR
-            problem = native_problem(network, problem.flat)
-            best = best and replace(best, values=problem.pack(best.values))
-            end = descend_to_minimum(problem, problem.pack(end.values), best_known=known, foretell=True)
+        end = descend_to_minimum(problem, start, best_known=known, foretell=True)
+        if end.status in ("stalled", "out of iterations") and not problem.thorough:
+            problem.thorough = True
+            end = descend_to_minimum(problem, end.values, best_known=known, foretell=True)
         reports.append(StartReport(name, initial, end.objective, end.iterations, end.status))
         log.info("%s: %s %.8g -> %.8g (%s)", network.source, name, initial, end.objective, end.status)
         if best is None or _better(end, best):
             best, winner = end, name
         if names is None and len(reports) == 1:
-            why = suspicion_of_answer(network, problem, end)
-            if not why or (certified is not None and end.status == "converged" and certified(network, problem, end)):
+            why = suspicion_of_answer(network, end)
+            if not why or (certified is not None and end.status == "converged" and certified(network, end)):
                 break
     if best is None:
         raise failure or IndeterminateError(f"{network.source}: no start could be made")
@@ -272,10 +242,6 @@ def _shown(names: list[str]) -> Iterable[str]:
     return Bar(names, name="starts", unit="start")
 
 
-def _is_native(problem: LeastSquaresProblem) -> bool:
-    return not isinstance(problem, SparseProblem)
-
-
 def _better(a: Any, b: Any) -> bool:
     """Lower; or equal, and converged where the other is not."""
     if a.objective < b.objective * (1.0 - SAME):
@@ -286,3 +252,29 @@ def _better(a: Any, b: Any) -> bool:
 def _agreed(reports: list[StartReport], lowest: float) -> bool:
     same = [r for r in reports if r.status == "converged" and r.objective <= lowest * (1.0 + SAME)]
     return len(same) >= 2
+
+
+def solve_from(graph: FactorGraph, *starts: str) -> str:
+    """Take a graph of relative poses to the lowest objective that is reached from its present values and other starts.
+
+    Parameters
+    ----------
+    starts : str
+        Keys of :data:`STARTS`; if not given, those that are worth trying.
+
+    Returns
+    -------
+    str
+        Which start won; ``"present"`` are the graph's values.
+
+    Raises
+    ------
+    SolverError
+        The graph holds more than relative poses: the other starts know nothing else.
+    UnknownNameError
+    """
+    network = network_of(graph.flat(), graph.values)
+    names = starts or tuple(n for n in default_starts(network) if n != "file")  # the graph's values are that
+    found = best_of_starts(network, names, flat=graph.flat(), given={"present": graph.values})
+    graph.set_values(found.best.values)
+    return found.start

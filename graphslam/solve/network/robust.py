@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Any
 
-import gtsam
 import numpy as np
 import numpy.typing as npt
 from scipy import stats
@@ -29,11 +27,11 @@ from graphslam.graph.network import network_values
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import descend_to_minimum
 from graphslam.solve.gnc import truncation_weights
-from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.consensus import REPEATED, loop_consensus, odometry_edges
 from graphslam.solve.network.diagnose import check_determined
-from graphslam.solve.network.leave_one_out import FEW, RobustResult, leave_one_out_test
-from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start
+from graphslam.solve.network.leave_one_out import FEW, RobustResult, leave_one_out_test, weighted_problem
+from graphslam.solve.network.start import chordal_start, landmarks_from, network_arrays, odometry_start
+from graphslam.solve.sparse import SparseProblem
 
 log = logging.getLogger(__name__)
 
@@ -67,8 +65,9 @@ def truncated_cost(flat: FactorArrays, values: Values, limit: Array) -> float:
 
 
 def truncated_least_squares(
-    problem: BatchProblem,
-    given: dict[str, Any] | None = None,
+    network: PoseNetwork,
+    flat: FactorArrays,
+    given: dict[str, Values] | None = None,
     probability: float = 0.99,
     *,
     trust_odometry: bool = True,
@@ -79,9 +78,9 @@ def truncated_least_squares(
 
     Parameters
     ----------
-    problem : BatchProblem
-        Of the whole network.
-    given : dict of str to gtsam.Values, optional
+    flat : FactorArrays
+        All measurements of the network.
+    given : dict of str to Values, optional
         Further starts.
     probability : float
         An inlier is kept with this probability, if noise is Gaussian.
@@ -96,12 +95,12 @@ def truncated_least_squares(
         raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")
     if noise_scale is not None and not (np.isfinite(noise_scale) and noise_scale > 0.0):
         raise ConfigError(f"noise_scale must be positive, got {noise_scale}")
-    network, m = problem.network, len(problem.network.edges)
+    m = len(network.edges)
     consensus = loop_consensus(network)
     trusted = np.zeros(m + len(network.observations), dtype=np.bool_)
     if trust_odometry:
         trusted[:m] = odometry_edges(network)
-    starts: dict[str, tuple[gtsam.Values, Mask]] = {}
+    starts: dict[str, tuple[Values, Mask]] = {}
     loops = int(np.count_nonzero(~trusted[:m]))
     guessed = np.count_nonzero(consensus.likely) >= BORNE_OUT * loops
     if noise_scale is None and not guessed:
@@ -111,24 +110,24 @@ def truncated_least_squares(
         if believed.any() and not (name == "core" and (believed == consensus.likely).all()):
             used = trusted | True
             used[:m] = consensus.odometry | believed
-            begun = _least_squares(problem, used, chordal=True)
+            begun = _least_squares(network, used, chordal=True)
             if begun is None:
                 continue
             starts[name] = (begun, used)
             if noise_scale is None:
-                costs = problem.flat.squared(problem.unpack(begun))
+                costs = flat.squared(begun)
                 scale = min(_scale(network, costs, used, believed), scale if len(starts) > 1 else np.inf)
     if not starts and trusted.any():
         used = trusted.copy()
         used[m:] = True
-        begun = _least_squares(problem, used, chordal=False)
+        begun = _least_squares(network, used, chordal=False)
         if begun is not None:
             starts["odometry"] = (begun, used)
     if not guessed and loops:
-        begun = _least_squares(problem, np.ones_like(trusted), chordal=True)
+        begun = _least_squares(network, np.ones_like(trusted), chordal=True)
         if begun is not None:
             used = np.ones_like(trusted)
-            starts["cauchy"] = (_under_kernel(problem, begun, trusted), used)
+            starts["cauchy"] = (_under_kernel(network, flat, begun, trusted), used)
     limit = _limits(network, probability, scale if noise_scale is not None else min(1.0, MARGIN * scale), trusted)
     starts |= {name: (values, np.ones_like(trusted)) for name, values in (given or {}).items()}
     found: list[tuple[str, RobustResult]] = []
@@ -136,18 +135,14 @@ def truncated_least_squares(
         if name not in starts:
             continue
         values, believed = starts[name]
-        trimmed = _trim(problem, values, problem.flat.squared(problem.unpack(values)) <= limit, limit)
+        trimmed = _trim(network, flat, values, flat.squared(values) <= limit, limit)
         confirmed = (trimmed.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED
         if not (name == "consensus" and confirmed):
-            weights, annealed = _anneal(problem, values, limit, believed)
-            trimmed = min(trimmed, _trim(problem, annealed, weights > 0.5, limit), key=lambda t: t.truncated)
+            weights, annealed = _anneal(network, flat, values, limit, believed)
+            trimmed = min(trimmed, _trim(network, flat, annealed, weights > 0.5, limit), key=lambda t: t.truncated)
+        here, kept = trimmed.end.values, trimmed.inliers
         best = leave_one_out_test(
-            problem,
-            trimmed.end.values,
-            trimmed.inliers,
-            limit,
-            probability=probability,
-            own_tail=noise_scale is None,
+            network, flat, here, kept, limit, probability=probability, own_tail=noise_scale is None
         )
         found.append((name, best))
         if name == "consensus" and (best.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED:
@@ -158,17 +153,17 @@ def truncated_least_squares(
     limit = np.min([f.limit for _, f in found], axis=0)
     reached: dict[str, float] = {}
     for name, settled in found:
-        cost = truncated_cost(problem.flat, problem.unpack(settled.end.values), limit)
+        cost = truncated_cost(flat, settled.end.values, limit)
         reached[name] = min(cost, reached.get(name, np.inf))
     name, best = min(found, key=lambda f: reached[f[0]])
-    final = _trim(problem, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
+    final = _trim(network, flat, best.end.values, best.inliers, best.limit, steps=FINAL_STEPS)
     return replace(final, scale=best.scale, rounds=best.rounds, start=name, reached=reached)
 
 
-def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam.Values | None:
+def _least_squares(network: PoseNetwork, used: Mask, *, chordal: bool) -> Values | None:
     """Least squares of the measurements in ``used`` alone, from rotations first or from dead reckoning."""
-    part = problem.network.only(used)
-    inner = BatchProblem(part)
+    part = network.only(used)
+    inner = SparseProblem(network_arrays(part), thorough=True)
     try:
         check_determined(part, inner.flat)
         if chordal and not len(part.observations):
@@ -176,24 +171,17 @@ def _least_squares(problem: BatchProblem, used: Mask, *, chordal: bool) -> gtsam
         else:
             poses = odometry_start(part)
             arrays = poses, landmarks_from(part, poses)
-        return descend_to_minimum(inner, inner.pack(network_values(part, *arrays)), max_iterations=START_STEPS).values
+        return descend_to_minimum(inner, network_values(part, *arrays), max_iterations=START_STEPS).values
     except (IndeterminateError, RuntimeError) as error:
         log.info("%s: %d measurements make no start: %s", part.source, int(used.sum()), error)
         return None
 
 
-def _under_kernel(problem: BatchProblem, values: gtsam.Values, trusted: Mask) -> gtsam.Values:
+def _under_kernel(network: PoseNetwork, flat: FactorArrays, values: Values, trusted: Mask) -> Values:
     """Iteratively reweighted least squares of everything, loops under Cauchy's kernel."""
-    network, m = problem.network, len(problem.network.edges)
     for _ in range(KERNEL_ROUNDS):
-        costs = problem.flat.squared(problem.unpack(values))
-        weights = np.where(trusted, 1.0, 1.0 / (1.0 + costs / CAUCHY**2))
-        weighted = replace(
-            network,
-            information=weights[:m, None, None] * network.information,
-            observation_information=weights[m:, None, None] * network.observation_information,
-        )
-        values = descend_to_minimum(BatchProblem(weighted), values, max_iterations=KERNEL_STEPS).values
+        weights = np.where(trusted, 1.0, 1.0 / (1.0 + flat.squared(values) / CAUCHY**2))
+        values = descend_to_minimum(weighted_problem(network, weights), values, max_iterations=KERNEL_STEPS).values
     return values
 
 
@@ -223,12 +211,13 @@ def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mas
     return limit
 
 
-def _anneal(problem: BatchProblem, values: gtsam.Values, limit: Array, believed: Mask) -> tuple[Array, gtsam.Values]:
+def _anneal(
+    network: PoseNetwork, flat: FactorArrays, values: Values, limit: Array, believed: Mask
+) -> tuple[Array, Values]:
     """Graduated non-convexity (Yang et al. 2020, eq. 14-16): weights and the values they lead to."""
-    network, m = problem.network, len(problem.network.edges)
 
-    def ratio(values: gtsam.Values) -> Array:
-        return np.where(loose, problem.flat.squared(problem.unpack(values)) / np.where(loose, limit, 1.0), 0.0)
+    def ratio(values: Values) -> Array:
+        return np.where(loose, flat.squared(values) / np.where(loose, limit, 1.0), 0.0)
 
     loose = np.isfinite(limit)
     now = ratio(values)
@@ -237,12 +226,7 @@ def _anneal(problem: BatchProblem, values: gtsam.Values, limit: Array, believed:
     weights = np.ones(len(limit))
     for _ in range(STAGES):
         weights = np.where(loose, truncation_weights(now, mu), 1.0)
-        weighted = replace(
-            network,
-            information=weights[:m, None, None] * network.information,
-            observation_information=weights[m:, None, None] * network.observation_information,
-        )
-        values = descend_to_minimum(BatchProblem(weighted, weights > 0.0), values, max_iterations=STEPS).values
+        values = descend_to_minimum(weighted_problem(network, weights), values, max_iterations=STEPS).values
         now = ratio(values)
         if not ((weights > 0.0) & (weights < 1.0)).any():
             break
@@ -251,16 +235,16 @@ def _anneal(problem: BatchProblem, values: gtsam.Values, limit: Array, believed:
 
 
 def _trim(
-    problem: BatchProblem, values: gtsam.Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
+    network: PoseNetwork, flat: FactorArrays, values: Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
 ) -> RobustResult:
     """Alternate least squares of the inliers and the choice of inliers until the choice stays.
 
     Neither step raises the truncated cost, so it ends.
     """
     for _ in range(ROUNDS):
-        inner = BatchProblem(problem.network, inliers, problem.flat)
+        inner = weighted_problem(network, inliers)
         end = descend_to_minimum(inner, values, max_iterations=steps)
-        costs = problem.flat.squared(problem.unpack(end.values))
+        costs = flat.squared(end.values)
         fresh = costs <= limit
         if (fresh == inliers).all():
             break

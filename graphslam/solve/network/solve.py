@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import ConfigError, SolverError, UnknownNameError
+from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.variables import Values
-from graphslam.solve.descent import SAME, LeastSquaresProblem, Optimum, descend_to_minimum, limits_of
+from graphslam.solve.descent import SAME, Optimum, descend_to_minimum, limits_of
 from graphslam.solve.network.diagnose import check_determined, check_full_rank
 from graphslam.solve.network.multistart import (
     StartReport,
@@ -25,14 +25,11 @@ from graphslam.solve.network.multistart import (
     best_of_starts,
     canonical_start,
     default_starts,
-    has_native_factors,
-    native_problem,
-    network_arrays,
 )
-from graphslam.solve.sparse import PcgProblem
+from graphslam.solve.network.start import network_arrays
+from graphslam.solve.sparse import PcgProblem, SparseProblem
 
 if TYPE_CHECKING:
-    from graphslam.solve.network.batch import BatchProblem
     from graphslam.solve.network.certificate import Certificate
     from graphslam.solve.network.leave_one_out import RobustResult
 
@@ -143,14 +140,13 @@ def g2o_objective(network: PoseNetwork, values: Values) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    values: Any
-    end: Values
+    values: Values
     iterations: int
     optimum: StartsResult
     start: str
     details: dict[str, Any]
     # what the solver minimised, where that is not the whole objective
-    minimised: LeastSquaresProblem | None = None
+    minimised: SparseProblem | None = None
     minimum: float | None = None
     inliers: npt.NDArray[np.bool_] | None = None
 
@@ -191,9 +187,8 @@ def solve_network(
     progress : bool
         Progress bars on stderr.
     **options
-        isam2: ``relinearise`` (True: close the gap), ``batch``, ``relinearize_threshold``, ``relinearize_skip``;
-        gnc: ``inlier_probability`` (0.9999), ``trust_odometry`` (True), ``noise_scale`` (true over stated variance;
-        None: estimated); pcg: ``tolerance``, ``max_iterations``.
+        isam2: ``relinearise`` (True: close the gap); gnc: ``inlier_probability`` (0.9999), ``trust_odometry`` (True),
+        ``noise_scale`` (true over stated variance; None: estimated); pcg: ``tolerance``, ``max_iterations``.
     """
     if solver not in SOLVERS:
         raise UnknownNameError("solver", solver, SOLVERS)
@@ -210,7 +205,7 @@ def solve_network(
     check_full_rank(network, flat, initial)
     answer = run(_Task(network, flat, starts, options, progress))
     best = answer.optimum.best
-    value = best.objective if answer.values is best.values else flat.objective(answer.end)
+    value = best.objective if answer.values is best.values else flat.objective(answer.values)
     gap = value - best.objective
     if answer.values is best.values and best.converged:
         # judged where the descent ended: evaluated again one step on, a decrement at the limit may lie beyond it
@@ -225,12 +220,12 @@ def solve_network(
         from graphslam.solve.network.certificate import certify
 
         judged = network if answer.inliers is None else network.only(answer.inliers)
-        shown = certify(judged, answer.end.poses, value if answer.minimum is None else answer.minimum)
+        shown = certify(judged, answer.values.poses, value if answer.minimum is None else answer.minimum)
     return NetworkSolution(
         network=network,
         solver=solver,
-        poses=answer.end.poses,
-        landmarks=answer.end.landmarks.reshape(-1, 2),
+        poses=answer.values.poses,
+        landmarks=answer.values.landmarks.reshape(-1, 2),
         objective=value,
         objective_initial=flat.objective(initial),
         iterations=answer.iterations,
@@ -248,18 +243,16 @@ def solve_network(
     )
 
 
-def _certified(network: PoseNetwork, problem: LeastSquaresProblem, end: Optimum) -> bool:
+def _certified(network: PoseNetwork, end: Optimum) -> bool:
     from graphslam.solve.network.certificate import certify
 
-    poses = problem.unpack(end.values).poses
-    return certify(network, poses, end.objective, eigenvalue=False).verdict == "certified"
+    return certify(network, end.values.poses, end.objective, eigenvalue=False).verdict == "certified"
 
 
 def _lm(task: _Task) -> _Answer:
     optimum = best_of_starts(task.network, task.starts, flat=task.flat, certified=_certified, progress=task.progress)
     best = optimum.best
-    end = optimum.problem.unpack(best.values)
-    return _Answer(best.values, end, best.iterations, optimum, optimum.start, {"doubt": optimum.doubt})
+    return _Answer(best.values, best.iterations, optimum, optimum.start, {"doubt": optimum.doubt})
 
 
 def _pcg(task: _Task) -> _Answer:
@@ -274,25 +267,22 @@ def _pcg(task: _Task) -> _Answer:
         "worst_linear_residual": max(report.residuals, default=0.0),
         "decrement_by": "direct sparse solve",
     }
-    return _Answer(best.values, best.values, best.iterations, optimum, optimum.start, details)
+    return _Answer(best.values, best.iterations, optimum, optimum.start, details)
 
 
 def _isam2(task: _Task) -> _Answer:
-    from graphslam.solve.network.incremental import Isam2Options, run_isam2
+    from graphslam.solve.network.incremental import grow_with_isam2
 
-    network, flat, starts, given_options, progress = task
-    options = dict(given_options)
-    close = bool(options.pop("relinearise", True))
-    problem = _native(network, flat, "isam2")
+    network, flat, starts, options, progress = task
+    close = bool(options.get("relinearise", True))
     begin = time.perf_counter()
-    settings = Isam2Options(factorization=problem.factorization, **options)
-    grown = run_isam2(network, settings, progress=progress)
+    grown = grow_with_isam2(network, progress=progress)
     seconds = time.perf_counter() - begin
     # the batch optimum is what the gap is measured against; iSAM2's own estimate is one of its starts
     names = None if starts is None else [n for n in starts if n != "incremental"]
-    given = {"incremental": problem.unpack(grown)}
-    optimum = best_of_starts(network, names, given=given, problem=problem, certified=_certified, progress=progress)
-    best, raw = optimum.best, problem.objective(grown)
+    given = {"incremental": grown}
+    optimum = best_of_starts(network, names, given=given, flat=flat, certified=_certified, progress=progress)
+    best, raw = optimum.best, flat.objective(grown)
     details: dict[str, Any] = {
         "doubt": optimum.doubt,
         "objective_incremental": raw,
@@ -300,12 +290,12 @@ def _isam2(task: _Task) -> _Answer:
         "seconds_incremental": seconds,
     }
     if not close:
-        return _Answer(grown, given["incremental"], 0, optimum, "incremental", details)
+        return _Answer(grown, 0, optimum, "incremental", details)
     # closed by relinearising everything, again and again: by the descent from there, or from another start in a lower
     # basin
     details["objective_relinearised"] = optimum.reports[0].objective
     details["reseeded"] = optimum.start != "incremental"
-    return _Answer(best.values, problem.unpack(best.values), best.iterations, optimum, optimum.start, details)
+    return _Answer(best.values, best.iterations, optimum, optimum.start, details)
 
 
 def _gnc(task: _Task) -> _Answer:
@@ -315,17 +305,17 @@ def _gnc(task: _Task) -> _Answer:
     network, flat, starts, options, progress = task
     probability = float(options.get("inlier_probability", INLIER_PROBABILITY))
     scale = options.get("noise_scale")
-    problem = _native(network, flat, "gnc")
     # least squares of everything, from every start, is worth its time only if asked for: wrong loops make it slow
-    asked = best_of_starts(network, starts, problem=problem, progress=progress) if starts is not None else None
+    asked = best_of_starts(network, starts, flat=flat, progress=progress) if starts is not None else None
     trust = bool(options.get("trust_odometry", True))
     given = {asked.start: asked.best.values} if asked is not None else {}
     if not given and not (trust and odometry_edges(network).any()):
         # nothing is trusted, so nothing else can make a start
-        asked = best_of_starts(network, starts, problem=problem, progress=progress)
+        asked = best_of_starts(network, starts, flat=flat, progress=progress)
         given = {asked.start: asked.best.values}
     robust = truncated_least_squares(
-        problem,
+        network,
+        flat,
         given,
         probability,
         trust_odometry=trust,
@@ -333,7 +323,7 @@ def _gnc(task: _Task) -> _Answer:
         progress=progress,
     )
     end = robust.end
-    optimum = asked or _from_robust(network, problem, robust)
+    optimum = asked or _from_robust(flat, robust)
     out = np.flatnonzero(~robust.inliers)
     m = len(network.edges)
     loops = ~odometry_edges(network)
@@ -354,7 +344,7 @@ def _gnc(task: _Task) -> _Answer:
         ],
         "objective_inliers": end.objective,
         "objective_truncated": robust.truncated,
-        "objective_truncated_batch": truncated_cost(flat, problem.unpack(optimum.best.values), robust.limit),
+        "objective_truncated_batch": truncated_cost(flat, optimum.best.values, robust.limit),
         "inlier_probability": probability,
         "noise_scale": robust.scale,
         "edge_limit": float(np.min(robust.limit[:m], initial=np.inf, where=np.isfinite(robust.limit[:m]))),
@@ -363,7 +353,6 @@ def _gnc(task: _Task) -> _Answer:
     }
     return _Answer(
         end.values,
-        problem.unpack(end.values),
         end.iterations,
         optimum,
         robust.start,
@@ -374,8 +363,9 @@ def _gnc(task: _Task) -> _Answer:
     )
 
 
-def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: RobustResult) -> StartsResult:
+def _from_robust(flat: FactorArrays, robust: RobustResult) -> StartsResult:
     """What least squares of everything makes of the robust answer, in a few steps: the gap is measured against it."""
+    problem = SparseProblem(flat, thorough=True)
     initial = problem.objective(robust.end.values)
     if np.mean(~robust.inliers) > FEW:
         # random loops fill the factorisation: a step of everything costs many times the whole robust solve
@@ -388,19 +378,10 @@ def _from_robust(network: PoseNetwork, problem: BatchProblem, robust: RobustResu
     return StartsResult(problem, best, "inliers", (report,))
 
 
-def _native(network: PoseNetwork, flat: FactorArrays, solver: str) -> BatchProblem:
-    if not has_native_factors(network):
-        raise SolverError(
-            f"{network.source}: solver {solver} needs GTSAM's native factors, which do not cover Cartesian landmark "
-            "observations; use lm or pcg"
-        )
-    return native_problem(network, flat)
-
-
 # name -> (function, its options)
 SOLVERS: dict[str, tuple[Solver, tuple[str, ...]]] = {
     "lm": (_lm, ()),
-    "isam2": (_isam2, ("relinearise", "batch", "relinearize_threshold", "relinearize_skip")),
+    "isam2": (_isam2, ("relinearise",)),
     "gnc": (_gnc, ("inlier_probability", "trust_odometry", "noise_scale")),
     "pcg": (_pcg, ("tolerance", "max_iterations")),
 }

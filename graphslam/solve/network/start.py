@@ -18,14 +18,21 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from graphslam.core import se3
 from graphslam.core.geometry import Array, rotation2, se2_transform, wrap_angle
-from graphslam.core.network import PoseNetwork
+from graphslam.core.network import Mask, PoseNetwork
 from graphslam.core.poses import group_of
+from graphslam.graph.factor_arrays import FactorArrays
+from graphslam.graph.network import problem_of_network
 from graphslam.solve.sparse import MANY, BlockElimination, factorise_sparse
 
 Index = npt.NDArray[np.intp]
 
 # A cycle that the measurements themselves close no better than this [rad] says nothing about turns too many.
 UNDECIDED = 2.0 * np.pi / 3.0
+
+
+def network_arrays(network: PoseNetwork, used: Mask | None = None) -> FactorArrays:
+    """The problem of a network, in an order of elimination unless it is dissected later."""
+    return problem_of_network(network, used, ordered=len(network) <= MANY[network.dim] or len(network.landmark_ids) > 0)
 
 
 def neighbours(network: PoseNetwork) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -181,7 +188,7 @@ def _least_squares(A: sp.csc_matrix, b: Array, width: int) -> Array:
     H = sp.csc_matrix(H + sp.identity(H.shape[0], format="csc") * (1e-12 * float(np.abs(H.diagonal()).max())))
     rhs = np.asarray(A.conj().T @ b)
     whole = np.iscomplexobj(rhs)
-    if H.shape[0] // (1 if whole else width) <= MANY:
+    if H.shape[0] // (1 if whole else width) <= MANY[width]:
         return np.asarray(factorise_sparse(H).solve(rhs))
     lu = BlockElimination(H, width).factor(H)
     if whole:

@@ -12,12 +12,11 @@ from graphslam.app.solve_file import solve_network_file
 from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.network import network_values
+from graphslam.graph.network import network_values, problem_of_network
 from graphslam.io.g2o import write_g2o
 from graphslam.io.network_file import read_network
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.descent import descend_to_minimum
-from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.certificate import (
     _descend,
     _matrices,
@@ -27,7 +26,9 @@ from graphslam.solve.network.certificate import (
     isotropic,
     residual_matrix,
 )
+from graphslam.solve.network.multistart import solve_from
 from graphslam.solve.network.solve import solve_network
+from graphslam.solve.sparse import SparseProblem
 from tests.reference.plain_network import exp
 from tests.solve.network.test_model import random_network
 
@@ -92,11 +93,11 @@ def twisted_ring(n: int, turns: int) -> tuple[PoseNetwork, np.ndarray]:
 
 def test_a_wound_up_ring_is_a_local_minimum_and_refused() -> None:
     net, wound = twisted_ring(20, 1)
-    problem = BatchProblem(net)
-    end = descend_to_minimum(problem, problem.pack(network_values(net, wound)))
+    problem = SparseProblem(problem_of_network(net))
+    end = descend_to_minimum(problem, (network_values(net, wound)))
     assert end.status == "converged"
     assert end.objective == pytest.approx(20 * (2 * np.pi / 20) ** 2, rel=1e-6)
-    refused = certify(net, problem.unpack(end.values).poses, end.objective)
+    refused = certify(net, end.values.poses, end.objective)
     assert refused.verdict == "not certified"
     assert refused.smallest_eigenvalue < -1e-3
     assert str(refused) == f"not certified (λ_min = {refused.smallest_eigenvalue:.3g})"
@@ -114,16 +115,16 @@ def test_a_graph_of_a_run_is_judged_and_started_elsewhere_too(rng: np.random.Gen
     assert solver.solution().converged
     assert solver.solution().objective == pytest.approx(20 * (2 * np.pi / 20) ** 2, rel=1e-6)
     assert solver.solution().certificate().verdict == "not certified"
-    assert solver.solve_from() == "chordal"
+    assert solve_from(graph) == "chordal"
     assert solver.solution().objective < 1e-12
     assert solver.solution().certificate().verdict == "certified"
     with pytest.raises(UnknownNameError, match="unknown start 'hope'"):
-        solver.solve_from("hope")
+        solve_from(graph, "hope")
     # with factors of other kinds neither applies, and both say so
     graph.add_range(2, 9, 4.0, 0.3, evidence="shared-scan")
     assert "other kinds (range)" in str(solver.solution().certificate())
     with pytest.raises(SolverError, match=r"other kinds \(range\)"):
-        solver.solve_from()
+        solve_from(graph)
 
 
 def test_what_cannot_be_judged_says_why(rng: np.random.Generator) -> None:
@@ -169,11 +170,11 @@ def test_a_grid_solved_from_nonsense_is_refused(data_dir: Path) -> None:
     for _ in range(4):
         poses = exp(np.concatenate([2.0 * rng.standard_normal((len(net), 3)), rng.standard_normal((len(net), 3))], 1))
         poses[0] = net.poses[0]
-        problem = BatchProblem(net)
-        end = descend_to_minimum(problem, problem.pack(network_values(net, poses)))
+        problem = SparseProblem(problem_of_network(net))
+        end = descend_to_minimum(problem, (network_values(net, poses)))
         if end.status != "converged" or end.objective < 1.001 * best:
             continue
-        found = certify(net, problem.unpack(end.values).poses, end.objective)
+        found = certify(net, end.values.poses, end.objective)
         assert found.verdict != "certified"
         refused += 1
     assert refused

@@ -12,7 +12,6 @@ from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
 from graphslam.graph.network import network_values, problem_of_network
 from graphslam.solve.descent import descend_to_minimum
-from graphslam.solve.network.batch import BatchProblem
 from graphslam.solve.network.leave_one_out import (
     LARGEST,
     family_quantile,
@@ -22,6 +21,7 @@ from graphslam.solve.network.leave_one_out import (
     tail_limit,
 )
 from graphslam.solve.network.solve import solve_network
+from graphslam.solve.sparse import SparseProblem
 from tests.reference.plain_network import edge_costs, subnetwork
 from tests.reference.slow_loop_evidence import fall_if_moved, fall_without
 from tests.reference.wrong_loops import add_wrong_loops, is_odometry
@@ -77,8 +77,8 @@ def test_evidence_of_right_loops_is_chi_squared(inflated: float) -> None:
         net = thinned(2, seed=seed)
         net = replace(net, information=net.information * inflated)
         rows = np.flatnonzero(~is_odometry(net.edges))
-        problem = BatchProblem(net)
-        values = problem.unpack(descend_to_minimum(problem, problem.pack(network_values(net, net.poses))).values)
+        problem = SparseProblem(problem_of_network(net))
+        values = descend_to_minimum(problem, network_values(net, net.poses)).values
         s, g, label = loop_evidence(problem.flat, np.ones(len(net.edges), bool), rows, values, accepted=True)
         single.append(s[4])  # alone
         group += [g[np.flatnonzero(label == name)[0]] for name in np.unique(label)]
@@ -141,19 +141,19 @@ def test_a_wrong_loop_that_bends_the_map_to_itself_is_taken_out_and_a_right_one_
     begun = solve_network(subnetwork(wrong, inliers), starts=("chordal",))
     costs = edge_costs(wrong, begun.poses)
     assert (costs[loops[:4]] < limit[loops[:4]]).all()
-    problem = BatchProblem(wrong)
-    end = leave_one_out_test(problem, problem.pack(network_values(wrong, begun.poses)), inliers, limit, own_tail=False)
+    start = network_values(wrong, begun.poses)
+    end = leave_one_out_test(wrong, problem_of_network(wrong), start, inliers, limit, own_tail=False)
     assert not end.inliers[loops[:4]].any()
     assert end.inliers[loops[4:]].all()
-    poses = end.problem.unpack(end.end.values).poses
+    poses = end.end.values.poses
     # the answer is that of the right loops alone, and nearer to that of all of them than where it began
     alone = solve_network(subnetwork(net, end.inliers), starts=("chordal",)).poses
     assert np.abs(poses[:, :2] - alone[:, :2]).max() < 1e-4
     error = np.linalg.norm(poses[:, :2] - clean[:, :2], axis=1)
     assert error.mean() < 0.7 * np.linalg.norm(begun.poses[:, :2] - clean[:, :2], axis=1).mean()
     # nothing to do where all is right
-    problem = BatchProblem(net)
-    same = leave_one_out_test(problem, problem.pack(network_values(net, clean)), np.ones(len(net.edges), bool), limit)
+    everything = np.ones(len(net.edges), bool)
+    same = leave_one_out_test(net, problem_of_network(net), network_values(net, clean), everything, limit)
     assert same.inliers.all()
     assert same.rounds == 1
 
