@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
+from typing import Any
 
 from graphslam.app.run.verdict import (
     TWO_MAPS_DO,
     ChiSquareTest,
     RunMetrics,
     chi_square_test,
+    class_rows,
     covariance_assessment,
     is_finite_number,
     nees_tests,
@@ -25,6 +27,9 @@ TRUST: dict[Level, str] = {
     "good": "Passed all available checks",
 }
 """Start of the line, by the worst finding: never better than the findings below it."""
+
+NOT_TESTED = "Not tested: nothing in this log could have shown an error of the result"
+"""Start of the line of a run without a reference, a redundant measurement or a test of its covariances."""
 
 ADVICE: dict[str, str] = {
     # what cannot be right in the log comes first: everything else may follow from it
@@ -159,7 +164,13 @@ def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
     trusted = covariance_assessment(figures)
     word = "" if trusted is None else trusted.word
     held = [] if chi2 is None or of_the_start(figures, chi2) else [chi2]
-    return headline(findings, facts, [*held, *([worst_nees] if worst_nees else [])], known=bool(known), word=word)
+    dofs: list[Any] = [figures.metrics.get(k) for k in ("loops_dof", "gps_nis_joint_dof")]
+    dofs += [row.get("dof") for row in class_rows(figures)]
+    passed = any(f.level == "good" and f.code == "passes" for f in findings)
+    redundant = passed or any(is_finite_number(d) and d > 0 for d in dofs)
+    tested = bool(known or chi2 or redundant or word not in ("", "undecided"))
+    judged = [*held, *([worst_nees] if worst_nees else [])]
+    return headline(findings, facts, judged, known=bool(known), tested=tested, word=word)
 
 
 def headline(
@@ -168,6 +179,7 @@ def headline(
     judged: Sequence[ChiSquareTest] = (),
     *,
     known: bool = True,
+    tested: bool = True,
     word: str = "",
 ) -> Finding:
     """All findings in one line.
@@ -180,12 +192,14 @@ def headline(
         Ratios of the findings with the codes ``chi2`` and ``nees``.
     known : bool
         Is there a reference to compare the result with?
+    tested : bool
+        Could anything have shown that the result is wrong: a reference, a redundant measurement, a test of covariances?
     word : str
         Verdict on the covariances without ground truth
         (:func:`graphslam.evaluate.covariance_assessment.assess_covariances`).
     """
     found = list(findings)
-    level = worst_level(found) or "good"
+    level: Level = worst_level(found) or "good"
     points = sum(f.level == level for f in found) if level in MARKED else 0
     marked = f" ({points} {'point' if points == 1 else 'points'} marked “{level}”)" if points else ""
     held = [consistency_line(j, found) for j in judged]
@@ -195,7 +209,10 @@ def headline(
     said = "; ".join([x for x in facts if x] + held)
     over = {j.code for j in judged if j.said == "over-confident"} | ({"trust"} if word == "over-confident" else set())
     do = _advice(found, over, known, word)
-    return Finding(level, "headline", f"{TRUST[level]}{marked}{': ' + said if said else ''}. To do: {do}.")
+    start = TRUST[level]
+    if level == "good" and not tested:
+        level, start = "", NOT_TESTED
+    return Finding(level, "headline", f"{start}{marked}{': ' + said if said else ''}. To do: {do}.")
 
 
 def consistency_line(j: ChiSquareTest, findings: Sequence[Finding]) -> str:
