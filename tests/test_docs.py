@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -140,8 +141,8 @@ def test_run_folder_holds_the_files_that_the_page_names(tmp_path: Path) -> None:
 
 
 def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_path: Path) -> None:
-    """As they stand there, but for time: the demo is its quick form, the tests are only named, and the environment,
-    with the package and its compiled kernels, is the one that runs this test."""
+    """As they stand there, but for time: the demo is its quick form, the tests are only named, and the environment
+    with the package is the one that runs this test. A demo is gone on with, to the same map."""
     clone, venv = tmp_path / "clone", tmp_path / "clone" / ".venv"
     subprocess.run(["git", "clone", "-q", "--no-local", str(ROOT), str(clone)], check=True)
     for name in subprocess.check_output(["git", "ls-files", "-mo", "--exclude-standard"], cwd=ROOT, text=True).split(
@@ -160,14 +161,24 @@ def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_pat
     commands = commands.replace("make demo ", 'make demo DEMO="--preset quick" ').replace("make test ", "make -n test ")
     (python,) = BLOCK.findall(text)
     script = f"set -e\n{commands}\npython - <<'END'\n{python}\nEND\n"
-    # PYTHONSAFEPATH: `python -` would take the clone's package, whose kernels nobody has compiled
+    script += "cp demo-run/map.ply before.ply\ngraphslam demo --preset quick --out demo-run --json >again.json\n"
+    # PYTHONSAFEPATH: `python -` would take the package of the clone
     environment = {**os.environ, "MPLBACKEND": "Agg", "OPENBLAS_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
     done = subprocess.run(
         ["bash", "-c", script], cwd=clone, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
-    for made in ("demo-run/report.html", "runs/field/report.html", "runs/field/path.tum"):
+    for made in ("runs/field/report.html", "runs/field/path.tum"):
         assert (clone / made).is_file(), made
+    demo = clone / "demo-run"
+    figures = {p.name for p in (demo / "figures").glob("*.png")}
+    assert {"map.png", "progress.png", "fused_level0.png", "fused_above.png", "fused_cut.png"} <= figures
+    assert {"report.html", "map.ply", "map.bt", "map-level0.pgm", "run.json"} <= {p.name for p in demo.iterdir()}
+    assert "map_entropy" in done.stdout
+    assert str(Path("demo-run") / "figures" / "progress.png") in done.stderr
+    assert "8/8 figures" in done.stderr
+    assert json.loads((clone / "again.json").read_text())["report"]["resumed_submaps"] > 2
+    assert (demo / "map.ply").read_bytes() == (clone / "before.ply").read_bytes()
 
 
 @every_page

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,25 +17,11 @@ from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.segslam.progress import SegSlamProgress
 from graphslam_frontends.segslam.segslam import run_segslam
-from tests.app.cli.test_cli import graphslam, refused
+from tests.app.cli.test_cli import refused
 
 
-def test_quick_demo_from_the_command_line(tmp_path: Path) -> None:
-    out = tmp_path / "demo"
-    done = graphslam("demo", "--preset", "quick", "--out", out)
-    assert done.returncode == 0, done.stderr
-    figures = {p.name for p in (out / "figures").glob("*.png")}
-    assert {"map.png", "progress.png", "fused_level0.png", "fused_above.png", "fused_cut.png"} <= figures
-    assert {"map.ply", "map.bt", "map-level0.pgm", "run.json"} <= {p.name for p in out.iterdir()}
-    assert "map_entropy" in done.stdout
-    assert str(out / "figures" / "progress.png") in done.stderr
-    assert "8/8 figures" in done.stderr
-    # it is gone on with, to the same map
-    before = (out / "map.ply").read_bytes()
-    again = graphslam("demo", "--preset", "quick", "--out", out, "--json")
-    assert again.returncode == 0, again.stderr
-    assert json.loads(again.stdout)["report"]["resumed_submaps"] > 2
-    assert (out / "map.ply").read_bytes() == before
+def test_an_unknown_demo_is_refused(tmp_path: Path) -> None:
+    """The quick one is run, and gone on with, by the test of the README."""
     refused("demo", "--preset", "huge", "--out", tmp_path / "h", saying="garage")
 
 

@@ -40,14 +40,14 @@ def landmarks() -> SensorLog:
 
 def clouds() -> SensorLog:
     config = LidarConfig(rate=4.0, points=2000, lines=32)
-    return simulate_lidar(mesh_world("building", seed=2), 2, config, most=6.0)
+    return simulate_lidar(mesh_world("building", seed=2), 2, config, most=4.5)
 
 
 def carried() -> SensorLog:
     """With an IMU beside the lidar."""
     noise = drawn_imu(2)
     config = LidarConfig(rate=4.0, points=2000, lines=32, sway=0.06, bob=0.03, imu=noise)
-    return simulate_lidar(mesh_world("building", seed=2), 2, config, most=7.0)
+    return simulate_lidar(mesh_world("building", seed=2), 2, config, most=5.0)
 
 
 def wheeled() -> SensorLog:
