@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import logging
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from graphslam.app.cli import app
+from graphslam.app.cli import app, main
 from graphslam.app.cli.terminal import log_to_stderr
 from graphslam.app.worlds import simulate
 from graphslam.core.progress import Bar
@@ -34,13 +36,30 @@ def graphslam(*args: object, env: dict[str, str] | None = None) -> subprocess.Co
 
 
 def refused(*args: object, saying: str, env: dict[str, str] | None = None) -> None:
-    """Exit 1, nothing on stdout, one line on stderr that says what is wrong; before it, at most bars of progress."""
-    done = graphslam(*args, env=env)
-    assert done.returncode == 1, done
-    assert done.stdout == ""
+    """Exit 1, nothing on stdout, one line on stderr that says what is wrong; before it, at most bars of progress.
+
+    In this process, but where the environment is another one; what the command does to logging is undone.
+    """
+    if env:
+        found = graphslam(*args, env=env)
+        code, out, err = found.returncode, found.stdout, found.stderr
+    else:
+        root, hidden = logging.getLogger(), Bar.hidden
+        handlers, level = root.handlers[:], root.level
+        command = ["graphslam", *map(str, args)]
+        texts = io.StringIO(), io.StringIO()
+        with redirect_stdout(texts[0]), redirect_stderr(texts[1]), pytest.MonkeyPatch.context() as m:
+            m.setattr(sys, "argv", command)
+            with pytest.raises(SystemExit) as ended:
+                main()
+        root.handlers[:], Bar.hidden = handlers, hidden
+        root.setLevel(level)
+        code, out, err = ended.value.code, *(t.getvalue() for t in texts)
+    assert code == 1, (out, err)
+    assert out == ""
     bars = "read: ", "front end: ", "compiling "
-    lines = [x for x in done.stderr.splitlines() if x.strip() and not x.startswith(bars)]
-    assert len(lines) == 1, done.stderr
+    lines = [x for x in err.splitlines() if x.strip() and not x.startswith(bars)]
+    assert len(lines) == 1, err
     assert saying in lines[0]
     assert lines[0].startswith("graphslam: ")
 
