@@ -25,12 +25,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from graphslam.association.clique import maximum_clique
 from graphslam.core import geometry as se2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, CovarianceError, GeometryError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 
 Ints = npt.NDArray[np.int64]
@@ -276,7 +276,7 @@ def consistent_loops(
     chain = OdometryChain.of(chain_increments, chain_covariances)
     edges = LoopArrays.of(chain, *loops)
     l = len(edges)
-    limit = float(stats.chi2.ppf(level, chain.tangent_dim))
+    limit = chi2_quantile(level, chain.tangent_dim)
     i, j = np.triu_indices(l, 1)
     chi2 = np.empty((l, l))
     chi2[i, j] = chi2[j, i] = pair_chi2(chain, edges, i, j)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
 
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.core.errors import CovarianceError, DataError, SolverError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
@@ -275,14 +275,14 @@ def _add(graph: FactorGraph, x: Loop, known: DenseSession, new: DenseSession) ->
     return graph.add_between(
         x.i, x.j, x.T_ij, x.covariance,
         evidence=EvidenceUse([f"{known.name}/scan", f"{new.name}/scan"], (0.0, 0.0), "shared-scan"),
-        robust=RobustKernel("huber", float(np.sqrt(stats.chi2.ppf(0.95, graph.values.group.dof)))), group=SESSION,
+        robust=RobustKernel("huber", float(np.sqrt(chi2_quantile(0.95, graph.values.group.dof)))), group=SESSION,
     )  # fmt: skip
 
 
 def _winnow(graph: FactorGraph, solver: Solver, factors: dict[int, Loop]) -> int:
     """Take out, worst first, ties that the solved graph contradicts; how many."""
     g = graph.values.group
-    limit, taken = float(stats.chi2.ppf(0.9999, g.dof)), 0
+    limit, taken = chi2_quantile(0.9999, g.dof), 0
     while factors:
         chi2 = {}
         for fid in factors:

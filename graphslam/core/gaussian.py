@@ -7,6 +7,7 @@ accept ``angular``, the indices of those components.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -187,8 +188,11 @@ def moment_match(
 
 @cache
 def chi2_quantile(probability: float, dof: float) -> float:
-    """Quantile of the chi-square distribution (``scipy.stats`` takes half a second to load)."""
-    return float(2.0 * special.gammaincinv(0.5 * dof, probability))
+    """Quantile of the chi-square distribution; NaN without degrees of freedom.
+
+    ``scipy.stats`` takes half a second to load, so the package uses ``scipy.special``.
+    """
+    return math.nan if not dof > 0 else float(2.0 * special.gammaincinv(0.5 * dof, probability))
 
 
 def equal_tail_gate(gate: float, dof: int, other_dof: int) -> float:

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from graphslam.core.findings import Finding, Level
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 
 CERTAIN = 0.999
@@ -151,7 +152,7 @@ class BiasTest:
     @property
     def bound(self) -> float:
         """What an honest run exceeds once in a thousand."""
-        return float(stats.chi2.ppf(CERTAIN, self.dof) / self.dof)
+        return float(np.divide(chi2_quantile(CERTAIN, self.dof), self.dof))
 
 
 ESTIMATED = {
@@ -214,7 +215,7 @@ def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
         return []
     names = list(KINDS)
     z = np.abs(found.error) / found.sigma
-    certain = z > stats.norm.isf((1.0 - CERTAIN) / len(names) / 2.0)
+    certain = z > -special.ndtri((1.0 - CERTAIN) / len(names) / 2.0)
     best = int(np.argmax(np.where(certain, found.taken, -1.0)))
     out = []
     misfit = found.ratio > found.bound

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy.linalg as sla
 import scipy.sparse as sp
-from scipy import stats
+from scipy import special
 
 from graphslam.core import se3
 from graphslam.core.errors import CovarianceError, DataError
@@ -80,7 +80,9 @@ def joint_nees(
 
 def consistency_index(d2: ArrayLike, dof: ArrayLike, *, confidence: float = 0.95) -> Array:
     """``CI = D² / χ²_{n,1-α}`` (eq. 20), α = 1 - confidence. A perfect estimator has mean ``n/χ²``, not 1."""
-    return np.asarray(d2, dtype=np.float64) / stats.chi2.ppf(confidence, np.asarray(dof, dtype=np.float64))
+    return np.asarray(d2, dtype=np.float64) / (
+        2.0 * special.gammaincinv(0.5 * np.asarray(dof, dtype=np.float64), confidence)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -193,6 +195,8 @@ class Consistency:
         """Two-sided binomial bounds of :attr:`coverage` for a consistent estimator, by number of independent units."""
         n = self.runs if self.unit == "run" else self.count
         a = (1.0 - self.confidence) / 2.0
+        from scipy import stats  # takes half a second to load
+
         binom = stats.binom(n, self.confidence)
         return float(binom.ppf(a) / n), float(binom.ppf(1.0 - a) / n)
 
@@ -207,7 +211,7 @@ class Consistency:
         mean = np.nanmean(self.nees / self.dof, axis=0)
         n = np.where(np.isfinite(self.nees), self.dof, np.inf).min(axis=0)
         a = (1.0 - self.confidence) / 2.0
-        low, high = (stats.chi2.ppf(q, n * runs) / (n * runs) for q in (a, 1.0 - a))
+        low, high = (2.0 * special.gammaincinv(0.5 * n * runs, q) / (n * runs) for q in (a, 1.0 - a))
         return mean, low, high
 
     def as_row(self) -> dict[str, Any]:

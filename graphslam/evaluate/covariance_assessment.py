@@ -24,8 +24,9 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.bias_test import BiasTest
 
 Word = Literal["consistent", "over-confident", "pessimistic", "undecided"]
@@ -74,7 +75,7 @@ class ConsistencyTest:
     @property
     def upper(self) -> float:
         """Ratio of true to stated variances that is still possible."""
-        return self.value * self.dof / max(float(stats.chi2.ppf(1.0 - SURE, self.dof)), 1e-12)
+        return self.value * self.dof / max(chi2_quantile(1.0 - SURE, self.dof), 1e-12)
 
 
 def chi_square_ratio_test(name: str, of: Of, value: float, dof: float) -> list[ConsistencyTest]:
@@ -82,13 +83,13 @@ def chi_square_ratio_test(name: str, of: Of, value: float, dof: float) -> list[C
     if not (np.isfinite(value) and np.isfinite(dof) and dof >= LEAST_DOF):
         return []
     chi2 = value * dof
-    large, small = float(stats.chi2.sf(chi2, dof)), float(stats.chi2.cdf(chi2, dof))
+    large, small = float(special.chdtrc(dof, chi2)), float(special.chdtr(dof, chi2))
     return [ConsistencyTest(name, of, float(value), float(dof), large, small)]
 
 
 def largest_score_test(name: str, of: Of, score: float, *, tests: int = 1) -> ConsistencyTest:
     """A score that is N(0, 1) if nothing lasts, the largest of so many."""
-    p = min(1.0, tests * float(stats.norm.sf(score)))
+    p = min(1.0, tests * float(special.ndtr(-score)))
     return ConsistencyTest(name, of, float(score), 1.0, p, 1.0, lasting=True)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, ArrayLike, align_se2, se2_compose, se2_transform
@@ -175,7 +175,7 @@ class FixDistances:
         The least favourable case is that all errors are one and the same along one axis; the median then is one draw of
         χ² with one degree of freedom.
         """
-        return float(stats.chi2.sf(self.ratio, 1))
+        return float(special.chdtrc(1, self.ratio))
 
 
 def fix_distances(trajectory: Trajectory, gps: Gps, *, sigma: float | None = None) -> FixDistances | None:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-from scipy import stats
 
 from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
@@ -120,7 +120,7 @@ class GpsInnovations:
                     "verdict": verdict,
                     "dof": dof,
                     "fixes": n,
-                    "inside": float(np.mean(np.sum(y**2, axis=1) < stats.chi2.ppf(self.confidence, d))),
+                    "inside": float(np.mean(np.sum(y**2, axis=1) < chi2_quantile(self.confidence, d))),
                     "autocorrelation": float(np.sum(pairs) / np.sum(y[1:][close] ** 2)) if len(pairs) else np.nan,
                     "white": float(1.96 / np.sqrt(d * len(pairs))) if len(pairs) else np.nan,
                     "confidence": self.confidence,

@@ -28,9 +28,10 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import scipy.sparse as sp
-from scipy import stats
+from scipy import special
 
 from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, rotation2, se2_adjoint, se2_between, se2_log, se2_transform, wrap_angle
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bounds
@@ -284,7 +285,7 @@ class LoopConsistency:
         low, high, verdict = two_sided_bounds(value, dof, self.confidence)
         off = self.d2[np.triu_indices(len(self.d2), 1)]
         off = off[np.isfinite(off)]
-        limit = stats.chi2.ppf(self.confidence, 3)
+        limit = chi2_quantile(self.confidence, 3)
         shape_dof = int(self.loops.shape_dof.sum())
         return {
             "loops": len(self.loops),
@@ -308,7 +309,7 @@ class LoopConsistency:
         other = self.d2.copy()
         np.fill_diagonal(other, np.nan)
         known = np.isfinite(other)
-        bad = np.where(known, other, 0.0) > stats.chi2.ppf(self.confidence, 3)
+        bad = np.where(known, other, 0.0) > chi2_quantile(self.confidence, 3)
         return np.asarray(bad.sum(axis=1) / np.maximum(known.sum(axis=1), 1))
 
     def worst_pairs(self, n: int = 20) -> pd.DataFrame:
@@ -326,7 +327,7 @@ class LoopConsistency:
                 "c": a[j],
                 "d": b[j],
                 "d2": d2[order],
-                "p": stats.chi2.sf(d2[order], 3),
+                "p": special.chdtrc(3, d2[order]),
                 "blame_ab": blame[i],
                 "blame_cd": blame[j],
             }
@@ -343,7 +344,7 @@ class LoopConsistency:
                 "error": np.hypot(e[:, 0], e[:, 1]),
                 "heading": e[:, 2],
                 "d2": self.single,
-                "p": stats.chi2.sf(self.single, 3),
+                "p": special.chdtrc(3, self.single),
                 "blame": self.blame(),
             }
         )

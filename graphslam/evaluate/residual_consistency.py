@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.evaluate.consistency import Verdict
 from graphslam.evaluate.whiteness import Whiteness, residual_whiteness
@@ -37,7 +37,7 @@ LONGEST_SERIES = 1200
 def two_sided_bounds(ratio: float, dof: float, confidence: float) -> tuple[float, float, Verdict]:
     """Bounds of ``χ²_dof / dof`` and the verdict on ``ratio``."""
     a = (1.0 - confidence) / 2.0
-    low, high = (float(stats.chi2.ppf(q, dof) / dof) for q in (a, 1.0 - a))
+    low, high = (float(np.divide(chi2_quantile(q, dof), dof)) for q in (a, 1.0 - a))
     return low, high, "over-confident" if ratio > high else "pessimistic" if ratio < low else "consistent"
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from graphslam.core.geometry import Array
 
@@ -52,7 +52,7 @@ class Whiteness:
     @property
     def p_value(self) -> float:
         """Probability that white residuals are so much alike."""
-        return float(stats.norm.sf(self.score))
+        return float(special.ndtr(-self.score))
 
     def lasting(self, level: float = 0.005) -> bool:
         """Do errors last for longer than from one residual to the next?"""

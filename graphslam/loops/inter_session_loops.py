@@ -18,10 +18,10 @@ from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from graphslam.association.consistent_set import LoopArrays, OdometryChain, largest_consistent_set, pair_chi2
 from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
@@ -258,7 +258,7 @@ class TwoSessions:
         rival, why, reach = 0, "", 0.0
         if len(good):
             D = self._disagreement([loops[k] for k in good])
-            limit = float(stats.chi2.ppf(config.level, self.chain.tangent_dim))
+            limit = chi2_quantile(config.level, self.chain.tangent_dim)
             best = largest_consistent_set(D, limit, against_chain=False)
             accepted[good[best.accepted]] = True
             for k, text in zip(good, best.reasons):

@@ -27,11 +27,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from graphslam.association.consistent_set import ConsistentSet, LoopArrays, OdometryChain, chain_chi2, consistent_loops
 from graphslam.core.errors import DataError
-from graphslam.core.gaussian import check_covariance
+from graphslam.core.gaussian import check_covariance, chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.graph.noise import RobustKernel
@@ -187,7 +186,7 @@ class LoopCloser:
         if not numbers:
             return set()
         chain = dict(zip(numbers, self._against_chain(numbers)))
-        limit = float(stats.chi2.ppf(self.config.chain, self._dof))
+        limit = chi2_quantile(self.config.chain, self._dof)
         inside = set(self.accepted)
         for n in numbers:
             if n not in inside and not chain[n] <= limit:
@@ -223,8 +222,8 @@ class LoopCloser:
     def _try(self, n: int) -> tuple[Verdict, str, dict[str, float]]:
         """Add one loop if the graph bears it: verdict, reason, figures."""
         c, d, loop = self.config, self._dof, self.loops[n]
-        limit = float(stats.chi2.ppf(c.level, d))
-        earlier_limit = float(stats.chi2.ppf(c.earlier, d))
+        limit = chi2_quantile(c.level, d)
+        earlier_limit = chi2_quantile(c.earlier, d)
         expected = float(self._against_graph([n])[0])
         if not expected <= limit:  # NaN is not
             return "rejected", f"graph: χ² {expected:.1f} > {limit:.1f}", {"chi2": expected}
@@ -307,7 +306,7 @@ class LoopCloser:
             return False
         both = [*inside, *outside]
         ends = self._arrays(both)[0]
-        limit = float(stats.chi2.ppf(CLASH, self._dof))
+        limit = chi2_quantile(CLASH, self._dof)
         changed = False
         for rows, columns in find_conflicting_groups(self._consistent(both).chi2, len(inside), ends, limit, least):
             a, b = [both[k] for k in rows], [both[k] for k in columns]
@@ -377,11 +376,11 @@ class LoopCloser:
 
     def _bears(self, n: int) -> bool:
         """Whether the chain alone bears a loop."""
-        return self._against_chain([n])[0] <= float(stats.chi2.ppf(self.config.chain, self._dof))
+        return self._against_chain([n])[0] <= chi2_quantile(self.config.chain, self._dof)
 
     def _reconsider(self) -> set[int]:
         """Switch off, worst first, what the rest of the graph contradicts; which these were."""
-        limit = float(stats.chi2.ppf(self.config.off, self._dof))
+        limit = chi2_quantile(self.config.off, self._dof)
         gone: set[int] = set()
         while inside := self.accepted:
             alone = self.without(inside)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from graphslam.core.geometry import Array
 from graphslam.loops.measure import Loop
@@ -60,6 +59,8 @@ def disagreement_shares(loops: Sequence[Loop], shares: Array) -> Array:
 
 def _law(shares: Array) -> Callable[[Array], Array]:
     """Log density of the next share, given these: Student's, of the angle whose squared sine it is."""
+    from scipy import stats  # takes half a second to load
+
     z, n = _angle(shares), len(shares)
     width = max(float(z.std(ddof=1)), GRAIN) * math.sqrt(1.0 + 1.0 / n)
     return lambda q: np.asarray(stats.t.logpdf(_angle(q), n - 1, float(z.mean()), width))

@@ -9,9 +9,9 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from graphslam.core.errors import ConfigError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.graph.noise import RobustKernel
@@ -98,7 +98,7 @@ class LoopConfig:
 
     def robust(self, dof: int) -> RobustKernel:
         """The kernel of loops in the graph."""
-        return RobustKernel("huber", math.sqrt(float(stats.chi2.ppf(self.kernel, dof))))
+        return RobustKernel("huber", math.sqrt(chi2_quantile(self.kernel, dof)))
 
     def __post_init__(self) -> None:
         for f in fields(self):

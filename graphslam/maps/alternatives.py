@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from scipy import stats
+from scipy import special
 
 from graphslam.core.errors import DataError
 from graphslam.evidence.beams import BeamModel
@@ -186,7 +186,7 @@ def rank_alternatives(
     fits = [(chi2_of(a.graph), a.solution.score.dof) for a in alternatives]
     scale = noise_scale([a.ties for a in alternatives], fits)
     judged = [
-        ScoredMap(k, a, chi2, dof, dof > 0 and float(stats.chi2.sf(chi2 / scale, dof)) < CONTRADICTION, clarity[k])
+        ScoredMap(k, a, chi2, dof, dof > 0 and float(special.chdtrc(dof, chi2 / scale)) < CONTRADICTION, clarity[k])
         for k, (a, (chi2, dof)) in enumerate(zip(alternatives, fits))
     ]
     order = sorted(judged, key=lambda j: (j.contradicted, j.chi2_per_dof if j.contradicted else 0.0,

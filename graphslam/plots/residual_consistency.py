@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import MaxNLocator
-from scipy import stats
 
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.gps_innovation import GpsInnovations
 from graphslam.evaluate.loop_consistency import LoopConsistency
 from graphslam.plots import style
@@ -25,7 +25,7 @@ def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency) -> Axes:
     image = ax.imshow(ratio, cmap="RdBu_r", norm=LogNorm(1e-2, 1e2), interpolation="nearest", origin="upper")
     bar = ax.figure.colorbar(image, ax=ax, shrink=0.85)
     bar.set_label("D² / 3   (consistent: 1)")
-    bar.ax.axhline(stats.chi2.ppf(loops.confidence, 3) / 3.0, color=style.BLACK, lw=1.0)
+    bar.ax.axhline(chi2_quantile(loops.confidence, 3) / 3.0, color=style.BLACK, lw=1.0)
     names = [f"{a}–{b}" for a, b in zip(loops.loops.a, loops.loops.b)]
     every = max(1, len(names) // 15)
     at = np.arange(0, len(names), every)
@@ -49,7 +49,7 @@ def plot_innovations(ax: Axes | None, gps: GpsInnovations, *, title: str | None 
     ax.axhspan(d * each["low"], d * each["high"], color=style.BOUNDS, alpha=0.8, lw=0, label=band, zorder=0)
     ax.plot(t, gps.nis, ".", color=style.GPS, ms=4, label="withheld fix", zorder=3)
     ax.axhline(d * each["value"], color=style.ESTIMATE, lw=1.2, label=f"mean {d * each['value']:.2f} (consistent: {d})")
-    limit = float(stats.chi2.ppf(gps.confidence, d))
+    limit = chi2_quantile(gps.confidence, d)
     ax.axhline(limit, color=style.BLACK, lw=0.8, ls="--", label=f"{gps.confidence:.0%} of consistent fixes below")
     ax.set_yscale("log")
     ax.set_ylim(bottom=1e-2)

@@ -15,11 +15,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from graphslam.core.dense import DenseMapView
 from graphslam.core.errors import GeometryError
-from graphslam.core.gaussian import check_covariance
+from graphslam.core.gaussian import check_covariance, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.points import check_pose, evenly_spaced
 from graphslam.core.poses import Group, group_of
@@ -242,7 +241,7 @@ def _judge(
         return _nothing(T, "nothing: no start led to a result", len(points))
     own = [_covariance(r, P, c) for r in modes]
     chi2 = np.array([prediction_chi2(r.T_target_source, C, T, P) for r, (C, _) in zip(modes, own)])
-    limit = float(stats.chi2.ppf(c.chi2_level, g.dof))
+    limit = chi2_quantile(c.chi2_level, g.dof)
     fit = np.array([_likeness(r) for r in modes])
     allowed = np.flatnonzero(chi2 <= limit)
     allowed = allowed[np.argsort(-fit[allowed], kind="stable")]  # best first

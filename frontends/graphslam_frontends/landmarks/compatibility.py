@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import special
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
@@ -30,8 +30,8 @@ Ints = npt.NDArray[np.int64]
 
 @lru_cache(maxsize=64)
 def _gates(gate: float, rows: int) -> Array:
-    probability = stats.chi2.sf(gate, 2)
-    out = np.concatenate([[0.0], stats.chi2.isf(probability, np.arange(1, rows + 1))])
+    probability = special.chdtrc(2, gate)
+    out = np.concatenate([[0.0], special.chdtri(np.arange(1, rows + 1), probability)])
     out.setflags(write=False)
     return out
 

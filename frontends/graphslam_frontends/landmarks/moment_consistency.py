@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from graphslam.core.errors import CovarianceError
-from graphslam.core.gaussian import Gaussian, moment_match
+from graphslam.core.gaussian import Gaussian, chi2_quantile, moment_match
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.summarise import (
     REGULARISER,
@@ -154,7 +154,7 @@ def consistency_flag(report: dict[str, Any], particles: int) -> list[str]:
         reasons.append("ancestors")
     if report["min_ess"] < min(LEAST_ESS, particles):
         reasons.append("ess")
-    if report.get("dof", 0) > 0 and report["chi2"] > stats.chi2.isf(FALSE_ALARM, report["dof"]):
+    if report.get("dof", 0) > 0 and report["chi2"] > special.chdtri(report["dof"], FALSE_ALARM):
         reasons.append("residuals")
     return reasons
 
@@ -169,4 +169,4 @@ def variance_bounds(samples: float) -> tuple[float, float]:
     if nu < 1.0:
         return 0.0, np.inf
     tail = FALSE_ALARM / 3.0 / 2.0
-    return float(stats.chi2.ppf(tail, nu) / samples), float(stats.chi2.isf(tail, nu) / samples)
+    return float(chi2_quantile(tail, nu) / samples), float(special.chdtri(nu, tail) / samples)

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from graphslam.association.consistent_set import LoopArrays, OdometryChain, chain_chi2, pair_chi2
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
@@ -154,8 +154,8 @@ def loop_consensus(network: PoseNetwork) -> LoopConsensus:
     nearest = nearest[nearest > REPEATED]
     if len(nearest) < 8:
         return nothing
-    scale = min(1.0, float(np.quantile(nearest, 0.25) / stats.chi2.ppf(0.25, d)))
-    limit = scale * stats.chi2.ppf(AGREEMENT, d)
+    scale = min(1.0, float(np.quantile(nearest, 0.25) / chi2_quantile(0.25, d)))
+    limit = scale * chi2_quantile(AGREEMENT, d)
     agree = (d2 <= limit) & close
     i, k = np.nonzero(agree)
     links = coo_matrix((np.ones(len(i)), (i, other[i, k])), shape=(len(rows), len(rows)))

@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy import stats
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import group_of
@@ -141,8 +141,8 @@ def tail_limit(D2: Array, dof: int, quantile: float = QUANTILE) -> tuple[float, 
     x = np.sort(D2[np.isfinite(D2) & (D2 >= 0.0)])
     if not len(x):
         return float("inf"), 1.0
-    scale = max(float(np.median(x)) / float(stats.chi2.median(dof)), np.finfo(float).tiny)
-    least = limit = scale * float(stats.chi2.ppf(quantile, dof))
+    scale = max(float(np.median(x)) / chi2_quantile(0.5, dof), np.finfo(float).tiny)
+    least = limit = scale * chi2_quantile(quantile, dof)
     for _ in range(FOLLOWED):
         n = int(np.searchsorted(x, limit, side="right"))
         k = max(int(TAIL * n), 1)
@@ -309,7 +309,7 @@ def leave_one_out_test(
     w = np.linalg.eigvalsh(network.information)
     judged = ~np.isinf(limit[:m]) & (w[:, 0] > 1e-12 * w[:, -1])
     limit, scale, rounds = limit.copy(), 0.0, 0
-    dull = float(stats.chi2.ppf(DULL, d))
+    dull = chi2_quantile(DULL, d)
     seen: set[bytes] = set()
     back = False
     single, worst = np.full(m, np.nan), np.full(m, np.nan)
@@ -332,7 +332,7 @@ def leave_one_out_test(
             quantile = family_quantile(probability, len(inside))
             most, scale = tail_limit(single[inside], d, quantile)
             if own_tail:
-                stated = float(stats.chi2.ppf(quantile, d))
+                stated = chi2_quantile(quantile, d)
                 most = min(most, stated) if len(inside) >= FEW else stated
                 limit[:m] = np.where(np.isinf(limit[:m]), np.inf, most)
             bad = worst[inside] > np.maximum(limit[inside], WORST * worst[inside].max())

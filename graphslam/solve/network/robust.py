@@ -16,9 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from graphslam.core.errors import ConfigError, IndeterminateError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.progress import Bar
@@ -201,12 +201,12 @@ def _scale(network: PoseNetwork, costs: Array, used: Mask, believed: Mask) -> fl
     costs = costs[costs > REPEATED]  # a loop of two moments between which nothing moved says nothing about noise
     if len(costs) < FEW:
         return 1.0
-    return min(1.0, float(np.median(costs)) / (left * float(stats.chi2.median(network.tangent_dim))))
+    return min(1.0, float(np.median(costs)) / (left * chi2_quantile(0.5, network.tangent_dim)))
 
 
 def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mask) -> Array:
-    limit = np.full(len(trusted), stats.chi2.ppf(probability, 2))
-    limit[: len(network.edges)] = scale * stats.chi2.ppf(probability, network.tangent_dim)
+    limit = np.full(len(trusted), chi2_quantile(probability, 2))
+    limit[: len(network.edges)] = scale * chi2_quantile(probability, network.tangent_dim)
     limit[trusted] = np.inf
     return limit
 
