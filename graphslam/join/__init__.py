@@ -4,6 +4,5 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "registry": "join_by_method",
-    "online": "RelinearisationPolicy join_online",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -190,13 +190,14 @@ class GaussianMap:
             step[columns] = wrap_angle(part) if word == "compass" else part
         return step
 
-    def tangents(self, step: Array) -> sp.csc_matrix | None:
-        """``T``: how a small step after ``step`` changes it; None for the identity."""
+    def tangents(self, step: Array, *, inverse: bool = False) -> sp.csc_matrix | None:
+        """``T``: how a small step after ``step`` changes it, or the inverse of it; None for the identity."""
         blocks: list[tuple[Index, Array]] = []
         for _, kind, _, _, columns in self.kinds():
             g = kind.pose_group(self.problem.dim)
             if g is not None and np.any(step[columns]):
-                blocks.append((columns, np.asarray(np.linalg.inv(g.right_jacobian(step[columns])), dtype=np.float64)))
+                J = g.right_jacobian(step[columns])
+                blocks.append((columns, np.asarray(J if inverse else np.linalg.inv(J), dtype=np.float64)))
         return self._identity_but(blocks) if blocks else None
 
     def _identity_but(self, blocks: list[tuple[Index, Array]], more: sp.csc_matrix | None = None) -> sp.csc_matrix:

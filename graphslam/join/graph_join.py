@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 from graphslam.core.errors import DataError, IndeterminateError
 from graphslam.core.geometry import Array
@@ -301,9 +300,8 @@ def join_graph_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEsti
             S, G = sp.csc_matrix(S + A), G + b
         columns = joined.columns
         step = _update_covariance(P, S, G, columns, old, d)
-        T = joined.tangents(step)
-        if T is not None:
-            inverse = sp.csc_matrix(spla.inv(T))
+        inverse = joined.tangents(step, inverse=True)
+        if inverse is not None:
             P[np.ix_(columns, columns)] = inverse @ (inverse @ P[np.ix_(columns, columns)]).T
         n = len(columns)
         nothing = sp.csc_matrix((n, n))

@@ -337,15 +337,12 @@ class JoinResult(SubmapEstimate):
         The landmark ids of every submap as joined: those given, or those association found.
     problem : SubmapProblem or None
         The least-squares problem of the same submaps, which a polish goes on with; not pickled.
-    relinearisations : mapping of str to int
-        How often all submaps were linearised afresh, by reason (the online joiner).
     """
 
     method: str = ""
     times: Mapping[str, float] = field(default_factory=dict)
     submap_ids: tuple[Ids, ...] = ()
     problem: SubmapProblem | None = field(default=None, repr=False, compare=False)
-    relinearisations: Mapping[str, int] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None}

@@ -423,33 +423,3 @@ def cut_into_blocks(A: Array, width: Index) -> Array:
             c += width[j]
         r += width[i]
     return out
-
-
-@njit
-def symmetrise_blocks(
-    width: Index, ptr: Index, idx: Index, block: Index, flip: Index, value: Array
-) -> tuple[Index, Array]:
-    """Blocks that are stored once for each pair (``flip`` = 1: with the neighbour's rows) as blocks stored both ways.
-
-    Returns
-    -------
-    block : (nb,); value : (k,)
-        As in :func:`join_blocks`.
-    """
-    total = 0
-    for i in range(len(width)):
-        for e in range(ptr[i], ptr[i + 1]):
-            total += width[i] * width[idx[e]]
-    out_block = np.empty(len(idx), np.int64)
-    out = np.empty(total)
-    k = 0
-    for i in range(len(width)):
-        wi = width[i]
-        for e in range(ptr[i], ptr[i + 1]):
-            wj, v = width[idx[e]], block[e]
-            out_block[e] = k
-            for p in range(wi):
-                for q in range(wj):
-                    out[k] = value[v + q * wi + p] if flip[e] else value[v + p * wj + q]
-                    k += 1
-    return out_block, out

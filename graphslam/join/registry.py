@@ -12,7 +12,6 @@ from graphslam.core.submap import Submap
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
-from graphslam.join.online import join_online
 from graphslam.join.optimise import optimise_from_join as polish_join
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.submap_blocks import relabel, scale_covariances
@@ -37,7 +36,6 @@ JOINERS: dict[str, Callable[..., JoinResult]] = {
     "eif-sequential": join_sequential,
     "eif-tree-classical": partial(join_tree, classical=True),
     "eif-sequential-classical": partial(join_sequential, classical=True),
-    "eif-online": join_online,
     "ekf": join_ekf,
 }
 
@@ -127,8 +125,8 @@ def join_by_method(
         :class:`~graphslam.join.graph_problem.JoinProblem` has all factors of a graph.
     method : str
         ``eif-tree``, ``eif-sequential``: extended information filters, in the chart of the submaps; with ``-classical``
-        as the paper has them, Cartesian and linearised once. ``ekf``: once linearised. ``eif-online``: in sequence,
-        linearised afresh when a loop closes or a heading moves. ``batch``, ``isam2``: least squares.
+        as the paper has them, Cartesian and linearised once. ``ekf``: once linearised. ``batch``,
+        ``isam2``: least squares.
     polish : bool
         Go on to the least-squares optimum from there.
     associate : "given", "nearest", "joint" or Association

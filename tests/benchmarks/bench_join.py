@@ -28,10 +28,10 @@ from graphslam.core.submap import Submap
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
-from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.submap_solver import solve_submaps
+from graphslam_studies.baselines.online import RelinearisationPolicy, join_online
 from graphslam_studies.io.slsjf import read_slsjf_local_maps
 from graphslam_studies.sim.local_maps import simulate_local_maps
 

@@ -26,9 +26,7 @@ def join_command(
     source: str = typer.Argument(
         ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
     ),
-    method: str = typer.Option(
-        "eif-tree", help="Name of the method: eif-tree, eif-sequential, eif-online, ekf, isam2 or batch."
-    ),
+    method: str = typer.Option("eif-tree", help="Name of the method: eif-tree, eif-sequential, ekf, isam2 or batch."),
     polish: bool = typer.Option(True, help="Refine the joined map to the least-squares optimum."),
     associate: str = typer.Option(
         "given", help="How landmarks are associated: given (by their ids), nearest or joint."
@@ -89,9 +87,7 @@ def compare_command(
     source: str = typer.Argument(
         ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
     ),
-    methods: str | None = typer.Option(
-        None, help="Names of methods, separated by commas. Default: all except eif-online."
-    ),
+    methods: str | None = typer.Option(None, help="Names of methods, separated by commas. Default: all."),
     polish: bool = typer.Option(True, help="Refine the result of every method to the least-squares optimum."),
     associate: str = typer.Option(
         "given", help="How landmarks are associated: given (by their ids), nearest or joint."

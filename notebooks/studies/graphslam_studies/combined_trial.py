@@ -24,13 +24,13 @@ from graphslam.core.random import SeedTree
 from graphslam.core.submap import Submap
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinResult
-from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.submap_isam2 import solve_submaps_isam2
 from graphslam.join.submap_solver import SubmapEstimate, solve_submaps
 from graphslam_frontends.landmarks.prepare import prepare_log
 from graphslam_studies.baselines.full_batch import full_batch
+from graphslam_studies.baselines.online import RelinearisationPolicy, join_online
 from graphslam_studies.frontends.ekf_slam import ekf_snapshots
 from graphslam_studies.frontends.rbpf_slam import rbpf_snapshots
 from graphslam_studies.frontends.snapshot import Snapshot

@@ -23,11 +23,11 @@ from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import Consistency, nees, vector_pose_error
 from graphslam.join.ekf import join_ekf
 from graphslam.join.joined_map import JoinedMapView, landmark_scalars, pose_scalars
-from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.optimise import optimise_from_join
 from graphslam.join.order import join_sequential, join_tree
 from graphslam.join.submap_blocks import SubmapProblem, check_identified
 from graphslam.join.submap_solver import SubmapEstimate, minimise_submaps
+from graphslam_studies.baselines.online import RelinearisationPolicy, join_online
 
 logger = logging.getLogger(__name__)
 

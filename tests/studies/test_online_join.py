@@ -12,9 +12,9 @@ from graphslam.core.submap import Submap
 from graphslam.evaluate.consistency import joint_nees
 from graphslam.join.association import MapAssociationConfig
 from graphslam.join.joined_map import JoinedMapView
-from graphslam.join.online import RelinearisationPolicy, join_online
 from graphslam.join.order import join_sequential
 from graphslam.join.submap_solver import solve_submaps
+from graphslam_studies.baselines.online import RelinearisationPolicy, join_online
 from graphslam_studies.sim.local_maps import simulate_local_maps
 from tests.reference.submap_chain import submap_chain
 

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, wrap_angle
+from graphslam.core.jit import njit
 from graphslam.core.progress import Bar
 from graphslam.core.submap import Submap
-from graphslam.join import kernels
 from graphslam.join.association import MapAssociationConfig, match_landmarks
 from graphslam.join.eif import join_maps, match_by_id
 from graphslam.join.joined_map import JoinedMap, JoinResult, JoinTimes, OnJoin, check_chain, finish_map, landmark_labels
@@ -29,6 +29,7 @@ from graphslam.join.submap_blocks import SubmapProblem
 from graphslam.join.submap_solver import MinimisationResult, minimise_submaps
 
 logger = logging.getLogger(__name__)
+Nodes = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,19 @@ class RelinearisationPolicy:
             raise ConfigError(f"relinearisation: {self}; wanted max_heading > 0 and rtol > 0")
 
 
+@dataclass(frozen=True)
+class OnlineJoinResult(JoinResult):
+    """The last map of the sequence.
+
+    Parameters
+    ----------
+    relinearisations : mapping of str to int
+        How often all submaps were linearised afresh, by reason.
+    """
+
+    relinearisations: Mapping[str, int] = field(default_factory=dict)
+
+
 @dataclass
 class _Online:
     """The map so far, and what the policy must remember of it."""
@@ -88,7 +102,7 @@ def join_online(
     association: MapAssociationConfig | None = None,
     on_join: OnJoin | None = None,
     progress: bool = False,
-) -> JoinResult:
+) -> OnlineJoinResult:
     """Join submaps in sequence, each linearised once, and all of them afresh when the policy says so.
 
     Parameters
@@ -104,7 +118,7 @@ def join_online(
 
     Returns
     -------
-    JoinResult
+    OnlineJoinResult
         ``relinearisations`` counts them by reason (one may have several) and in all; ``times`` has a part
         ``relinearisation``; ``iterations`` are those of all Gauss–Newton searches; ``converged`` says whether the last
         submap's search ended at the optimum.
@@ -154,7 +168,11 @@ def join_online(
     joined = finish_map(
         submaps, state.joined, identified=identified, method="eif-online", times=times, information=matrices
     )
-    return replace(joined, iterations=iterations, converged=converged, relinearisations=counts)
+    parts = {f.name: getattr(joined, f.name) for f in fields(joined)} | {
+        "iterations": iterations,
+        "converged": converged,
+    }
+    return OnlineJoinResult(**parts, relinearisations=counts)
 
 
 def _relinearise(
@@ -173,7 +191,7 @@ def _relinearise(
     )
     best = minimise_submaps(problem, joined.x[scalars], rtol=policy.rtol, max_iterations=policy.max_iterations)
     pattern = problem.pattern
-    block, values = kernels.symmetrise_blocks(
+    block, values = _symmetrise_blocks(
         pattern.width, pattern.ptr, pattern.neighbours, pattern.block, pattern.flip, best.data
     )
     m = problem.m
@@ -193,3 +211,33 @@ def _relinearise(
         fill=pattern.symbolic.nnz / len(values),
     )
     return fresh, best
+
+
+@njit
+def _symmetrise_blocks(
+    width: Nodes, ptr: Nodes, idx: Nodes, block: Nodes, flip: Nodes, value: Array
+) -> tuple[Nodes, Array]:
+    """Blocks that are stored once for each pair (``flip`` = 1: with the neighbour's rows) as blocks stored both ways.
+
+    Returns
+    -------
+    block : (nb,); value : (k,)
+        As in :func:`~graphslam.join.kernels.join_blocks`.
+    """
+    total = 0
+    for i in range(len(width)):
+        for e in range(ptr[i], ptr[i + 1]):
+            total += width[i] * width[idx[e]]
+    out_block = np.empty(len(idx), np.int64)
+    out = np.empty(total)
+    k = 0
+    for i in range(len(width)):
+        wi = width[i]
+        for e in range(ptr[i], ptr[i + 1]):
+            wj, v = width[idx[e]], block[e]
+            out_block[e] = k
+            for p in range(wi):
+                for q in range(wj):
+                    out[k] = value[v + q * wi + p] if flip[e] else value[v + p * wj + q]
+                    k += 1
+    return out_block, out
