@@ -203,7 +203,7 @@ def test_robust_kernels_stay_robust() -> None:
 def test_what_cannot_be_joined_is_refused_in_one_line() -> None:
     submaps, problem = dense_submaps()
     refused = [
-        (lambda: join_by_method(problem, "eif-online"), UnknownNameError, "eif-online"),
+        (lambda: join_by_method(problem, "eif-tree-classical"), UnknownNameError, "classical"),
         (lambda: compare_methods(problem, ["magic"], memory=False), UnknownNameError, "magic"),
         (lambda: join_by_method(problem, "eif-tree", associate="joint"), ConfigError, "only landmark submaps"),
         (lambda: join_by_method(problem, "eif-tree", workers=2), ConfigError, "one process"),

@@ -87,7 +87,9 @@ def compare_command(
     source: str = typer.Argument(
         ..., help="Folder of submaps, folder of a run, name of a data set of submaps, or pose-graph file."
     ),
-    methods: str | None = typer.Option(None, help="Names of methods, separated by commas. Default: all."),
+    methods: str | None = typer.Option(
+        None, help="Names of methods, separated by commas. Default: isam2, batch, eif-tree, eif-sequential, ekf."
+    ),
     polish: bool = typer.Option(True, help="Refine the result of every method to the least-squares optimum."),
     associate: str = typer.Option(
         "given", help="How landmarks are associated: given (by their ids), nearest or joint."
