@@ -44,6 +44,7 @@ _TYPES = {
     "Submap": "graphslam.core.submap",
     "Trajectory": "graphslam.core.trajectory",
     "FactorGraph": "graphslam.graph.factor_graph",
+    "EvidenceUse": "graphslam.graph.ledger",
     "Run": "graphslam.app.run.run",
     "Slam": "graphslam.app.run.slam",
     "Collapse": "graphslam.skeleton.collapse",

@@ -10,6 +10,7 @@ from graphslam import maps as maps
 from graphslam import plots as plots
 from graphslam import sim as sim
 from graphslam.skeleton.collapse import Collapse as Collapse
+from graphslam.graph.ledger import EvidenceUse as EvidenceUse
 from graphslam.graph.factor_graph import FactorGraph as FactorGraph
 from graphslam.core.records import Gps as Gps
 from graphslam.core.imu import Imu as Imu

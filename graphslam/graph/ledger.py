@@ -44,6 +44,11 @@ class EvidenceUse:
         Of time, ``[t_start, t_end)`` [s].
     kind : str
         ``"measurement"``, which nothing else may use, or a kind declared in the ledger (``"shared-scan"``).
+
+    Examples
+    --------
+    >>> gs.EvidenceUse(["controls"], (0.0, 12.5)).kind
+    'measurement'
     """
 
     streams: Sequence[str]

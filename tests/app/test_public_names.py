@@ -22,7 +22,9 @@ STREAMS = {
     *("Gps", "Imu", "LandmarkObservations", "LaserScans", "Odometry", "PointClouds", "PointObservations", "RangeScans"),
     *("SteeringControls", "VelocityControls"),
 }
-TYPES = {"Collapse", "FactorGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory"}
+TYPES = {
+    *("Collapse", "EvidenceUse", "FactorGraph", "Run", "SensorLog", "SkeletonProblem", "Slam", "Submap", "Trajectory")
+}
 
 
 def test_tab_completion_offers_these_and_no_more() -> None:
