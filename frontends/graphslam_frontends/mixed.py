@@ -91,13 +91,7 @@ class MixedFrontEnd(FrontEnd):
         )
 
     def split(self, log: SensorLog) -> tuple[FrontEnd, StepwiseFrontEnd]:
-        """The front end of landmarks and that of scans.
-
-        Raises
-        ------
-        ConfigError
-            Not one of each, or front ends of two dimensions.
-        """
+        """The front end of landmarks and that of scans."""
         scans = [p for p in self.parts if isinstance(p, StepwiseFrontEnd)]
         seen = [p for p in self.parts if not isinstance(p, StepwiseFrontEnd) and p.observations(log) is not None]
         names = ", ".join(p.name for p in self.parts)

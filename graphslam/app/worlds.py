@@ -89,10 +89,6 @@ def simulate(
     SensorLog
         With its truth, in the frame of the first base [m, rad].
 
-    Raises
-    ------
-    UnknownNameError, ConfigError
-
     Examples
     --------
     >>> gs.simulate("landmark-field", preset="quick", seed=1)

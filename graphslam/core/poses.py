@@ -62,12 +62,7 @@ SE3 = Group(
 
 
 def group_of(poses: Any) -> Group:
-    """SE(2) or SE(3), by the length of the last axis.
-
-    Raises
-    ------
-    GeometryError
-    """
+    """SE(2) or SE(3), by the length of the last axis."""
     size = np.shape(poses)[-1] if np.ndim(poses) else 0
     if size not in (3, 7):
         raise GeometryError("poses have the wrong shape", got=np.shape(poses), wanted="(..., 3) or (..., 7)")

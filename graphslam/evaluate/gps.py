@@ -103,11 +103,6 @@ def gps_residuals(
         Fixes that determine the alignment and fixes that are scored; default all. Withheld fixes: disjoint masks.
     max_gap : float, optional
         A fix between two poses farther apart than this is counted, not scored [s].
-
-    Raises
-    ------
-    DataError
-        Trajectory not 2-D, or fewer than two usable fixes.
     """
     if trajectory.dim != 2:
         raise DataError("GPS residuals need a 2-D trajectory", got=f"{trajectory.dim}-D")

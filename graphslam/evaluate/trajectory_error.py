@@ -103,11 +103,6 @@ def fit_alignment(reference: Array, estimate: Array, alignment: Alignment) -> tu
 
     ``none``; ``origin``: the first poses coincide, heading included; ``se``: rigid least squares on positions;
     ``sim``: with scale (Umeyama 1991).
-
-    Raises
-    ------
-    DataError
-        Fewer than three pairs, or positions without extent, for a fit.
     """
     planar = reference.shape[1] == 3
     if alignment == "none":
@@ -177,11 +172,6 @@ def ate(
         See :func:`fit_alignment`.
     max_diff : float
         Stamps farther apart than this are no pair [s].
-
-    Raises
-    ------
-    DataError
-        No pairs, or too few for the alignment.
     """
     times, ref, est, T, scale = _pair(reference, estimate, alignment, max_diff)
     between = se2_between if reference.dim == 2 else se3.se3_between

@@ -68,13 +68,6 @@ def update_grids(
     -------
     UpdateReport
         Counts summed over the grids.
-
-    Raises
-    ------
-    GridError, GeometryError
-        Grids that do not belong together, or shapes and poses that are impossible; nothing was written.
-    MemoryError
-        Each grid holds either the whole scan or nothing of it.
     """
     if threads < 1:
         raise ConfigError(f"{threads} threads; wanted at least 1")

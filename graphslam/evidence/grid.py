@@ -45,11 +45,6 @@ class EvidenceGrid(GridTree):
         Storage shared with other grids; default a pool of its own.
     dim : {3, 2}
 
-    Raises
-    ------
-    GridError
-        Voxel size not positive and finite, or another dimension.
-
     Examples
     --------
     >>> grid = EvidenceGrid(0.1)
@@ -91,12 +86,6 @@ class EvidenceGrid(GridTree):
             Longer beams are cut there and give free space only [m].
         returns : (n,) bool, optional
             False where a beam met nothing: it is free up to its point. Default all True.
-
-        Raises
-        ------
-        GridError, GeometryError
-            Impossible shapes or pose; nothing was written.
-        GridLockedError
         """
         self.check_writable()
         scan = scan_rows(points, origin, returns, max_range, self.dim, self.voxel_size)
@@ -113,11 +102,6 @@ class EvidenceGrid(GridTree):
             Signed; brick b holds voxels 8b … 8b + 7. None twice.
         values : (n, 512) int16
             In units of `layout.STEP`, x fastest; `layout.UNKNOWN` where nothing is known.
-
-        Raises
-        ------
-        GridError
-            Wrong shapes, a coordinate twice or outside the addressable cube; nothing was written.
         """
         self.check_writable()
         c = np.ascontiguousarray(coordinates, dtype=np.int64)

@@ -92,11 +92,6 @@ def shared_bricks(grid: GridTree, others: Sequence[GridTree]) -> npt.NDArray[np.
     ----------
     others : sequence of EvidenceGrid
         Of the same pool.
-
-    Raises
-    ------
-    GridError
-        Grids of different pools.
     """
     if any(g.pool is not grid.pool for g in others):
         raise GridError("grids of different pools share nothing", wanted="one pool")

@@ -146,14 +146,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
             self._by_factor.setdefault(factor_id, []).append(e)
 
     def enter(self, factor_id: int, factor: str, evidence: EvidenceUse | str) -> str:
-        """Enter what one factor uses, or a declared kind without streams; returns the kind.
-
-        Raises
-        ------
-        ConfigError
-            A measurement without streams.
-        DataError, EvidenceReusedError
-        """
+        """Enter what one factor uses, or a declared kind without streams; returns the kind."""
         use = EvidenceUse((), (0.0, 0.0), evidence) if isinstance(evidence, str) else evidence
         if use.kind == EXCLUSIVE and not use.streams:
             raise ConfigError(f"{factor} must name the streams and the interval that it uses")

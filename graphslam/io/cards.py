@@ -151,13 +151,7 @@ def list_cards() -> tuple[Card, ...]:
 
 
 def find_card(name: str) -> Card:
-    """The data set description of that name.
-
-    Raises
-    ------
-    UnknownNameError
-        Says which names are close.
-    """
+    """The data set description of that name."""
     known = {c.name: c for c in list_cards()}
     if name not in known:
         raise UnknownNameError("data set", name, known)

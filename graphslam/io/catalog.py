@@ -121,19 +121,6 @@ def load_recording(source: str | os.PathLike[str], *, reader: str | None = None,
         By the reader. A pose network of g2o, TORO or iSAM gives the path of its file, for
         :func:`graphslam.io.network_file.read_network`. ``meta["reader"]`` of a log says who read what, with which
         options.
-
-    Raises
-    ------
-    UnknownNameError
-        Neither a data set nor a path; no such reader.
-    MissingDataError
-        The files of the data set are not on this machine; or something is missing in the folder, or a package.
-    FormatError
-        A file or folder that no reader knows.
-    DataError
-        A data set for which there is no reader.
-    ConfigError
-        An option that the reader has not.
     """
     text = os.fspath(source)
     known = {c.name for c in list_cards()}

@@ -319,11 +319,6 @@ class GaussianMap:
             How often everything that meets here is linearised.
         force : bool
             Nothing more will come: no factor may wait.
-
-        Raises
-        ------
-        IndeterminateError
-            A variable is not determined.
         """
         begin, enter = self.admitted(factors, force=force)
         return begin.solved(enter, lambda values: self.carried(self.step_to(values)), passes) if len(enter) else begin

@@ -90,13 +90,7 @@ def _plain(value: Any) -> type:
 
 
 def read_graph_arrays(path: str | os.PathLike[str]) -> tuple[Values, list[FactorRecord], dict[str, Any]]:
-    """Values, factors and parts of :func:`graph_arrays`.
-
-    Raises
-    ------
-    FormatError
-        A damaged file.
-    """
+    """Values, factors and parts of :func:`graph_arrays`."""
     arrays: dict[str, Any] = read_npz(path, fmt=GRAPH_FORMAT)
     try:
         dim = int(arrays["dim"])

@@ -277,11 +277,6 @@ def join_graph_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEsti
 
     A submap and the factors that enter with it measure old and new variables together. What they say of the old ones
     alone is a measurement update; the new ones follow, with their correlations.
-
-    Raises
-    ------
-    DataError
-        More states than a dense covariance has room for.
     """
     if problem.states > MOST_STATES:
         raise DataError("the dense filter has no room for so many states", got=problem.states, wanted=MOST_STATES)

@@ -89,11 +89,6 @@ class JoinProblem:
         Filters carry Gaussians, so a factor with a robust kernel has the weight that the kernel gives it at the values
         of the graph. The weighted sum and a constant (:attr:`offset`) have the value and the gradient of the robust
         sum there: its optimum is that of the graph.
-
-        Raises
-        ------
-        DataError
-            No submaps, or several sessions: submaps are joined along one chain.
         """
         chain = graph.submaps
         if not chain:

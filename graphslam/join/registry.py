@@ -144,10 +144,6 @@ def join_by_method(
     SubmapEstimate
         A :class:`~graphslam.join.joined_map.JoinResult` for landmark submaps in the plane, else a
         :class:`~graphslam.join.graph_join.GraphEstimate`.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError, DataError, GeometryError, CovarianceError
     """
     submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
     methods = methods_for(submaps)

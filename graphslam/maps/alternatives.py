@@ -172,11 +172,6 @@ def rank_alternatives(
         Of the same submaps, or of the same log.
     model : BeamModel, optional
         Whose clamp bounds the fused maps.
-
-    Raises
-    ------
-    DataError
-        Nothing to choose from.
     """
     if not alternatives:
         raise DataError("there are no graphs to choose from", wanted="one at least")

@@ -149,13 +149,7 @@ def has_maps(submaps: Sequence[Submap]) -> bool:
 
 
 def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
-    """Times ``(k,)`` and solved poses ``(k, 3|7)`` of the nodes of each submap, its base first, its exit left out.
-
-    Raises
-    ------
-    DataError
-        The map is not of these submaps.
-    """
+    """Times ``(k,)`` and solved poses ``(k, 3|7)`` of the nodes of each submap, its base first, its exit left out."""
     bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
     if len(bases) != len(submaps) + 1:
         raise DataError("the solved nodes are not those of the submaps", got=len(bases) - 1, wanted=len(submaps))
@@ -187,12 +181,6 @@ def make_run_map(
         Of the sensor [m].
     config : MapConfig, optional
         Heights of the floor plans.
-
-    Raises
-    ------
-    MissingDataError
-        Submaps without maps.
-    DataError, GridError, GeometryError
     """
     config = MapConfig() if config is None else config
     if not has_maps(submaps):

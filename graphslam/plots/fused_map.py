@@ -43,11 +43,6 @@ def plot_storey(
         ``T_world_body``; drawn where it is in the band, or less than 1.5 m below.
     truth : Trajectory, optional
         The true path in the same frame, drawn in the same way.
-
-    Raises
-    ------
-    GridError
-        A 2-D grid, or an empty band.
     """
     ax = plot_section(floor_plan(grid, low, high), ax, title=title or f"{low:.1f} to {high:.1f} m")
     for way, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path")):
@@ -131,12 +126,6 @@ def plot_cut(
         ``T_world_body``.
     truth : Trajectory, optional
         The true path in the same frame.
-
-    Raises
-    ------
-    DataError
-        A path in the plane.
-    ConfigError
     """
     if path.dim != 3:
         raise DataError("a path in the plane has no side", got=f"{path.dim}-D", wanted="3-D")

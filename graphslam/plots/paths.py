@@ -58,11 +58,6 @@ def plot_paths(
         Of each path that has covariances, spread over its length.
     plane : {"xy", "xz", "yz"}
         Seen from above, or from the side.
-
-    Raises
-    ------
-    DataError
-        No path, or one without that plane.
     """
     if plane not in ("xy", "xz", "yz"):
         raise ConfigError(f"plane {plane!r}; known: xy, xz, yz")

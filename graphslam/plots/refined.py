@@ -25,11 +25,6 @@ def plot_before_after(
     ----------
     graph, refined : Trajectory
         Where the refinement began, and its result. Covariances of the result are drawn as the σ that it claims.
-
-    Raises
-    ------
-    DataError
-        The paths share no time.
     """
     ax = style.new_axes(ax, (8.0, 3.2))
     begin = refined.times[0]

@@ -57,11 +57,6 @@ def plot_segments(
     truth : Trajectory or (n, dim), optional
     plane : {"xy", "xz", "yz"}
         Seen from above, or from the side.
-
-    Raises
-    ------
-    DataError
-        Nothing to draw.
     """
     if not paths:
         raise DataError("no segment to draw")

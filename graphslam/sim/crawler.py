@@ -58,13 +58,6 @@ def simulate_crawler(world: World, seed: int, config: CrawlerConfig = DEFAULTS, 
         Streams ``scanner`` (RangeScans; ``scanner2``, which looks back, if there are two), ``imu`` (Imu) and ``wheels``
         (VelocityControls). Truth at the rate of the IMU, in the frame of the first base made level; ``meta`` holds
         every figure, the errors that were drawn, and ``T_world_frame`` (7,), that frame in the world's.
-
-    Raises
-    ------
-    GeometryError, DataError
-        A world without triangles, or a way that cannot be driven.
-    GraphSlamError
-        Open3D is not there.
     """
     caster = RayCaster.of(world)
     motion = crawler_motion(world, config, caster)

@@ -59,10 +59,6 @@ def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
         building: ``drawn-17``, drawn by that number.
     seed : int
         Of what can be moved in it.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
     """
     found = MESH_WORLDS[name] if name in MESH_WORLDS else load_plugin("graphslam.worlds", "world", name, MESH_WORLDS)
     if not isinstance(found, MeshWorld):

@@ -55,11 +55,6 @@ class BatchSolver:
 
         Reweighting under robust kernels converges slowly, so with kernels it stops here when a step promises less than
         1e-6 of the objective; :meth:`solve_to_optimum` goes all the way.
-
-        Raises
-        ------
-        IndeterminateError
-            Names the unconstrained variables; the graph's values stay as they were.
         """
         kernels = self.graph.flat().has_kernels
         self._solve(replace(self.config, tolerance=max(self.config.tolerance, 1e-6)) if kernels else self.config)

@@ -185,11 +185,6 @@ def detect_trees(scans: LaserScans, config: TreeDetectorConfig | None = None) ->
     """Tree trunks as landmark observations, one entry a scan (a scan may be empty).
 
     The sigmas are ``config.noise``'s; see the module for both formulas.
-
-    Raises
-    ------
-    DataError
-        If the beams are not evenly spaced.
     """
     c = config or TreeDetectorConfig()
     found = find_trunks(scans, c)

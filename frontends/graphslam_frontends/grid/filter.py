@@ -151,11 +151,6 @@ class GridFilter:
         Storage of the maps; default one of its own.
     prune_every : int
         See :class:`~graphslam_frontends.grid.ancestry.Ancestry`.
-
-    Raises
-    ------
-    GeometryError
-        No such step, or an impossible start.
     """
 
     def __init__(

@@ -57,15 +57,6 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
     Returns
     -------
     Steps
-
-    Raises
-    ------
-    MissingDataError
-        No scanner or no motion.
-    DataError
-        A gap in the motion that is too long; a scanner whose clock is not that of the motion.
-    ConfigError
-        Streams that do not fit together.
     """
     config = config or StepConfig()
     count = DropCounter()

@@ -75,11 +75,6 @@ def run_segslam(
         See :class:`~graphslam_frontends.grid.ancestry.Ancestry`.
     watch : callable, optional
         Called with a :class:`~graphslam_frontends.segslam.progress.SegSlamProgress` after every step; changes nothing.
-
-    Raises
-    ------
-    DataError
-        Fewer than two steps: there is no interval.
     """
     if len(steps) < 2:
         raise DataError("too few steps for a segment", where=steps.name, got=len(steps), wanted="at least 2")

@@ -56,13 +56,7 @@ class SensorFactors(ABC):
 
     @abstractmethod
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
-        """Take readings, at any time and in any portion; returns the ids of their factors.
-
-        Raises
-        ------
-        EvidenceReusedError
-            A submap that holds a reading already used ``stream``, or the reading was given before. Nothing is changed.
-        """
+        """Take readings, at any time and in any portion; returns the ids of their factors."""
 
     def add_factors(self, submap: SubmapNode) -> None:  # noqa: B027
         """Factors of readings that waited for a submap, which is in the graph now."""

@@ -115,16 +115,6 @@ class ImuFactors(SensorFactors):
         -------
         list of int
             Ids of the new factors.
-
-        Raises
-        ------
-        EvidenceReusedError
-            A submap, or another factor, used the stream over an overlapping interval. Nothing is changed then.
-        DataError
-            Fewer than two readings; readings that were given before; or axes that are not those of the mounting, named.
-        GeometryError
-            A planar IMU in space.
-        ConfigError, CovarianceError
         """
         imu, stream = readings, stream or self.name
         known = self.used.get(stream)
@@ -173,11 +163,6 @@ class ImuFactors(SensorFactors):
         """Compare the axes of an IMU with the paths of the submaps; returns what is wrong in words, or nothing.
 
         Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
-
-        Raises
-        ------
-        DataError
-            The mounting is contradicted and ``axes`` is ``"refuse"``.
         """
         if axes == "ignore":
             return ""

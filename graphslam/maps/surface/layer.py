@@ -56,13 +56,7 @@ class SurfaceLayer:
     # --- pieces ----------------------------------------------------------------------------------------------
 
     def read(self, name: PieceId, scans: Iterable[Scan], pose: Array) -> SurfacePiece:
-        """Make the piece of a node of scans in the world frame, the node at ``pose`` ``(7,)``.
-
-        Raises
-        ------
-        DataError
-            The piece is there already, or points that are not finite.
-        """
+        """Make the piece of a node of scans in the world frame, the node at ``pose`` ``(7,)``."""
         piece = piece_of_scans(scans, pose, self.config)
         self.add(name, piece, pose)
         return piece
@@ -76,13 +70,7 @@ class SurfaceLayer:
         self.pieces[name], self.poses[name] = piece, T
 
     def move(self, poses: Mapping[PieceId, Array]) -> int:
-        """Put pieces at other poses ``(7,)``; number of those that moved.
-
-        Raises
-        ------
-        DataError
-            A node without a piece.
-        """
+        """Put pieces at other poses ``(7,)``; number of those that moved."""
         strange = [name for name in poses if name not in self.pieces]
         if strange:
             raise DataError("no surface was read at this node", got=strange[0])

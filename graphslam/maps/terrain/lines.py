@@ -108,11 +108,6 @@ def lines_of_scans(scans: RangeScans, path: Trajectory, height: float) -> ScanLi
         ``T_world_base`` in space, z up; each beam has the pose of its own time.
     height : float
         Of the sensor above the ground it drives on [m].
-
-    Raises
-    ------
-    DataError
-        A path in the plane, or one that does not cover the scans.
     """
     if path.dim != 3:
         raise DataError("terrain is read along a path in space", got=f"{path.dim}-D", wanted="3-D, z up")

@@ -128,10 +128,6 @@ class Pyramid:
     cells : tuple of float, optional
         Widths of the cells of the bands [m]; the same width for all is a map of a single resolution, in which all
         bands are *added*.
-
-    Raises
-    ------
-    ConfigError, GridError
     """
 
     def __init__(
@@ -192,13 +188,7 @@ class Pyramid:
         )
 
     def merge(self, other: Pyramid) -> None:
-        """Add the evidence of another pyramid of the same box and bands; the order of such sums means nothing.
-
-        Raises
-        ------
-        GridError
-            Another box or other bands.
-        """
+        """Add the evidence of another pyramid of the same box and bands; the order of such sums means nothing."""
         same = np.array_equal(self.first, other.first) and np.array_equal(self.shapes, other.shapes)
         if not same or not np.array_equal(self.cells, other.cells):
             raise GridError("terrain maps of different boxes or cells cannot be added")

@@ -44,10 +44,6 @@ class TerrainWeights:
         Probability above which a cell is not driven, fixed on the drives that the tables were learnt on.
     provenance : dict
         What they were learnt on.
-
-    Raises
-    ------
-    ConfigError
     """
 
     ratios: npt.NDArray[np.int32]
@@ -96,12 +92,7 @@ class TerrainWeights:
 
 
 def read_tables(path: str | Path = DEFAULT) -> TerrainWeights:
-    """Tables of a file; default those of the package, learnt for the panning line laser of the simulated streets.
-
-    Raises
-    ------
-    MissingDataError, FormatError
-    """
+    """Tables of a file; default those of the package, learnt for the panning line laser of the simulated streets."""
     shape = {
         "provenance": object, "threshold": float, "step": [[int]], "support": [[int]], "weights": [(float,) * WEIGHTS],
         "single": (float,) * WEIGHTS,

@@ -68,11 +68,6 @@ def grow_with_isam2(network: PoseNetwork, *, batch: int = 0, progress: bool = Fa
     ----------
     batch : int
         Poses an update; 0: as many as make :data:`UPDATES`.
-
-    Raises
-    ------
-    IndeterminateError
-        Measurements so far leave a pose free at some update.
     """
     batch = batch or -(-len(network) // UPDATES)
     try:

@@ -266,12 +266,6 @@ def solve_from(graph: FactorGraph, *starts: str) -> str:
     -------
     str
         Which start won; ``"present"`` are the graph's values.
-
-    Raises
-    ------
-    SolverError
-        The graph holds more than relative poses: the other starts know nothing else.
-    UnknownNameError
     """
     network = network_of(graph.flat(), graph.values)
     names = starts or tuple(n for n in default_starts(network) if n != "file")  # the graph's values are that

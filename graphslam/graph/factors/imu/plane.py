@@ -82,11 +82,6 @@ def planar_imu(imu: Imu, where: str) -> Imu:
     Imu
         Entries out of the plane are zero; ``T_base_imu`` is a shift. The noise of a unit with three axes holds the
         gravity that a body which leans has in the plane.
-
-    Raises
-    ------
-    DataError
-        The mean vertical force of a unit with three axes is not gravity.
     """
     rate, force = (quat_rotate(imu.T_base_imu[3:], a) for a in (imu.angular_rate, imu.specific_force))
     noise = imu.noise
