@@ -296,6 +296,7 @@ def test_largest_sigmas_are_those_of_the_longest_axes(rng):
     np.testing.assert_allclose(largest_sigmas(P), np.sqrt(np.linalg.eigvalsh(P)[:, -1]), rtol=1e-9)
     assert largest_sigmas(np.zeros((0, 3, 3))).shape == (0,)
     assert first_no_covariance(P) is None
+    assert first_no_covariance(np.zeros((2, 3, 3))) is None
     uneven = np.diag([1e-4, 1e-2, 1e6])[None]
     uneven[0, 0, 1] = 1e-3  # rounding of the largest entry, though not of the second
     assert first_no_covariance(uneven) is None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.errors import ConfigError, CovarianceError, DataError, EvidenceReusedError
-from graphslam.graph.ledger import Ledger
+from graphslam.graph.ledger import EXCLUSIVE, EvidenceUse, Ledger
 from graphslam.graph.noise import RobustKernel, whitener
 from tests.reference.graph_chain import correlated_covariance
 
@@ -165,3 +165,13 @@ def test_what_was_only_a_start_leaves_its_streams_to_be_spent() -> None:
     with pytest.raises(EvidenceReusedError, match="scan-pairs used it"):
         start.spend(4, "late", ["laser"], (9.0, 11.0))
     assert ledger.conflict("laser", (5.0, 6.0)).factor == "submap 0"  # the first ledger is as it was
+
+
+def test_a_declared_kind_is_entered_without_streams_and_a_measurement_is_not(ledger) -> None:
+    ledger.declare("calibration", "used to calibrate, variance inflated")
+    assert ledger.enter(7, "range x0 x1", "calibration") == "calibration"
+    (e,) = [e for e in ledger.entries() if e.factor_id == 7]
+    assert (e.stream, e.t_start, e.t_end, e.kind) == ("-", 0.0, 0.0, "calibration")
+    with pytest.raises(ConfigError, match="range x0 x2 must name the streams"):
+        ledger.enter(8, "range x0 x2", EXCLUSIVE)
+    assert ledger.enter(9, "range x0 x3", EvidenceUse(["radio"], (50.0, 51.0))) == EXCLUSIVE
