@@ -43,11 +43,9 @@ def examine_installation() -> list[InstallCheck]:
     """Python, packages, extras and what each buys, front ends, folders; "absent" is an optional part."""
     found = [InstallCheck("python", "ok", f"{platform.python_version()}, {os.cpu_count()} cores, {platform.system()}")]
     there = {name: all(find_spec(m) for m in e.modules) for name, e in EXTRAS.items()}
-    codes = {name: f"import {module}" for name, module in REQUIRED.items()}
-    for extra in (name for name, is_there in there.items() if is_there):
-        lines = [f"import_extra({module!r}, {extra!r})" for module in EXTRAS[extra].modules]
-        codes[f"extra {extra}"] = "\n".join(["from graphslam.core.extras import import_extra", *lines])
-    problems = dict(zip(codes, import_errors([*codes.values()])))
+    wanted = {name: f":{module}" for name, module in REQUIRED.items()}
+    wanted |= {f"extra {extra}": f"{extra}:{','.join(EXTRAS[extra].modules)}" for extra in there if there[extra]}
+    problems = dict(zip(wanted, import_errors([*wanted.values()])))
     found += [_finding(name, problems[name]) for name in REQUIRED]
     for extra, e in EXTRAS.items():
         problem = problems.get(f"extra {extra}", "not installed")
@@ -129,29 +127,39 @@ def _finding(name: str, problem: str) -> InstallCheck:
 
 
 _TRIES = """
-import os, sys, traceback
+import importlib, os, sys, traceback
 answers = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
-for code in sys.argv[1:]:
+for word in sys.argv[1:]:
     said = ""
+    extra, _, modules = word.partition(":")
     try:
-        exec(code)
+        for module in modules.split(","):
+            if extra:
+                importlib.import_module("graphslam.core.extras").import_extra(module, extra)
+            else:
+                importlib.import_module(module)
     except BaseException as error:
         said = traceback.format_exception_only(error)[-1].strip().splitlines()[-1]
     print(said, file=answers, flush=True)
 """
 
 
-def import_errors(codes: list[str]) -> list[str]:
-    """Of each piece of code, run one after the other in one process, the last line of its error; empty without one.
+def import_errors(wanted: list[str]) -> list[str]:
+    """Import modules one after the other in another process: the last line of each error, empty without one.
 
-    A piece that ends the interpreter is an error as well; those after it are run by another process.
+    A module that ends the interpreter is an error as well; those after it are imported by a further process.
+
+    Parameters
+    ----------
+    wanted : list of str
+        ``":module"``, or ``"extra:module,module"``.
     """
     found: list[str] = []
-    while len(found) < len(codes):
-        command = [sys.executable, "-c", _TRIES, *codes[len(found) :]]
+    while len(found) < len(wanted):
+        command = [sys.executable, "-c", _TRIES, *wanted[len(found) :]]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         found += done.stdout.splitlines()
-        if len(found) < len(codes):
+        if len(found) < len(wanted):
             found.append(f"import ended the interpreter with code {done.returncode}")
     return found

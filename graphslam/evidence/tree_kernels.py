@@ -18,18 +18,6 @@ NODES_USED, NODES_FREE, BRICKS_USED, BRICKS_FREE = 0, 1, 2, 3
 
 
 @kernel()
-def free_nodes(node_free, counters):
-    """Nodes that can be taken without growing."""
-    return node_free.shape[0] - counters[NODES_USED] + counters[NODES_FREE]
-
-
-@kernel()
-def free_bricks(brick_free, counters):
-    """Bricks that can be taken without growing."""
-    return brick_free.shape[0] - counters[BRICKS_USED] + counters[BRICKS_FREE]
-
-
-@kernel()
 def take_node(children, node_ref, node_occupied, node_free, counters):
     """An empty node with one parent."""
     if counters[NODES_FREE] > 0:

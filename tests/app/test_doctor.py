@@ -39,9 +39,16 @@ def test_what_an_old_install_left_is_found(tmp_path: Path) -> None:
     assert f"rm -r {tmp_path / 'graphslam'}" in finding.detail
 
 
-def test_what_fails_is_said_and_what_comes_after_it_is_tried() -> None:
-    codes = ["import json", "print('noise'); import no_such_module", "import os; os._exit(7)", "raise SystemExit", ""]
-    assert doctor.import_errors(codes) == [
+def test_what_fails_is_said_and_what_comes_after_it_is_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = {
+        "noisy": "print('noise'); import no_such_module",
+        "ends": "import os; os._exit(7)",
+        "leaves": "raise SystemExit",
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert doctor.import_errors([":json", ":noisy", ":ends", ":leaves", ":json"]) == [
         "",
         "ModuleNotFoundError: No module named 'no_such_module'",
         "import ended the interpreter with code 7",

@@ -50,7 +50,7 @@ class RbpfEkf(FrontEnd):
         """
         if not corrected or self.config.lasting is not None or "lasting" in asked:
             return self
-        return RbpfEkf(replace(self.config, lasting=possible_biases(log, self.config.detector)))
+        return type(self)(config=replace(self.config, lasting=possible_biases(log, self.config.detector)))
 
     def follow(
         self,
