@@ -48,6 +48,15 @@ def study(
     Study
         Also written to the folder: ``table.csv``, ``timings.csv``, ``report.md``, ``figures/``.
 
+    Raises
+    ------
+    UnknownNameError, ConfigError
+        Unknown study or world, or an impossible option.
+    RunFolderError
+        The folder holds another study.
+    KeyboardInterrupt
+        After what is done has been written.
+
     Examples
     --------
     >>> study = gs.study("charts", 1, quick=True, out="studies/one", progress=False)
@@ -81,6 +90,13 @@ def open_study(folder: str | Path, definition: Any = None) -> Any:
     Study
         Its tidy ``table`` (``world, run, algorithm, submap, quantity, value``), ``report()`` and figures.
 
+    Raises
+    ------
+    MissingDataError, FormatError
+        Not the folder of a study.
+    UnknownNameError
+        A study that is not registered.
+
     Examples
     --------
     >>> made = gs.study("charts", 1, quick=True, out="studies/charts", progress=False)
@@ -101,6 +117,13 @@ def find_study(name: str) -> Any:
     -------
     StudyDefinition
         Name, worlds, algorithms, and what one trial is.
+
+    Raises
+    ------
+    UnknownNameError
+        Nothing is registered under that name.
+    ConfigError
+        ``module:object`` cannot be imported, or is no study.
 
     Examples
     --------

@@ -89,6 +89,10 @@ def simulate(
     SensorLog
         With its truth, in the frame of the first base [m, rad].
 
+    Raises
+    ------
+    UnknownNameError, ConfigError
+
     Examples
     --------
     >>> gs.simulate("landmark-field", preset="quick", seed=1)

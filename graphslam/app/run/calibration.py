@@ -95,6 +95,11 @@ def calibrate_log(
     Calibration
         ``corrections`` [SI units, rad], σ of each, ``config()`` for :func:`run`, and reasons for missing estimates.
 
+    Raises
+    ------
+    GraphSlamError
+        Or one of its children: the log does not determine its noise.
+
     Examples
     --------
     >>> found = gs.calibrate_log(log, quick=True)

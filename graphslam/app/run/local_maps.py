@@ -55,6 +55,11 @@ def local_maps(
     list of Submap
         Each in the frame of its first pose [m, rad].
 
+    Raises
+    ------
+    GraphSlamError
+        Or one of its children.
+
     Examples
     --------
     >>> submaps = gs.local_maps(log, "rbpf-ekf", seed=1)
@@ -91,6 +96,13 @@ def first_particles(
         In the frame of its first pose [m, rad].
     particles : ParticleSet
         Poses ``(N, 3)`` in the same frame, weights ``(N,)``, and the landmarks of each.
+
+    Raises
+    ------
+    ConfigError
+        The front end has no particles to show.
+    GraphSlamError
+        Or another of its children.
 
     Examples
     --------

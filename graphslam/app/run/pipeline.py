@@ -66,6 +66,11 @@ def run(
     Run
         In the frame of the first base [m, rad].
 
+    Raises
+    ------
+    GraphSlamError
+        Or one of its children; says what, where, got, wanted.
+
     Examples
     --------
     >>> made = gs.run(log, frontend="rbpf-ekf", solver="batch", config={"frontend": {"particles": 10}}, progress=False)
