@@ -1,7 +1,7 @@
 """Landmarks that turned out to be one.
 
 Two tests with different blind spots. The Mahalanobis test believes the covariances and never merges two landmarks of
-one submap, so it cannot repair a duplicate that a front end made inside a submap, nor a split from an over-confident
+one submap, so it cannot repair a duplicate that a front end made inside a submap, nor a split from an overconfident
 covariance. The Euclidean test knows only how close two things of the kind can stand (trees do not grow within 0.7 m
 of each other, and the detector isolates them by metres) and repairs both.
 """

@@ -45,7 +45,7 @@ TOGETHER = 40
 """… stretches of so many are looked at, so that short and long times are both told."""
 NAT = 0.5
 """Of parameters whose log-likelihood is this near to the best, those with the strongest lasting part are taken: a bias
-that is believed too small makes a map over-confident, one that is believed too large costs accuracy."""
+that is believed too small makes a map overconfident, one that is believed too large costs accuracy."""
 LOOSE = 1e3
 """σ of each number of the datum, of which fixes tell nothing here."""
 

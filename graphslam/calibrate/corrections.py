@@ -12,12 +12,20 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import SensorLog
-from graphslam.core.poses import group_of
+from graphslam.core.poses import compose_increments, group_of
 from graphslam.core.records import LandmarkObservations, Odometry, SteeringControls, Stream, VelocityControls
-from graphslam_frontends.odometry.motion import MotionNoise, motion_stream, steering_odometry, velocity_odometry
+from graphslam_frontends.odometry.motion import (
+    MotionNoise,
+    dead_reckoned_increments,
+    motion_stream,
+    steering_odometry,
+    velocity_odometry,
+)
 
 _LEAST = (1e-9, 1e-10)
 _MOVING = 1e-9
+CERTAIN = 3.3
+"""σ that a normal variable exceeds once in a thousand cases."""
 VISIT = 5.0
 """A landmark that was out of sight for longer is visited anew [s]."""
 
@@ -141,6 +149,31 @@ def apply_corrections(log: SensorLog, c: Corrections) -> SensorLog:
         if other != name:
             streams[other] = corrected_sightings(stream, c) if isinstance(stream, LandmarkObservations) else stream
     return replace(log, streams=streams)
+
+
+def moved_end(log: SensorLog, corrected: SensorLog, noise: MotionNoise) -> tuple[float, float]:
+    """How far corrections move the end of the dead-reckoned path, and how far the noise of both paths allows [m].
+
+    Parameters
+    ----------
+    noise : MotionNoise
+        Of controls; recorded odometry brings its own covariances.
+    """
+    ends, covariance = [], 0.0
+    for each in (log, corrected):
+        odometry = motion_stream(each)[1]
+        if not isinstance(odometry, Odometry):
+            odometry = dead_reckoned_increments(each, odometry.times, noise)[0]
+        G = group_of(odometry.increments)
+        poses = compose_increments(odometry.increments)[1:]
+        after = G.inverse(G.between(poses, np.broadcast_to(poses[-1], poses.shape)))
+        A = G.adjoint(after)  # T_i Exp(δ) T_i,end = T_end Exp(Ad(T_i,end⁻¹) δ)
+        covariance = covariance + np.einsum("nij,njk,nlk->il", A, odometry.covariances, A)[G.position, G.position]
+        ends.append(poses[-1])
+    moved = G.between(*ends)[: len(covariance)]
+    d = float(np.linalg.norm(moved))
+    along = moved / max(d, 1e-12)
+    return d, CERTAIN * float(np.sqrt(along @ covariance @ along))
 
 
 def corrected_sightings(s: LandmarkObservations, c: Corrections) -> LandmarkObservations:

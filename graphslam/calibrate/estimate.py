@@ -104,20 +104,20 @@ class Prediction:
 
     @property
     def taken(self) -> str:
-        """``all``, ``noise``, or ``nothing`` of the estimate."""
+        """``all``, ``noise``, or ``nothing`` of the estimate: it replaces what the log states only if it wins."""
         best = max(self.gains, key=lambda k: self.gains[k])
-        return best if self.gains[best] > 0.0 else "nothing"
+        return best if self.gains[best] > GAIN else "nothing"
 
     def in_words(self) -> str:
         """What they say."""
-        test = f"cross-validation on {self.count} {self.what}: log-likelihood"
+        test = f"cross-validation on {self.count} {self.what} [+{GAIN:g} nats needed]: log-likelihood"
         gain = self.gains["all"]
         if self.taken == "all":
             return f"{test} +{gain:.0f} nats with the estimated noise and calibration"
         if self.taken == "noise":
             less = self.gains["noise"] - gain
             return f"{test} +{less:.0f} nats with the estimated noise alone, without the systematic errors"
-        return f"{test} {gain:.0f} nats with the estimated noise and calibration"
+        return f"{test} {gain:+.0f} nats with the estimated noise and calibration"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,14 +170,14 @@ class Calibration:
         taken = "all" if self.prediction is None else self.prediction.taken
         if self.prediction is not None:
             text = f"{self.prediction.in_words()} ({self.data})"
+            alike = taken == "nothing" and self.prediction.gains["all"] > -GAIN
             text += {
                 "all": " — used.",
                 "noise": " — systematic errors are not corrected.",
-                "nothing": " — the estimate is not used.",
+                "nothing": " — the noise of the log is kept." if alike else " — the estimate is not used.",
             }[taken]
-            out.append(
-                Finding("", "calibrated", text) if taken == "all" else Finding("look", "calibration-refused", text)
-            )
+            right = taken == "all" or alike
+            out.append(Finding("", "calibrated", text) if right else Finding("look", "calibration-refused", text))
         for e in self.estimates:
             said = estimate_text(e.name, e.value, e.sigma)
             if e.applied:

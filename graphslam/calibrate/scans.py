@@ -39,6 +39,9 @@ FREEDOM = 4.0
 ALIKE = 0.9
 """Constants whose errors are correlated more than this are one."""
 LEAST = 30
+LEAST_SHARE = 0.5
+"""Share of the neighbouring pairs that must match. Where most do not, as along a street, matches are a biased sample,
+and the half of them that is held out is biased alike."""
 MATCHING = {
     2: RegistrationConfig(radii=(1.0, 0.3), near=0.15),
     3: RegistrationConfig(radii=(1.0, 0.5), near=0.4),
@@ -107,7 +110,7 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
     growing = (dt * moving, d, turns, np.abs(turns), variances[:, g.heading], variances[:, g.position].mean(axis=1))
     sums = [np.cumsum(v) for v in growing]
     targets: dict[int, Target] = {}
-    rows = []
+    rows, tried = [], 0
     config = MATCHING[steps.dim]
     for apart in APART[steps.dim]:
         count = len(keys) - apart
@@ -122,6 +125,7 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
                     targets[k] = Target(points[returns], voxel=VOXEL[steps.dim])
             if min(len(targets[a]), len(targets[b])) < config.least_points:
                 continue
+            tried += apart == 1
             found = register(targets[b], targets[a], T, config)
             if not found.converged or found.fitness < FITNESS:
                 continue
@@ -141,6 +145,10 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
             rows.append([apart, *gone, chord, float(e[g.heading]), along, side])
     if len(rows) < LEAST:
         raise DataError("too few scans match to calibrate the odometry", where=steps.name, got=len(rows), wanted=LEAST)
+    near = sum(row[0] == 1 for row in rows)
+    if near < LEAST_SHARE * tried:
+        got, wanted = f"{near} of {tried} neighbouring key scans", f"{LEAST_SHARE:.0%}"
+        raise DataError("most scans do not match the next: a biased sample", where=steps.name, got=got, wanted=wanted)
     return ScanPairs(**dict(zip(ScanPairs.__dataclass_fields__, np.array(rows).T)))
 
 

@@ -203,7 +203,7 @@ def equal_tail_gate(gate: float, dof: int, other_dof: int) -> float:
 def chi2_mean_bounds(dof: float, runs: int, confidence: float = 0.95) -> tuple[float, float]:
     """Two-sided bounds of the *mean* of ``runs`` independent chi-square values of ``dof`` each.
 
-    An estimator whose mean NEES lies below the lower bound is pessimistic; above the upper, over-confident.
+    An estimator whose mean NEES lies below the lower bound is conservative; above the upper, overconfident.
     """
     a = (1.0 - confidence) / 2.0
     n = dof * runs

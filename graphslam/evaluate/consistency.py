@@ -2,7 +2,7 @@
 
 Combined SLAM (2012): ``D² = (x - x̂)ᵀ P⁻¹ (x - x̂)`` (eq. 18), consistent if ``D² < χ²_{n,1-α}`` (eq. 19), index
 ``CI = D²/χ²_{n,1-α}`` (eq. 20). ``CI < 1`` alone is a weak test: with three degrees of freedom it passes an
-estimator whose covariance is 2.6 times too small, and it never complains of a pessimistic one. The verdict here
+estimator whose covariance is 2.6 times too small, and it never complains of a conservative one. The verdict here
 therefore rests on the *mean* NEES over independent runs and its two-sided χ² bounds; CI is reported beside it.
 
 Poses are judged by their right-tangent error ``ξ = Log(T_est⁻¹ T_true)`` in GTSAM's order.
@@ -25,7 +25,7 @@ from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_log, wrap
 from graphslam.core.markup import pair_list
 
 Unit = Literal["run", "value"]
-Verdict = Literal["consistent", "over-confident", "pessimistic"]
+Verdict = Literal["consistent", "overconfident", "conservative"]
 
 
 def pose_error(estimate: ArrayLike, truth: ArrayLike) -> Array:
@@ -150,7 +150,7 @@ class Consistency:
 
     @property
     def mean_normalised(self) -> float:
-        """Mean of ``D²/n``: 1 for a consistent estimator, above it over-confident, below it pessimistic."""
+        """Mean of ``D²/n``: 1 for a consistent estimator, above it overconfident, below it conservative."""
         if self.unit == "value":
             known = np.isfinite(self.nees)
             return float(np.sum(self.nees[known]) / np.sum(self.dof[known]))
@@ -174,10 +174,10 @@ class Consistency:
 
     @property
     def verdict(self) -> Verdict:
-        """``over-confident`` above the bounds, ``pessimistic`` below, else ``consistent``."""
+        """``overconfident`` above the bounds, ``conservative`` below, else ``consistent``."""
         low, high = self.bounds
         m = self.mean_normalised
-        return "over-confident" if m > high else "pessimistic" if m < low else "consistent"
+        return "overconfident" if m > high else "conservative" if m < low else "consistent"
 
     @property
     def index(self) -> Array:

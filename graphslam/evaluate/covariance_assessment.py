@@ -1,20 +1,20 @@
-"""Can the covariances of a map be believed, where no truth is known? One word, and what it rests on.
+"""Are the covariances of a map consistent, where no ground truth is known? One word, and the tests behind it.
 
-Every test without truth that a run has made is one row of evidence: its statistic, the degrees of freedom that
-independent residuals would have, and with these how probable it is that an honest run shows so large or so small a
-value. The word follows from all of them together:
+Each test that a run has made without ground truth is a `ConsistencyTest`: a statistic, its degrees of freedom, and the
+probability that a consistent run shows so large or so small a value. One word follows from all tests together:
 
-- *over-confident* if errors are too large in any of them, or last: alike from one residual to the next, from window to
-  window, or as a constant error of calibration. Rows share one level (Bonferroni), so that an honest run is called
-  wrong in at most :data:`LEVEL` of the cases however many tests it has;
-- *cannot be decided from this log* where the rows could not have seen an error that matters: of motion and sightings,
-  and of fixes if any were used, some row must exclude that variances are :data:`DETECTABLE_VARIANCE_RATIO` times as
-  large as stated; and where submaps bend by more than :data:`MAX_NONLINEARITY`, so that no Gaussian describes them (all
-  rows hold Gaussians);
-- *pessimistic* if errors are too small in any of them, and by as much as matters, and none of the above;
-- *consistent* else.
+- *overconfident*: errors are too large in a test, by more than :data:`TOLERANCE` allows, or they are correlated: from
+  one residual to the next, from window to window, or as a constant calibration error. The tests share one significance
+  level (Bonferroni): a consistent run is called overconfident in at most :data:`LEVEL` of the cases;
+- *not tested*: no test of motion and observations, or none of the fixes if the graph has any, had the power
+  :data:`LEAST_POWER` to show covariances that are half as large as they should be, or could exclude variances that are
+  :data:`DETECTABLE_VARIANCE_RATIO` times as large as stated; or the posteriors of submaps are not Gaussian
+  (:data:`MAX_NONLINEARITY`), which all tests assume;
+- *conservative*: errors are too small in a test, by as much as matters, and none of the above;
+- *consistent*: otherwise.
 
-Small residuals alone never make a map pessimistic: the first rule comes before the third.
+Small residuals alone never make a map conservative, because a map follows errors that are correlated: the first rule
+comes before the third.
 """
 
 from __future__ import annotations
@@ -29,10 +29,17 @@ from scipy import special
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.bias_test import BiasTest
 
-Word = Literal["consistent", "over-confident", "pessimistic", "undecided"]
+Word = Literal["consistent", "conservative", "not tested", "overconfident"]
 Of = Literal["map", "fixes", "other"]
 LEVEL = 0.05
-"""Share of honest runs that are called wrong, at most."""
+"""Largest share of consistent runs that are called overconfident."""
+TOLERANCE = 1.1
+"""Ratio of true to stated variances that is called consistent: 5 % of σ. Linearised covariances are no better, and a
+test with a thousand degrees of freedom detects less."""
+HALF = 2.0
+"""Ratio of true to stated variances at which the power of a test is computed: covariances half as large as the true."""
+LEAST_POWER = 0.8
+"""Power against covariances that are too small by :data:`HALF`, below which a test cannot carry *consistent*."""
 DETECTABLE_VARIANCE_RATIO = 1.5
 """Ratio of true to stated variances that a decision must exclude."""
 SURE = 0.975
@@ -59,7 +66,8 @@ class ConsistencyTest:
     dof : float
         Of independent residuals.
     too_large, too_small : float
-        Probability that an honest run shows at least, or at most, this value.
+        Probability that a run whose variances are at most :data:`TOLERANCE` times as large as stated shows at least,
+        or that a consistent run shows at most, this value.
     lasting : bool
         It looks for errors that last, not for their size.
     """
@@ -77,13 +85,24 @@ class ConsistencyTest:
         """Ratio of true to stated variances that is still possible."""
         return self.value * self.dof / max(chi2_quantile(1.0 - SURE, self.dof), 1e-12)
 
+    def power(self, tests: int) -> float:
+        """Probability that this test, one of so many, detects covariances that are too small by :data:`HALF`."""
+        if self.lasting:
+            return 0.0
+        return detection_power(self.dof, TOLERANCE * chi2_quantile(1.0 - LEVEL / tests, self.dof))
+
+
+def detection_power(dof: float, limit: float) -> float:
+    """Probability that χ² exceeds ``limit`` if the covariances are too small by :data:`HALF`."""
+    return float(special.chdtrc(dof, limit / HALF))
+
 
 def chi_square_ratio_test(name: str, of: Of, value: float, dof: float) -> list[ConsistencyTest]:
     """A statistic χ²/dof; none where it has hardly any degrees of freedom."""
     if not (np.isfinite(value) and np.isfinite(dof) and dof >= LEAST_DOF):
         return []
     chi2 = value * dof
-    large, small = float(special.chdtrc(dof, chi2)), float(special.chdtr(dof, chi2))
+    large, small = float(special.chdtrc(dof, chi2 / TOLERANCE)), float(special.chdtr(dof, chi2))
     return [ConsistencyTest(name, of, float(value), float(dof), large, small)]
 
 
@@ -113,19 +132,21 @@ def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
 
 @dataclass(frozen=True, slots=True)
 class CovarianceAssessment:
-    """The word, and what it rests on.
+    """The word, and the tests behind it.
 
     Parameters
     ----------
     word : str
     speaking : tuple of ConsistencyTest
-        Rows that decided it: those that are too large or too small; for the other words those that cover it.
+        Tests that decided it: those that are too large or too small; for the other words those with enough power.
     chance : float
-        Probability that an honest run has a row like the worst, all rows counted.
+        Probability that a consistent run has a test like the worst, all tests counted.
     missing : tuple of str
-        What nothing in this log could have seen.
+        What no test in this log could have shown.
     bent : bool
-        Submaps are no Gaussians.
+        Posteriors of submaps are not Gaussian.
+    power : float
+        Of the tests behind the word, against covariances that are too small by :data:`HALF`.
     """
 
     word: Word
@@ -133,6 +154,7 @@ class CovarianceAssessment:
     chance: float
     missing: tuple[str, ...] = ()
     bent: bool = False
+    power: float = 0.0
 
 
 def assess_covariances(
@@ -150,24 +172,26 @@ def assess_covariances(
     m = max(1, sum(1 if r.lasting else 2 for r in rows))
     large = sorted((r for r in rows if m * r.too_large < LEVEL), key=lambda r: r.too_large)
     if large:
-        return CovarianceAssessment("over-confident", tuple(large), min(1.0, m * large[0].too_large))
+        return CovarianceAssessment("overconfident", tuple(large), min(1.0, m * large[0].too_large))
     wanted: dict[Of, str] = {"map": "odometry and observations"}
     if fixes:
         wanted["fixes"] = "fixes"
     covers = {
-        of: [r for r in rows if r.of == of and not r.lasting and r.upper <= DETECTABLE_VARIANCE_RATIO] for of in wanted
+        of: [r for r in rows if r.of == of and r.power(m) >= LEAST_POWER and r.upper <= DETECTABLE_VARIANCE_RATIO]
+        for of in wanted
     }
     missing = tuple(what for of, what in wanted.items() if not covers[of])
+    power = min((max((r.power(m) for r in found), default=0.0) for found in covers.values()), default=0.0)
     bent = nonlinearity > MAX_NONLINEARITY
     if missing or bent:
         return CovarianceAssessment(
-            "undecided", tuple(r for found in covers.values() for r in found), 1.0, missing, bent
+            "not tested", tuple(r for found in covers.values() for r in found), 1.0, missing, bent, power
         )
     small = [r for r in rows if m * r.too_small < LEVEL and r.value < 1.0 / DETECTABLE_VARIANCE_RATIO]
     small.sort(key=lambda r: r.too_small)
     if small:
-        return CovarianceAssessment("pessimistic", tuple(small), min(1.0, m * small[0].too_small))
-    return CovarianceAssessment("consistent", tuple(r for found in covers.values() for r in found), 1.0)
+        return CovarianceAssessment("conservative", tuple(small), min(1.0, m * small[0].too_small), power=power)
+    return CovarianceAssessment("consistent", tuple(r for found in covers.values() for r in found), 1.0, power=power)
 
 
 def pooled_nonlinearity(reports: Sequence[Mapping[str, Any]]) -> float:

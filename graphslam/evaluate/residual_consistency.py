@@ -5,7 +5,7 @@ Residuals at the optimum are smaller than the noise, because the unknowns were f
 (:mod:`graphslam.evaluate.gps_innovation`) and loops against each other
 (:mod:`graphslam.evaluate.loop_consistency`) are the other two tests that need nothing but the data.
 
-All are two-sided: below the bounds an estimate is pessimistic, and its gates let in what they should keep out.
+All are two-sided: below the bounds an estimate is conservative, and its gates let in what they should keep out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import GpsBatch
 from graphslam.graph.noise import robust_terms
 
-LASTING = "correlated: over-confident"
+LASTING = "correlated: overconfident"
 """Verdict on residuals that are alike from one to the next, whatever their size."""
 JUDGED_WITH = {"path": "gps"}
 """Factors that measure nothing by themselves: points of a path are there for the fixes, and share their residuals."""
@@ -38,7 +38,7 @@ def two_sided_bounds(ratio: float, dof: float, confidence: float) -> tuple[float
     """Bounds of ``χ²_dof / dof`` and the verdict on ``ratio``."""
     a = (1.0 - confidence) / 2.0
     low, high = (float(np.divide(chi2_quantile(q, dof), dof)) for q in (a, 1.0 - a))
-    return low, high, "over-confident" if ratio > high else "pessimistic" if ratio < low else "consistent"
+    return low, high, "overconfident" if ratio > high else "conservative" if ratio < low else "consistent"
 
 
 def correlated_dof(covariance: Array, d: int) -> float:
@@ -108,7 +108,7 @@ class ClassConsistency:
         """One row of a table, with the two-sided bounds of the ratio and the verdict.
 
         The bounds are those of ``χ²_dof``. One class of several is a part of a projection and varies less, so they are
-        wide rather than narrow. Residuals that are alike from one to the next are over-confident whatever their size:
+        wide rather than narrow. Residuals that are alike from one to the next are overconfident whatever their size:
         a map that follows errors that last has small residuals.
         """
         low, high, verdict = float("nan"), float("nan"), "no redundancy"

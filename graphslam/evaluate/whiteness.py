@@ -1,6 +1,6 @@
 """Are residuals independent from one to the next? What errors that last do to a series, and what it is still worth.
 
-A map follows errors that last, so their residuals are *small*, and a test of size alone calls such a map pessimistic
+A map follows errors that last, so their residuals are *small*, and a test of size alone calls such a map conservative
 while it is wrong by several of its own σ. What is left of them is alike from one to the next. So the sign of a verdict
 comes from the correlation first, and the size is judged by as many degrees of freedom as independent residuals there
 are.

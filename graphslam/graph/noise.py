@@ -29,7 +29,7 @@ def whitener(cov: ArrayLike, *, what: str = "covariance", dim: int | None = None
     dim : int, optional
         Wanted d.
     scale : float
-        Factor on the covariance (> 0): 5 says that the front end is over-confident by a factor of 5 in variance.
+        Factor on the covariance (> 0): 5 says that the front end is overconfident by a factor of 5 in variance.
     """
     if not (np.isfinite(scale) and scale > 0):
         raise CovarianceError(f"scale of the {what} is not usable", got=scale, wanted="> 0")

@@ -16,8 +16,8 @@ from graphslam.plots import style
 def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency) -> Axes:
     """``D²/3`` of every pair of loops (off the diagonal) and of every loop against the chain (on it).
 
-    White is expected of a consistent map. A false loop is a dark cross, an over-confident front end a dark page, a
-    pessimistic one a pale blue page.
+    White is expected of a consistent map. A false loop is a dark cross, an overconfident front end a dark page, a
+    conservative one a pale blue page.
     """
     ax = style.new_axes(ax, (6.5, 5.5))
     ax.grid(False)

@@ -76,6 +76,17 @@ def test_scans_that_see_nothing_are_refused(log) -> None:
         calibrate_scans(make_steps(nothing, StepConfig(period=None)), QUICK)
 
 
+def test_matches_of_few_places_are_no_fair_sample(log) -> None:
+    """Along a street most scans do not match; those that do once made good wheels six times worse."""
+    scans = log["scans"]
+    rng = np.random.default_rng(5)
+    street = rng.random(len(scans.ranges)) < 0.55
+    ranges = np.where(street[:, None], rng.uniform(1.0, 9.0, scans.ranges.shape), scans.ranges)
+    few = dataclasses.replace(log, streams={**log.streams, "scans": dataclasses.replace(scans, ranges=ranges)})
+    with pytest.raises(DataError, match=r"biased sample.* of .* neighbouring key scans; wanted 50%"):
+        calibrate_scans(make_steps(few, StepConfig(period=None)), QUICK)
+
+
 def test_regression_finds_noise_that_grows_and_is_not_led_by_outliers() -> None:
     rng = np.random.default_rng(1)
     d = rng.choice([0.4, 1.3], 600)

@@ -12,8 +12,11 @@ from typer.testing import CliRunner
 import graphslam as gs
 from graphslam.app.cli import app
 from graphslam.app.cli.run import join_note
+from graphslam.app.run.calibration import keep_user_settings
+from graphslam.app.run.front_ends import recommended_options
+from graphslam.app.run.options import RunOptions
 from graphslam.calibrate.clock import profile_clock
-from graphslam.calibrate.corrections import Corrections, apply_corrections
+from graphslam.calibrate.corrections import Corrections, apply_corrections, moved_end
 from graphslam.calibrate.estimate import Estimate
 from graphslam.calibrate.landmark_calibration import LONG, QUICK, RAN_AWAY, SHORT, calibrate_sightings
 from graphslam.calibrate.landmarks import fit_noise, smooth_sightings
@@ -22,7 +25,10 @@ from graphslam.calibrate.smoothing import CONSTANTS
 from graphslam.calibrate.windows import SightingLog, window_scans
 from graphslam.core.config import read_toml
 from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import se2_between, se2_compose, se2_exp
+from graphslam.core.poses import compose_increments
 from graphslam.io.log_store import save_log
+from graphslam_frontends.landmarks.rbpf_ekf import RbpfEkf
 from graphslam_frontends.odometry.motion import MotionNoise
 from graphslam_studies.calibration_robot import draw_robot, drive
 
@@ -214,3 +220,52 @@ def test_a_scale_that_runs_away_is_held_and_the_noise_is_found(data_dir):
     assert found.corrections.distance_scale == 1.0
     assert 0.01 < found.noise["range_sigma"] < 0.1
     assert int(found.data.split()[3]) > 900  # sightings: nearly none is trimmed
+
+
+def test_no_constant_is_corrected_twice() -> None:
+    """A file of options that corrects ranges, on top of an estimate of the same error, divided it out twice."""
+    c = Corrections(range_scale=1.066, range_offset=0.1, turn_per_metre=0.01, yaw_bias=0.02, along_metre=0.1)
+    own = {"frontend": {"noise": {"range_scale": 1.066}, "steps": {"yaw_per_metre": 0.01}}}
+    kept = keep_user_settings(c, own)
+    assert (kept.range_scale, kept.range_offset, kept.turn_per_metre) == (1.0, 0.0, 0.0)
+    assert (kept.yaw_bias, kept.along_metre) == (0.02, 0.1)
+    assert keep_user_settings(c, {"frontend": {"smoothing_noise": None}}) == c
+
+
+def test_a_preset_of_another_set_is_read_without_its_noise(log) -> None:
+    assert recommended_options(log, "rbpf-ekf", "victoria-park")["frontend"].keys() & {"motion", "noise"}
+
+    def set_by_preset(**calibrate: str) -> set[str]:
+        config = {"preset": "victoria-park", "calibrate": calibrate}
+        options = RunOptions.for_log(log, "rbpf-ekf", "batch", 0, config)
+        default = RbpfEkf().config
+        assert options.front is not None
+        return {k for k in ("motion", "noise") if getattr(options.front.config, k) != getattr(default, k)}
+
+    assert set_by_preset() == set()
+    assert set_by_preset(use="none")
+
+
+def test_the_end_of_a_corrected_path_moves_as_a_monte_carlo_says(log) -> None:
+    c = Corrections(distance_scale=1.02, yaw_bias=0.002)
+    corrected = apply_corrections(log, c)
+    moved, allowed = moved_end(log, corrected, MotionNoise())
+    odometry = [each["odometry"] for each in (log, corrected)]
+    end = [compose_increments(o.increments)[-1] for o in odometry]
+    assert moved == pytest.approx(np.hypot(*(end[0] - end[1])[:2]), rel=1e-6)
+    rng = np.random.default_rng(0)
+    direction = se2_between(*end)[:2] / moved
+    ends = []
+    for o in odometry:
+        root = np.linalg.cholesky(o.covariances[1:] + 1e-12 * np.eye(3))
+        noise = se2_exp(np.einsum("nij,rnj->rni", root, rng.standard_normal((400, len(root), 3))))
+        drawn = [
+            compose_increments(np.concatenate([o.increments[:1], se2_compose(o.increments[1:], e)])) for e in noise
+        ]
+        ends.append(
+            se2_between(np.broadcast_to(compose_increments(o.increments)[-1], (400, 3)), np.array(drawn)[:, -1])
+        )
+    R = se2_between(*end)[2]
+    turned = ends[1][:, :2] @ np.array([[np.cos(R), np.sin(R)], [-np.sin(R), np.cos(R)]])
+    sigma = np.sqrt(np.var(ends[0][:, :2] @ direction) + np.var(turned @ direction))
+    assert allowed == pytest.approx(3.3 * sigma, rel=0.12)

@@ -134,13 +134,13 @@ def test_honest_estimator_is_consistent_as_often_as_stated(unit: str, rng: np.ra
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 400, 0.95)
     assert low <= passed <= high
     # both kinds of false alarm occur: the bounds are two-sided
-    assert {"over-confident", "pessimistic"} <= set(verdicts)
+    assert {"overconfident", "conservative"} <= set(verdicts)
 
 
 @pytest.mark.parametrize("unit", ["run", "value"])
 @pytest.mark.parametrize(
     ("claim", "verdict"),
-    [(1 / 1.8, "over-confident"), (1.8, "pessimistic"), (0.1, "over-confident"), (10, "pessimistic")],
+    [(1 / 1.8, "overconfident"), (1.8, "conservative"), (0.1, "overconfident"), (10, "conservative")],
 )
 def test_dishonest_estimators_fail(unit: str, claim: float, verdict: str, rng: np.random.Generator) -> None:
     """A covariance that is wrong by 1.8 (σ by 1.34) must be caught with 50 runs, in either direction."""
@@ -151,7 +151,7 @@ def test_dishonest_estimators_fail(unit: str, claim: float, verdict: str, rng: n
 def test_ci_below_one_passes_an_estimator_that_the_verdict_rejects(rng: np.random.Generator) -> None:
     c = judged(simulated(rng, 50, 1, 3, 0.5), 3)
     assert c.as_row()["ci_mean"] < 1.0
-    assert c.verdict == "over-confident"
+    assert c.verdict == "overconfident"
 
 
 def test_coverage_and_its_bounds(rng: np.random.Generator) -> None:
@@ -253,9 +253,9 @@ def test_values_on_the_border_are_consistent_and_outside_their_region() -> None:
     c = judged(np.array([[edge * (1 - 1e-12)], [edge], [edge * (1 + 1e-12)], [0.1]]), 2)
     assert c.coverage == pytest.approx(0.5, abs=0.26)
     low, high = judged(np.ones((3, 1)), 2).bounds
-    for value, verdict in ((low * 2, "consistent"), (low * 1.99, "pessimistic"), (high * 2, "consistent")):
+    for value, verdict in ((low * 2, "consistent"), (low * 1.99, "conservative"), (high * 2, "consistent")):
         assert judged(np.full((3, 1), value), 2).verdict == verdict
-    assert judged(np.full((3, 1), high * 2.01), 2).verdict == "over-confident"
+    assert judged(np.full((3, 1), high * 2.01), 2).verdict == "overconfident"
 
 
 def test_row_states_gauge_dimension_runs_and_confidence() -> None:
@@ -347,7 +347,7 @@ def test_smoothed_submaps_are_honest_and_scaled_ones_are_not() -> None:
         changed = LandmarkMap(ids=m.ids, exit_pose=m.exit_pose, positions=m.positions, covariance=P)
         return Submap.from_landmarks(s.key, changed, interval=s.interval)
 
-    for factor, verdict in ((1.0, "consistent"), (0.7, "over-confident"), (1.4, "pessimistic")):
+    for factor, verdict in ((1.0, "consistent"), (0.7, "overconfident"), (1.4, "conservative")):
         c = submaps_consistency([scaled(s, factor) for s in submaps], log.truth)
         assert c["joint"].verdict == verdict, c["joint"].as_row()
         assert c["joint"].count == len(submaps)

@@ -119,7 +119,7 @@ def test_matrix_equals_one_pair_at_a_time(rng):
     assert len(got.table()) == len(loops)
 
 
-@pytest.mark.parametrize(("claimed", "verdict"), [(1.0, "consistent"), (0.25, "over-confident"), (4.0, "pessimistic")])
+@pytest.mark.parametrize(("claimed", "verdict"), [(1.0, "consistent"), (0.25, "overconfident"), (4.0, "conservative")])
 def test_alarm_fires_for_half_and_double_noise_and_is_silent_else(claimed, verdict):
     verdicts, values, inside, shape = [], [], [], []
     for seed in range(20):
@@ -160,7 +160,7 @@ def test_a_false_loop_disagrees_with_the_others_and_is_named(rng):
     false = np.flatnonzero(got.blame() > 0.5)
     assert {(int(got.loops.a[i]), int(got.loops.b[i])) for i in false} >= {(2, 8)}
     assert all(8 in (got.loops.a[i], got.loops.b[i]) for i in false)  # all that are blamed hang on the false names
-    assert got.test()["verdict"] == "over-confident"
+    assert got.test()["verdict"] == "overconfident"
 
 
 def test_matches_of_a_front_end_are_loops(rng):

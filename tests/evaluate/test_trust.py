@@ -12,6 +12,7 @@ from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
 from graphslam.core.records import Gps
 from graphslam.evaluate.bias_test import sum_bias_windows
 from graphslam.evaluate.covariance_assessment import (
+    HALF,
     MAX_NONLINEARITY,
     ConsistencyTest,
     assess_covariances,
@@ -101,7 +102,7 @@ def test_fixes_whose_errors_last_are_over_confident_however_small_their_residual
     lasting = [class_consistency(solved(rng, lambda n: walk(rng, n, 0.97)))["gps"] for _ in range(6)]
     assert sum(c.as_row()["verdict"] == LASTING for c in white) <= 1
     assert all(c.as_row()["verdict"] == LASTING for c in lasting)
-    # by size alone most of them would be honest or pessimistic
+    # by size alone most of them would be honest or conservative
     assert np.median([c.ratio for c in lasting]) < 1.0
     assert all(c.independent < 0.4 * c.dof for c in lasting)
 
@@ -116,22 +117,22 @@ SMALL = chi_square_ratio_test("fixes", "fixes", 0.13, 400.0)
     [
         (HONEST, True, "consistent"),
         (HONEST[:1], False, "consistent"),
-        (HONEST[:1], True, "undecided"),  # nothing says how good the fixes are
-        (chi_square_ratio_test("map", "map", 1.0, 8.0), False, "undecided"),  # half as large again is possible
-        ([], False, "undecided"),
-        (chi_square_ratio_test("map", "map", 1.3, 2000.0), False, "over-confident"),
-        (chi_square_ratio_test("map", "map", 0.6, 2000.0), False, "pessimistic"),
+        (HONEST[:1], True, "not tested"),  # nothing says how good the fixes are
+        (chi_square_ratio_test("map", "map", 1.0, 8.0), False, "not tested"),  # half as large again is possible
+        ([], False, "not tested"),
+        (chi_square_ratio_test("map", "map", 1.3, 2000.0), False, "overconfident"),
+        (chi_square_ratio_test("map", "map", 0.6, 2000.0), False, "conservative"),
         (chi_square_ratio_test("map", "map", 0.97, 20000.0), False, "consistent"),  # significant, and of no matter
-        # small residuals, and alike from one to the next: never pessimistic
-        ([*HONEST[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "over-confident"),
-        ([*HONEST[:1], *SMALL], True, "pessimistic"),
+        # small residuals, and alike from one to the next: never conservative
+        ([*HONEST[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "overconfident"),
+        ([*HONEST[:1], *SMALL], True, "conservative"),
         (
             [
                 *chi_square_ratio_test("map", "map", 0.5, 2000.0),
                 largest_score_test("calibration", "map", 6.0, tests=16),
             ],
             False,
-            "over-confident",
+            "overconfident",
         ),
     ],
 )  # fmt: skip
@@ -139,18 +140,35 @@ def test_the_word(rows: list[ConsistencyTest], fixes: bool, word: str) -> None:
     assert assess_covariances(rows, fixes=fixes).word == word
 
 
+def test_power_is_the_share_of_maps_half_as_certain_that_are_detected(rng) -> None:
+    dof = 80.0
+    (row,) = chi_square_ratio_test("map", "map", 1.0, dof)
+    found = assess_covariances([row], fixes=False)
+    assert found.word == "consistent"
+    drawn = HALF * rng.chisquare(dof, 4000) / dof
+    words = [assess_covariances(chi_square_ratio_test("map", "map", v, dof), fixes=False).word for v in drawn]
+    share = words.count("overconfident") / len(drawn)
+    assert abs(share - found.power) < 4.0 * np.sqrt(share * (1.0 - share) / len(drawn))
+    assert row.power(50) < row.power(2)
+    # a test without power cannot carry "consistent", however well it fits
+    assert assess_covariances(chi_square_ratio_test("map", "map", 0.6, 20.0), fixes=False).word == "not tested"
+    # linearised covariances are no better than the tolerance
+    assert assess_covariances(chi_square_ratio_test("map", "map", 1.09, 1e5), fixes=False).word == "consistent"
+    assert assess_covariances(chi_square_ratio_test("map", "map", 1.13, 1e5), fixes=False).word == "overconfident"
+
+
 def test_maps_that_bend_are_promised_nothing() -> None:
     assert assess_covariances(HONEST, fixes=True, nonlinearity=0.9 * MAX_NONLINEARITY).word == "consistent"
     found = assess_covariances(HONEST, fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY)
-    assert found.word == "undecided"
+    assert found.word == "not tested"
     assert found.bent
     assert not found.missing
     assert (
-        assess_covariances([*HONEST[:1], *SMALL], fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY).word == "undecided"
+        assess_covariances([*HONEST[:1], *SMALL], fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY).word == "not tested"
     )
     # what the log itself contradicts comes first
     wrong = chi_square_ratio_test("map", "map", 1.3, 2000.0)
-    assert assess_covariances(wrong, fixes=False, nonlinearity=1.1 * MAX_NONLINEARITY).word == "over-confident"
+    assert assess_covariances(wrong, fixes=False, nonlinearity=1.1 * MAX_NONLINEARITY).word == "overconfident"
     # a mean over unknowns, of the submaps that say it
     reports = [{"nonlinearity": 0.01, "unknowns": 30}, {"nonlinearity": 0.04, "unknowns": 10}, {}]
     assert pooled_nonlinearity(reports) == pytest.approx(0.0175)
@@ -164,7 +182,7 @@ def test_honest_runs_are_seldom_called_wrong(rng):
             chi_square_ratio_test(f"{k}", "map", rng.chisquare(200 * k) / (200 * k), 200.0 * k)[0] for k in range(1, 8)
         ]
         rows += [largest_score_test(f"s{k}", "map", rng.standard_normal()) for k in range(5)]
-        wrong += assess_covariances(rows, fixes=False).word in ("over-confident", "pessimistic")
+        wrong += assess_covariances(rows, fixes=False).word in ("overconfident", "conservative")
     assert wrong <= stats.binom.ppf(0.999, 400, 0.05)
 
 

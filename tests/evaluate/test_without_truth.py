@@ -213,7 +213,7 @@ def test_alarm_is_silent_for_honest_noise_and_fires_for_half_and_double(scale, r
         verdicts += [*tests["verdict"], *(c["verdict"] for c in classes)]
         ratios.append([*tests["value"], *(c["chi2_per_dof"] for c in classes)])
         assert np.all(np.abs(tests["autocorrelation"]) < 4 * tests["white"] / 1.96)
-    wrong = {2.0: "over-confident", 0.5: "pessimistic"}
+    wrong = {2.0: "overconfident", 0.5: "conservative"}
     if scale == 1.0:
         # 40 verdicts at 95 %, of ten independent runs: more than 7 alarms have a probability below 1e-3
         assert verdicts.count("consistent") >= 33

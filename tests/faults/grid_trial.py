@@ -53,7 +53,7 @@ class Seen:
         return {f.code for f in self.lines if f.level in level}
 
     def silently_wrong(self, clean: Seen) -> bool:
-        """Over-confident, worse than without the fault, and no line that the clean run does not have."""
+        """Overconfident, worse than without the fault, and no line that the clean run does not have."""
         worse = self.error > ERROR_MARGIN[0] * clean.error + ERROR_MARGIN[1]
         return not self.refused and self.confident and worse and not self.said() - clean.said()
 

@@ -240,7 +240,7 @@ def _rows() -> list[Row]:
     rows += [Row("beacons", "10 % wrong identities", inject.wrong_identities(0.1), "reported", FIT, log="beacons")]
     for frontend in ("rbpf-ekf", "ekf-slam", "rbpf-slam"):
         rows += [Row("wheels", f, i, "reported", "calibration|residuals", frontend, "velocities") for f, i in RATES]
-        for f, i, o, s in ODOMETRY:  # one filter over a whole log is over-confident without a gap, too, and says so
+        for f, i, o, s in ODOMETRY:  # one filter over a whole log is overconfident without a gap, too, and says so
             out: Outcome = "reported" if frontend == "rbpf-slam" and o == "handled" else o
             rows.append(Row("odometry", f, i, out, s, frontend, "increments"))
         rows.append(Row("IMU", "level, in the plane", inject.with_imu, "handled", "", frontend))

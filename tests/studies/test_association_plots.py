@@ -37,7 +37,7 @@ def test_loop_matrix_shows_each_pair_in_units_of_its_dof(rng):
     assert image[0, 0] == pytest.approx(np.clip(np.sum(errors[0] ** 2) / 3, 1e-2, 1e2))
     assert np.all(image[4] == 1e2)  # the false loop is a cross
     assert [t.get_text() for t in ax.get_xticklabels()] == [f"{a}–{a + 5}" for a in range(6)]
-    assert "over-confident" in ax.get_title()
+    assert "overconfident" in ax.get_title()
 
 
 def test_innovations_show_every_fix_and_the_mean_with_its_bounds(rng):

@@ -146,9 +146,9 @@ def test_report_and_figures(table, tmp_path):
 def test_honesty_of_local_maps_is_judged_from_both_sides(table):
     rows = local_nees(table).set_index(["world", "algorithm"])
     for world in QUICK:
-        # a curved way that is poorly known makes a Cartesian Gaussian a little over-confident, whoever is who
+        # a curved way that is poorly known makes a Cartesian Gaussian a little overconfident, whoever is who
         assert 0.7 < rows.loc[(world, "known"), "nees_over_n"] < 1.7
-        assert rows.loc[(world, "rbpf-paper"), "verdict"] == "over-confident"
+        assert rows.loc[(world, "rbpf-paper"), "verdict"] == "overconfident"
         assert rows.loc[(world, "rbpf-paper"), "nees_over_n"] > 5.0
     assert rows.loc[("rows-quick", "known"), "submaps"] == sum(
         (table["world"] == "rows-quick") & (table["algorithm"] == "known") & (table["quantity"] == "local_pose_nees")

@@ -135,7 +135,7 @@ def test_reports_say_what_the_table_says(table: pd.DataFrame, trials: list[list[
 
 
 def test_targets_can_fail(table: pd.DataFrame) -> None:
-    """Over-confident local maps are seen: NEES doubled, targets missed."""
+    """Overconfident local maps are seen: NEES doubled, targets missed."""
     worse = table.copy()
     worse.loc[worse["quantity"].isin(["local_joint_nees", "feature_joint_nees"]), "value"] *= 2.0
     met = targets(table).set_index("target")["met"]

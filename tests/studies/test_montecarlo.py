@@ -36,7 +36,7 @@ from tests.reference.trials import dies_once, fails_once, gives_a_lambda, notes_
 
 
 def noisy_trial(seed: int) -> Iterator[Measurement]:
-    """NEES of an honest and of an over-confident estimator at three submaps, and a final RMSE."""
+    """NEES of an honest and of an overconfident estimator at three submaps, and a final RMSE."""
     rng = np.random.default_rng(seed)
     for submap in range(3):
         d2 = rng.chisquare(3)
@@ -106,7 +106,7 @@ def test_summary_by_hand() -> None:
 
 def test_consistency_from_the_table_has_the_right_verdicts() -> None:
     t = run_trials(noisy_trial, 60, progress=False)
-    for name, verdict in (("honest", "consistent"), ("bold", "over-confident")):
+    for name, verdict in (("honest", "consistent"), ("bold", "overconfident")):
         submaps, c = consistency_of(t, name, "nees", dof=3, gauge="first base fixed")
         assert submaps.tolist() == [0, 1, 2]
         assert c.nees.shape == (60, 3)

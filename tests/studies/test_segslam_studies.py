@@ -116,7 +116,7 @@ def test_dead_reckoning_is_lost_and_segslam_is_not(tables: dict[str, tuple[pd.Da
     assert mean(table, "segslam-5", "matches") > 0
     assert mean(table, "segslam-5", "entropy") < mean(table, "dead-reckoning", "entropy")
     assert mean(table, "segslam-5", "effective_median") < 1.0
-    # moment matching is over-confident by far
+    # moment matching is overconfident by far
     d2 = table[table["quantity"].str.startswith("exit_nees")].groupby("quantity")["value"].median()
     assert d2["exit_nees_matched"] > 20 * 4 > 5 * d2["exit_nees_stated"]
     assert mean(timings, "segslam-5", "seconds_total") >= mean(timings, "segslam-5", "seconds_match") > 0.0

@@ -77,6 +77,6 @@ def test_the_table_counts_what_must_not_happen():
         "quick-04": False, "quick-22": False, "quick-31": True, "quick-09": False,
     }  # fmt: skip
     table = summary_table(worlds).set_index("worlds are")
-    assert table.loc["NEES/n > 1.5", "points the wrong way"] == 1.0  # it was called pessimistic
+    assert table.loc["NEES/n > 1.5", "points the wrong way"] == 1.0  # it was called conservative
     assert table.loc["clean", "points the wrong way"] == 0.5
-    assert table.loc["other", "undecided"] == 3
+    assert table.loc["other", "not tested"] == 3

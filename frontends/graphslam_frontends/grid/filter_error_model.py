@@ -3,7 +3,7 @@
 Particles share their ancestors, and with them most of what is wrong with all of them; their spread is a small part of
 how far off they are. What is left is, above all, a heading that walks: its errors turn everything that comes after, so
 the end of a segment is off across its path, the more the longer the way from where the heading erred. A model that only
-knows the length cannot say so, and is over-confident in position where it is right in heading.
+knows the length cannot say so, and is overconfident in position where it is right in heading.
 
 What a filter leaves has two sources. One is its own (noise of its particles, voxels, a flat likelihood): it is there
 with the best of odometry, and is what `FilterDrift` was fitted to. The other are errors of the motion that reach the

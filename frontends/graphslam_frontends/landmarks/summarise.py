@@ -1,6 +1,6 @@
 """From particles to one Gaussian: common features (B4), moment matching (B3), and smoothing under the winner.
 
-A moment-matched set of 40 particles is over-confident by itself (finite sample), so the default hand-over smooths the
+A moment-matched set of 40 particles is overconfident by itself (finite sample), so the default hand-over smooths the
 submap once under the winning particle's association and gives the optimum with its Laplace covariance; the
 moment-matched Gaussian stays as the paper's mode and as a figure of honesty beside every map.
 """

@@ -1,6 +1,6 @@
 """How sure a segment is of its exit: the spread of the particles, and what particles cannot know.
 
-The spread alone, which is what moment matching hands over, is over-confident a hundredfold: resampling leaves the
+The spread alone, which is what moment matching hands over, is overconfident a hundredfold: resampling leaves the
 particles a recent common ancestor, and the error that all of them share (a bias of the heading) is in none of them.
 So the default adds a drift model, the covariance of dead reckoning over the length of the segment.
 """

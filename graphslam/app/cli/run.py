@@ -197,7 +197,7 @@ def join_note(result: Any) -> list[str]:
         f"note: χ²/dof of the join: {chi2:.3g} [{low:.3g}, {high:.3g} in 999 of 1000 consistent runs; {dof:.4g} dof]. "
     )
     causes = [f.code for f in result.verdict if f.code in CAUSES and f.level in ("look", "bad")]
-    if said == "over-confident" and causes:
+    if said == "overconfident" and causes:
         named = ", ".join(f"“{c}”" for c in dict.fromkeys(causes))
         return [f"{text}The verdict names a cause ({named}): correct it before you scale covariances"]
     scale = result.report["covariance_scale"] * chi2

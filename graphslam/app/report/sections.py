@@ -137,7 +137,7 @@ def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str
         if owner is None:
             continue
         low, high, value = m[key], m[f"{stem}_high"], m[owner]
-        said = "over-confident" if value > high else "pessimistic" if value < low else "consistent"
+        said = "overconfident" if value > high else "conservative" if value < low else "consistent"
         out[owner] = (f"{low:.3g} to {high:.3g}", said)
         folded_in |= {key, f"{stem}_high"}
     for key in m:

@@ -13,7 +13,7 @@ from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.run.source import load_log_source
 from graphslam.calibrate.calibrate import CALIBRATIONS
-from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections
+from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections, moved_end
 from graphslam.calibrate.estimate import NAMES, SURE, Calibration, estimate_text
 from graphslam.calibrate.landmark_calibration import FULL, QUICK, CalibrationBudget, calibrate_sightings
 from graphslam.calibrate.windows import SightingLog
@@ -26,6 +26,7 @@ from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.mixed import MixedFrontEnd
+from graphslam_frontends.odometry.motion import MotionNoise
 
 LANDMARKS, SCANS = "rbpf-ekf", "segslam"
 """Front ends whose settings are used to read a log of landmarks, or of scans, where none is named."""
@@ -51,6 +52,7 @@ def apply_calibration(
         options = {"frontend": options.get("frontend", {}).get(front.name, {})}
     said, found = [], None
     if config.given is not None:  # what a user wrote down stands before what would be estimated
+        config = replace(config, given=keep_user_settings(config.given, options))
         said = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
     elif config.use == "auto" and own and front.calibrates:
         said = [Finding("", "calibrated", OWN)]
@@ -61,7 +63,24 @@ def apply_calibration(
             config, said = replace(config, given=keep_user_settings(found.corrections, options)), found.findings()
         except GraphSlamError as error:
             said = [Finding("", "calibrated", f"noise: default values — not estimated from the log: {error}.")]
-    return log if config.given is None else apply_corrections(log, config.given), config, said, found
+    if config.given is None:
+        return log, config, said, found
+    corrected = apply_corrections(log, config.given)
+    return corrected, config, [*said, *_path_moved(log, corrected, config.given, front)], found
+
+
+def _path_moved(log: SensorLog, corrected: SensorLog, c: Corrections, front: FrontEnd) -> list[Finding]:
+    """A line where the corrected path is further from that of the log than the noise of both allows."""
+    if c.without_constants() == c:
+        return []
+    moved, allowed = moved_end(log, corrected, getattr(front.config, "motion", None) or MotionNoise())
+    if moved <= allowed:
+        return []
+    text = (
+        f"dead reckoning: the calibrated path ends {moved:.3g} m from that of the log [≤ {allowed:.2g} m by the noise "
+    )
+    text += "of both] — one of them is wrong. To do: check one distance, or run again with --set calibrate.use=none."
+    return [Finding("look", "calibration-path", text)]
 
 
 def calibrate_log(
@@ -222,10 +241,18 @@ def _sigma_in_words(row: Mapping[str, Any]) -> str:
 
 
 def keep_user_settings(c: Corrections, options: Mapping[str, Any]) -> Corrections:
-    """What of a calibration is used where the user has set noise by hand."""
+    """What of a calibration is used where the user has set noise or constants, or a file of options has.
+
+    No parameter is corrected twice: a constant that the options have is not estimated as well.
+    """
     own = options.get("frontend", {})
+    noise = {**(own.get("noise") or {}), **(own.get("smoothing_noise") or {})}
     if "motion" in own:
         c = c.without_motion_noise()
-    if "noise" in own or "smoothing_noise" in own:
+    if noise:
         c = c.without_sensor_noise()
+    if {"range_scale", "range_offset"} & set(noise):
+        c = replace(c, range_scale=1.0, range_offset=0.0)
+    if "yaw_per_metre" in own.get("steps", {}):
+        c = replace(c, turn_per_metre=0.0)
     return c

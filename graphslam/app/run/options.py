@@ -49,6 +49,11 @@ def check_names(frontend: FrontEnds | None, solver: str) -> None:
         raise UnknownNameError("solver", solver, SOLVERS)
 
 
+def _estimates_nothing(asked: Mapping[str, Any]) -> bool:
+    calibrate = asked.get("calibrate", {})
+    return isinstance(calibrate, Mapping) and calibrate.get("use") == "none"
+
+
 @dataclass(frozen=True)
 class RunOptions:
     """What a run is made with.
@@ -97,7 +102,8 @@ class RunOptions:
         if read:
             names = name if isinstance(name, str) else ", ".join(name)
             logger.warning("front end: %s (%s); preset: %s", names, why, preset or taken or "none")
-        own = bool(suggested) and (preset is not None or for_this_set)
+        # noise and constants of another set's preset are not those of this log: they are estimated, unless that is off
+        own = bool(suggested) and (for_this_set if preset in (None, taken) else _estimates_nothing(asked))
         if isinstance(frontend, FrontEnd) and not isinstance(frontend, type):
             suggested = {k: v for k, v in suggested.items() if k != "frontend"}
         if not (own and uses_preset_noise(asked)):
@@ -157,7 +163,7 @@ class RunOptions:
         front = self.front.with_calibration(
             log,
             asked.get("frontend", {}),
-            corrected=applied.given is not None and not (found and found.contradictions()),
+            corrected=applied.given is not None and not applied.given.neutral,
             drift=found is not None and found.kind == "clouds" and found.corrections.along_metre is not None,
         )
         options = replace(self, settings=replace(self.settings, calibrate=applied), front=front)

@@ -1,17 +1,18 @@
-"""The first line of a verdict: overall result, main values, and the most important next step."""
+"""The first line of a verdict: one of five words, main values, and the most important next step.
+
+The words are *consistent*, *conservative*, *not tested*, *overconfident* and *wrong* (:func:`verdict_word`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
-from typing import Any
 
 from graphslam.app.run.verdict import (
     TWO_MAPS_DO,
     ChiSquareTest,
     RunMetrics,
     chi_square_test,
-    class_rows,
     covariance_assessment,
     is_finite_number,
     nees_tests,
@@ -19,17 +20,22 @@ from graphslam.app.run.verdict import (
 )
 from graphslam.core.errors import DataError
 from graphslam.core.findings import LEVELS, Finding, Level, worst_level
+from graphslam.evaluate.covariance_assessment import LEAST_POWER, CovarianceAssessment
 from graphslam.loops.ledger import ledger_of_events
 
-TRUST: dict[Level, str] = {
-    "bad": "Do not rely on this yet",
-    "look": "Plausible; check the marked findings",
-    "good": "Passed all available checks",
+START: dict[str, str] = {
+    "consistent": "Consistent: errors match the covariances in all tests",
+    "conservative": "Conservative: covariances are larger than the errors",
+    "not tested": "Not tested: nothing in this log could have shown that the covariances are too small",
+    "overconfident": "Overconfident: errors are larger than the covariances",
+    "wrong": "Wrong: do not rely on this",
 }
-"""Start of the line, by the worst finding: never better than the findings below it."""
-
-NOT_TESTED = "Not tested: nothing in this log could have shown an error of the result"
-"""Start of the line of a run without a reference, a redundant measurement or a test of its covariances."""
+"""Start of the line, by the word of the verdict."""
+CONSISTENCY_CODES = frozenset(
+    {"chi2", "nees", "trust", "consistency-test", "correlated", "gps-correlated", "imu-contradicted"}
+)
+"""Codes of findings on the size of errors. Where one of them is bad, the result is overconfident; where another finding
+is bad, it is wrong."""
 
 ADVICE: dict[str, str] = {
     # what cannot be right in the log comes first: everything else may follow from it
@@ -130,47 +136,61 @@ ADVICE: dict[str, str] = {
 """Next step for a finding, by its code. Of several findings of one level the earliest in this list counts: causes
 come before their effects."""
 JUDGED = frozenset({"chi2", "nees", "trust"})
-"""Codes of findings that may be pessimistic."""
+"""Codes of findings that may be conservative."""
 MARKED = frozenset({"look", "bad"})
 SHORT = 90
 """Longest “To do” of a finding that is repeated in the first line, in characters."""
 WORDS = {
     ("chi2", "consistent"): "residuals match the noise model",
-    ("chi2", "over-confident"): "residuals larger than the noise model explains",
-    ("chi2", "pessimistic"): "residuals smaller than the noise model expects",
+    ("chi2", "overconfident"): "residuals larger than the noise model explains",
+    ("chi2", "conservative"): "residuals smaller than the noise model expects",
     ("nees", "consistent"): "covariances match the true errors",
-    ("nees", "over-confident"): "covariances over-confident: true errors are larger",
-    ("nees", "pessimistic"): "covariances pessimistic: true errors are smaller",
-}
-WITHOUT_TRUTH = {
-    "consistent": "covariances consistent in all available tests",
-    "over-confident": "covariances over-confident",
-    "pessimistic": "covariances pessimistic",
-    "undecided": "covariance consistency not testable with this log",
+    ("nees", "overconfident"): "true errors are larger than the covariances",
+    ("nees", "conservative"): "true errors are smaller than the covariances",
 }
 SMALL_RESIDUALS = "find out why residuals are small: the assumed noise is too large, or errors are time-correlated"
-PESSIMISTIC = "nothing urgent; covariances are larger than needed, which only costs accuracy"
-NOTHING_KNOWN = "measure one distance in the field: there is no ground truth and no GPS to compare with"
+CONSERVATIVE = "nothing urgent; covariances are larger than needed, which only costs accuracy"
+NOTHING_KNOWN = "measure some distances or points in the field (--check), to test the result"
 NOTHING = "nothing; the result can be used"
 
 
 def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
     """First line of the verdict of a run or of a merge."""
     known = _error(figures)
-    nees = nees_tests(figures)
-    chi2, worst_nees = chi_square_test(figures), max(nees, key=lambda j: LEVELS.index(j.level), default=None)
-    open_chain = "" if chi2 else "no redundant measurements, so consistency is not testable"
+    chi2 = chi_square_test(figures)
+    worst_nees = max(nees_tests(figures), key=lambda j: LEVELS.index(j.level), default=None)
+    open_chain = "" if chi2 else "no redundant measurements"
     facts = [_made(figures), known or "true error unknown", open_chain]
-    trusted = covariance_assessment(figures)
-    word = "" if trusted is None else trusted.word
-    held = [] if chi2 is None or of_the_start(figures, chi2) else [chi2]
-    dofs: list[Any] = [figures.metrics.get(k) for k in ("loops_dof", "gps_nis_joint_dof")]
-    dofs += [row.get("dof") for row in class_rows(figures)]
-    passed = any(f.level == "good" and f.code == "passes" for f in findings)
-    redundant = passed or any(is_finite_number(d) and d > 0 for d in dofs)
-    tested = bool(known or chi2 or redundant or word not in ("", "undecided"))
-    judged = [*held, *([worst_nees] if worst_nees else [])]
-    return headline(findings, facts, judged, known=bool(known), tested=tested, word=word)
+    judged = [j for j in (chi2, worst_nees) if j is not None and not (j is chi2 and of_the_start(figures, chi2))]
+    return headline(findings, facts, judged, known=bool(known), assessed=covariance_assessment(figures))
+
+
+def verdict_word(
+    findings: Iterable[Finding], judged: Sequence[ChiSquareTest], assessed: CovarianceAssessment | None
+) -> tuple[str, float]:
+    """One of five words on a result, and the power of the tests behind it (see :data:`START`).
+
+    Parameters
+    ----------
+    judged : sequence of ChiSquareTest
+        NEES where ground truth is known; χ² where there is no assessment.
+    assessed : CovarianceAssessment or None
+        Tests without ground truth.
+    """
+    bad = {f.code for f in findings if f.level == "bad"}
+    if bad - CONSISTENCY_CODES:
+        return "wrong", 0.0
+    nees = [j for j in judged if j.code == "nees"]
+    tests = nees or (list(judged) if assessed is None else [])
+    words = {j.said for j in tests} | ({assessed.word} if assessed else set())
+    if bad or "overconfident" in words:
+        return "overconfident", 0.0
+    power = max((j.power for j in tests), default=0.0)
+    if "conservative" in {j.said for j in nees}:  # small residuals alone may be those of correlated errors
+        return "conservative", power
+    if power >= LEAST_POWER and {j.said for j in tests} == {"consistent"}:
+        return "consistent", power
+    return (assessed.word, assessed.power) if assessed else ("not tested", power)
 
 
 def headline(
@@ -179,8 +199,7 @@ def headline(
     judged: Sequence[ChiSquareTest] = (),
     *,
     known: bool = True,
-    tested: bool = True,
-    word: str = "",
+    assessed: CovarianceAssessment | None = None,
 ) -> Finding:
     """All findings in one line.
 
@@ -192,27 +211,23 @@ def headline(
         Ratios of the findings with the codes ``chi2`` and ``nees``.
     known : bool
         Is there a reference to compare the result with?
-    tested : bool
-        Could anything have shown that the result is wrong: a reference, a redundant measurement, a test of covariances?
-    word : str
-        Verdict on the covariances without ground truth
-        (:func:`graphslam.evaluate.covariance_assessment.assess_covariances`).
+    assessed : CovarianceAssessment or None
+        Tests of the covariances without ground truth.
     """
     found = list(findings)
-    level: Level = worst_level(found) or "good"
-    points = sum(f.level == level for f in found) if level in MARKED else 0
-    marked = f" ({points} {'point' if points == 1 else 'points'} marked “{level}”)" if points else ""
-    held = [consistency_line(j, found) for j in judged]
-    by_truth = any(j.code == "nees" for j in judged)  # then tests without ground truth matter less
-    if word and not (by_truth and word != "over-confident"):
-        held.append(WITHOUT_TRUTH[word])
-    said = "; ".join([x for x in facts if x] + held)
-    over = {j.code for j in judged if j.said == "over-confident"} | ({"trust"} if word == "over-confident" else set())
+    worst: Level = worst_level(found) or "good"
+    points = sum(f.level == worst for f in found) if worst in MARKED else 0
+    word, power = verdict_word(found, judged, assessed)
+    start = START[word]
+    if word == "consistent":
+        start += f" (power {min(power, 0.99):.0%} against covariances half as large as they should be)"
+    if points:
+        start += f"; {points} {'point' if points == 1 else 'points'} marked “{worst}”"
+    said = "; ".join([x for x in facts if x] + [consistency_line(j, found) for j in judged])
+    over = {j.code for j in judged if j.said == "overconfident"} | ({"trust"} if word == "overconfident" else set())
     do = _advice(found, over, known, word)
-    start = TRUST[level]
-    if level == "good" and not tested:
-        level, start = "", NOT_TESTED
-    return Finding(level, "headline", f"{start}{marked}{': ' + said if said else ''}. To do: {do}.")
+    level: Level = "" if worst == "good" and word == "not tested" else worst
+    return Finding(level, "headline", f"{start}{' — ' + said if said else ''}. To do: {do}.")
 
 
 def consistency_line(j: ChiSquareTest, findings: Sequence[Finding]) -> str:
@@ -227,10 +242,10 @@ def _advice(findings: Sequence[Finding], over: set[str], known: bool, word: str)
     """The most important next step."""
     level = worst_level(findings)
     if level not in MARKED:
-        return NOTHING if known else NOTHING_KNOWN
+        return NOTHING if known and word != "not tested" else NOTHING_KNOWN
     _, first = min(((_rank(f.code, over), f) for f in findings if f.level == level), key=lambda r: r[0])
     if first.code in JUDGED - over:
-        return SMALL_RESIDUALS if first.code == "chi2" and word != "pessimistic" else PESSIMISTIC
+        return SMALL_RESIDUALS if first.code == "chi2" and word != "conservative" else CONSERVATIVE
     own = first.text.partition("To do: ")[2].rstrip(".")
     if own and len(own) <= SHORT:
         return own

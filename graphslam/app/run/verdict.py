@@ -20,10 +20,12 @@ from graphslam.core.submap import Submap
 from graphslam.evaluate.covariance_assessment import (
     LEVEL,
     MAX_NONLINEARITY,
+    TOLERANCE,
     ConsistencyTest,
     CovarianceAssessment,
     assess_covariances,
     consistency_tests_of_json,
+    detection_power,
 )
 from graphslam.evaluate.intervals import by_chance, two_sided_width
 from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
@@ -37,13 +39,13 @@ CERTAIN = 0.999
 """A test that a consistent run fails less often than once in a thousand runs is no accident."""
 IN_WORDS = {
     "consistent": "errors match the covariances",
-    "over-confident": "errors are larger than the covariances (over-confident)",
-    "pessimistic": "errors are smaller than the covariances (pessimistic)",
+    "overconfident": "errors are larger than the covariances (overconfident)",
+    "conservative": "errors are smaller than the covariances (conservative)",
 }
 RESIDUALS_IN_WORDS = {
     "consistent": "residuals match the noise model",
-    "over-confident": "residuals are larger than the noise model explains",
-    "pessimistic": "residuals are smaller than the noise model expects",
+    "overconfident": "residuals are larger than the noise model explains",
+    "conservative": "residuals are smaller than the noise model expects",
 }
 """Of fitted residuals; the line on the covariances is about the errors of the map."""
 CERTAIN_OVER_CONFIDENT = two_sided_width(CERTAIN) / two_sided_width(CONFIDENCE)
@@ -300,23 +302,34 @@ class ChiSquareTest:
     dof: float
     about: str = ""
 
+    def bounds(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+        """Two-sided bounds of the ratio; above those of residuals there is the tolerance of their tests."""
+        low, high, _ = two_sided_bounds(self.ratio, self.dof, confidence)
+        return low, high * (TOLERANCE if self.code == "chi2" else 1.0)
+
     @property
     def said(self) -> str:
-        """``consistent``, ``over-confident`` or ``pessimistic``."""
-        return two_sided_bounds(self.ratio, self.dof, CONFIDENCE)[2]
+        """``consistent``, ``overconfident`` or ``conservative``."""
+        low, high = self.bounds()
+        return "overconfident" if self.ratio > high else "conservative" if self.ratio < low else "consistent"
+
+    @property
+    def power(self) -> float:
+        """Probability that the test detects covariances that are half as large as they should be."""
+        return detection_power(self.dof, self.bounds()[1] * self.dof)
 
     @property
     def level(self) -> Level:
         """One consistent run in forty is outside on either side; bad is less likely than one in a thousand."""
         if self.said == "consistent":
             return "good"
-        return "bad" if self.ratio > two_sided_bounds(self.ratio, self.dof, CERTAIN)[1] else "look"
+        return "bad" if self.ratio > self.bounds(CERTAIN)[1] else "look"
 
     @property
     def text(self) -> str:
         """``1.02 per degree of freedom [0.94, 1.06; 4321 dof] — residuals match the noise model``."""
-        low, high, said = two_sided_bounds(self.ratio, self.dof, CONFIDENCE)
-        meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[said]
+        low, high = self.bounds()
+        meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[self.said]
         return f"{self.ratio:.3g} per degree of freedom [{low:.3g}, {high:.3g}; {self.dof:.4g} dof] — {meaning}"
 
 
@@ -330,7 +343,7 @@ def chi_square_test(figures: RunMetrics) -> ChiSquareTest | None:
 
 def of_the_start(figures: RunMetrics, chi2: ChiSquareTest) -> bool:
     """Does it say of the start of a refined path only that its noise was stated too large?"""
-    return bool(figures.part("refine")) and chi2.said == "pessimistic"
+    return bool(figures.part("refine")) and chi2.said == "conservative"
 
 
 def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
@@ -412,10 +425,10 @@ def _trust(figures: RunMetrics) -> list[Finding]:
     rest = "Tested with residuals and withheld data, without ground truth"
     if figures.report.get("identities") == "run" and figures.metrics.get("landmarks", 0.0) > 0:
         rest += "; correct data association is assumed"
-    if found.word == "over-confident":
-        text = f"covariances: over-confident — above the bounds: {said}. {rest}."
+    if found.word == "overconfident":
+        text = f"covariances: overconfident — above the bounds: {said}. {rest}."
         return [Finding("bad" if found.chance < 1.0 - CERTAIN else "look", "trust", text)]
-    if found.word == "undecided":
+    if found.word == "not tested":
         held = f" Available tests: {said}." if said else ""
         causes = []
         if found.missing:
@@ -426,16 +439,17 @@ def _trust(figures: RunMetrics) -> list[Finding]:
                 "bearing noise is much larger than range noise, so submap posteriors are not Gaussian "
                 f"(nonlinearity {figures.report['nonlinearity']:.2g} [< {MAX_NONLINEARITY:g}])"
             )
-        text = f"covariances: {'not tested' if found.missing else 'undecided'} — {'; '.join(causes)}.{held}"
+        text = f"covariances: not tested — {'; '.join(causes)}.{held}"
         if figures.part("refine"):
             text += " The noise of the refined path was estimated from its own residuals, so they cannot test it."
         if found.missing:
             text += " Add loop closures, GPS or control points."
         return [Finding("", "trust", text)]
-    if found.word == "pessimistic":
-        text = f"covariances: pessimistic — below the bounds: {said}; residuals are not time-correlated. {rest}."
+    if found.word == "conservative":
+        text = f"covariances: conservative — below the bounds: {said}; residuals are not time-correlated. {rest}."
         return [Finding("look", "trust", text)]
-    text = f"covariances: consistent — {said}. {rest}."
+    power = f"power {min(found.power, 0.99):.0%} against covariances half as large as they should be"
+    text = f"covariances: consistent [{power}] — {said}. {rest}."
     return [Finding("good", "trust", text)]
 
 
@@ -452,7 +466,7 @@ def _tests(figures: RunMetrics) -> list[Finding]:
     def judge(what: str, value: Any, dof: Any, cause: str) -> None:
         if not (is_finite_number(value) and is_finite_number(dof) and dof > 0):
             return
-        high = two_sided_bounds(float(value), float(dof), CERTAIN)[1]
+        high = TOLERANCE * two_sided_bounds(float(value), float(dof), CERTAIN)[1]
         if value > high:
             bounds = f"[≤ {high:.3g} in 999 of 1000 consistent runs]"
             out.append(Finding("bad", "consistency-test", f"{what}: {value:.3g} {bounds} — {cause}"))
@@ -499,7 +513,7 @@ def _lasting(row: Mapping[str, Any]) -> Finding:
     text = (
         f"autocorrelation of “{row.get('class')}” residuals: {float(row['lag1']):.2f}, that is "
         f"{float(row['lag1_score']):.1f} σ (correlation length {float(row['correlation_time']):.3g} residuals, χ²/dof "
-        f"{float(row['chi2_per_dof']):.3g}) — the map follows time-correlated errors and is over-confident"
+        f"{float(row['chi2_per_dof']):.3g}) — the map follows time-correlated errors and is overconfident"
     )
     if row.get("class") == "gps":
         return Finding("look", "gps-correlated", f"{text}: {_LASTS}")

@@ -204,7 +204,7 @@ def sentences(found: pd.DataFrame) -> list[str]:
         one = rows.set_index("algorithm")
         best = one.loc[f"batch{sensors}"]
         value = best["NEES/n after"]
-        word = "pessimistic" if value < WANTED[0] else "over-confident" if value > WANTED[1] else "consistent"
+        word = "conservative" if value < WANTED[0] else "overconfident" if value > WANTED[1] else "consistent"
         others = ", ".join(
             f"{m} {one.loc[m + sensors, 'NEES/n before']:.2f}" for m in DEFAULT_METHODS if m + sensors in one.index
         )

@@ -12,7 +12,7 @@ Quantities
 ----------
 ``node``: NEES of the nodes, each by itself, over 3, mean; ``node_dof``: the degrees of freedom that this mean has
 (errors of nodes are correlated: ``n² / ‖C‖²``); ``joint``, ``joint_dof``: NEES/n of all nodes together; ``rms`` of
-their positions [m]; ``word``: 0 consistent, 1 over-confident, 2 pessimistic, 3 cannot be decided; ``clean``.
+their positions [m]; ``word``: 0 consistent, 1 overconfident, 2 conservative, 3 not tested; ``clean``.
 """
 
 from __future__ import annotations
@@ -34,11 +34,9 @@ from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam_studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log
 
-WORDS = ("consistent", "over-confident", "pessimistic", "undecided")
-NOT_TESTED = "not tested"
-"""What the verdict prints for an undecided word where no measurement could have shown an error."""
+WORDS = ("consistent", "overconfident", "conservative", "not tested")
 WRONG = 1.5
-"""NEES/n from which on a map must not be called consistent or pessimistic."""
+"""NEES/n from which on a map must not be called consistent or conservative."""
 WORLDS_DRAWN = range(500, 560)
 """Worlds of the study. Of those before some were looked at while rules and defaults were made: they judge no more."""
 
@@ -109,8 +107,8 @@ def honesty(error: Array, covariance: Array) -> dict[str, float]:
 def covariance_verdict(found: Run) -> int:
     """The verdict on the covariances of a run, as a number into :data:`WORDS`."""
     (line,) = [f.text for f in found.verdict if f.code == "trust"]
-    word = line.removeprefix("covariances: ").partition(" — ")[0]
-    return WORDS.index("undecided" if word == NOT_TESTED else word)
+    word = line.removeprefix("covariances: ").partition(" — ")[0].partition(" [")[0]
+    return WORDS.index(word)
 
 
 def run_trial(w: TrustWorld, seed: int) -> Iterator[Measurement]:
@@ -172,9 +170,9 @@ def summary_table(worlds: pd.DataFrame) -> pd.DataFrame:
     ):
         counts = {word: int(rows[word].sum()) for word in WORDS}
         runs = sum(counts.values())
-        bad = counts["consistent"] + counts["pessimistic"]
+        bad = counts["consistent"] + counts["conservative"]
         if name != "NEES/n > 1.5":
-            bad = counts["over-confident"] + counts["pessimistic"]
+            bad = counts["overconfident"] + counts["conservative"]
         low, high = share_interval(bad, runs) if runs else (np.nan, np.nan)
         share = {"points the wrong way": bad / runs if runs and name != "other" else np.nan, "from": low, "to": high}
         out.append({"worlds are": name, "worlds": len(rows), "runs": runs, **counts, **share})

@@ -216,7 +216,7 @@ def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
         ("accepted", "agrees", "a 0.5"),
         ("rejected", "<b>no</b>", "a 0.5"),
     ]
-    assert [k for k, t in page.verdict if "base of b in the common frame" in t and "over-confident" in t] == ["bad"]
+    assert [k for k, t in page.verdict if "base of b in the common frame" in t and "overconfident" in t] == ["bad"]
     assert "1.5" in page.sections["times"]
     add_events(tmp_path, [{"event": "between", "factor_id": 4, "i": 1, "j": 9, "group": "session"}])
     assert "cannot be drawn" in Page(make_report(tmp_path).html).sections["figures"]

@@ -111,8 +111,8 @@ def test_the_verdict_is_that_of_the_figures(folder: Path, whole: Page) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "kind", "said"),
     [
-        ("nees_per_dof", 9.0, "bad", "over-confident"),
-        ("nees_per_dof", 0.01, "look", "pessimistic"),
+        ("nees_per_dof", 9.0, "bad", "overconfident"),
+        ("nees_per_dof", 0.01, "look", "conservative"),
         ("gap", 5.0, "look", "lower by 5"),
         ("gap", 1e-9, "good", "is no lower"),
         ("gap", None, "good", "not compared with a batch"),

@@ -19,12 +19,12 @@ from graphslam.app.report.report import make_report
 from graphslam.app.run.run import Run
 from graphslam.app.run.summary import (
     ADVICE,
-    NOT_TESTED,
+    CONSERVATIVE,
+    CONSISTENCY_CODES,
     NOTHING,
     NOTHING_KNOWN,
-    PESSIMISTIC,
     SMALL_RESIDUALS,
-    TRUST,
+    START,
     length_text,
     summarise_run,
 )
@@ -130,34 +130,34 @@ def test_the_first_line_is_never_greener_than_the_lines_below_it() -> None:
             lines = [*findings_from_metrics(figs), *more]
             first = summarise_run(figs, lines)
             level = worst_level(lines) or "good"
-            agreed = any(f.code == "passes" and f.level == "good" for f in lines)
-            if level == "good" and (chi2, nees, loops) == (None, None, None) and own in (None, 0.0) and not agreed:
-                assert (first.level, first.text[: len(NOT_TESTED)]) == ("", NOT_TESTED)
-            else:
-                assert first.level == level
-                assert first.text.startswith(TRUST[level])
-            assert not [t for other, t in TRUST.items() if other != level and t in first.text]
-            assert len(first.text) < 420
+            (word,) = [w for w, start in START.items() if first.text.startswith(start)]
+            assert first.level == ("" if level == "good" and word == "not tested" else level)
+            bad = {f.code for f in lines if f.level == "bad"}
+            assert (word == "wrong") == bool(bad - CONSISTENCY_CODES)
+            over = bad & CONSISTENCY_CODES or own == 2.0 or (nees or 0.0) > 2.0
+            assert (word == "overconfident") == bool(over and word != "wrong")
+            if word == "consistent":
+                assert nees in (1.0, 1.19) or own == 1.0 or (nees is own is None and chi2 in (1.0, 1.19))
+                assert "power" in first.text
+            if (chi2, nees, loops) == (None, None, None) and own in (None, 0.0) and not bad:
+                assert word == "not tested"
+            assert len(first.text) < 470
             do = first.text.partition("To do: ")[2].rstrip(".")
             held = {f.code: f.level for f in lines if f.code in ("chi2", "nees")}
             if held["nees"] != "good":
                 assert "covariances match the true" not in first.text
-            if own == 2.0:
-                assert "covariances over-confident" in first.text
-            if own != 1.0:
-                assert "covariances consistent in all" not in first.text
             if own in (None, 0.0, 1.0) and held["nees"] != "look":
-                assert do != PESSIMISTIC
+                assert do != CONSERVATIVE
             if held["chi2"] != "good" or any(f.code == "consistency-test" for f in lines):
                 assert "residuals match" not in first.text
             at = {f.code for f in lines if f.level == level}
             if level in ("look", "bad"):
                 named = {c for c, text in ADVICE.items() if text == do} | {do.partition("“")[2].rstrip("”")}
-                assert do in (PESSIMISTIC, SMALL_RESIDUALS) or any(fnmatchcase(c, n) for c in at for n in named), (
+                assert do in (CONSERVATIVE, SMALL_RESIDUALS) or any(fnmatchcase(c, n) for c in at for n in named), (
                     do,
                     at,
                 )
-                assert level == "look" or do not in (PESSIMISTIC, SMALL_RESIDUALS)
+                assert level == "look" or do not in (CONSERVATIVE, SMALL_RESIDUALS)
             else:
                 assert do in (NOTHING, NOTHING_KNOWN)
             said.add(first.text)
@@ -167,9 +167,10 @@ def test_the_first_line_is_never_greener_than_the_lines_below_it() -> None:
 def test_the_first_line_says_what_was_made_and_what_to_do() -> None:
     figs = figures(True, 1.0, 6.3, None)
     assert summarise_run(figs, findings_from_metrics(figs)).text == (
-        "Do not rely on this yet (1 point marked “bad”): 305 m in 7 submaps, no loop closures; path error 4.1 cm "
-        "(RMSE, ground truth); residuals match the noise model (χ²/dof 1); covariances over-confident: true errors "
-        "are larger (NEES/dof 6.3). To do: repeat with other seeds (--seed 1, 2, …) before you use its covariances."
+        "Overconfident: errors are larger than the covariances; 1 point marked “bad” — 305 m in 7 submaps, no loop "
+        "closures; path error 4.1 cm (RMSE, ground truth); residuals match the noise model (χ²/dof 1); true errors are "
+        "larger than the covariances (NEES/dof 6.3). To do: repeat with other seeds (--seed 1, 2, …) before you use "
+        "its covariances."
     )
     own = Finding("bad", "calibration", "Ranges are long. To do: check the unit of the ranges.")
     (cause,) = (summarise_run(figs, [*findings_from_metrics(figs), own]).text,)

@@ -217,7 +217,7 @@ def judged():
 
 
 def test_range_only_maps_are_honest(judged):
-    """Joint, exit pose and landmarks: none over-confident, none too modest."""
+    """Joint, exit pose and landmarks: none overconfident, none too modest."""
     _, results = judged
     assert len(results) > 60
     dof = sum(r.joint_dof for r in results)

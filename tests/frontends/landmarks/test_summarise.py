@@ -179,7 +179,7 @@ def test_smoothed_submaps_are_honest_and_moment_matched_ones_are_not_with_a_good
     assert honest["joint"].verdict == "consistent", honest["joint"]
     assert honest["exit"].verdict == "consistent", honest["exit"]
     paper = submaps_consistency(front(handover="moments", particles=40).submaps(log, seed=SeedTree(1)), log.truth)
-    assert paper["joint"].verdict == "over-confident"
+    assert paper["joint"].verdict == "overconfident"
     assert paper["exit"].mean_normalised > 2 * honest["exit"].mean_normalised
 
 

@@ -106,7 +106,7 @@ def test_what_is_new_in_each_step_is_as_stated() -> None:
 
 
 def test_independent_increments_promise_too_much() -> None:
-    """The reason for carrying errors that last: composing white increments is over-confident many times over."""
+    """The reason for carrying errors that last: composing white increments is overconfident many times over."""
     d = drive(np.random.default_rng(5))
     r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
     P = np.zeros((6, 6))

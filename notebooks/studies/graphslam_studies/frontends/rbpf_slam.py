@@ -1,7 +1,7 @@
 """RBPF-SLAM with a single map over the whole log: the baseline that Combined SLAM compares submaps with.
 
 One FastSLAM filter, moment-matched (B3) wherever it is asked what it believes. Forty particles cannot hold the
-uncertainty of a long path, so this map is over-confident by orders of magnitude; it is here to be measured.
+uncertainty of a long path, so this map is overconfident by orders of magnitude; it is here to be measured.
 """
 
 from __future__ import annotations

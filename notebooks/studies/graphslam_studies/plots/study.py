@@ -56,7 +56,7 @@ def plot_ci(
     """Consistency index along the run, mean or median over the runs (Fig. 6 of Combined SLAM).
 
     ``CI = D²/χ²_{n,1-α}`` (eq. 20). The band is where the mean (median) over as many runs of an honest estimator lies;
-    below it an estimator is pessimistic. CI = 1 is the paper's one-sided limit.
+    below it an estimator is conservative. CI = 1 is the paper's one-sided limit.
 
     Parameters
     ----------
