@@ -159,7 +159,7 @@ def moved_end(log: SensorLog, corrected: SensorLog, noise: MotionNoise) -> tuple
     noise : MotionNoise
         Of controls; recorded odometry brings its own covariances.
     """
-    ends, covariance = [], 0.0
+    ends, covariances = [], []
     for each in (log, corrected):
         odometry = motion_stream(each)[1]
         if not isinstance(odometry, Odometry):
@@ -168,8 +168,9 @@ def moved_end(log: SensorLog, corrected: SensorLog, noise: MotionNoise) -> tuple
         poses = compose_increments(odometry.increments)[1:]
         after = G.inverse(G.between(poses, np.broadcast_to(poses[-1], poses.shape)))
         A = G.adjoint(after)  # T_i Exp(δ) T_i,end = T_end Exp(Ad(T_i,end⁻¹) δ)
-        covariance = covariance + np.einsum("nij,njk,nlk->il", A, odometry.covariances, A)[G.position, G.position]
+        covariances.append(np.einsum("nij,njk,nlk->il", A, odometry.covariances, A)[G.position, G.position])
         ends.append(poses[-1])
+    covariance = covariances[0] + covariances[1]
     moved = G.between(*ends)[: len(covariance)]
     d = float(np.linalg.norm(moved))
     along = moved / max(d, 1e-12)

@@ -14,12 +14,13 @@ import pandas as pd
 from graphslam.core.charts import apply_inverse_left_jacobian
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, rotation2
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.plan_view import plan_path, plan_pose
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
+from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import joint_nees, vector_pose_error
@@ -308,6 +309,8 @@ def truth_metrics(
     P = P[np.ix_(ix, ix)]
     add_nees(out, "nees", joint_nees(charted if solution.chart == "group" else error, covariance=P), len(error))
     out.add("nees_plain", joint_nees(error, covariance=P))
+    poses_error = (charted if solution.chart == "group" else error)[:n_pose].reshape(-1, 3)
+    add_axis_nees(out, poses_error, P[:n_pose, :n_pose], AXES[2])
     true_points = truth.landmarks[theirs] if identities else points
     parts = {"": slice(None), "_poses": slice(0, n_pose), "_landmarks": slice(n_pose, None)}
     for name, part in parts.items():
@@ -426,12 +429,42 @@ def end_metrics(
             out.add(name.replace("rmse", "max"), whole.statistics.maximum, "m", "lower")
     nees = float(e.ravel() @ np.linalg.solve(P, e.ravel()))
     add_nees(out, "nees", nees, e.size)
+    chart = np.zeros((len(poses), g.dof, g.dof))  # right tangents along the axes of the map
+    R = quat_to_matrix(poses[:, 3:]) if g.dim == 3 else rotation2(poses[:, 2])
+    chart[:, g.position, g.position] = R
+    if g.dim == 3:
+        chart[:, :3, :3] = R
+    else:
+        chart[:, 2, 2] = 1.0
     k = np.arange(len(poses))
-    marginals = P.reshape(len(k), g.dof, len(k), g.dof)[k, :, k, :]
+    joint = P.reshape(len(k), g.dof, len(k), g.dof)
+    turned = np.einsum("kab,kblc,lec->kale", chart, joint, chart, optimize=True).reshape(P.shape)
+    add_axis_nees(out, np.einsum("kab,kb->ka", chart, e), turned, AXES[g.dim])
+    marginals = joint[k, :, k, :]
     for name, block in blocks.items():
         d = e[:, block]
         each = np.einsum("ki,kij,kj->k", d, np.linalg.inv(marginals[:, block, block]), d)
         out.add(f"anees_{name}_per_dof", float(np.mean(each)) / d.shape[1], "", "one")
+
+
+AXES = {2: ("x", "y", "heading"), 3: ("roll", "pitch", "heading", "x", "y", "z")}
+"""Components of the error of a pose along the axes of the map, by dimension."""
+
+
+def add_axis_nees(out: Metrics, errors: Array, P: Array, axes: Sequence[str]) -> None:
+    """NEES of all nodes axis by axis: one axis may be overconfident where the sum over all is not.
+
+    Parameters
+    ----------
+    errors : (m, d)
+        Along the axes of the map.
+    P : (m d, m d)
+        Joint covariance.
+    """
+    d = len(axes)
+    for a, name in enumerate(axes):
+        own = np.ascontiguousarray(P[a::d, a::d])
+        add_nees(out, f"nees_{name}", float(errors[:, a] @ np.linalg.solve(own, errors[:, a])), len(errors))
 
 
 def rms(errors: np.ndarray) -> float:

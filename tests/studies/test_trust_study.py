@@ -78,5 +78,5 @@ def test_the_table_counts_what_must_not_happen():
     }  # fmt: skip
     table = summary_table(worlds).set_index("worlds are")
     assert table.loc["NEES/n > 1.5", "points the wrong way"] == 1.0  # it was called conservative
-    assert table.loc["clean", "points the wrong way"] == 0.5
+    assert table.loc["clean", "points the wrong way"] == 0.5  # overconfident
     assert table.loc["other", "not tested"] == 3

@@ -294,6 +294,8 @@ class ChiSquareTest:
         ``χ²/dof``.
     about : str
         Of what.
+    tests : int
+        That share the significance level (Bonferroni).
     """
 
     code: str
@@ -301,10 +303,11 @@ class ChiSquareTest:
     ratio: float
     dof: float
     about: str = ""
+    tests: int = 1
 
     def bounds(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
         """Two-sided bounds of the ratio; above those of residuals there is the tolerance of their tests."""
-        low, high, _ = two_sided_bounds(self.ratio, self.dof, confidence)
+        low, high, _ = two_sided_bounds(self.ratio, self.dof, 1.0 - (1.0 - confidence) / self.tests)
         return low, high * (TOLERANCE if self.code == "chi2" else 1.0)
 
     @property
@@ -347,18 +350,20 @@ def of_the_start(figures: RunMetrics, chi2: ChiSquareTest) -> bool:
 
 
 def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
-    """NEES against the truth, where it is known, in each gauge in which it was taken."""
+    """NEES against the truth, where it is known: in each gauge in which it was taken, and of overconfident axes."""
     m = dict(figures.metrics)
     gauges = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after alignment")]
     bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]
     if bases := [k for k in bases if m.get(f"{k}_dof", 0.0) > 0 and is_finite_number(m.get(k))]:
         m |= {f"{k}_per_dof": m[k] / m[f"{k}_dof"] for k in bases}
         gauges += [(k, f"base of {k.removesuffix('_base_nees')} in the common frame") for k in bases]
-    return [
-        ChiSquareTest("nees", "NEES/dof", m[f"{key}_per_dof"], m[f"{key}_dof"], gauge)
-        for key, gauge in gauges
+    axes = [k for k in ("x", "y", "z", "roll", "pitch", "heading") if f"nees_{k}_dof" in m]
+    known = [
+        ChiSquareTest("nees", "NEES/dof", m[f"{key}_per_dof"], m[f"{key}_dof"], about, n)
+        for key, about, n in [(*g, 1) for g in gauges] + [(f"nees_{k}", f"{k} of all nodes", len(axes)) for k in axes]
         if is_finite_number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0
     ]
+    return [j for j in known if j.tests == 1 or j.said == "overconfident"]
 
 
 def is_finite_number(value: Any) -> bool:
