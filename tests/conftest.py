@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+
+from tests.pictures import save_point
 
 matplotlib.use("Agg")
 
@@ -41,3 +45,11 @@ def data_dir() -> Path:
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
     """Generator seeded by the test's name: independent of order."""
     return np.random.default_rng(list(request.node.nodeid.encode()))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_pictures() -> Iterator[None]:
+    """Figures are made, and written as one point; see ``full_pictures`` of tests/pictures.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", save_point)
+        yield

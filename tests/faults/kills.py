@@ -14,18 +14,15 @@ verb changes the file system, with k drawn from all of them: so the writing phas
 from __future__ import annotations
 
 import argparse
-import base64
 import os
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 import traceback
-import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
@@ -44,7 +41,6 @@ from graphslam.app.run import outputs
 from graphslam.app.run.files import loops_of_run
 from graphslam.app.sessions import merge_outputs
 from graphslam.app.worlds import simulate, write_simulated
-from graphslam.core.digest import Digest
 from graphslam.core.errors import RunFolderError
 from graphslam.io.submap_store import SubmapStore, read_submaps
 from graphslam.sim.crawler import simulate_crawler
@@ -52,6 +48,7 @@ from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.ring_hall import ring_hall
 from graphslam_studies.montecarlo import folder as study_folder
 from graphslam_studies.montecarlo.folder import StudyFolder
+from tests.pictures import save_point
 
 ROOT = Path(__file__).resolve().parents[2]
 STUDY = "tests.reference.small_study:STUDY"
@@ -187,30 +184,6 @@ VERBS = {
 # --- processes --------------------------------------------------------------------------------------------------
 
 
-def quick_pictures() -> None:
-    """From here on a picture is one point that says what was drawn: drawing is most of the time of a tiny run."""
-    one = base64.b64decode(
-        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNoAAAAggCBd81ytgAAAABJRU5ErkJggg=="
-    )
-    at = len(one) - 12  # of the chunk that ends it
-
-    def point(figure: Figure, file: Any, **_: Any) -> None:
-        d = Digest()
-        for axes in figure.axes:
-            d.add("title", axes.get_title())
-            for line in axes.lines:
-                d.add("line", np.asarray(line.get_xydata(), dtype=np.float64))
-        said = b"tEXtdrawn\0" + d.text().encode()
-        chunk = struct.pack(">I", len(said) - 4) + said + struct.pack(">I", zlib.crc32(said))
-        data = one[:at] + chunk + one[at:]
-        if hasattr(file, "write"):
-            file.write(data)
-        else:
-            Path(file).write_bytes(data)
-
-    Figure.savefig = point  # type: ignore[method-assign, assignment]
-
-
 def called(arguments: list[str]) -> None:
     """A verb, in this process."""
     result = CliRunner().invoke(app, arguments)
@@ -305,7 +278,7 @@ class Bench:
         self.name, self.verb = name, VERBS[name]
         names = sorted(n for n, v in VERBS.items() if v.prepare is self.verb.prepare)
         self.base, self.work = work / "-".join(names), work / "work"
-        quick_pictures()
+        Figure.savefig = save_point  # type: ignore[method-assign, assignment]
         if not self.base.is_dir():  # another verb begins with the same
             self.prepare()
         self.fresh()

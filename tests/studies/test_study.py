@@ -26,6 +26,7 @@ from graphslam_studies.montecarlo.definition import find_study, fingerprint, sou
 from graphslam_studies.montecarlo.folder import TABLE_COLUMNS, StudyFolder
 from graphslam_studies.montecarlo.study import Study, markdown_table, open_study, study
 from graphslam_studies.montecarlo.trials import Measurement, run_trials, trial_seed
+from tests.pictures import full_pictures
 from tests.reference import small_study
 from tests.reference.trials import steady
 
@@ -67,7 +68,8 @@ def gone(group: int) -> bool:
 @pytest.fixture(scope="module")
 def serial(tmp_path_factory) -> Study:
     """Four runs of two worlds, in this process."""
-    return study(SMALL, 4, out=tmp_path_factory.mktemp("serial"), seed=5, progress=False)
+    with full_pictures():
+        return study(SMALL, 4, out=tmp_path_factory.mktemp("serial"), seed=5, progress=False)
 
 
 def test_table_is_what_the_trials_gave(serial: Study) -> None:

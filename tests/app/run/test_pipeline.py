@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 import graphslam as gs
+from graphslam.app.run.figures import save_figures
 from graphslam.core.atomic import read_npz
 from graphslam.core.errors import EvidenceReusedError, MissingDataError, RunFolderError, UnknownNameError
 from graphslam.core.gaussian import chi2_mean_bounds
 from graphslam.evaluate.consistency import nees, pose_error
 from graphslam.io.tum import read_tum
+from tests.pictures import full_pictures
 
 FILES = {
     *("config.toml", "run.json", "metrics.json", "events.jsonl", "ledger.csv", "landmarks.csv", "map.npz"),
@@ -40,7 +42,7 @@ def submap_bytes(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in sorted((folder / "submaps").iterdir())}
 
 
-def test_run_folder_is_complete(result):
+def test_run_folder_is_complete(result, tmp_path):
     assert {p.name for p in result.folder.iterdir()} == FILES
     assert {p.name for p in (result.folder / "figures").iterdir()} == {
         "map.png",
@@ -48,6 +50,8 @@ def test_run_folder_is_complete(result):
         "gps_residuals.png",
         "loops.png",
     }
+    with full_pictures():
+        assert all(p.stat().st_size > 5_000 for p in save_figures(result, tmp_path))
     report = json.loads((result.folder / "run.json").read_text())
     assert report["seed"] == 5
     assert report["records_read"]["landmarks"] > 0

@@ -25,6 +25,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.gps import level_datum_pose
 from graphslam.io.g2o import read_g2o
 from graphslam_frontends.base import FrontEnd
+from tests.pictures import full_pictures
 from tests.reference.space_chain import dense_chain
 
 GROUP = {2: SE2, 3: SE3}
@@ -87,7 +88,8 @@ def solved(dim: int, monkeypatch: pytest.MonkeyPatch, out: Any = None, *, seed: 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_folder_is_complete_and_comes_back(dim, tmp_path, monkeypatch):
-    r = solved(dim, monkeypatch, tmp_path / "run")
+    with full_pictures():
+        r = solved(dim, monkeypatch, tmp_path / "run")
     names = {p.name for p in (tmp_path / "run").iterdir()}
     wanted = {"trajectory.tum", "nodes.tum", "graph.g2o", "run.json", "metrics.json", "events.jsonl", "map.npz"}
     assert wanted <= names

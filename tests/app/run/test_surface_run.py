@@ -19,6 +19,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.trajectory import Trajectory
 from graphslam.maps.surface.piece import SurfaceConfig
+from tests.pictures import full_pictures
 
 
 def room_from(x: float, rng: np.random.Generator) -> Array:
@@ -71,7 +72,8 @@ def test_what_is_written(made: tuple[RunSurface, PointClouds, Trajectory], tmp_p
     facts = json.loads((tmp_path / "surface.json").read_text())
     assert facts["pieces"] == 3
     assert facts["triangles"] == len(trimesh.load(tmp_path / "surface.glb", force="mesh").faces)
-    drawn = draw_surface(made[0], folder.figures, name="room")
+    with full_pictures():
+        drawn = draw_surface(made[0], folder.figures, name="room")
     assert [p.name for p in drawn] == ["surface.png", "surface_sigma.png"]
     assert all(p.stat().st_size > 10_000 for p in drawn)
     with pytest.raises(UnknownNameError, match="colour"):

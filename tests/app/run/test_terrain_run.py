@@ -21,6 +21,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.terrain.pyramid import TerrainClass
 from graphslam.plots.terrain import class_colours
+from tests.pictures import full_pictures
 
 HEIGHT, CURB_Y = 1.6, 4.0
 LEAN = se3.so3_exp(np.array([0.06, -0.04, 0.0]))
@@ -125,7 +126,8 @@ def test_what_is_written(made: tuple[RunTerrain, PointClouds, Trajectory], tmp_p
     assert facts["scans"] == 8
     with np.load(tmp_path / "terrain.npz") as arrays:
         assert np.array_equal(arrays["classes"], made[0].map.classes)
-    drawn = draw_terrain(made[0], folder.figures, name="street")
+    with full_pictures():
+        drawn = draw_terrain(made[0], folder.figures, name="street")
     assert [p.name for p in drawn] == ["terrain.png", "terrain_plain.png"]
     assert all(p.stat().st_size > 5_000 for p in drawn)
 

@@ -15,6 +15,7 @@ from graphslam.core.atomic import read_npz
 from graphslam.core.errors import ConfigError, DataError, RunFolderError
 from graphslam.core.geometry import se2_between
 from graphslam.io.tum import read_tum
+from tests.pictures import full_pictures
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +108,8 @@ def test_what_cannot_be_merged_is_refused(runs):
 def test_command_line_writes_what_can_be_read_back(runs, merged, tmp_path):
     out = tmp_path / "merged"
     arguments = ["merge", str(runs[0].folder), str(runs[1].folder), "--out", str(out), "--json"]
-    done = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    with full_pictures():
+        done = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert done.exit_code == 0
     value = json.loads(done.stdout)
     assert {m["key"]: m["value"] for m in value["metrics"]}["sessions"] == 2

@@ -40,6 +40,7 @@ from graphslam.loops.inter_session_loops import InterSessionConfig, TwoSessions
 from graphslam.maps.surface.piece import SurfaceConfig
 from graphslam.solve.registry import make_solver
 from graphslam_frontends.base import FrontEnd
+from tests.pictures import full_pictures
 from tests.reference.box_submaps import straight_path
 from tests.reference.box_world import corridor, hall
 from tests.reference.hall_sessions import HallDrive, hall_drive
@@ -283,7 +284,8 @@ def test_places_that_ties_bring_near_each_other_have_a_say(runs: list[Any]) -> N
 def test_command_lines(drives: list[HallDrive], runs: list[Any], tmp_path: Path) -> None:
     out = tmp_path / "both"
     folders = [str(r.folder) for r in runs]
-    done = CliRunner().invoke(app, ["merge", *folders, "--out", str(out), "--json"], catch_exceptions=False)
+    with full_pictures():
+        done = CliRunner().invoke(app, ["merge", *folders, "--out", str(out), "--json"], catch_exceptions=False)
     assert done.exit_code == 0
     assert {m["key"]: m["value"] for m in json.loads(done.stdout)["metrics"]}["sessions"] == 2
     a = read_npz(out / "merged.npz", fmt="graphslam.merged-submaps/1")
