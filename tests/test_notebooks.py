@@ -6,11 +6,13 @@ import ast
 import importlib
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import pytest
+from jupyter_core.utils import run_sync
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
@@ -28,8 +30,12 @@ TIMEOUT_S = 900
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 
 
-def execute(path: Path, where: Path, **environment: str) -> Any:
-    """Run a notebook in a kernel of its own, in an empty folder; returns it with its outputs."""
+def execute(path: Path, where: Path, kernel: NotebookClient | None = None, **environment: str) -> Any:
+    """Run a notebook in an empty folder; returns it with its outputs.
+
+    In a kernel of its own, or in one that other notebooks have used: its names and settings are then as in a new one,
+    but modules that it imports may be loaded already.
+    """
     book = nbformat.read(path, as_version=4)
     env = {
         **os.environ,
@@ -42,11 +48,46 @@ def execute(path: Path, where: Path, **environment: str) -> Any:
         book, timeout=TIMEOUT_S, kernel_name="python3", resources={"metadata": {"path": str(where)}}
     )
     try:
-        client.execute(env=env)
+        if kernel is None:
+            client.execute(env=env)
+        else:
+            client.km, client.kc = kernel.km, kernel.kc
+            first = nbformat.v4.new_code_cell(AS_NEW.format(env=env, where=str(where)))
+            book.cells.insert(0, first)
+            client.execute(cleanup_kc=False)
+            book.cells.remove(first)
     except CellExecutionError as error:
         error.book = book  # type: ignore[attr-defined]
         raise
     return book
+
+
+AS_NEW = """%reset -f
+import os, warnings
+import matplotlib
+from matplotlib import pyplot
+os.environ.clear()
+os.environ.update({env!r})
+os.chdir({where!r})
+pyplot.close("all")
+matplotlib.rcdefaults()
+get_ipython().run_line_magic("matplotlib", "inline")
+with warnings.catch_warnings():
+    pass  # each warning is shown once more
+%reset -f
+"""
+
+
+@pytest.fixture(scope="module")
+def kernel() -> Iterator[NotebookClient]:
+    """A kernel for one notebook after the other: starting one and importing the package takes three seconds."""
+    client = NotebookClient(nbformat.v4.new_notebook(), timeout=TIMEOUT_S, kernel_name="python3")
+    client.create_kernel_manager()
+    client.start_new_kernel(env={**os.environ, "MPLBACKEND": "module://matplotlib_inline.backend_inline"})
+    client.start_new_kernel_client()
+    yield client
+    client.kc.stop_channels()
+    run_sync(client.km.shutdown_kernel)(now=True)
 
 
 def outputs(book: Any) -> list[Any]:
@@ -165,11 +206,11 @@ def test_absolute_paths_are_found() -> None:
 
 
 @every_notebook
-def test_notebook_runs(path: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_notebook_runs(path: Path, tmp_path: Path, kernel: NotebookClient, request: pytest.FixtureRequest) -> None:
     data = {}
     if path.stem in NEEDS_DATA | USES_DATA:
         data["GRAPHSLAM_DATA"] = str(request.getfixturevalue("data_dir"))
-    book = execute(path, tmp_path, **data)
+    book = execute(path, tmp_path, kernel, **data)
     found = outputs(book)
     pictures = [o["data"]["image/png"] for o in found if "image/png" in o.get("data", {})]
     assert len(pictures) >= 5
