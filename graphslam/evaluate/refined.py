@@ -19,8 +19,10 @@ from graphslam.maps.refined import steps_at
 from graphslam.refine.refine import Refinement
 
 
-def level_truth(truth: MapTruth, path: Trajectory | None, true_base: Array) -> tuple[MapTruth, Trajectory | None]:
-    """Truth in the gravity-aligned frame at the first base, which is the frame of a refined path.
+def level_truth(
+    truth: MapTruth, path: Trajectory | None, true_base: Array, refined: Trajectory
+) -> tuple[MapTruth, Trajectory | None]:
+    """Truth in the frame of a refined path: level, and with the first position and heading of that path.
 
     Parameters
     ----------
@@ -30,11 +32,16 @@ def level_truth(truth: MapTruth, path: Trajectory | None, true_base: Array) -> t
         True path in that frame.
     true_base : (7,) or (3,)
         Of the first submap, in a gravity-aligned frame.
+    refined : Trajectory
+        Its first position and heading are fixed. Where their truth is not known, those of the first base are equal.
     """
     g = group_of(true_base)
     if g.dim == 2:
         return truth, path
     T = g.between(remove_roll_pitch(true_base), true_base)
+    if path is not None and path.times[0] == refined.times[0]:  # the base lies below the body, by an estimated tilt
+        begin = remove_roll_pitch(g.compose(T, path.poses[0]))
+        T = g.compose(g.compose(remove_roll_pitch(refined.poses[0]), g.inverse(begin)), T)
     moved = replace(truth, exit_poses=g.compose(np.broadcast_to(T, truth.exit_poses.shape), truth.exit_poses))
     if path is not None:
         path = Trajectory(path.times, g.compose(np.broadcast_to(T, path.poses.shape), path.poses))

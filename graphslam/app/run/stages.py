@@ -282,7 +282,7 @@ def _truth(made: SolvedMap, graph_path: Trajectory) -> str:
     if truth is not None:
         known = all(s.landmarks is None or bool(np.all(s.landmarks.ids >= 0)) for s in submaps)
         if refined is not None:
-            truth, true_path = level_truth(truth, true_path, np.array(base))
+            truth, true_path = level_truth(truth, true_path, np.array(base), path)
             base = remove_roll_pitch(np.array(base)).tolist() if dim == 3 else base
             refined_truth_metrics(out, made.map, refined.refinement, submaps, truth, path=true_path)
             if true_path is not None and len(true_path) >= 3:
