@@ -165,9 +165,9 @@ def _compared(cloud: Array, T: Array, piece: Piece, model: BeamModel) -> tuple[i
     voxels = np.zeros((len(points), 3), np.int64)
     voxels[:, : piece.dim] = np.floor(points / piece.voxel_size)
     voxels = voxels[_values(piece, voxels) != UNKNOWN]
-    top, low = np.full(len(voxels), UNKNOWN, np.int16), np.full(len(voxels), 32767, np.int16)
-    for beside in product(range(-BESIDE, BESIDE + 1), repeat=piece.dim):
-        values = _values(piece, voxels + np.array([*beside, 0][:3]))
-        top, low = np.maximum(top, values), np.minimum(low, values)
+    beside = np.zeros(((2 * BESIDE + 1) ** piece.dim, 3), np.int64)
+    beside[:, : piece.dim] = list(product(range(-BESIDE, BESIDE + 1), repeat=piece.dim))
+    values = _values(piece, (voxels[:, None] + beside).reshape(-1, 3)).reshape(len(voxels), len(beside))
+    top, low = values.max(axis=1), values.min(axis=1)
     free = (top <= SURE * model.clamp_steps[0]) & (low != UNKNOWN)
     return int(np.sum(top >= model.threshold_step)), int(np.sum(free))
