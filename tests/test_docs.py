@@ -141,7 +141,7 @@ def test_run_folder_holds_the_files_that_the_page_names(tmp_path: Path) -> None:
 
 
 def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_path: Path) -> None:
-    """As they stand there, but for time: the demo is its quick form, the tests are only named, and the environment
+    """As they stand there, but for time: the demo and the mixed world are the quick ones, the tests are only named, and the environment
     with the package is the one that runs this test. A demo is gone on with, to the same map."""
     clone, venv = tmp_path / "clone", tmp_path / "clone" / ".venv"
     subprocess.run(["git", "clone", "-q", "--no-local", str(ROOT), str(clone)], check=True)
@@ -158,7 +158,13 @@ def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_pat
     text = (clone / "README.md").read_text(encoding="utf-8")
     commands = "\n".join(re.findall(r"^```sh\n(.*?)^```$", text, re.M | re.S))
     assert commands.splitlines()[0].startswith("make demo ")
-    commands = commands.replace("make demo ", 'make demo DEMO="--preset quick" ').replace("make test ", "make -n test ")
+    assert "graphslam simulate mixed --out " in commands
+    for plain, quick in (
+        ("make demo ", 'make demo DEMO="--preset quick" '),
+        ("make test ", "make -n test "),
+        ("graphslam simulate mixed ", "graphslam simulate mixed --preset quick "),
+    ):
+        commands = commands.replace(plain, quick)
     (python,) = BLOCK.findall(text)
     script = f"set -e\n{commands}\npython - <<'END'\n{python}\nEND\n"
     script += "cp demo-run/map.ply before.ply\ngraphslam demo --preset quick --out demo-run --json >again.json\n"
