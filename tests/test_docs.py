@@ -141,8 +141,8 @@ def test_run_folder_holds_the_files_that_the_page_names(tmp_path: Path) -> None:
 
 
 def test_commands_and_python_of_the_readme_run_in_order_in_a_fresh_clone(tmp_path: Path) -> None:
-    """As they stand there, but for time: the demo and the mixed world are the quick ones, the tests are only named, and the environment
-    with the package is the one that runs this test. A demo is gone on with, to the same map."""
+    """As they stand there, but for time: the demo and the mixed world are the quick ones, the tests are only named, and
+    the environment with the package is the one that runs this test. A demo is gone on with, to the same map."""
     clone, venv = tmp_path / "clone", tmp_path / "clone" / ".venv"
     subprocess.run(["git", "clone", "-q", "--no-local", str(ROOT), str(clone)], check=True)
     for name in subprocess.check_output(["git", "ls-files", "-mo", "--exclude-standard"], cwd=ROOT, text=True).split(
