@@ -4,7 +4,7 @@ What decides is the start of each match. A hand-held lidar turns by ten degrees 
 20 m by metres, while a match sees no farther than a cell. So rotations about the prediction and about the last pose are
 tried on the coarsest cells, wherever the prediction's own match is not as good as the scans before it. A scan that
 finds less of itself in the map than usual is looked for far and wide before it enters the map: a lost scan in the map
-spoils all that come after.
+spoils all that come after. Where a gyro says how the sensor turned, a match that is turned otherwise is refused.
 """
 
 from __future__ import annotations
@@ -105,6 +105,11 @@ WINDOW_SCANS = 100
 """Cells of so many scans are kept at least, however far the sensor has moved since."""
 SUSPICIOUS = 0.7
 """Share of the running median of the overlap below which a scan is looked for far and wide."""
+
+
+GYRO_OFF = 0.15
+"""A match that is turned further than this from what a gyro says [rad] is another place that looks alike: rooms look
+alike when turned by a right angle. A gyro that is believed is off by a hundredth of it between two scans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,7 +296,7 @@ class LidarOdometry:
             if bridge is not None:
                 self.pose, seen = bridge, replace(seen, bridged=True)
         else:
-            self.pose, fit, seen = self._match(raw, chosen, predicted, bridge, Q, time)
+            self.pose, fit, seen = self._match(raw, chosen, predicted, bridge, Q, time, ahead is not None)
             seen = replace(seen, watched=bridge is not None, bridged=bridge is not None and seen.unheld > 0)
         if ahead is not None or raw.straight is not None:
             seen = replace(seen, aided=True)
@@ -455,6 +460,7 @@ class LidarOdometry:
         bridge: Array | None,
         told: Array | None,
         time: float,
+        by_gyro: bool,
     ) -> tuple[Array, NormalEquations | None, ScanResult]:
         """Pose of a scan, the fit there, and what came of it.
 
@@ -469,7 +475,13 @@ class LidarOdometry:
             Covariance of that motion; None: of an even one, as scans saw it lately.
         time : float
             [s]
+        by_gyro : bool
+            A gyro says how ``predicted`` is turned: matches that are turned otherwise are refused.
         """
+
+        def turned_alike(pose: Array) -> bool:
+            return not by_gyro or float(np.linalg.norm(se3.se3_log(se3.se3_between(predicted, pose))[:3])) < GYRO_OFF
+
         points = self._unbent(raw, predicted, time)[chosen]
         stands = predicted if bridge is None else bridge
         if len(points) < FEW:
@@ -482,14 +494,16 @@ class LidarOdometry:
             searched = True
             tried = [(coarse.overlap, start)]
             tried += self._search(points, few, (predicted, self.anchor), self.near_rotations, 2, top)
-            _, start = max(tried, key=lambda x: x[0])
+            alike = [x for x in tried if turned_alike(x[1])]
+            start = max(alike, key=lambda x: x[0])[1] if alike else predicted
         pose, points, fit = self._finish(raw, chosen, start, time)
         state = "matched"
         few_of_it = len(self.overlaps) >= 3 and fit.overlap < SUSPICIOUS * np.median(self.overlaps)
         if few_of_it or self._late(time):
             searched = True
             found = self._search(points, few, (predicted, self.anchor), self.wide_rotations, 6, self.levels)
-            overlap, best = max(found, key=lambda x: x[0])
+            alike = [x for x in found if turned_alike(x[1])]
+            overlap, best = max(alike, key=lambda x: x[0]) if alike else (0.0, start)
             if overlap > BETTER * fit.overlap:
                 start = best
                 pose, points, fit = self._finish(raw, chosen, start, time)
@@ -501,6 +515,8 @@ class LidarOdometry:
                 )
                 spread = self.spread if told is None else told
                 state = "new space" if fits and not _far(stands, pose, spread) else "lost"
+        if not turned_alike(pose):
+            state = "lost"
         if state == "lost":
             return stands, None, ScanResult(len(points), fit.overlap, 6, state, searched)
         if fit.known < LITTLE:

@@ -14,6 +14,7 @@ from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.random import SeedTree
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
+from graphslam_frontends.lidar_odometry import odometry as odometry_module
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, start_odometry
 from graphslam_frontends.lidar_odometry.inertial import (
@@ -24,7 +25,9 @@ from graphslam_frontends.lidar_odometry.inertial import (
     fit_velocity_gravity,
     gravity_along_path,
 )
+from graphslam_frontends.lidar_odometry.odometry import GYRO_OFF
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
+from graphslam_studies.trust import ScanWorld
 
 NOISE = ImuNoise(
     gyro=3e-4,
@@ -354,3 +357,12 @@ def test_scans_may_be_stamped_when_they_begin(paths):
     assert all(s.report["scans_lost"] == 0 for s in made)
     for s in made:
         assert np.linalg.eigvalsh(s.trajectory.covariances[1:]).min() > 0
+
+
+@pytest.mark.parametrize(("limit", "fooled"), [(GYRO_OFF, False), (10.0, True)])
+def test_a_place_that_looks_alike_when_turned_is_refused_by_the_gyro(monkeypatch, limit, fooled):
+    """Rooms look alike when turned by a right angle: the search once turned this path by 90° against its own gyro."""
+    monkeypatch.setattr(odometry_module, "GYRO_OFF", limit)
+    log = ScanWorld(kind="lidar", number=91, seconds=70.0).log(7)
+    path, _ = follow(log, log["imu"])
+    assert (float(np.abs(errors(path, log)[:, :3]).max()) > 1.0) == fooled
