@@ -10,16 +10,38 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
+from threading import Lock
 
 from threadpoolctl import threadpool_limits
 
 from graphslam.core.jit import compile_seconds
 
+_open: list[object] = []
+_limits: list[threadpool_limits] = []
+_lock = Lock()
 
-def one_blas_thread() -> threadpool_limits:
-    """Context in which BLAS works on one thread; the caller's setting comes back at its end."""
-    return threadpool_limits(limits=1, user_api="blas")
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Context in which BLAS works on one thread.
+
+    Contexts may end in any order: the caller's setting comes back at the end of the last one.
+    """
+    mine = object()
+    with _lock:
+        if not _open:
+            _limits.append(threadpool_limits(limits=1, user_api="blas"))
+        _open.append(mine)
+    try:
+        yield
+    finally:
+        with _lock:
+            _open.remove(mine)
+            if not _open:
+                _limits.pop().restore_original_limits()
 
 
 def hold_one_thread() -> None:
