@@ -75,10 +75,14 @@ def score(run: Run, log: SensorLog) -> Score:
 
 
 @functools.cache
-def clean_score(frontend: str, kind: str) -> Score:
-    log = clean_log(kind)
+def clean_run(frontend: str, kind: str) -> Run:
     config = {"gps": {"use": "all"}} if kind == "gps" else KNOWN
-    return score(gs.run(inject.clean(log), frontend=frontend, seed=1, config=config, progress=False), log)
+    return gs.run(inject.clean(clean_log(kind)), frontend=frontend, seed=1, config=config, progress=False)
+
+
+@functools.cache
+def clean_score(frontend: str, kind: str) -> Score:
+    return score(clean_run(frontend, kind), clean_log(kind))
 
 
 def judge(row: Row) -> tuple[str, list[str], Score | None]:
@@ -112,9 +116,7 @@ def test_a_fault_has_its_outcome(row: Row) -> None:
 
 @pytest.mark.parametrize(("frontend", "kind"), sorted({(r.frontend, r.log) for r in ROWS}))
 def test_a_log_without_a_fault_is_not_blamed(frontend: str, kind: str) -> None:
-    log = clean_log(kind)
-    config = {"gps": {"use": "all"}} if kind == "gps" else KNOWN
-    run = gs.run(inject.clean(log), frontend=frontend, seed=1, config=config, progress=False)
+    run = clean_run(frontend, kind)
     codes = {f.code for f in run.verdict if f.level == "bad"}
     assert codes == ({"particles"} if frontend == "rbpf-slam" else set())  # one filter over a whole log always is wrong
 
