@@ -18,12 +18,14 @@ from graphslam.backend.ambiguous_maps import AmbiguousMaps, ambiguous_maps
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
 from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, repreintegrate_until_converged
+from graphslam.core.control import ControlTable
 from graphslam.core.errors import DataError
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import NO_KERNEL, RobustKernel
+from graphslam.graph.sensors.control import ControlFactors
 from graphslam.graph.sensors.gps import GpsFactors
 from graphslam.loops.appearance import AppearanceConfig
 from graphslam.loops.candidates import FRONT_END, CandidateConfig
@@ -101,6 +103,8 @@ class BackEnd:
     others: OtherSources | None = None
     """Sensors of the log that have no options."""
     observers: Sequence[Observer] = ()
+    control: ControlTable | None = None
+    """Control points and distances, which enter when all submaps are there."""
     two_maps: AmbiguousMaps | None = None
     """Once it is finished: the graph with either of two groups of loops that cannot both be right, if nothing told."""
 
@@ -234,6 +238,8 @@ class BackEnd:
             submaps has them, and then one that is not in this graph is noted and stays undone.
         """
         self._give_fixes(np.inf)
+        if self.control is not None:
+            ControlFactors.of(self.graph).add(self.control)
         self.graph.finish_sensors()
         if self.imu is not None:
             self.imu.attach(self.graph)

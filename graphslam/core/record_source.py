@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Stream
 
@@ -11,7 +12,14 @@ class RecordSource:
 
     One that grows is a :class:`graphslam.io.growing_log.GrowingLog`. What a front end makes of a feed depends on its
     records alone, never on the portions in which they came.
+
+    Attributes
+    ----------
+    places : (times (q,), lever (2,)) or None
+        Where the path will be measured besides by fixes: control and check points.
     """
+
+    places: tuple[Array, Array] | None = None
 
     def __init__(self, log: SensorLog) -> None:
         self._log = log

@@ -161,7 +161,7 @@ def gps_innovations(
     values, lay = graph.values, graph.flat().layout
     if values.datum is None or graph.gps_origin is None:
         raise DataError("withheld fixes cannot be predicted: the graph has no GPS datum", wanted="a graph with GPS")
-    node, arm, arm_cov, inner = _arms(graph, gps)
+    node, arm, arm_cov, inner = antenna_places(graph, gps.times, gps.lever[: graph.dim])
     found = node >= 0
     if not np.any(found):
         raise DataError("no withheld fix lies inside a submap's path", got=len(gps.times))
@@ -232,7 +232,7 @@ def gps_innovations(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Inner:
+class InnerAntennas:
     """Fixes at points of the path of a landmark submap, given what the graph solves for.
 
     Parameters
@@ -255,7 +255,7 @@ class _Inner:
     left: Array
 
 
-def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inner:
+def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> InnerAntennas:
     """Points of a path given exit, landmarks, and those of its points that the graph solves for."""
     inner, values, lay = s.inner_points, graph.values, graph.flat().layout
     assert inner is not None
@@ -295,29 +295,29 @@ def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> _Inn
     )
     left = inner.scale * (path.covariance[np.ix_(ix, ix)] - gain @ cross.T)
     turned = np.kron(np.eye(len(points)), V)
-    return _Inner(fixes, path.positions[points] + off, columns, turned @ gain @ J, 0.5 * (left + left.T))
+    return InnerAntennas(fixes, path.positions[points] + off, columns, turned @ gain @ J, 0.5 * (left + left.T))
 
 
-def _arms(graph: FactorGraph, gps: Gps) -> tuple[Ints, Array, Array, list[_Inner]]:
-    """Node of every fix (-1: none), antenna in its frame, joint covariance of these points ``(dim n, dim n)``.
+def antenna_places(graph: FactorGraph, times: Array, lever: Array) -> tuple[Ints, Array, Array, list[InnerAntennas]]:
+    """Node at each time (-1: none), antenna in its frame, joint covariance of these points ``(dim n, dim n)``.
 
     Fixes of one stretch of path, from a node to the next, share what the path has lost since the node. Those at points
     of a landmark submap's path come by the joint rows of its Gaussian.
     """
-    n, d = len(gps.times), graph.dim
+    n, d = len(times), graph.dim
     node, arm, cov = np.full(n, -1, dtype=np.int64), np.zeros((n, d)), np.zeros((d * n, d * n))
-    inner: list[_Inner] = []
+    inner: list[InnerAntennas] = []
     for k, s in enumerate(graph.submaps):
         path = s.trajectory
         if path is None or not len(path):
             continue
         t0, t1 = max(s.interval[0], path.times[0]), min(s.interval[1], path.times[-1])
         last = k == len(graph.submaps) - 1
-        inside = (gps.times >= t0) & ((gps.times <= t1) if last else (gps.times < t1))
+        inside = (times >= t0) & ((times <= t1) if last else (times < t1))
         known = s.inner_points
         if known is not None:
             mine = np.flatnonzero(inside)
-            at = [known.path.at(t, gps.lever[:d]) for t in gps.times[mine].tolist()]
+            at = [known.path.at(t, lever) for t in times[mine].tolist()]
             pairs = [(f, p) for f, p in zip(mine.tolist(), at) if p is not None]
             if pairs:
                 told = _inner(graph, s, np.array([f for f, _ in pairs]), np.array([p for _, p in pairs]))
@@ -326,15 +326,15 @@ def _arms(graph: FactorGraph, gps: Gps) -> tuple[Ints, Array, Array, list[_Inner
                 node[told.fixes], arm[told.fixes] = s.node, told.places
                 ix = (d * told.fixes[:, None] + np.arange(d)).ravel()
                 cov[np.ix_(ix, ix)] = told.left
-        at_node = s.before(gps.times)
+        at_node = s.before(times)
         for i in range(len(s.nodes) - 1):
             rows = np.flatnonzero(inside & (at_node == i))
             if len(rows):
-                T, P = s.local(gps.times[rows], at_node[rows])
+                T, P = s.local(times[rows], at_node[rows])
                 node[rows] = s.nodes[i]
-                arm[rows], _ = lever_arm(T, None, gps.lever[:d])
+                arm[rows], _ = lever_arm(T, None, lever)
                 ix = (d * rows[:, None] + np.arange(d)).ravel()
-                cov[np.ix_(ix, ix)] = _arm_covariance(T, P, gps.lever[:d])
+                cov[np.ix_(ix, ix)] = _arm_covariance(T, P, lever)
     return node, arm, cov, inner
 
 

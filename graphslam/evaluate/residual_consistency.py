@@ -28,8 +28,9 @@ from graphslam.graph.noise import robust_terms
 
 LASTING = "correlated: overconfident"
 """Verdict on residuals that are alike from one to the next, whatever their size."""
-JUDGED_WITH = {"path": "gps"}
-"""Factors that measure nothing by themselves: points of a path are there for the fixes, and share their residuals."""
+JUDGED_WITH = {"path": ("gps", "control", "distance")}
+"""Factors that measure nothing by themselves: points of a path are there for the fixes or control points, and share
+their residuals; the first class that a graph has."""
 LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
@@ -152,13 +153,14 @@ def class_consistency(graph: FactorGraph, *, confidence: float = 0.95) -> dict[s
     blocks = graph.flat().factor_blocks(graph.values)
     sandwich = _sandwich(covariance, blocks) if np.any(blocks.weight != 1.0) else None
     sums: dict[str, list[tuple[float, ...]]] = {}
+    classes = {r.group for r in blocks.records}
     for record, columns, H, d2, w in zip(blocks.records, blocks.columns, blocks.H, blocks.d2, blocks.weight):
         free = columns >= 0
         c, H_free = columns[free], H[np.ix_(free, free)]
         h = float(np.sum(H_free * covariance.columns(c))) if len(c) else 0.0
         again = w * h if sandwich is None else float(np.sum(H_free * sandwich[np.ix_(c, c)]))
         dof = record.rows - 2.0 * w * h + again
-        name = JUDGED_WITH.get(record.group, record.group)
+        name = next((n for n in JUDGED_WITH.get(record.group, ()) if n in classes), record.group)
         own = float(name == record.group)  # points of a path are no fixes
         sums.setdefault(name, []).append((record.rows, w * h, dof, float(d2), float(w), own))
     series = _series(graph, covariance)

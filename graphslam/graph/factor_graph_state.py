@@ -291,6 +291,12 @@ class FactorGraphState:
             self.records[fid] = replace(record, landmark_ids=ids)  # a new object: solvers see that it changed
             self._seen_in[keep].add(fid)
             self._path_follows(record.submap_key, ids)
+        for fid, r in list(self.records.single.items()) if "control" in self.sensors else ():
+            moved = {n: keep for n in ("landmark", "landmark_to") if getattr(r, n, None) == drop}
+            if moved:
+                self.records[fid] = replace(cast(Any, r), **moved)
+                if len(set(self.records[fid].variables())) < len(self.records[fid].variables()):
+                    self.take_out(fid, "both of its landmarks are one")
         self._seen_in[drop] = set()
         self.drop_landmarks([drop])
         self.revision += 1

@@ -111,7 +111,7 @@ for _kind in (
         remedy="the sensor position needs a prior.",
     ),
     # In space the datum's heading stands last and it moves by addition.
-    VariableKind("datum", "g", {2: "mmr", 3: "mmmr"}, group=True, single=True, classes=("gps",)),
+    VariableKind("datum", "g", {2: "mmr", 3: "mmmr"}, group=True, single=True, classes=("gps", "control")),
     VariableKind(
         "bias", "b", {2: "mm", 3: "mmm"}, classes=("gps-bias",),
         remedy="a GPS bias has neither a prior nor a fix of its own: set bias_sigma.",

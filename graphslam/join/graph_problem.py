@@ -285,13 +285,12 @@ class JoinProblem:
             v = self.variables[f]
             points = v[(v >= p0) & (v < p1)]
             if len(points):
-                low[f] = high[f] = home[points].max()
+                low[f], high[f] = home[points].min(), home[points].max()
                 unknown = v[home[v] < 0]
                 home[unknown] = high[f]
         for f in np.flatnonzero(high < 0).tolist():
             at = home[self.variables[f]]
-            if np.any(at < 0):
-                at = np.array([len(self.keys) - 1])
+            at = at[at >= 0] if np.any(at >= 0) else np.array([len(self.keys) - 1])
             low[f], high[f] = at.min(), at.max()
         return low, high
 

@@ -20,6 +20,8 @@ from graphslam.join.graph_problem import JoinProblem
 from graphslam.solve.batch import BatchSolver
 from tests.agreement.test_graph_solvers import build
 from tests.graph.factors.test_compass_and_range import everything
+from tests.graph.factors.test_control import planar as surveyed_in_the_plane
+from tests.graph.factors.test_control import spatial as surveyed_in_space
 from tests.graph.factors.test_imu_plane import mixed
 from tests.reference.imu_ring import ring
 from tests.reference.imu_study import solved
@@ -57,6 +59,8 @@ CASES: dict[str, Callable[[np.random.Generator], FactorGraph]] = {
     "compass, beacons and GPS in space": lambda rng: everything(rng, 3),
     "IMU, GPS and gravity in space": in_space,
     "landmarks in space": points_in_space,
+    "control points and distances in the plane": surveyed_in_the_plane,
+    "control points and distances in space": surveyed_in_space,
 }
 
 
@@ -71,7 +75,7 @@ def test_every_method_solves_the_same_factors(problem: JoinProblem) -> None:
     table = compare_methods(problem, memory=False)
     assert len(set(table["factors"])) == 1
     assert len(set(table["dof"])) == len(set(table["states"])) == 1
-    best = problem.graph.objective().total
+    best = problem.graph.objective().total + problem.offset
     np.testing.assert_allclose(table["objective_polished"], best, rtol=1e-9, atol=1e-9)
     assert (table["objective"] >= best * (1 - 1e-9) - 1e-9).all()
     assert set(problem.factor_counts()) == {r.group for r in problem.graph.records.values()}

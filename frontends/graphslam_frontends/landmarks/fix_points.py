@@ -39,13 +39,24 @@ def expects_fixes(feed: RecordSource, until: float) -> bool:
     return not feed.ended and name is not None and feed.until(name) < until
 
 
-def has_fixes(feed: RecordSource, t_start: float, times: Array) -> bool:
-    """Was any fix taken between the ends of a submap?"""
+def measured_times(feed: RecordSource) -> tuple[Array, Array] | None:
+    """Times of the fixes, and of control and check points with the same lever; and that lever ``(2,)``."""
     name = feed.of_type(Gps)
     if name is None:
+        return feed.places
+    gps: Gps = feed.part(name)  # type: ignore[assignment]
+    lever = np.asarray(gps.lever[:2], dtype=np.float64)
+    if feed.places is None or np.abs(feed.places[1] - lever).max() > SAME_TIME:
+        return gps.times, lever
+    return np.union1d(gps.times, feed.places[0]), lever
+
+
+def has_fixes(feed: RecordSource, t_start: float, times: Array) -> bool:
+    """Was the path measured between the ends of a submap?"""
+    found = measured_times(feed)
+    if found is None:
         return False
-    t = feed.part(name).times
-    return bool(np.any((t > t_start + SAME_TIME) & (t < times[-1] - SAME_TIME)))
+    return bool(np.any((found[0] > t_start + SAME_TIME) & (found[0] < times[-1] - SAME_TIME)))
 
 
 def transfer_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, joint: Array) -> PathPoints | None:
@@ -102,13 +113,12 @@ def place_fixes(feed: RecordSource, smoothed: SmoothingResult, t_start: float, t
     times : (T,)
         Of the smoothed poses [s].
     """
-    name = feed.of_type(Gps)
-    if name is None or not has_fixes(feed, t_start, times):
+    found = measured_times(feed)
+    if found is None or not has_fixes(feed, t_start, times):
         return None
-    gps: Gps = feed.part(name)  # type: ignore[assignment]
-    inside = (gps.times > t_start + SAME_TIME) & (gps.times < times[-1] - SAME_TIME)
-    at_fixes = np.unique(gps.times[inside])
-    lever = np.asarray(gps.lever[:2], dtype=np.float64)
+    measured, lever = found
+    inside = (measured > t_start + SAME_TIME) & (measured < times[-1] - SAME_TIME)
+    at_fixes = np.unique(measured[inside])
     known = np.concatenate([[min(t_start, times[0])], times])
     poses = np.concatenate([np.zeros((1, 3)), smoothed.poses])
     k = np.clip(np.searchsorted(known, at_fixes, side="right") - 1, 0, len(known) - 2)

@@ -51,6 +51,7 @@ JSON = typer.Option(False, "--json", help="Print one JSON object on stdout, and 
 
 SHORT = (
     *("submaps", "landmarks_confirmed", "objective", "converged", "join_chi2_per_dof", "join_dof"),
+    *("check_rmse", "check_nis_value", "check_nis_dof", "check_power"),
     *("gps_rmse", "gps_withheld_rmse", "path_rmse", "path_rmse_aligned", "landmark_rmse_aligned"),
     *("nees_per_dof", "nees_dof", "ci", "map_entropy", "seconds_total", "times_real_time"),
 )
@@ -78,6 +79,8 @@ def run_command(
     preset: str | None = PRESET,
     config: Path | None = typer.Option(None, help="TOML file with options; they replace those of the preset."),
     setting: list[str] = typer.Option([], "--set", help="Set one option, as a.b=value. May be repeated."),
+    control: Path | None = typer.Option(None, help="CSV file of control points and distances; they enter the graph."),
+    check: Path | None = typer.Option(None, help="CSV file of check points and distances; they test the result."),
     seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
     out: Path = typer.Option(..., help="Folder for the results of the run."),
     resume: bool = typer.Option(False, "--resume", help="Continue an interrupted run after its last finished submap."),
@@ -102,6 +105,7 @@ def run_command(
     options = run_options(config, setting)
     if preset is not None:
         options["preset"] = preset
+    options |= {name: str(file) for name, file in (("control", control), ("check", check)) if file is not None}
     log: Any = source
     if reader is not None or reader_option:
         log = load_log_source(source, reader=reader, **reader_options(reader_option))

@@ -14,6 +14,7 @@ from graphslam.app.report.markup import whole_page
 from graphslam.app.report.refinement import refinement_section
 from graphslam.app.report.scene import report_scene
 from graphslam.app.report.sections import (
+    control_section,
     events_section,
     evidence_section,
     graph_section,
@@ -36,6 +37,7 @@ _PARTS = {
     "refinement": refinement_section,
     "run": what_was_run,
     "records": records_section,
+    "points": control_section,
     "metrics": metrics_section,
     "graph": graph_section,
     "loops": loops_section,

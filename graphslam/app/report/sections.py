@@ -148,6 +148,31 @@ def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str
     return out, folded_in
 
 
+def control_section(folder: ReportFolder) -> Markup:
+    """Check points with their errors, and rows of control and check points that were refused."""
+    checked, control = folder.part("check_points"), folder.part("control_points")
+    if not checked and not control:
+        return Markup("")
+    parts: list[Any] = []
+    if checked:
+        names = ("said", "rmse", "nis_per_dof", "low", "high", "dof", "power", "aligned")
+        parts += [html_element("h3", "Check points"), pair_list({k: checked.get(k) for k in names})]
+        columns = {
+            **{"line": "line", "name": "name", "place": "place", "frame": "frame", "error": "error [m]"},
+            **{"sigma": "expected [m]", "nis": "NIS", "dof": "dof"},
+        }
+        parts.append(html_table(checked.get("rows", []), columns))
+    if control:
+        facts = {k: control.get(k) for k in ("source", "used", "frame")}
+        facts["T_control_map"] = compact_json(control.get("T_control_map"))
+        parts += [html_element("h3", "Control points"), pair_list(facts)]
+    refused = [{"file": t["source"], **r} for t in (control, checked) if t for r in t.get("refused", [])]
+    if refused:
+        columns = {"file": "file", "line": "line", "why": "why"}
+        parts += [html_element("h3", "Refused rows"), html_table(refused, columns)]
+    return page_section("points", "Control and check points", *parts)
+
+
 def times_section(folder: ReportFolder) -> Markup:
     """Seconds of each stage: the one part of the page that differs when the same run is made again."""
     timed = [r for r in folder.metrics if is_time(r.get("key"))]

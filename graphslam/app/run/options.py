@@ -28,6 +28,7 @@ from graphslam.app.run.front_ends import (
     recommended_options,
 )
 from graphslam.core.config import build_config, dump_toml, merge_options, options_dict
+from graphslam.core.control import ControlTable, control_lines
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.json_file import check_json
 from graphslam.core.log import SensorLog
@@ -62,7 +63,7 @@ class RunOptions:
     ----------
     settings : RunConfig
     named : mapping
-        Source, front end, solver, seed, and the digest of the log.
+        Source, front end, solver, seed, the digest of the log, and the lines of control and check points.
     front : FrontEnd or None
         None where submaps come from a folder.
     asked : mapping
@@ -87,7 +88,7 @@ class RunOptions:
         ``config["preset"]`` names another preset than that of the log; ``"none"``: defaults.
         """
         asked = dict(config or {})
-        preset = asked.pop("preset", None)
+        points, preset = _points_of(asked), asked.pop("preset", None)
         if isinstance(frontend, (list, tuple)) and len(frontend) < 2:
             frontend = frontend[0] if frontend else None
         why, read = "as asked for", reading_line(log)
@@ -110,7 +111,7 @@ class RunOptions:
             suggested = without_noise(suggested, mixed=not isinstance(name, str))
         settings: RunConfig = build_config(RunConfig, merge_options(suggested, asked))
         front = make_front_end(frontend, settings.frontend)  # type: ignore[arg-type]
-        named = {"source": log.name, "frontend": name, "solver": solver, "seed": seed}
+        named = {"source": log.name, "frontend": name, "solver": solver, "seed": seed, **points}
         return cls(settings, named, front, asked, own)
 
     @classmethod
@@ -119,19 +120,22 @@ class RunOptions:
     ) -> RunOptions:
         """Options for records that are still to come: nothing is estimated from them."""
         asked = dict(config or {})
+        points = _points_of(asked)
         options = merge_options(named_preset(frontend, asked.pop("preset", None)), asked)
         settings: RunConfig = build_config(RunConfig, options)
         front = make_front_end(frontend, settings.frontend)
         if front.calibrates and settings.calibrate.given is None and settings.calibrate.use == "auto":
             settings = replace(settings, calibrate=replace(settings.calibrate, use="none"))
-        return cls(settings, {"source": name, "frontend": frontend, "solver": solver, "seed": seed}, front, asked)
+        named = {"source": name, "frontend": frontend, "solver": solver, "seed": seed, **points}
+        return cls(settings, named, front, asked)
 
     @classmethod
     def of_folder(cls, root: Path) -> RunOptions:
         """Those of a run folder."""
         stored = read_options(root)
-        wanted = {"run": {"source": str, "frontend": object, "solver": str, "seed": int}}
-        named = check_json(stored, wanted, str(root / CONFIG))["run"]
+        points = {"source": str, "rows": [str]}
+        names = {"source": str, "frontend": object, "solver": str, "seed": int, "control?": points, "check?": points}
+        named = check_json(stored, {"run": names}, str(root / CONFIG))["run"]
         settings: RunConfig = build_config(RunConfig, {k: v for k, v in stored.items() if k != "run"})
         return cls(settings, named, stored=stored)
 
@@ -139,6 +143,11 @@ class RunOptions:
     def solver(self) -> str:
         """Name of the solver."""
         return str(self.named["solver"])
+
+    def table(self, name: str) -> ControlTable | None:
+        """Rows of ``control`` or ``check``; None: there are none."""
+        given = self.named.get(name)
+        return None if given is None else ControlTable.parse(given["source"], given["rows"])
 
     @property
     def with_grids(self) -> bool:
@@ -178,3 +187,11 @@ class RunOptions:
         out = {"run": dict(self.named), "frontend": options_dict(self.front.config)}
         out |= {name: options_dict(getattr(self.settings, name)) for name in parts}
         return tomllib.loads(dump_toml(out)) if "log" in self.named else out  # as it comes back from the folder
+
+
+def _points_of(asked: dict[str, Any]) -> dict[str, Any]:
+    """Lines of control and check points, taken out of what the user asked for; what cannot be read is refused here."""
+    given: dict[str, Any] = {name: control_lines(asked.pop(name)) for name in ("control", "check") if name in asked}
+    for lines in given.values():
+        ControlTable.parse(lines["source"], lines["rows"])
+    return given

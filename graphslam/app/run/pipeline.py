@@ -54,7 +54,9 @@ def run(
         Run folder; without one nothing is written.
     config : mapping, optional
         Nested options over the source's preset: ``{"frontend": {...}, "backend": {...}, "gps": {...}}``; ``"preset"``
-        names another preset than that of the log, its reader or its kind, ``"none"`` for defaults.
+        names another preset than that of the log, its reader or its kind, ``"none"`` for defaults. ``"control"`` and
+        ``"check"``: control points and distances that enter the graph, and check points that are held back to test the
+        result; each a CSV file, a table, or a list of mappings (:mod:`graphslam.core.control`).
     resume : bool
         Go on after the last finished submap of ``out``, to the same result. Loops that were undone stay so.
     progress : bool or sequence of Observer

@@ -159,7 +159,7 @@ def check_residual_consistency(
                 direction = "one" if key == "value" else "none"
                 out.add(f"gps_nis_{row['test']}_{key}", row[key], "", direction)
     fixes = None
-    if gps is not None and graph.values.datum is None:
+    if gps is not None and graph.gps_origin is None:
         fixes = fix_distances(path, gps, sigma=settings.gps.sigma)
     if fixes is not None:
         out.add("gps_distance_median", fixes.median, "m", "lower")

@@ -166,6 +166,14 @@ class Run:
         """First line of the verdict: overall result, main values, next step."""
         return headline_of_json(self.report.get("verdict")) or Finding("", "headline", "No verdict.")
 
+    @property
+    def check_points(self) -> pd.DataFrame:
+        """Check points, a row each: ``line``, ``name``, ``place``, ``frame``, ``error`` [m] and its predicted
+        ``sigma`` [m], ``nis``, ``dof``; none where the run had no check rows. The test of all of them together is in
+        ``report["check_points"]``."""
+        columns = ["line", "name", "place", "frame", "error", "sigma", "nis", "dof"]
+        return pd.DataFrame(self.report.get("check_points", {}).get("rows", []), columns=columns)
+
     def to_pandas(self) -> pd.DataFrame:
         """The path at full rate, a row an instant, in the frame of the first base: :meth:`Trajectory.to_pandas`."""
         return self.map.trajectory.to_pandas()

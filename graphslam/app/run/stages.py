@@ -12,6 +12,7 @@ import numpy as np
 from graphslam.app.machine import Stopwatch, versions
 from graphslam.app.run.audit import audit_association
 from graphslam.app.run.calibration import bias_findings, bias_table, explain_disagreement
+from graphslam.app.run.control import check_metrics, control_facts, control_findings, left_out_of_refinement
 from graphslam.app.run.maps import sensor_reach
 from graphslam.app.run.outputs import graph_metrics
 from graphslam.app.run.residual_consistency import ResidualConsistency, check_residual_consistency
@@ -21,6 +22,7 @@ from graphslam.app.run.stream_use import stream_use
 from graphslam.app.run.submap_slam import SubmapSlam, tell_stage
 from graphslam.app.run.summary import summarise_run
 from graphslam.app.run.verdict import RunMetrics, findings_from_run, run_findings
+from graphslam.backend.config import GpsOptions
 from graphslam.backend.refining import RefinedRun, refine_run, refined_ledger
 from graphslam.backend.streams import split_fixes, used_fixes
 from graphslam.core.errors import GraphSlamError
@@ -33,6 +35,7 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.bias_test import bias_test_findings
+from graphslam.evaluate.check_points import CheckPoints, check_points
 from graphslam.evaluate.covariance_assessment import consistency_tests_as_json, pooled_nonlinearity
 from graphslam.evaluate.dead_reckoning_baseline import dead_reckoned_path
 from graphslam.evaluate.gps import GpsResiduals
@@ -61,6 +64,7 @@ from graphslam.evaluate.refined import (
 )
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.ledger import Ledger
+from graphslam.graph.sensors.control import ROBUST, SPANNED, ControlFactors
 from graphslam.maps.global_map import GlobalMap, make_global_map
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import RunMap, has_maps, make_run_map
@@ -124,6 +128,7 @@ class SolvedMap:
     fused: RunMap | None = None
     why_no_map: str = ""
     residuals: dict[str, GpsResiduals] = field(default_factory=dict)
+    checked: CheckPoints | None = None
     dead_reckoning: Trajectory | None = None
     truth: MapTruth | None = None
     truth_path: Trajectory | None = None
@@ -167,6 +172,7 @@ def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clo
     tell_stage(slam.back.observers, "evaluation")
     _time_and_way(made)
     _gps(made)
+    _check(made)
     identified = [
         s.with_ids(slam.back.graph.landmark_ids_of(s.key)) if s.landmarks is not None else s for s in slam.submaps
     ]
@@ -210,9 +216,19 @@ def _refine(made: SolvedMap) -> None:
     fixes = None
     if gps is not None and made.solution.T_gps_world is not None:
         fixes = split_fixes(gps, settings.gps)[0], settings.gps
+    control = None if made.slam.control is None else ControlFactors.of(graph)
+    own = None if fixes is not None or control is None else control.as_fixes()
+    if own is not None:
+        fixes = own, GpsOptions(robust=ROBUST, baseline=SPANNED * float(np.median(own.sigma)), errors="stated")
     made.refined, findings = refine_run(settings.refine, made.inputs.scans, submaps, made.map, gps=fixes, graph=graph)
     made.findings = list(findings)
     if made.refined is not None:
+        if control is not None:
+            held = 0 if own is None or made.refined.refinement.fixes is None else made.refined.refinement.fixes.used
+            if held < len(control.used):
+                made.findings.append(left_out_of_refinement(held, len(control.used)))
+            if own is not None and control.frame != "gps":  # the frame of the survey is not that of the fixes
+                made.refined = replace(made.refined, map=replace(made.refined.map, T_gps_world=None))
         made.seconds["refine"] = time.perf_counter() - clock
         made.seconds["total"] += made.seconds["refine"]
     trim_heap()
@@ -266,6 +282,15 @@ def _gps(made: SolvedMap) -> None:
         dead_reckoning_metrics(made.out, made.dead_reckoning, gps)
 
 
+def _check(made: SolvedMap) -> None:
+    """Against the check points."""
+    table, r = made.slam.check, made.refined
+    if table is not None:
+        refined = None if r is None else (r.refinement, r.map.trajectory)
+        made.checked = check_points(made.slam.back.graph, table, refined)
+        check_metrics(made.out, made.checked)
+
+
 def _truth(made: SolvedMap, graph_path: Trajectory) -> str:
     """Against ground truth, where it is known; returns whose identities the landmarks have."""
     log, submaps, out, path, refined = (
@@ -304,7 +329,7 @@ def _report(made: SolvedMap, checks: ResidualConsistency, identities: str) -> di
     names, dropped = config["run"]["frontend"], {**log.dropped, **made.drops.counts}
     report = {
         "format": "graphslam.run/1",
-        **config["run"],
+        **{k: v for k, v in config["run"].items() if k not in ("control", "check")},
         "frontend": names if isinstance(names, str) else ", ".join(names),
         "backend": config["backend"],
         "gps": config["gps"],
@@ -333,6 +358,10 @@ def _report(made: SolvedMap, checks: ResidualConsistency, identities: str) -> di
     lasting = bias_table(back.graph)
     if lasting:
         report["lasting"] = lasting
+    if made.slam.control is not None:
+        report["control_points"] = control_facts(back.graph, made.slam.control)
+    if made.checked is not None:
+        report["check_points"] = made.checked.facts()
     if refined is not None:
         report["refine"] = refinement_facts(refined.refinement)
     if back.two_maps is not None:
@@ -364,6 +393,7 @@ def _verdict(made: SolvedMap, report: dict[str, Any]) -> None:
         *sighting_findings(log, reports, dropped),
         *bias_test_findings(reports),
         *made.findings,
+        *control_findings(report),
         *run_findings(figures),
     ]
     report["verdict"] = verdict_json(summarise_run(figures, lines), lines)

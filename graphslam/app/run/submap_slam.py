@@ -18,6 +18,7 @@ from graphslam.app.run.run_bar import RunBar
 from graphslam.app.run.run_inputs import RunInputs, collect_inputs
 from graphslam.backend.back_end import BackEnd, Observer
 from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, optional_sensors
+from graphslam.core.control import measured_places
 from graphslam.core.geometry import Array
 from graphslam.core.heap import trim_heap
 from graphslam.core.log import DropCounter, SensorLog
@@ -72,6 +73,8 @@ class SubmapSlam:
         folder: RunFolder | None = None,
     ) -> None:
         self.options, self.feed, self.folder = options, feed, folder
+        self.control, self.check = options.table("control"), options.table("check")
+        feed.places = measured_places(self.control, self.check)
         self.settled = None if folder is None else folder.settled()
         """What earlier draws of the folder came to, where that is decided."""
         self._begin(0 if self.settled is None else self.settled.draw, observers)
@@ -109,6 +112,7 @@ class SubmapSlam:
         imu, fixes = ImuSource(feed, settings.imu), GpsSource(feed, settings.gps)
         others = OtherSources(feed)
         back = BackEnd(settings.backend, options.solver, imu=imu, observers=observers, fixes=fixes, others=others)
+        back.control = self.control
         if feed.ended:  # compasses and beacons are given whole
             for name, readings, config in optional_sensors(feed.log, settings.compass, settings.beacons):
                 back.add_sensor(name, readings, config)
@@ -160,6 +164,7 @@ class SubmapSlam:
         tell_stage(bars, "front end")
         made = copy.copy(self)
         made.feed = RecordSource(self.feed.log)
+        made.feed.places = self.feed.places
         made._begin(self.draw + 1, bars)
         made.step()
         made.release_memory()

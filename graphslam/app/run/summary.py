@@ -103,6 +103,9 @@ ADVICE: dict[str, str] = {
     "residuals": "check units and signs of odometry and observations, or increase their noise",
     "imu-contradicted": "increase the IMU noise, or leave the IMU out (--set imu.use=none)",
     "consistency-test": "check the measurements that are named below: they contradict the others",
+    "check-points": "check the row with the largest NIS, then noise and loop closures of the map",
+    "control-points-*": "correct the rows that are refused, or leave them out",
+    "check-points-*": "correct the rows that are refused, or leave them out",
     "gps-contradicts": "use the GPS fixes (--set gps.use=all) and check the new contradictions",
     "interrupted": "resume it: the same command with --resume",
     # then what its covariances say
@@ -287,6 +290,7 @@ def _error(figures: RunMetrics) -> str:
         ("path_rmse_aligned", "path error {} (RMSE, ground truth)"),
         ("pose_rmse", "submap pose error {} (RMSE, ground truth)"),
         ("landmark_rmse_aligned", "landmark error {} (RMSE, ground truth)"),
+        ("check_rmse", "{} RMSE at the check points"),
         ("gps_withheld_rmse", "{} RMSE against withheld GPS fixes"),
         ("gps_rmse", "{} RMSE against GPS fixes"),
     ):

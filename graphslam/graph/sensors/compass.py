@@ -143,6 +143,8 @@ class CompassFactors(PendingMeasurements):
         g = self.graph
         if cfg.declination is None or not g.structure.count("datum") or compass not in self.rows["compass"]:
             return
+        if g.gps_origin is None:  # a datum of control points: nobody says where north is in their frame
+            return
         zero = self.rows["compass"][compass]
         if any(isinstance(r, DeclinationRecord) and r.compass == zero for r in g.records.values()):
             return

@@ -211,6 +211,14 @@ def start_datum(world: Array, fixes: Array, sigma: Array) -> Array:
     return T
 
 
+def level_datum(world: Array, fixes: Array, sigma: Array) -> Array:
+    """:func:`start_datum` of positions ``(q, dim)``; in space with the median height, as ``[x, y, z, heading]``."""
+    level = start_datum(world[:, :2], fixes[:, :2], sigma)
+    if world.shape[1] == 2:
+        return level
+    return np.array([*level[:2], np.median(fixes[:, 2] - world[:, 2]), level[2]])
+
+
 class GpsFactors(SensorFactors):
     """The fixes of a graph: those that are not factors yet, and how they become so.
 
@@ -374,16 +382,20 @@ class GpsFactors(SensorFactors):
             # of a fix that is not equally sure in all directions the arm's alone, until the datum says how to turn it
             covariance = cov[0] if f.uneven is not None else sigma**2 * np.eye(len(f.lever)) + cov[0]
             self.tied.append(AttachedFix(f, s.nodes[int(at[0])], arm[0], covariance, point))
-        self._tie_points(s)
+        self.tie_points(s)
         return dropped
 
     def _inner_point(self, s: SubmapNode, fix: PendingFix) -> int | None:
         """Row of the point of a submap's path at a fix; a new one where it has none yet. None: no such point."""
+        inner = self.graph.submap(s.key).inner_points
+        k = None if inner is None else inner.path.at(fix.time, fix.lever)
+        return None if k is None else self.row_of_point(s, k)
+
+    def row_of_point(self, s: SubmapNode, k: int) -> int:
+        """Row of point k of a submap's path; a new one where it has none yet (:meth:`tie_points` follows)."""
         g, s = self.graph, self.graph.submap(s.key)
         inner = s.inner_points
-        k = None if inner is None else inner.path.at(fix.time, fix.lever)
-        if inner is None or k is None:
-            return None
+        assert inner is not None
         if k not in inner.rows:
             place = group_of(g.structure.poses).transform(g.pose(s.node), inner.path.positions[k])
             rows = {**inner.rows, k: g.structure.append("point", place)}
@@ -396,7 +408,7 @@ class GpsFactors(SensorFactors):
         k = next(k for k, other in enumerate(submaps) if other.key == s.key)
         submaps[k] = replace(submaps[k], inner_points=inner)
 
-    def _tie_points(self, s: SubmapNode) -> None:
+    def tie_points(self, s: SubmapNode) -> None:
         """Tie the points of a submap that are used to its exit and landmarks, by one factor."""
         g, s = self.graph, self.graph.submap(s.key)
         inner = s.inner_points
@@ -428,8 +440,10 @@ class GpsFactors(SensorFactors):
         for fid, r in list(g.records.items()):
             if isinstance(r, PathRecord):
                 g.records[fid] = replace(r, points=np.array([new[k] for k in r.points.tolist()], dtype=np.int64))
-            elif isinstance(r, GpsRecord) and r.point is not None:
-                g.records[fid] = replace(r, point=new[r.point])
+                continue
+            ends = {name: getattr(r, name, None) for name in ("point", "point_to")}
+            if ends := {name: new.get(k, -1) for name, k in ends.items() if k is not None}:  # -1: its point went
+                g.records[fid] = replace(r, **ends)  # type: ignore[type-var]
         for other in list(g.submaps):
             if other.inner_points is not None and other.key != s.key:
                 rows = {k: new[v] for k, v in other.inner_points.rows.items()}
@@ -453,10 +467,7 @@ class GpsFactors(SensorFactors):
             return None
         fix = [np.zeros((group.dim, group.dim)) if t.fix.uneven is None else t.fix.uneven for t in self.tied]
         sigma = np.array([np.sqrt(np.trace((t.covariance + P)[:2, :2]) / 2.0) for t, P in zip(self.tied, fix)])
-        level = start_datum(world[:, :2], fixes[:, :2], sigma)
-        if group.dim == 2:
-            return level
-        return np.array([*level[:2], np.median(fixes[:, 2] - world[:, 2]), level[2]])
+        return level_datum(world, fixes, sigma)
 
     def _bias_of(self, fix: PendingFix) -> int | None:
         cfg, previous = fix.config, self.last_time
