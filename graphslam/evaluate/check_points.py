@@ -22,6 +22,7 @@ from graphslam.core.geometry import Array, align_se2, rotation2
 from graphslam.core.poses import group_of
 from graphslam.core.se3 import align_se3, quat_to_matrix, so3_exp
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.covariance_assessment import LEAST_POWER
 from graphslam.evaluate.gps_innovation import antenna_places
 from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.factor_graph import FactorGraph
@@ -36,7 +37,6 @@ Said = Literal["consistent", "conservative", "overconfident", "wrong", "not test
 CONFIDENCE = 0.95
 TOO_SMALL = 2.0
 """The power is against true covariances that are so many times those of the map."""
-LEAST_POWER = 0.5
 WRONG = 9.0
 """NIS by degree of freedom from which errors are no matter of covariances: three standard deviations on average."""
 

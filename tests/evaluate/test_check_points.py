@@ -122,7 +122,7 @@ def test_power_is_that_of_the_map_and_not_of_the_rows():
     ("ratio", "power", "said"),
     [
         (1.0, 0.9, "consistent"),
-        (1.0, 0.3, "not tested"),
+        (1.0, 0.7, "not tested"),
         (0.3, 0.9, "conservative"),
         (3.0, 0.9, "overconfident"),
         (12.0, 0.9, "wrong"),

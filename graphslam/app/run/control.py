@@ -8,7 +8,8 @@ from typing import Any
 from graphslam.app.run.verdict import CERTAIN
 from graphslam.core.control import ControlTable
 from graphslam.core.findings import Finding, Level
-from graphslam.evaluate.check_points import LEAST_POWER, CheckPoints
+from graphslam.evaluate.check_points import CheckPoints
+from graphslam.evaluate.covariance_assessment import LEAST_POWER
 from graphslam.evaluate.metrics import Metrics
 from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.factor_graph import FactorGraph
@@ -81,7 +82,7 @@ def control_findings(report: Mapping[str, Any]) -> list[Finding]:
             said = "; ".join(f"line {r['line']}: {r['why']}" for r in refused[:SHOWN])
             more = "; …" if len(refused) > SHOWN else ""
             text = f"{what} ({facts['source']}): {n} of {n + len(refused)} rows used — refused: {said}{more}."
-            out.append(Finding("look" if n else "bad", f"{key.replace('_', '-')}-refused", text))
+            out.append(Finding("look", f"{key.replace('_', '-')}-refused", text))
         elif key == "control_points":
             frame = f"; their frame ({facts['frame']}) is a variable of the graph" if "frame" in facts else ""
             out.append(Finding("", "control-points", f"{what} ({facts['source']}): {n} rows used{frame}."))
@@ -110,4 +111,4 @@ def _tested(facts: Mapping[str, Any]) -> Finding:
     if level in ("look", "bad") and said != "conservative":
         worst = max(facts["rows"], key=lambda r: r["nis"] / max(r["dof"], 1))
         text += f" Check line {worst['line']} first: error {worst['error']:.3g} m, expected {worst['sigma']:.2g} m."
-    return Finding(level, "check-points", text)
+    return Finding(level, "check-points-wrong" if said == "wrong" else "check-points", text)

@@ -6,6 +6,7 @@ The words are *consistent*, *conservative*, *not tested*, *overconfident* and *w
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 
 from graphslam.app.run.verdict import (
@@ -32,7 +33,7 @@ START: dict[str, str] = {
 }
 """Start of the line, by the word of the verdict."""
 CONSISTENCY_CODES = frozenset(
-    {"chi2", "nees", "trust", "consistency-test", "correlated", "gps-correlated", "imu-contradicted"}
+    {"chi2", "nees", "trust", "consistency-test", "correlated", "gps-correlated", "imu-contradicted", "check-points"}
 )
 """Codes of findings on the size of errors. Where one of them is bad, the result is overconfident; where another finding
 is bad, it is wrong."""
@@ -103,6 +104,7 @@ ADVICE: dict[str, str] = {
     "residuals": "check units and signs of odometry and observations, or increase their noise",
     "imu-contradicted": "increase the IMU noise, or leave the IMU out (--set imu.use=none)",
     "consistency-test": "check the measurements that are named below: they contradict the others",
+    "check-points-wrong": "check the row with the largest NIS, then the loop closures of the map",
     "check-points": "check the row with the largest NIS, then noise and loop closures of the map",
     "control-points-*": "correct the rows that are refused, or leave them out",
     "check-points-*": "correct the rows that are refused, or leave them out",
@@ -165,7 +167,10 @@ def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
     open_chain = "" if chi2 else "no redundant measurements"
     facts = [_made(figures), known or "true error unknown", open_chain]
     judged = [j for j in (chi2, worst_nees) if j is not None and not (j is chi2 and of_the_start(figures, chi2))]
-    return headline(findings, facts, judged, known=bool(known), assessed=covariance_assessment(figures))
+    assessed, checked = covariance_assessment(figures), figures.part("check_points")
+    if assessed is not None and assessed.word == "not tested" and checked.get("said", "wrong") != "wrong":
+        assessed = replace(assessed, word=checked["said"], power=float(checked.get("power", 0.0)))
+    return headline(findings, facts, judged, known=bool(known), assessed=assessed)
 
 
 def verdict_word(

@@ -12,8 +12,12 @@ from typer.testing import CliRunner
 
 import graphslam as gs
 from graphslam.app.cli import app
+from graphslam.app.run.control import control_findings
 from graphslam.app.run.reopened import resolve_from_folder
+from graphslam.app.run.summary import summarise_run
+from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
 from graphslam.core.errors import DataError, RunFolderError
+from graphslam.evaluate.check_points import CheckPoints
 from graphslam.graph.factors.control import ControlRecord
 from graphslam.io.log_store import save_log
 from graphslam.join.graph_problem import JoinProblem
@@ -106,6 +110,20 @@ def test_without_control_the_frame_is_moved_and_the_map_is_that_of_a_plain_run(r
     assert held.report["check_points"]["dof"] == 25.0
     assert "check_points" not in plain.report
     assert plain.check_points.empty
+
+
+@pytest.mark.parametrize(
+    ("nis", "power", "first"),
+    [(1.0, 0.9, "Consistent"), (1.0, 0.5, "Not tested"), (0.1, 0.9, "Conservative"), (3.0, 0.9, "Overconfident"),
+     (20.0, 0.9, "Wrong")],
+)  # fmt: skip
+def test_check_points_give_a_map_that_nothing_else_tests_its_word(nis, power, first):
+    rows = [{"line": 2, "error": 0.1, "sigma": 0.1, "nis": 2.0 * nis, "dof": 2}]
+    facts = CheckPoints("check.csv", rows, [], 40.0 * nis, 40.0, power).facts()
+    report = {"evidence": [], "converged": True, "check_points": facts}
+    figures = RunMetrics(report, {"submaps": 3.0, "path_length": 30.0, "check_rmse": 0.1})
+    lines = [*control_findings(report), *findings_from_metrics(figures)]
+    assert summarise_run(figures, lines).text.startswith(first)
 
 
 def test_tables_without_a_row_stop_the_run(log):
