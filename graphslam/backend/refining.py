@@ -20,6 +20,7 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.ledger import EXCLUSIVE, Ledger
+from graphslam.graph.sensors.control import CONTROL_ROWS
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.moving import moving_points, without_moving
@@ -191,7 +192,9 @@ def wrong_loops(graph: FactorGraph, m: GlobalMap) -> list[tuple[int, int, float,
     return [(int(i[k]), int(j[k]), float(off[k]), float(turned[k])) for k in wrong]
 
 
-def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> tuple[Ledger, list[Finding]]:
+def refined_ledger(
+    ledger: Ledger, submaps: Sequence[Submap], r: Refinement, control: Sequence[str] = ()
+) -> tuple[Ledger, list[Finding]]:
     """Measurements of a refined path: scans, motion and gravity, once each; the graph was its initial guess.
 
     Parameters
@@ -200,6 +203,8 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
         Of the graph.
     submaps : sequence of Submap
         That say which streams their front end used.
+    control : sequence of str
+        Control rows that hold the refined path, as the ledger names them.
 
     Returns
     -------
@@ -212,9 +217,9 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
     gravity = frozenset().union(*(s.assisting_streams for s in submaps)) if "gravity" in r.parts else frozenset()
     out.spend(SCAN_PAIRS, "scan-pairs", streams | gravity, (float(r.times[0]), float(r.times[-1])))
     held = {e.stream for e in entries if e.kind == EXCLUSIVE and e.factor.startswith("GPS fix")} if r.fixes else set()
-    for stream in sorted(held):
+    for stream in sorted(held.union(control)):
         out.spend(SCAN_PAIRS, "fixes", [stream], (float(r.times[0]), float(r.times[-1])))
-    streams = streams | held
+    streams = streams | held | ({CONTROL_ROWS} if control else set())
     factors = len({e.factor_id for e in entries})
     spent = ", ".join(sorted(streams | gravity)) or "the scans"
     text = (
@@ -222,7 +227,7 @@ def refined_ledger(ledger: Ledger, submaps: Sequence[Submap], r: Refinement) -> 
         "are only its initial guess."
     )
     found = [Finding("", "refine-evidence", text)]
-    lost = sorted({e.stream.partition("/")[0] for e in entries if e.kind == EXCLUSIVE} - streams)
+    lost = sorted({e.stream.partition("/")[0] for e in entries if e.kind == EXCLUSIVE} - streams - {CONTROL_ROWS})
     if lost:
         text = f"streams used by the graph only: {', '.join(lost)} — not used in the refined path."
         if some := sorted(gravity.intersection(lost)):

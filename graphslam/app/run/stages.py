@@ -129,6 +129,7 @@ class SolvedMap:
     why_no_map: str = ""
     residuals: dict[str, GpsResiduals] = field(default_factory=dict)
     checked: CheckPoints | None = None
+    control_rows: list[str] = field(default_factory=list)
     dead_reckoning: Trajectory | None = None
     truth: MapTruth | None = None
     truth_path: Trajectory | None = None
@@ -219,12 +220,16 @@ def _refine(made: SolvedMap) -> None:
     control = None if made.slam.control is None else ControlFactors.of(graph)
     own = None if fixes is not None or control is None else control.as_fixes()
     if own is not None:
-        fixes = own, GpsOptions(robust=ROBUST, baseline=SPANNED * float(np.median(own.sigma)), errors="stated")
+        baseline = SPANNED * float(np.median(own[0].sigma))
+        fixes = own[0], GpsOptions(robust=ROBUST, baseline=baseline, errors="stated")
     made.refined, findings = refine_run(settings.refine, made.inputs.scans, submaps, made.map, gps=fixes, graph=graph)
     made.findings = list(findings)
     if made.refined is not None:
         if control is not None:
-            held = 0 if own is None or made.refined.refinement.fixes is None else made.refined.refinement.fixes.used
+            if own is not None and made.refined.refinement.fixes is not None:
+                made.control_rows = own[1]
+                made.findings = [replace(f, text=f.text.replace("GPS fixes", "control points")) for f in made.findings]
+            held = len(made.control_rows)
             if held < len(control.used):
                 made.findings.append(left_out_of_refinement(held, len(control.used)))
             if own is not None and control.frame != "gps":  # the frame of the survey is not that of the fixes
@@ -240,7 +245,7 @@ def _fuse(made: SolvedMap, graph_map: GlobalMap) -> None:
     made.fuse(submaps, graph_map)
     if refined is not None:
         made.map = refined.map
-        made.ledger, spent = refined_ledger(made.ledger, submaps, refined.refinement)
+        made.ledger, spent = refined_ledger(made.ledger, submaps, refined.refinement, made.control_rows)
         made.findings += spent
         refinement_metrics(made.out, refined.refinement)
         if made.fused is not None and refined.submaps:

@@ -22,6 +22,8 @@ from graphslam.graph.submap_node import SubmapNode
 
 ROBUST = RobustKernel("cauchy", 2.385)
 """As for GPS fixes."""
+CONTROL_ROWS = "control rows"
+"""Name in the ledger; a line follows: several rows may be of one time."""
 SPANNED = 10.0
 """A datum starts where control points span so many of their standard deviations."""
 
@@ -75,9 +77,9 @@ class ControlFactors(SensorFactors):
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
         """See :meth:`SensorFactors.add`; ids one a row."""
         new = [(self.graph.next_factor(), r) for r in readings.rows]
-        for fid, r in new:  # a stream for each row: several may be of one time
+        for fid, r in new:
             time = r.place.time or 0.0
-            self.graph.ledger.spend(fid, f"control row at {r.label()}", [f"control rows/{r.line}"], (time, time))
+            self.graph.ledger.spend(fid, f"control row at {r.label()}", [f"{CONTROL_ROWS}/{r.line}"], (time, time))
         self.waiting += new
         return [fid for fid, _ in new]
 
@@ -195,8 +197,9 @@ class ControlFactors(SensorFactors):
             )
         )  # fmt: skip
 
-    def as_fixes(self) -> Gps | None:
-        """Coordinates at times, of the most frequent lever, as fixes of a path; None: there are none."""
+    def as_fixes(self) -> tuple[Gps, list[str]] | None:
+        """Coordinates at times, of the most frequent lever, as fixes of a path, and their names in the ledger; None:
+        there are none."""
         rows = [r for r in self.used if r.to is None and r.place.time is not None]
         levers = [r.place.lever for r in rows]
         lever = max(levers, key=levers.count, default=())
@@ -206,11 +209,13 @@ class ControlFactors(SensorFactors):
         d = self.graph.dim
         parts = [by_time[t].coordinates(d) for t in sorted(by_time)]
         P = np.array([c for _, c in parts])
-        return Gps(
+        names = [f"{CONTROL_ROWS}/{by_time[t].line}" for t in sorted(by_time)]
+        fixes = Gps(
             times=np.array(sorted(by_time)), positions=np.array([z for z, _ in parts]),
             sigma=np.sqrt(np.trace(P, axis1=1, axis2=2) / d), lever=np.array([*lever, 0.0, 0.0, 0.0][:d]),
             covariances=P,
         )  # fmt: skip
+        return fixes, names
 
     def remove(self, submap: SubmapNode) -> None:
         """See :meth:`SensorFactors.remove`; points of its path were taken out before."""

@@ -126,6 +126,33 @@ def test_check_points_give_a_map_that_nothing_else_tests_its_word(nis, power, fi
     assert summarise_run(figures, lines).text.startswith(first)
 
 
+def test_a_refined_path_is_held_by_rows_at_times():
+    log = gs.simulate("court", preset="light", seed=1)
+    (begin, end), path = log.interval, log.truth.trajectory
+
+    def rows(times, seed):
+        at = path.interpolate(times)[:, :3]
+        return surveyed(zip(times.tolist(), at), np.random.default_rng(seed), SIGMA)
+
+    control = rows(np.linspace(begin + 3.0, end - 3.0, 6), 1)
+    ends = path.interpolate(np.array([begin + 4.0, end - 9.0]))[:, :3]
+    far = float(np.linalg.norm(ends[0] - ends[1]))
+    control.append({"place": begin + 4.0, "to": end - 9.0, "distance": far, "sigma": SIGMA})
+    options = {"control": control, "check": rows(np.linspace(begin + 5.0, end - 5.0, 12), 2)}
+    run = gs.run(log, config=options, progress=False)
+    assert run.refined is not None
+    assert run.refined.refinement.fixes.used == 6
+    assert run.map.T_gps_world is None
+    said = {f.code: f.text for f in run.verdict}
+    assert "6 of 7 rows hold the refined path" in said["control-points-refined"]
+    assert said["refine-fixes"].startswith("control points in the refinement: 6")
+    check = run.report["check_points"]
+    assert (check["aligned"], check["dof"]) == (4, 32.0)
+    assert check["low"] < check["nis_per_dof"] < check["high"]
+    held = run.ledger[run.ledger["factor"] == "fixes"]
+    assert sorted(held["stream"]) == [f"control rows/{k}" for k in range(2, 8)]
+
+
 def test_tables_without_a_row_stop_the_run(log):
     with pytest.raises(DataError, match=r"rows: no row can be used \(line 2: sigma is not above 0"):
         gs.run(log, config={"check": [{"place": 3.0, "x": 0, "y": 0, "sigma": 0}]}, progress=False)
