@@ -101,6 +101,9 @@ def _scored_in_plane(found: Run, log: SensorLog) -> dict[str, float]:
     assert g is not None
     nodes = np.array([s.node for s in g.submaps] + [g.submaps[-1].exit_node])
     times = np.array([s.interval[0] for s in g.submaps] + [g.submaps[-1].interval[1]])
+    assert log.truth is not None
+    known = log.truth.trajectory.times
+    times = np.clip(times, known[0], known[-1])  # a clock that was corrected moves the ends of the log
     fixes = g.values.datum is not None
     true, poses, lay = true_in_frame(log, times, gps=fixes), g.values.poses[nodes], g.flat().layout
     at = (
