@@ -182,7 +182,7 @@ class TrustStudy(WorldsStudy[TrustWorld | ScanWorld]):
 def world_table(table: pd.DataFrame, known: dict[str, TrustWorld | ScanWorld]) -> pd.DataFrame:
     """A row a world: what is wrong with it, NEES/n pooled over its runs, and how often each word was said.
 
-    ``wrong`` where the nodes, each by itself or all together, have more than :data:`WRONG`, and more than chance
+    ``bad map`` where the nodes, each by itself or all together, have more than :data:`WRONG`, and more than chance
     (97.5 %) gives honest runs: a mean over a dozen correlated errors of few runs is above 1.5 now and then.
     """
     out = []
@@ -198,7 +198,7 @@ def world_table(table: pd.DataFrame, known: dict[str, TrustWorld | ScanWorld]) -
             mean = float(np.sum(figures[q] * dof) / np.sum(dof))
             wrong |= mean > max(WRONG, float(stats.chi2.ppf(0.975, np.sum(dof)) / np.sum(dof)))
             row[q] = mean
-        row["wrong"], row["clean"] = wrong, known[world].clean
+        row["bad map"], row["clean"] = wrong, known[world].clean
         out.append(row | {word: int(np.sum(figures["word"] == k)) for k, word in enumerate(WORDS)})
     return pd.DataFrame(out)
 
@@ -207,9 +207,9 @@ def summary_table(worlds: pd.DataFrame) -> pd.DataFrame:
     """How often which word was said of wrong worlds, of clean ones, and of the rest; and the shares that count."""
     out = []
     for name, rows in (
-        ("NEES/n > 1.5", worlds[worlds["wrong"]]),
+        ("NEES/n > 1.5", worlds[worlds["bad map"]]),
         ("clean", worlds[worlds["clean"]]),
-        ("other", worlds[~worlds["clean"] & ~worlds["wrong"]]),
+        ("other", worlds[~worlds["clean"] & ~worlds["bad map"]]),
     ):
         counts = {word: int(rows[word].sum()) for word in WORDS}
         runs = sum(counts.values())
