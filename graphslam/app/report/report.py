@@ -92,7 +92,7 @@ def _page(home: Path, root: Path) -> Report:
         headline=said,
         findings=[replace(f, text=plain_text(f.text)) for f in lines],
         scene=shown,
-        parts={name: part(found) for name, part in _PARTS.items()},
+        parts={name: made for name, part in _PARTS.items() if (made := part(found))},
     )
     return Report(html, found.kind, dict(found.problems))
 
