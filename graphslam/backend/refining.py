@@ -34,10 +34,6 @@ logger = logging.getLogger(__name__)
 
 CONTRADICTED = 3.0
 """χ² of the walk of the yaw bias by its degrees of freedom beyond which scans of passes and motion contradict."""
-LEAST_PASSES = 0.05
-"""Share of pairs between traversals below which scans whose odometry was made by matching them are not refined: what
-neighbouring scans say of each other is in it already, and from finer cells. On drawn lidars without a second traversal
-the refined path was 1.0 to 3.4 times as far off as the odometry."""
 WIDENED = 1.5
 """Ratio of estimated to assumed σ of the motion from which it is reported."""
 NAMED = {
@@ -126,13 +122,6 @@ def refine_run(
                 f"path and in {found.agreement[0]:.0%} along the graph's path, which is the result."
             )
             return None, [Finding("look", "refine-refused", text), *_input(found)]
-        last = found.rounds[-1]
-        if scans.matched and gps is None and last.passes < LEAST_PASSES * last.pairs:
-            text = (
-                f"refinement: not used — {last.passes} of {last.pairs} point-to-surface pairs join two traversals "
-                f"[≥ {LEAST_PASSES:.0%}]. The odometry is made of the same scans, so the refinement adds nothing."
-            )
-            return None, [Finding("", "refine-none", text), *_input(found)]
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []

@@ -58,8 +58,6 @@ class Scans:
         Roll and pitch by gravity [rad].
     tilt_sigma, tilt_time : float
         Of their fading error [rad], [s].
-    matched : bool
-        The odometry was made by matching these scans one after the other.
     """
 
     times: Array
@@ -75,7 +73,6 @@ class Scans:
     tilt_sigma: float = 0.0
     tilt_time: float = 1.0
     name: str = "scans"
-    matched: bool = False
 
     @classmethod
     def of(cls, steps: Steps) -> Scans:
@@ -98,7 +95,6 @@ class Scans:
             tilt_sigma=steps.tilt_sigma,
             tilt_time=steps.tilt_time,
             name=steps.name,
-            matched=steps.matched,
         )
 
     def __len__(self) -> int:

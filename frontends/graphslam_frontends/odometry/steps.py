@@ -54,8 +54,6 @@ class Steps:
         What was noticed when scans and motion were put beside each other.
     recorded : Odometry or None
         The motion without what scans say of it, where ``odometry`` holds that too.
-    matched : bool
-        The odometry was made by matching these scans one after the other.
     """
 
     times: Array
@@ -77,7 +75,6 @@ class Steps:
     gaps: Gaps = field(default_factory=Gaps)
     findings: tuple[Finding, ...] = ()
     recorded: Odometry | None = None
-    matched: bool = False
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
