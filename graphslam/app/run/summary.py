@@ -134,6 +134,7 @@ ADVICE: dict[str, str] = {
     "refine-widened": "increase the odometry noise as the scans show",
     "refine-*": "check the findings of the refinement",
     "calibration-*": "estimate noise and calibration from all of the log (`graphslam calibrate`)",
+    "*-refused": "correct the rows that were refused",
     "chi2": "find the factor class with the largest χ²/dof",
     "map-*": "check the findings on the fused map",
     "certificate": "try other initial values: the optimum may not be the global one",
