@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +16,15 @@ from graphslam_studies import association_trial
 from graphslam_studies.association_ambiguity import PAIRS, QUICK, STUDY, WORLDS, local_nees, paired
 from graphslam_studies.association_trial import FIVE_SIGMA_3DOF, LOCAL, SINGLE, Trial, run_trial
 from graphslam_studies.montecarlo.definition import StudyDefinition, find_study, fingerprint
+from tests.pictures import full_pictures
 
 CONFIG = QUICK["rows-quick"]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _full_pictures() -> Iterator[None]:
+    with full_pictures():
+        yield
 
 
 def rows_of(world: str, runs: int) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -26,8 +27,15 @@ from graphslam_studies.segslam_building import STUDY as BUILDING
 from graphslam_studies.segslam_garage import STUDY as GARAGE
 from graphslam_studies.segslam_mine import STUDY as MINE
 from graphslam_studies.segslam_trial import GridTrial, GridTrialConfig, drawn_algorithm, family_of, run_trial
+from tests.pictures import full_pictures
 
 STUDIES = {"segslam-garage": GARAGE, "segslam-mine": MINE, "segslam-building": BUILDING}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _full_pictures() -> Iterator[None]:
+    with full_pictures():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,14 @@ from graphslam_studies.plots.study_figures import save_paper_figures
 from graphslam_studies.plots.study_local import plot_local_consistency
 from graphslam_studies.plots.study_table import algorithms_with
 from graphslam_studies.plots.study_time import plot_cumulative_time
+from tests.pictures import full_pictures
 from tests.reference.study_rows import COLUMNS, study_rows
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _full_pictures() -> Iterator[None]:
+    with full_pictures():
+        yield
 
 
 @pytest.fixture(autouse=True)

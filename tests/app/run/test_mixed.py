@@ -172,7 +172,7 @@ def test_a_folder_gives_back_every_factor(tmp_path):
         },
         "imu": {"use": "auto"},
         "gps": {"use": "all"},
-        "calibrate": {"given": {"distance_scale": 1.002}},  # with it the graph estimates what is left of constant errors
+        "calibrate": {"given": {"distance_scale": 1.002}},  # then the graph estimates what is left of them
     }
     world = gs.simulate("mixed", seed=2, preset="quick")
     made = gs.run(world, frontend=BOTH, config=options, progress=False, out=tmp_path / "run")
