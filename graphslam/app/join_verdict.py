@@ -64,10 +64,10 @@ def join_headline(row: Mapping[str, Any], findings: Sequence[Finding], *, submap
         Of the path through the nodes [m].
     """
     marks = f", {row['landmarks']} landmarks" if row["landmarks"] else ""
-    judged = join_consistency_tests(row)
-    known = any(j.code == "nees" for j in judged)
+    tests = join_consistency_tests(row)
+    known = any(j.code == "nees" for j in tests)
     facts = [f"{length_text(length)} through {submaps} submaps{marks}", "" if known else "true error unknown"]
-    return headline(findings, facts, judged, known=known)
+    return headline(findings, facts, tests, known=known)
 
 
 def _state(row: Mapping[str, Any], estimate: MapEstimate) -> Finding:

@@ -89,6 +89,7 @@ def refine_run(
     gps: tuple[Gps, GpsConfig] | None = None,
     graph: FactorGraph | None = None,
     progress: Callable[[str], Any] | None = None,
+    fixes: str = "GPS fixes",
 ) -> tuple[RefinedRun | None, list[Finding]]:
     """Refine the solved map of a run, and say what was found.
 
@@ -102,6 +103,8 @@ def refine_run(
         Fixes that are in the graph, and their options; the refined path uses them, too.
     graph : FactorGraph, optional
         The graph of the map; its loop closures are compared with the refined path.
+    fixes : str
+        What ``gps`` holds, for the findings.
 
     Returns
     -------
@@ -132,7 +135,7 @@ def refine_run(
             Finding("look", "refine-failed", f"refinement: failed — {error}. The graph's path is the result.")
         ]
     wrong = None if graph is None else wrong_loops(graph, refined)
-    return RefinedRun(found, refined, drawn, path), [*refinement_findings(found, wrong), *moved]
+    return RefinedRun(found, refined, drawn, path), [*refinement_findings(found, wrong, fixes), *moved]
 
 
 def _input(r: Refinement) -> list[Finding]:
@@ -229,13 +232,17 @@ SCAN_PAIRS = -1
 """Number of the refinement in a ledger of factors, which are counted from 0."""
 
 
-def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None) -> list[Finding]:
+def refinement_findings(
+    r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None, fixes: str = "GPS fixes"
+) -> list[Finding]:
     """Findings of a refinement, as lines of the verdict.
 
     Parameters
     ----------
     wrong : sequence of (i, j, metres, radians), optional
         Loops of the graph that it contradicts (:func:`wrong_loops`); None: the graph is not known.
+    fixes : str
+        What holds the path beside scans.
     """
     if r.left is not None:
         return _input(r)
@@ -249,7 +256,7 @@ def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, fl
     out += _input(r)
     if (f := r.fixes) is not None:
         text = (
-            f"GPS fixes in the refinement: {f.used}, {f.rms:.2f} m RMS from the path — median χ² is {f.typical:.2f} "
+            f"{fixes} in the refinement: {f.used}, {f.rms:.2f} m RMS from the path — median χ² is {f.typical:.2f} "
             "times the expected one."
         )
         if f.left:
@@ -258,9 +265,9 @@ def refinement_findings(r: Refinement, wrong: Sequence[tuple[int, int, float, fl
             text += f" {f.wild} are outliers and have a low weight."
         if f.contradicted:
             text += (
-                " GPS errors are larger than assumed or time-correlated, so the covariance of this path is too small. "
-                "Set gps.bias_sigma and gps.bias_time, or a larger gps.sigma."
+                " Their errors are larger than assumed or time-correlated: the covariance of this path is too small. "
             )
+            text += "Check their sigma; for GPS, set gps.bias_sigma and gps.bias_time, or a larger gps.sigma."
         out.append(Finding("look" if f.contradicted else "good", "refine-fixes", text))
     if wrong:
         some = "; ".join(f"x{i} and x{j} by {d:.1f} m, {np.rad2deg(t):.0f}°" for i, j, d, t in wrong[:4])

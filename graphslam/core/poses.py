@@ -157,7 +157,8 @@ def pose_scatter(poses: ArrayLike, about: ArrayLike, weights: ArrayLike | None =
 def compose_increments(increments: Array) -> Array:
     """Poses of nodes in the frame of the first ``(n + 1, 7|3)``; given, that of each in the one before ``(n, 7|3)``."""
     g = group_of(increments)
-    poses = [g.identity]
-    for T in increments:
-        poses.append(g.compose(poses[-1], T))
-    return np.stack(poses)
+    poses, reach = np.concatenate([g.identity[None], increments]), 1
+    while reach < len(poses):  # each pose is that of the last 1, 2, 4, … increments before it
+        poses[reach:] = g.compose(poses[:-reach], poses[reach:])
+        reach *= 2
+    return poses

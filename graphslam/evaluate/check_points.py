@@ -22,7 +22,7 @@ from graphslam.core.geometry import Array, align_se2, rotation2
 from graphslam.core.poses import group_of
 from graphslam.core.se3 import align_se3, quat_to_matrix, so3_exp
 from graphslam.core.trajectory import Trajectory
-from graphslam.evaluate.covariance_assessment import LEAST_POWER
+from graphslam.evaluate.covariance_assessment import HALF, LEAST_POWER
 from graphslam.evaluate.gps_innovation import antenna_places
 from graphslam.evaluate.residual_consistency import two_sided_bounds
 from graphslam.graph.factor_graph import FactorGraph
@@ -33,10 +33,8 @@ from graphslam.graph.sensors.control import ControlFactors
 from graphslam.graph.sensors.gps import arm_jacobian
 from graphslam.refine.refine import Refinement
 
-Said = Literal["consistent", "conservative", "overconfident", "wrong", "not tested"]
+Word = Literal["consistent", "conservative", "overconfident", "wrong", "not tested"]
 CONFIDENCE = 0.95
-TOO_SMALL = 2.0
-"""The power is against true covariances that are so many times those of the map."""
 WRONG = 9.0
 """NIS by degree of freedom from which errors are no matter of covariances: three standard deviations on average."""
 
@@ -71,8 +69,8 @@ class CheckPoints:
         return two_sided_bounds(1.0, self.dof, CONFIDENCE)[:2] if self.dof > 0 else (0.0, float("inf"))
 
     @property
-    def said(self) -> Said:
-        """What follows."""
+    def word(self) -> Word:
+        """One of the five words of a verdict."""
         ratio, (low, high) = self.nis / max(self.dof, 1.0), self.bounds
         if ratio > high:
             return "wrong" if ratio > max(WRONG, high) else "overconfident"
@@ -89,7 +87,7 @@ class CheckPoints:
         """What ``run.json`` holds."""
         low, high = self.bounds
         refused = [{"line": line, "why": why} for line, why in self.refused]
-        out: dict[str, Any] = {"source": self.source, "rows": self.rows, "refused": refused, "said": self.said}
+        out: dict[str, Any] = {"source": self.source, "rows": self.rows, "refused": refused, "word": self.word}
         if self.rows:
             ratio = self.nis / self.dof if self.dof > 0 else None
             out |= {"rmse": self.rmse, "nis_per_dof": ratio, "dof": self.dof, "power": self.power}
@@ -350,7 +348,7 @@ class _Innovations:
         N = U[:, rank:]  # what no motion takes up
         r = N.T @ y
         K = sla.solve_triangular(L, N, lower=True, trans="T")
-        eigenvalues = 1.0 + (TOO_SMALL - 1.0) * np.clip(np.linalg.eigvalsh(K.T @ of_map @ K), 0.0, 1.0)
+        eigenvalues = 1.0 + (HALF - 1.0) * np.clip(np.linalg.eigvalsh(K.T @ of_map @ K), 0.0, 1.0)
         return CheckPoints(source, rows, [], float(r @ r), float(len(r)), power_of_test(eigenvalues), rank)
 
     def _by_row(self, e: Array, of_map: Array, of_rows: Array, G: Array) -> list[dict[str, Any]]:
@@ -366,6 +364,6 @@ class _Innovations:
             kept = w > 1e-9 * size[part].max()
             nis = float(np.sum((V[:, kept].T @ e[part]) ** 2 / w[kept]))
             error = float(np.linalg.norm(e[part])) if row.to is None else float(e[part][0])
-            said = {"line": row.line, "name": row.name, "place": str(row.place), "frame": row.frame, "error": error}
-            out.append(said | {"sigma": float(np.sqrt(np.sum(w[kept]))), "nis": nis, "dof": int(kept.sum())})
+            figures = {"line": row.line, "name": row.name, "place": str(row.place), "frame": row.frame, "error": error}
+            out.append(figures | {"sigma": float(np.sqrt(np.sum(w[kept]))), "nis": nis, "dof": int(kept.sum())})
         return out

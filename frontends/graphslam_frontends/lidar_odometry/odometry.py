@@ -109,7 +109,7 @@ SUSPICIOUS = 0.7
 
 GYRO_OFF = 0.15
 """A match that is turned further than this from what a gyro says [rad] is another place that looks alike: rooms look
-alike when turned by a right angle. A gyro that is believed is off by a hundredth of it between two scans."""
+alike when turned by a right angle. A bias of 0.005 rad/s, large for a cheap gyro, turns by this in 30 s."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,16 +73,17 @@ def left_out_of_refinement(held: int, used: int) -> Finding:
 def control_findings(report: Mapping[str, Any]) -> list[Finding]:
     """Lines of the verdict."""
     out = []
-    for what, key in (("control points", "control_points"), ("check points", "check_points")):
+    for kind in ("control", "check"):
+        what, key = f"{kind} points", f"{kind}_points"
         if (facts := report.get(key)) is None:
             continue
         n = facts["used"] if key == "control_points" else len(facts["rows"])
         refused: Sequence[Mapping[str, Any]] = facts["refused"]
         if refused or not n:
-            said = "; ".join(f"line {r['line']}: {r['why']}" for r in refused[:SHOWN])
+            lines = "; ".join(f"line {r['line']}: {r['why']}" for r in refused[:SHOWN])
             more = "; …" if len(refused) > SHOWN else ""
-            text = f"{what} ({facts['source']}): {n} of {n + len(refused)} rows used — refused: {said}{more}."
-            out.append(Finding("look", f"{key.replace('_', '-')}-refused", text))
+            text = f"{what} ({facts['source']}): {n} of {n + len(refused)} rows used — refused: {lines}{more}."
+            out.append(Finding("look", f"{kind}-points-refused", text))
         elif key == "control_points":
             frame = f"; their frame ({facts['frame']}) is a variable of the graph" if "frame" in facts else ""
             out.append(Finding("", "control-points", f"{what} ({facts['source']}): {n} rows used{frame}."))
@@ -92,23 +93,23 @@ def control_findings(report: Mapping[str, Any]) -> list[Finding]:
 
 def _tested(facts: Mapping[str, Any]) -> Finding:
     """``check points: NIS …``."""
-    said, n, dof, ratio = facts["said"], len(facts["rows"]), facts["dof"], facts["nis_per_dof"]
+    word, n, dof, ratio = facts["word"], len(facts["rows"]), facts["dof"], facts["nis_per_dof"]
     head = f"check points ({facts['source']}): RMSE {facts['rmse']:.3g} m at {n} rows"
     if ratio is None:
         text = f"{head}; not tested — the rows determine no more than where their frame is. Measure more check points."
         return Finding("", "check-points", text)
     text = (
         f"{head}; NIS {ratio:.3g} per degree of freedom [{facts['low']:.3g}, {facts['high']:.3g}; {dof:g} dof] — "
-        f"{said}: {MEANINGS[said]}. Power {facts['power']:.2f} [≥ {LEAST_POWER:g}] against covariances that are too "
+        f"{word}: {MEANINGS[word]}. Power {facts['power']:.2f} [≥ {LEAST_POWER:g}] against covariances that are too "
         "small by two"
     )
     text += f"; {facts['aligned']} dof moved the frame of the rows onto the map." if facts["aligned"] else "."
-    if said in ("conservative", "overconfident") and facts["power"] < LEAST_POWER:
+    if word in ("conservative", "overconfident") and facts["power"] < LEAST_POWER:
         text += " Most of the expected error is that of the rows: check their sigma first."
-    level: Level = {"consistent": "good", "not tested": "", "wrong": "bad"}.get(said, "look")  # type: ignore[assignment]
-    if said == "overconfident" and ratio > two_sided_bounds(1.0, dof, CERTAIN)[1]:
+    level: Level = {"consistent": "good", "not tested": "", "wrong": "bad"}.get(word, "look")  # type: ignore[assignment]
+    if word == "overconfident" and ratio > two_sided_bounds(1.0, dof, CERTAIN)[1]:
         level = "bad"
-    if level in ("look", "bad") and said != "conservative":
+    if level in ("look", "bad") and word != "conservative":
         worst = max(facts["rows"], key=lambda r: r["nis"] / max(r["dof"], 1))
         text += f" Check line {worst['line']} first: error {worst['error']:.3g} m, expected {worst['sigma']:.2g} m."
-    return Finding(level, "check-points-wrong" if said == "wrong" else "check-points", text)
+    return Finding(level, "check-points-wrong" if word == "wrong" else "check-points", text)

@@ -222,13 +222,15 @@ def _refine(made: SolvedMap) -> None:
     if own is not None:
         baseline = SPANNED * float(np.median(own[0].sigma))
         fixes = own[0], GpsOptions(robust=ROBUST, baseline=baseline, errors="stated")
-    made.refined, findings = refine_run(settings.refine, made.inputs.scans, submaps, made.map, gps=fixes, graph=graph)
+    what = "GPS fixes" if own is None else "control points"
+    made.refined, findings = refine_run(
+        settings.refine, made.inputs.scans, submaps, made.map, gps=fixes, graph=graph, fixes=what
+    )
     made.findings = list(findings)
     if made.refined is not None:
         if control is not None:
             if own is not None and made.refined.refinement.fixes is not None:
                 made.control_rows = own[1]
-                made.findings = [replace(f, text=f.text.replace("GPS fixes", "control points")) for f in made.findings]
             held = len(made.control_rows)
             if held < len(control.used):
                 made.findings.append(left_out_of_refinement(held, len(control.used)))

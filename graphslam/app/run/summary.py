@@ -106,8 +106,8 @@ ADVICE: dict[str, str] = {
     "consistency-test": "check the measurements that are named below: they contradict the others",
     "check-points-wrong": "check the row with the largest NIS, then the loop closures of the map",
     "check-points": "check the row with the largest NIS, then noise and loop closures of the map",
-    "control-points-*": "correct the rows that are refused, or leave them out",
-    "check-points-*": "correct the rows that are refused, or leave them out",
+    "*-points-refused": "correct the rows that are refused, or leave them out",
+    "control-points-*": "compare with a run without refinement (--set refine.use=false)",
     "gps-contradicts": "use the GPS fixes (--set gps.use=all) and check the new contradictions",
     "interrupted": "resume it: the same command with --resume",
     # then what its covariances say
@@ -134,7 +134,6 @@ ADVICE: dict[str, str] = {
     "refine-widened": "increase the odometry noise as the scans show",
     "refine-*": "check the findings of the refinement",
     "calibration-*": "estimate noise and calibration from all of the log (`graphslam calibrate`)",
-    "*-refused": "correct the rows that were refused",
     "chi2": "find the factor class with the largest χ²/dof",
     "map-*": "check the findings on the fused map",
     "certificate": "try other initial values: the optimum may not be the global one",
@@ -167,48 +166,54 @@ def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
     worst_nees = max(nees_tests(figures), key=lambda j: LEVELS.index(j.level), default=None)
     open_chain = "" if chi2 else "no redundant measurements"
     facts = [_made(figures), known or "true error unknown", open_chain]
-    judged = [j for j in (chi2, worst_nees) if j is not None and not (j is chi2 and of_the_start(figures, chi2))]
-    assessed, checked = covariance_assessment(figures), figures.part("check_points")
-    if assessed is not None and assessed.word == "not tested" and checked.get("said", "wrong") != "wrong":
-        assessed = replace(assessed, word=checked["said"], power=float(checked.get("power", 0.0)))
-    return headline(findings, facts, judged, known=bool(known), assessed=assessed)
+    tests = [j for j in (chi2, worst_nees) if j is not None and not (j is chi2 and of_the_start(figures, chi2))]
+    return headline(findings, facts, tests, known=bool(known), assessment=_with_check_points(figures))
+
+
+def _with_check_points(figures: RunMetrics) -> CovarianceAssessment | None:
+    """The assessment; check points decide where nothing else tests the map, and wherever they show larger errors."""
+    found, checked = covariance_assessment(figures), figures.part("check_points")
+    word = checked.get("word", "wrong")  # a wrong map has a finding of its own
+    if found is None or word == "wrong" or (found.word != "not tested" and word != "overconfident"):
+        return found
+    return replace(found, word=word, power=float(checked.get("power", 0.0)))
 
 
 def verdict_word(
-    findings: Iterable[Finding], judged: Sequence[ChiSquareTest], assessed: CovarianceAssessment | None
+    findings: Iterable[Finding], tests: Sequence[ChiSquareTest], assessment: CovarianceAssessment | None
 ) -> tuple[str, float]:
     """One of five words on a result, and the power of the tests behind it (see :data:`START`).
 
     Parameters
     ----------
-    judged : sequence of ChiSquareTest
+    tests : sequence of ChiSquareTest
         NEES where ground truth is known; χ² where there is no assessment.
-    assessed : CovarianceAssessment or None
+    assessment : CovarianceAssessment or None
         Tests without ground truth.
     """
     bad = {f.code for f in findings if f.level == "bad"}
     if bad - CONSISTENCY_CODES:
         return "wrong", 0.0
-    nees = [j for j in judged if j.code == "nees"]
-    tests = nees or (list(judged) if assessed is None else [])
-    words = {j.said for j in tests} | ({assessed.word} if assessed else set())
+    nees = [j for j in tests if j.code == "nees"]
+    used = nees or (list(tests) if assessment is None else [])
+    words = {j.word for j in used} | ({assessment.word} if assessment else set())
     if bad or "overconfident" in words:
         return "overconfident", 0.0
-    power = max((j.power for j in tests), default=0.0)
-    if "conservative" in {j.said for j in nees}:  # small residuals alone may be those of correlated errors
+    power = max((j.power for j in used), default=0.0)
+    if "conservative" in {j.word for j in nees}:  # small residuals alone may be those of correlated errors
         return "conservative", power
-    if power >= LEAST_POWER and {j.said for j in tests} == {"consistent"}:
+    if power >= LEAST_POWER and {j.word for j in used} == {"consistent"}:
         return "consistent", power
-    return (assessed.word, assessed.power) if assessed else ("not tested", power)
+    return (assessment.word, assessment.power) if assessment else ("not tested", power)
 
 
 def headline(
     findings: Iterable[Finding],
     facts: Sequence[str] = (),
-    judged: Sequence[ChiSquareTest] = (),
+    tests: Sequence[ChiSquareTest] = (),
     *,
     known: bool = True,
-    assessed: CovarianceAssessment | None = None,
+    assessment: CovarianceAssessment | None = None,
 ) -> Finding:
     """All findings in one line.
 
@@ -216,24 +221,24 @@ def headline(
     ----------
     facts : sequence of str
         The result, in a few words each.
-    judged : sequence of ChiSquareTest
+    tests : sequence of ChiSquareTest
         Ratios of the findings with the codes ``chi2`` and ``nees``.
     known : bool
         Is there a reference to compare the result with?
-    assessed : CovarianceAssessment or None
+    assessment : CovarianceAssessment or None
         Tests of the covariances without ground truth.
     """
     found = list(findings)
     worst: Level = worst_level(found) or "good"
     points = sum(f.level == worst for f in found) if worst in MARKED else 0
-    word, power = verdict_word(found, judged, assessed)
+    word, power = verdict_word(found, tests, assessment)
     start = START[word]
     if word == "consistent":
         start += f" (power {min(power, 0.99):.0%} against covariances half as large as they should be)"
     if points:
         start += f"; {points} {'point' if points == 1 else 'points'} marked “{worst}”"
-    said = "; ".join([x for x in facts if x] + [consistency_line(j, found) for j in judged])
-    over = {j.code for j in judged if j.said == "overconfident"} | ({"trust"} if word == "overconfident" else set())
+    said = "; ".join([x for x in facts if x] + [consistency_line(j, found) for j in tests])
+    over = {j.code for j in tests if j.word == "overconfident"} | ({"trust"} if word == "overconfident" else set())
     do = _advice(found, over, known, word)
     level: Level = "" if worst == "good" and word == "not tested" else worst
     return Finding(level, "headline", f"{start}{' — ' + said if said else ''}. To do: {do}.")
@@ -244,7 +249,7 @@ def consistency_line(j: ChiSquareTest, findings: Sequence[Finding]) -> str:
     ratio = f"{j.name} {j.ratio:.3g}"
     if j.code == "chi2" and any(f.code == "consistency-test" for f in findings):
         return f"some measurements contradict the others (all: {ratio})"
-    return f"{WORDS[j.code, j.said]} ({ratio})"
+    return f"{WORDS[j.code, j.word]} ({ratio})"
 
 
 def _advice(findings: Sequence[Finding], over: set[str], known: bool, word: str) -> str:

@@ -311,7 +311,7 @@ class ChiSquareTest:
         return low, high * (TOLERANCE if self.code == "chi2" else 1.0)
 
     @property
-    def said(self) -> str:
+    def word(self) -> str:
         """``consistent``, ``overconfident`` or ``conservative``."""
         low, high = self.bounds()
         return "overconfident" if self.ratio > high else "conservative" if self.ratio < low else "consistent"
@@ -324,7 +324,7 @@ class ChiSquareTest:
     @property
     def level(self) -> Level:
         """One consistent run in forty is outside on either side; bad is less likely than one in a thousand."""
-        if self.said == "consistent":
+        if self.word == "consistent":
             return "good"
         return "bad" if self.ratio > self.bounds(CERTAIN)[1] else "look"
 
@@ -332,7 +332,7 @@ class ChiSquareTest:
     def text(self) -> str:
         """``1.02 per degree of freedom [0.94, 1.06; 4321 dof] — residuals match the noise model``."""
         low, high = self.bounds()
-        meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[self.said]
+        meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[self.word]
         return f"{self.ratio:.3g} per degree of freedom [{low:.3g}, {high:.3g}; {self.dof:.4g} dof] — {meaning}"
 
 
@@ -346,7 +346,7 @@ def chi_square_test(figures: RunMetrics) -> ChiSquareTest | None:
 
 def of_the_start(figures: RunMetrics, chi2: ChiSquareTest) -> bool:
     """Does it say of the start of a refined path only that its noise was stated too large?"""
-    return bool(figures.part("refine")) and chi2.said == "conservative"
+    return bool(figures.part("refine")) and chi2.word == "conservative"
 
 
 def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
@@ -363,7 +363,7 @@ def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
         for key, about, n in [(*g, 1) for g in gauges] + [(f"nees_{k}", f"{k} of all nodes", len(axes)) for k in axes]
         if is_finite_number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0
     ]
-    return [j for j in known if j.tests == 1 or j.said == "overconfident"]
+    return [j for j in known if j.tests == 1 or j.word == "overconfident"]
 
 
 def is_finite_number(value: Any) -> bool:

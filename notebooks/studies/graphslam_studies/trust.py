@@ -5,14 +5,16 @@ receiver), and robots with scans (:class:`ScanWorld`: a park with a building, ga
 worlds are as stated; the others have one or two errors that are not stated. ``graphslam.run`` maps each with its
 default options: front end, calibration, refinement and loop closures are chosen as for a newcomer's log.
 
-The score has nothing in common with what it judges: it is made here of the simulator's poses and the covariances that
-the graph reports. With fixes poses are scored in the frame of the fixes, else in that of the first base.
+Among landmarks the score has nothing in common with what it judges: it is made here of the simulator's poses and the
+covariances that the graph reports. With fixes poses are scored in the frame of the fixes, else in that of the first
+base.
 
 Quantities
 ----------
 ``node``: NEES of the nodes, each by itself, over its dimension, mean; ``node_dof``: the degrees of freedom of this mean
 (errors of nodes are correlated: ``n² / ‖C‖²``); ``joint``, ``joint_dof``: NEES/n of all nodes together; ``rms`` of
-their positions [m]; ``word``: index into :data:`WORDS`; ``clean``. Worlds with scans have ``joint`` of their path only.
+their positions [m]; ``word``: index into :data:`WORDS`; ``clean``. Worlds with scans
+are scored by the run's own NEES of its nodes or of its refined path (``nees_per_dof``), as ``joint`` and ``node``.
 """
 
 from __future__ import annotations
