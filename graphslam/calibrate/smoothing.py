@@ -52,6 +52,8 @@ SIGMAS = (
     "floor_heading",
 )
 """In the order of the kernels: m/√m, m/√s, m/√m, rad/√m, rad/√rad, rad/√s, m, rad, m, rad, rad/s, s, m/s, s, m, rad."""
+CHI2_CLASS = dict(zip(SIGMAS, (0, 0, 1, 2, 2, 2, 3, 4, 3, 4, 5, 5, 5, 5, 0, 2)))
+"""Class of the residuals that each one weights, as the kernels count them."""
 START = {
     **{"along_metre": 0.05, "along_second": 0.02, "lateral_metre": 0.03, "heading_metre": 0.01},
     **{"heading_radian": 0.02, "heading_second": 0.005, "range": 0.2, "bearing": 0.02},
@@ -239,30 +241,38 @@ class Smoothing:
         names = list(self.fitted)
         value = self.objective()
         for _ in range(rounds if names else 0):
-            x0 = np.log([self.sigmas[s] for s in names])
+            x0, scale = np.log([self.sigmas[s] for s in names]), self._fisher_scale(names)
 
-            def negative(x: Array) -> float:
-                return self.objective(dict(zip(names, np.exp(x).tolist())))
+            def negative(y: Array, x0: Array = x0, scale: Array = scale) -> float:
+                return self.objective(dict(zip(names, np.exp(x0 + y / scale).tolist())))
 
             found = minimize(
                 negative,
-                x0,
+                np.zeros(len(names)),
                 method="L-BFGS-B",
-                bounds=[(a - 3.0, a + 3.0) for a in x0],
+                bounds=[(-3.0 * a, 3.0 * a) for a in scale],
                 options={
-                    "eps": 1e-3,
+                    "eps": 1e-3 * scale,
                     "ftol": tolerance / max(abs(value), 1.0),
+                    # in units of scale the Hessian is about 1: half the square of the gradient is what can be won
+                    "gtol": np.sqrt(2.0 * tolerance / len(names)),
                     "maxfun": budget,
                     "maxls": 10,
                 },
             )
-            self.sigmas.update(dict(zip(names, np.exp(found.x).tolist())))
+            moved = found.x / scale
+            self.sigmas.update(dict(zip(names, np.exp(x0 + moved).tolist())))
             self.settle(6)
             before, value = value, self.objective()
-            if before - value < 10.0 * tolerance and float(np.max(np.abs(found.x - x0))) < 0.1:
+            if before - value < 10.0 * tolerance and float(np.max(np.abs(moved))) < 0.1:
                 break
         self._constants_covariance()
         return value
+
+    def _fisher_scale(self, names: list[str]) -> Array:
+        """Root of the Fisher information of the logarithm of each standard deviation, about 2 χ² of its residuals."""
+        chi2 = self._eliminated(self._parameters())[3]
+        return np.array([np.sqrt(2.0 * chi2[CHI2_CLASS[s]] + WIDTH**-2) for s in names])
 
     def _constants_covariance(self) -> None:
         i = self._index

@@ -30,6 +30,10 @@ def test_quick_study_maps_a_drawn_robot_three_ways(tmp_path) -> None:
     found = {r["quantity"]: r["median"] for r in reports["found"]}
     assert 0.8 < found["range_sigma_ratio"] < 1.2
     assert abs(found["clock_error"]) < 0.05
+    (planted,) = reports["planted"]
+    assert planted["error"] == "yaw rate 0.3 deg/s"
+    assert planted["within"] == 1.0
+    assert planted["false_clock"] == 0.0
 
 
 def wandering(g, seed: int = 2) -> SensorLog:

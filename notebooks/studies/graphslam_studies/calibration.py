@@ -1,9 +1,10 @@
 """The study ``calibration``: noise and lasting errors told from a log itself, and the maps made with them.
 
 Worlds: ``drawn`` robots whose wheels no default knows and whose logs state a quarter of their noise
-(``drawn-lasting``: with errors that last for seconds); ``plaza1`` with 0.31 deg/s added; the robots of MRCLAM 7 as if
-each were unknown; and scans of recorded sets to whose odometry a yaw bias, a scale and noise are added, drawn in
-each run. The recorded sets must be found (``GRAPHSLAM_DATA``).
+(``drawn-lasting``: with errors that last for seconds; ``planted``: one constant error at a time, and none);
+``plaza1`` with 0.31 deg/s added; the robots of MRCLAM 7 as if each were unknown; and scans of recorded sets to whose
+odometry a yaw bias, a scale and noise are added, drawn in each run. The recorded sets must be found
+(``GRAPHSLAM_DATA``).
 
 Quantities
 ----------
@@ -11,6 +12,7 @@ Quantities
 m, rad); ``path``, ``landmarks`` [m], ``nees_poses``, ``nees_landmarks`` by degree of freedom, ``join_chi2_per_dof``.
 Of scans: ``relations`` of pairs of poses drawn at random [m], ``…_input`` of the odometry that came in; ``input_told``:
 the verdict says that this is better; ``worse_untold``: it is, by a tenth of its error, and the verdict does not.
+Planted errors: ``within`` 3σ of the estimate, ``corrected``, ``strength`` error/σ, ``false`` other constants corrected.
 Algorithms: ``stated``, ``calibrated``, ``oracle``, ``preset``; of scans as in
 :func:`graphslam_studies.calibration_scanned.scanned`.
 """
@@ -23,13 +25,14 @@ import numpy as np
 import pandas as pd
 
 from graphslam_studies.calibration_scanned import Added
-from graphslam_studies.calibration_trial import CalibrationTrialConfig, run_calibration_trial
+from graphslam_studies.calibration_trial import PLANTED, CalibrationTrialConfig, run_calibration_trial
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 
 BIAS = float(np.deg2rad(0.31))
 WORLDS = {
     "drawn": CalibrationTrialConfig(),
     "drawn-lasting": CalibrationTrialConfig(lasting=True, seconds=300.0),
+    "planted": CalibrationTrialConfig(planted=tuple(PLANTED)),
     "plaza1": CalibrationTrialConfig(source="plaza1", added=Added(bias=BIAS), presets="plaza1.rbpf-ekf"),
 }
 WORLDS |= {
@@ -47,7 +50,11 @@ WORLDS |= {
     for name in names
 }
 """Of the long logs the first ten minutes."""
-QUICK_WORLDS = {"drawn-quick": CalibrationTrialConfig(seconds=40.0)}
+QUICK_WORLDS = {
+    "drawn-quick": CalibrationTrialConfig(seconds=40.0),
+    "planted-quick": CalibrationTrialConfig(seconds=40.0, planted=("yaw rate 0.3 deg/s",)),
+}
+PLANTED_FIGURES = ("within", "corrected", "strength", "false", "false_clock", "normalised_error")
 MAPS = (
     *("path", "landmarks", "nees_poses", "nees_landmarks", "join_chi2_per_dof"),
     *("relations", "relations_input", "path_input", "input_told", "worse_untold", "calibration_refused"),
@@ -61,7 +68,8 @@ class CalibrationStudy(WorldsStudy[CalibrationTrialConfig]):
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
         """``maps`` of each way to get the noise, ``found``: ratios and errors of the estimates, ``cpu`` [s]."""
-        out = {"maps": maps_table(table), "found": found_table(table)}
+        out = {"maps": maps_table(table), "found": found_table(table), "planted": planted_table(table)}
+        out = {name: rows for name, rows in out.items() if not rows.empty}
         if not timings.empty:
             rows = timings[timings["quantity"] == "cpu_seconds"].groupby("world")["value"].agg(["mean", "max"])
             out["cpu"] = rows.reset_index()
@@ -93,6 +101,20 @@ def found_table(table: pd.DataFrame) -> pd.DataFrame:
                 row = {"world": world, "algorithm": algorithm, "quantity": name, "runs": len(v)}
                 row |= {"median": float(np.median(v)), "least": float(v.min()), "greatest": float(v.max())}
                 out.append(row | {"rms": float(np.sqrt(np.mean(v**2)))})
+    return pd.DataFrame(out)
+
+
+def planted_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Of each planted error the share of runs, the mean strength (error / σ) and the RMS of the normalised error."""
+    out = []
+    rows = table[table["quantity"].isin(["false"])]
+    for (world, name), _ in rows.groupby(["world", "algorithm"], sort=False):
+        runs = table[(table["world"] == world) & (table["algorithm"] == name)]
+        v = {q: whole(runs, q)["value"].to_numpy() for q in PLANTED_FIGURES}
+        row: dict[str, object] = {"world": world, "error": name, "runs": len(v["false"])}
+        row |= {q: float(np.mean(x)) if len(x) else np.nan for q, x in v.items() if q != "normalised_error"}
+        z = v["normalised_error"]
+        out.append(row | {"normalised_error": float(np.sqrt(np.mean(z**2))) if len(z) else np.nan})
     return pd.DataFrame(out)
 
 

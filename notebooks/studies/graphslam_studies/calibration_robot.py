@@ -37,6 +37,7 @@ class DrawnRobot:
     range_offset: float
     sensor_yaw: float
     clock: float
+    range_scale: float = 1.0
     lasting_rate: float = 0.0
     lasting_speed: float = 0.0
     memory: float = 5.0
@@ -159,7 +160,9 @@ def _sightings(
         r = np.hypot(d[:, 0], d[:, 1])
         b = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - pose[2])
         seen = np.flatnonzero((r < reach) & (np.abs(b) < np.pi / 2))
-        ranges.append(r[seen] + robot.range_offset + robot.range_sigma * rng.standard_normal(len(seen)))
+        ranges.append(
+            robot.range_scale * r[seen] + robot.range_offset + robot.range_sigma * rng.standard_normal(len(seen))
+        )
         bearings.append(b[seen] - robot.sensor_yaw + robot.bearing_sigma * rng.standard_normal(len(seen)))
         ids.append(seen)
         offsets.append(offsets[-1] + len(seen))

@@ -45,6 +45,8 @@ class CalibrationTrialConfig:
     """Of a drawn robot's drive."""
     lasting: bool = False
     """Do its wheels err for seconds on end?"""
+    planted: tuple[str, ...] = ()
+    """Of a drawn robot without constant errors: those of ``PLANTED`` that are added, one at a time; no maps."""
     added: Added | None = field(default_factory=Added)
     """To the motion of a recorded log; None: drawn in each run."""
     first: float | None = None
@@ -59,6 +61,8 @@ class CalibrationTrialConfig:
 def run_calibration_trial(config: CalibrationTrialConfig, seed: int) -> list[Measurement]:
     """All figures of one trial."""
     with one_blas_thread():
+        if config.planted:
+            return list(_planted(config, seed))
         if not config.source:
             return list(_drawn(config, seed))
         if config.frontend == "rbpf-ekf":
@@ -79,6 +83,46 @@ def _drawn(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
     ways["oracle"] = {"use": "none", "given": options_dict(true_figures(robot))}
     for name, calibrate in ways.items():
         yield from _mapped(name, log, {**OPTIONS, "calibrate": calibrate}, seed)
+
+
+EXACT: dict[str, float] = {
+    **dict.fromkeys(("yaw_bias", "range_offset", "sensor_yaw", "clock"), 0.0),
+    **dict.fromkeys(("distance_scale", "range_scale"), 1.0),
+}
+PLANTED: dict[str, tuple[dict[str, float], str, float]] = {
+    "none": ({}, "", 0.0),
+    "clock 50 ms": ({"clock": 0.05}, "clock", 0.05),
+    "distances 2 % long": ({"distance_scale": 1.02}, "distance_scale", float(np.log(1.02))),
+    "yaw rate 0.3 deg/s": ({"yaw_bias": float(np.deg2rad(0.3))}, "yaw_bias", float(np.deg2rad(0.3))),
+    "sensor turned 1 deg": ({"sensor_yaw": float(np.deg2rad(1.0))}, "sensor_yaw", float(np.deg2rad(1.0))),
+    # only the ratio of the two scales can be observed, and it is given as that of the distances
+    "ranges 5 % long": ({"range_scale": 1.05}, "distance_scale", -float(np.log(1.05))),
+}
+"""Changes of an exact robot, the constant that has to show them, and its value."""
+
+
+def _planted(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
+    """Of each planted error: whether it lies within 3 sigma of its estimate, and what was corrected besides."""
+    exact = replace(draw_robot(seed, lasting=config.lasting), **EXACT)
+    for name in config.planted:
+        changes, constant, true = PLANTED[name]
+        log = drive(replace(exact, **changes), seed, config.seconds)
+        begin = process_time()
+        found = calibrate_log(log, frontend="rbpf-ekf", quick=True, seed=seed)
+        yield Measurement(name, "cpu_seconds", process_time() - begin, timing=True)
+        estimates = {e.name: e for e in found.estimates}
+        yield Measurement(name, "false", float(sum(e.applied for k, e in estimates.items() if k != constant)))
+        false_clock = "clock" in estimates and constant != "clock" and estimates["clock"].applied
+        yield Measurement(name, "false_clock", float(false_clock))
+        if constant and constant in estimates:
+            e = estimates[constant]
+            yield Measurement(name, "normalised_error", (e.value - true) / e.sigma)
+            yield Measurement(name, "within", float(abs(e.value - true) <= 3.0 * e.sigma))
+            yield Measurement(name, "strength", abs(true) / e.sigma)
+            yield Measurement(name, "corrected", float(e.applied))
+        elif constant:
+            yield Measurement(name, "within", 0.0)
+            yield Measurement(name, "corrected", 0.0)
 
 
 def true_figures(r: DrawnRobot) -> Corrections:
