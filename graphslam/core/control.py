@@ -171,7 +171,7 @@ def control_lines(given: Any) -> dict[str, Any]:
         A mapping holds the cells of a row by column; ``sigma`` and ``lever`` may be numbers or sequences of them.
     """
     if isinstance(given, (str, Path)):
-        return {"source": Path(given).name, "rows": read_text(given).removeprefix("\ufeff").splitlines()}
+        return {"source": Path(given).name, "rows": read_text(given).splitlines()}
     if isinstance(given, Mapping) and set(given) == {"source", "rows"}:
         return dict(given)
     rows = given.to_dict("records") if hasattr(given, "to_dict") else given

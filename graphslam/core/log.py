@@ -16,6 +16,9 @@ from graphslam.core.markup import html_element, html_table, item_list, join_part
 from graphslam.core.records import Stream, check_times
 from graphslam.core.trajectory import Trajectory
 
+FAR_FIX = "far from all other fixes"
+"""Reason for which readers leave out a fix; a check of the log names it."""
+
 
 @dataclass
 class DropCounter:

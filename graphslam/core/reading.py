@@ -157,10 +157,10 @@ def _unpacked(stream: IO[bytes], make: Callable[[], Any], where: str, step: int)
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Text of a file in UTF-8, decompressed as :func:`read_bytes` does."""
+    """Text of a file in UTF-8, decompressed as :func:`read_bytes` does; a byte order mark is left out."""
     raw = read_bytes(path)
     try:
-        return raw.decode("utf-8")
+        return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise FormatError(

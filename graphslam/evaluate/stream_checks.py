@@ -1,7 +1,7 @@
 """Raw streams looked at before a run: what cannot be right in them whatever the map.
 
 Every check rests on what a stream says of itself, on physics, or on two streams that must agree. What is found is a
-line of the verdict; nothing is changed and nothing is dropped here.
+line of the verdict, or ends the run (:data:`STOPPING`); nothing is changed and nothing is dropped here.
 """
 
 from __future__ import annotations
@@ -10,16 +10,35 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
 from graphslam.core.imu import Imu
-from graphslam.core.log import SensorLog
+from graphslam.core.log import FAR_FIX, SensorLog
 from graphslam.core.point_clouds import PointClouds
+from graphslam.core.poses import group_of
 from graphslam.core.range_scans import RangeScans
-from graphslam.core.records import Gps, LandmarkObservations, LaserScans, SteeringControls, VelocityControls
+from graphslam.core.records import (
+    Gps,
+    LandmarkObservations,
+    LaserScans,
+    Odometry,
+    SteeringControls,
+    VelocityControls,
+)
 from graphslam.evaluate.stream_checks_beams import check_beams
+from graphslam.evaluate.stream_checks_clock import ORDER, check_clocks
 from graphslam.evaluate.stream_checks_gps import check_gps
-from graphslam.evaluate.stream_checks_imu import check_imu, check_turns
+from graphslam.evaluate.stream_checks_imu import check_imu, check_turns, compare_turns
+from graphslam.evaluate.stream_checks_motion import check_odometry, check_sighted_motion
 from graphslam.evaluate.stream_checks_sightings import check_sightings, check_steering
+from graphslam.io.clock import CLOCK_SET_BACK
+
+GYRO = 40.0
+"""No IMU of a robot measures faster turns [rad/s]: 2000 °/s are 35 rad/s."""
+BENT = 0.1
+"""Motion within a scan that bends it visibly [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +63,57 @@ def check_speeds(wheels: VelocityControls, name: str, log: SensorLog) -> list[Fi
     return [Finding("bad", "wheels-still", text)]
 
 
+def _gyro(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
+    if not len(imu.times):
+        return []
+    fastest = float(np.percentile(np.abs(imu.angular_rate), 99.9))
+    if fastest > GYRO:
+        text = (
+            f"gyro of {name}: up to {fastest:.3g} rad/s [≤ {GYRO:g}] — probably in degrees per second. Convert it to "
+            "rad/s."
+        )
+        return [Finding("bad", "gyro-unit", text)]
+    if any(isinstance(s, VelocityControls) for s in log.streams.values()):
+        return []  # compared with wheels by every run
+    odometry = next((s for s in log.streams.values() if isinstance(s, Odometry) and len(s.times) > 2), None)
+    if odometry is None:
+        return []
+    g = group_of(odometry.increments)
+    dt = np.diff(odometry.times)
+    turn = np.asarray(g.log(odometry.increments))[1:, g.heading] / dt
+    middle = odometry.times[1:] - 0.5 * dt
+    return compare_turns(imu, VelocityControls(times=middle, speed=np.zeros(len(turn)), yaw_rate=turn), name)
+
+
+def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding]:
+    """Points without times, or with one time for all, on a robot that moves while it scans."""
+    k = next((k for k in range(len(clouds)) if len(clouds.cloud(k))), None)
+    if k is None or clouds.ages(k) is not None:
+        return []
+    odometry = next((s for s in log.streams.values() if isinstance(s, Odometry) and len(s.times) > 2), None)
+    moved = float("nan")
+    if odometry is not None:
+        way = np.linalg.norm(odometry.increments[1:, : group_of(odometry.increments).dim], axis=1)
+        period = min(float(np.median(np.diff(clouds.times))), 0.1)
+        moved = float(np.percentile(way / np.diff(odometry.times), 75)) * period
+    stuck = log.meta.get("point_times") == "constant"
+    if not stuck and not moved > BENT:
+        return []
+    said = "the same for all points of a scan" if stuck else "none"
+    bent = f", which distorts a scan by {moved:.2f} m at the usual speed" if np.isfinite(moved) else ""
+    text = (
+        f"point times of {name}: {said}{bent} — scans cannot be deskewed. Switch on point times in the lidar driver, "
+        "or deskew the scans before."
+    )
+    return [Finding("bad" if stuck and not moved <= BENT else "look", "points-without-times", text)]
+
+
+_UNPLACED = (
+    "mounting of {0}: unknown, the log has no transform to its frame — the base pose is assumed. Set it with "
+    "--reader-option mount=[x, y, z, roll, pitch, yaw] (metres, radians), or record tf_static."
+)
+
+
 STREAM_CHECKS: tuple[tuple[tuple[type, ...], Callable[[Any, str, SensorLog], list[Finding]]], ...] = (
     ((LaserScans, RangeScans, PointClouds), check_beams),
     ((LandmarkObservations,), check_sightings),
@@ -52,22 +122,77 @@ STREAM_CHECKS: tuple[tuple[tuple[type, ...], Callable[[Any, str, SensorLog], lis
     ((Imu,), check_imu),
     ((Imu,), check_turns),
     ((VelocityControls,), check_speeds),
+    ((Odometry, VelocityControls), lambda stream, name, log: check_odometry(stream, name)),
+    ((LandmarkObservations,), check_sighted_motion),
+    ((Imu,), _gyro),
+    ((PointClouds,), _point_times),
 )
 """Kinds of streams, and what is checked in each of them: ``check(stream, name, log)``."""
 
 
-def check_streams(log: SensorLog) -> list[StreamFinding]:
-    """Look at every stream of a log.
+def check_streams(log: SensorLog, *, refusals: bool = True) -> list[StreamFinding]:
+    """Check every stream of a log, its clocks, and what its reader left out.
+
+    Parameters
+    ----------
+    refusals : bool
+        Raise for a stream that cannot be used at all; otherwise that is a finding like the others.
 
     Returns
     -------
     list of StreamFinding
-        In the order of the streams.
+        Faults of the clocks first: they are the cause of many others. Then in the order of the streams.
     """
-    return [
-        StreamFinding(name, finding)
-        for name, stream in log.streams.items()
-        for kinds, check in STREAM_CHECKS
-        if isinstance(stream, kinds)
-        for finding in check(stream, name, log)
-    ]
+    out = [StreamFinding(name, f) for name, f in check_clocks(log)]
+    for name, stream in log.streams.items():
+        for check in (check for kinds, check in STREAM_CHECKS if isinstance(stream, kinds)):
+            try:
+                out += [StreamFinding(name, finding) for finding in check(stream, name, log)]
+            except GraphSlamError as error:
+                if refusals:
+                    raise
+                out.append(StreamFinding("", Finding("bad", "refused", str(error))))
+    for name in log.meta.get("unplaced", ()):
+        out.append(StreamFinding(name, Finding("look", "mounting-unknown", _UNPLACED.format(name))))
+    out += [StreamFinding("", Finding(level, "assumed", text)) for level, text in log.meta.get("assumed", ())]
+    return [*out, *_losses(log)]
+
+
+STOPPING = ("stamps-unit",)
+"""Codes of faults with which no map can be made: a run ends with their text."""
+CLOCK_CODES = ("stamps-unit", "clock-jump", "clock-set-back", "no-common-time", "stamps-order")
+
+
+def refuse_faulty(found: list[StreamFinding], log: SensorLog) -> None:
+    """Raise :class:`~graphslam.core.errors.DataError` for the first fault with which no map can be made."""
+    for f in found:
+        if f.finding.code in STOPPING:
+            raise DataError(f.finding.text, where=f"{log.name}, {f.stream}")
+
+
+LOST = 0.05
+"""Share of the records of a stream that a reader leaves out above which it is a line of the verdict."""
+EXPECTED_LOSSES = ("no fix (status)", CLOCK_SET_BACK, *ORDER)
+"""Reasons that are no fault of a log, or that :func:`check_clocks` names."""
+
+
+def _losses(log: SensorLog) -> list[StreamFinding]:
+    """Records that the reader left out: any fix that is far from the others, and much of any stream."""
+    lost: dict[str, dict[str, int]] = {}
+    for key, n in log.dropped.items():
+        name, _, reason = key.partition(": ")
+        if name in log.read and not reason.startswith(("point ", *EXPECTED_LOSSES)) and not reason.endswith("(kept)"):
+            lost.setdefault(name, {})[reason] = n
+    out = []
+    for name, reasons in lost.items():
+        total, read = sum(reasons.values()), max(log.read[name], 1)
+        far = FAR_FIX in reasons
+        if total <= LOST * read and not far:
+            continue
+        why = "; ".join(f"{n} {r}" for r, n in reasons.items())
+        share = 100 * total / read
+        text = f"records of {name} left out: {total} of {read} ({share:.1f} %): {why}. Check the recording."
+        if far:
+            text += " A receiver reports such fixes before it has a solution: they are outliers."
+        out.append(StreamFinding(name, Finding("look", "records-left-out", text)))
+    return out

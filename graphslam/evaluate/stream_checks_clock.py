@@ -14,6 +14,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import Gps, LandmarkObservations, LaserScans, Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
+from graphslam.io.clock import CLOCK_SET_BACK
 
 STEADY = (Imu, LaserScans, Odometry, PointClouds, RangeScans, SteeringControls, VelocityControls)
 """Streams that bring records all the time; landmarks and fixes come when there are some."""
@@ -23,6 +24,7 @@ JUMP, JUMP_TIMES = 20.0, 50.0
 """A pause this long [s], and this many times the usual one, is one that somebody should know of."""
 TOGETHER = 0.5
 """Share of the shorter of two streams that the other covers: below it they hardly tell of the same drive."""
+ORDER = ("stamp out of order", "repeated stamp", "stamp is not finite")
 REORDERED = 0.001
 """Share of stamps that fall back or stand twice above which it is said."""
 
@@ -86,9 +88,16 @@ def _order(read: Mapping[str, int], dropped: Mapping[str, int]) -> list[tuple[st
     out = []
     for key, n in dropped.items():
         name, _, reason = key.partition(": ")
-        if reason not in ("stamp out of order", "repeated stamp", "stamp is not finite"):
+        if reason not in (*ORDER, CLOCK_SET_BACK):
             continue
         share = n / max(read.get(name, n), 1)
+        if reason == CLOCK_SET_BACK:
+            text = (
+                f"records of {name} left out: {n} ({100 * share:.1f} %), {reason}, or of a second drive in the same "
+                "recording. Cut the log where the stamps go back, and map the parts one by one."
+            )
+            out.append((name, Finding("bad", "clock-set-back", text)))
+            continue
         if share <= REORDERED:
             continue
         text = (

@@ -17,10 +17,11 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
-from graphslam.core.reading import finite_mask
 from graphslam.io import ros_messages as ros
 from graphslam.io.bag_files import BagFiles, BagTopic, error_text
-from graphslam.io.cloud_logs import ages_of
+from graphslam.io.cloud_files import CloudData
+from graphslam.io.frame_tree import FrameTree, TopicRows
+from graphslam.io.point_times import PointClock
 
 KINDS = {
     "sensor_msgs/msg/LaserScan": "laser",
@@ -34,43 +35,8 @@ KINDS = {
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _NO_LIDAR = re.compile(r"depth|camera|rgbd|stereo|cost|octomap|map\b|_map|registered|mesh|obstacle|cluster|ground")
 _MADE = re.compile(r"filtered|fused|ekf|ukf|global|map|ground_truth|gt\b|reference")
-ODOMETRY_FRAMES = ("odom", "odom_combined", "odometry", "world_odom")
 _PACKETS = re.compile(r"packets|VelodyneScan|PacketMsg|RawPacket|hesai|UdpFrame", re.IGNORECASE)
 WANTED = "messages of LaserScan, PointCloud2 or CustomMsg (and Odometry)"
-
-
-class SpooledClouds:
-    """Clouds of a bag, in a file without a name that goes with the process; see ``CloudSource``.
-
-    Parameters
-    ----------
-    bounds : (n + 1,) int64
-    points : (q, 3) float32
-    ages : (q,) float32 or None
-    """
-
-    def __init__(
-        self, bounds: npt.NDArray[np.int64], points: npt.NDArray[np.float32], ages: npt.NDArray[np.float32] | None
-    ) -> None:
-        self._bounds, self._points, self._ages = bounds, points, ages
-        self.counts = np.diff(bounds)
-
-    def cloud(self, k: int) -> Array:
-        """See :class:`~graphslam.core.point_clouds.CloudSource`."""
-        return self._points[self._bounds[k] : self._bounds[k + 1]].astype(np.float64)
-
-    def ages(self, k: int) -> Array | None:
-        """See :class:`~graphslam.core.point_clouds.CloudSource`."""
-        return None if self._ages is None else self._ages[self._bounds[k] : self._bounds[k + 1]].astype(np.float64)
-
-    def packed(self) -> bytes:
-        """See :class:`~graphslam.core.point_clouds.CloudSource`: digests of the points."""
-        d = hashlib.blake2b(self._bounds.tobytes(), digest_size=32)
-        for a in (self._points, self._ages):
-            if a is not None:
-                for k in range(0, len(a), 1 << 20):
-                    d.update(a[k : k + (1 << 20)].tobytes())
-        return d.digest()
 
 
 class FloatSpool:
@@ -91,70 +57,77 @@ class FloatSpool:
 
 
 @dataclass
-class TopicRows:
-    """What was read of one topic."""
+class CloudSpool:
+    """Points of the clouds of a bag and their times, on disk while the bag is read.
 
-    stamps: list[float] = field(default_factory=list)
-    bag_stamps: list[float] = field(default_factory=list)
-    values: list[Any] = field(default_factory=list)
-    frame: str = ""
-    child: str = ""
-    damaged: int = 0
-    why: str = ""
-    one_time: bool = False  # points have a field of times, which says nothing
+    Times are kept less the earliest of their scan, ``first`` (n,), which is NaN for scans without times; ``spans`` (n,)
+    are those between the earliest and the latest. Both in the unit of the field.
+    """
+
+    points: FloatSpool = field(default_factory=lambda: FloatSpool(3))
+    times: FloatSpool = field(default_factory=lambda: FloatSpool(1))
+    first: list[float] = field(default_factory=list)
+    spans: list[float] = field(default_factory=list)
+
+    def add(self, cloud: CloudData) -> None:
+        self.points.add(cloud.points)
+        t = cloud.times if cloud.times is not None and len(cloud.times) else None
+        self.first.append(float("nan") if t is None else float(t.min()))
+        self.spans.append(float("nan") if t is None else float(np.ptp(t)))
+        self.times.add(np.zeros(len(cloud.points)) if t is None else t - t.min())
 
 
-class FrameTree:
-    """Transforms between frames that do not change, and one that does: of an odometry frame to the robot."""
+class SpooledClouds:
+    """Clouds of a bag, in a file without a name that goes with the process; see ``CloudSource``.
 
-    def __init__(self) -> None:
-        self.fixed: dict[tuple[str, str], list[float]] = {}
-        self.moving: dict[tuple[str, str], TopicRows] = {}
+    Parameters
+    ----------
+    counts : (n,) int64
+        Points of each scan.
+    stamps : (n,)
+        Of the scans [s].
+    clock : PointClock or None
+        Unit of the times of points; None: they are not used.
+    T_base_frame : (n, 7) or None
+        Pose of the frame of each cloud in the base, where that frame moves against it; None: it does not.
+    """
 
-    def add(self, message: Any, bag_stamp: float, static: bool) -> None:
-        for t in message.transforms:
-            key = t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")
-            pose = ros.pose_of_message(t.transform)
-            norm = float(np.linalg.norm(pose[3:]))
-            if not np.all(finite_mask(pose)) or abs(norm - 1.0) > 0.05:
-                continue
-            if static:
-                self.fixed[key] = pose
-            else:
-                rows = self.moving.setdefault(key, TopicRows())
-                rows.stamps.append(ros.stamp_of(t))
-                rows.bag_stamps.append(bag_stamp)
-                rows.values.append(pose)
+    def __init__(
+        self,
+        spool: CloudSpool,
+        counts: npt.NDArray[np.int64],
+        stamps: Array,
+        clock: PointClock | None,
+        T_base_frame: Array | None = None,
+    ) -> None:
+        self._bounds = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self._points, self._times, self._first = spool.points.map(), spool.times.map(), np.array(spool.first)
+        self._stamps, self._clock, self._T_base_frame = stamps, clock, T_base_frame
+        self.counts = np.diff(self._bounds)
 
-    def settle(self) -> None:
-        """Transforms of ``tf`` that never changed are fixed ones."""
-        for key, rows in list(self.moving.items()):
-            if np.ptp(np.array(rows.values), axis=0).max() == 0.0 and key[0] not in ODOMETRY_FRAMES:
-                self.fixed.setdefault(key, rows.values[0])
-                del self.moving[key]
+    def cloud(self, k: int) -> Array:
+        """See :class:`~graphslam.core.point_clouds.CloudSource`."""
+        points = self._points[self._bounds[k] : self._bounds[k + 1]].astype(np.float64)
+        if self._T_base_frame is None:
+            return points
+        T = self._T_base_frame[k]
+        return np.asarray(se3.quat_rotate(np.tile(T[3:], (len(points), 1)), points) + T[:3])
 
-    def know(self, a: str, b: str) -> bool:
-        """Is the place of one in the other known?"""
-        return self.between(a, b) is not None
+    def ages(self, k: int) -> Array | None:
+        """See :class:`~graphslam.core.point_clouds.CloudSource`."""
+        if self._clock is None or np.isnan(self._first[k]):
+            return None
+        times = self._times[self._bounds[k] : self._bounds[k + 1]].astype(np.float64) + self._first[k]
+        return self._clock.ages(times, float(self._stamps[k]))
 
-    def between(self, a: str, b: str) -> Array | None:
-        """``T_a_b`` over fixed transforms, or None."""
-        if a == b:
-            return np.array([0.0, 0, 0, 0, 0, 0, 1])
-        steps: dict[str, list[tuple[str, Array]]] = {}
-        for (parent, child), pose in self.fixed.items():
-            T = np.concatenate([pose[:3], se3.quat_normalize(np.array(pose[3:]))])
-            steps.setdefault(parent, []).append((child, T))
-            steps.setdefault(child, []).append((parent, se3.se3_inverse(T)))
-        reached = {a: np.array([0.0, 0, 0, 0, 0, 0, 1])}
-        todo = [a]
-        while todo:
-            at = todo.pop(0)
-            for to, T in steps.get(at, []):
-                if to not in reached:
-                    reached[to] = se3.se3_compose(reached[at], T)
-                    todo.append(to)
-        return reached.get(b)
+    def packed(self) -> bytes:
+        """See :class:`~graphslam.core.point_clouds.CloudSource`: digests of the points."""
+        d = hashlib.blake2b(self._bounds.tobytes(), digest_size=32)
+        T = self._T_base_frame
+        for a in (self._points, self._times, self._first, *(() if T is None else (T,))):
+            for k in range(0, len(a), 1 << 20):
+                d.update(a[k : k + (1 << 20)].tobytes())
+        return d.digest()
 
 
 def choose_topics(
@@ -209,14 +182,13 @@ def _rank(kind: str, topic: str) -> int:
 
 
 def collect_messages(
-    bag: BagFiles, chosen: dict[str, BagTopic], counter: DropCounter, point_times: bool
-) -> tuple[FrameTree, dict[str, TopicRows], tuple[FloatSpool, FloatSpool | None] | None]:
+    bag: BagFiles, chosen: dict[str, BagTopic], counter: DropCounter
+) -> tuple[FrameTree, dict[str, TopicRows], CloudSpool | None]:
     """All messages of the chosen topics, points in a spool."""
     kind_of = {t.name: k for k, t in chosen.items()}
     transforms = {t.name for t in bag.topics.values() if t.type in TRANSFORMS}
     frames, rows = FrameTree(), {k: TopicRows() for k in chosen}
-    points, ages = FloatSpool(3), FloatSpool(1)
-    timed: bool | None = None if point_times else False
+    spool = CloudSpool()
     lost: Counter[str] = Counter()
     for topic, raw, bag_stamp in bag.messages({*kind_of, *transforms}, counter):
         kind = kind_of.get(topic)
@@ -237,12 +209,7 @@ def collect_messages(
                     cloud = ros.point_cloud(message)
                 lost["point not finite"] += cloud.not_finite
                 lost["point at the origin (no return)"] += cloud.at_origin
-                before = ages_of(cloud, stamp or bag_stamp) if timed is not False else None
-                if timed is None and len(cloud.points):
-                    timed = before is not None
-                    r.one_time = not timed and cloud.times is not None
-                points.add(cloud.points)
-                ages.add(before if before is not None else np.zeros(len(cloud.points)))
+                spool.add(cloud)
                 r.values.append(len(cloud.points))
             else:
                 r.values.append(_TAKE[kind](message))
@@ -263,9 +230,7 @@ def collect_messages(
         counter.drop(kind, f"message cannot be decoded ({r.why})", r.damaged)
         if not r.values:
             del rows[kind]
-    if "clouds" not in rows:
-        return frames, rows, None
-    return frames, rows, (points, ages if timed else None)
+    return frames, rows, spool if "clouds" in rows else None
 
 
 def _take_laser(m: Any) -> tuple[Any, ...]:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
@@ -28,28 +29,31 @@ from graphslam.core.geodesy import geodetic_to_ecef
 from graphslam.core.geometry import Array
 from graphslam.core.gnss import TangentPlane
 from graphslam.core.imu import GRAVITY, Imu
-from graphslam.core.log import DropCounter, SensorLog
+from graphslam.core.log import FAR_FIX, DropCounter, SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.core.reading import finite_mask
 from graphslam.core.records import Gps, LaserScans, Odometry, Stream
 from graphslam.io.bag_files import BagFiles
 from graphslam.io.bag_messages import (
-    ODOMETRY_FRAMES,
     WANTED,
-    FloatSpool,
-    FrameTree,
+    CloudSpool,
     SpooledClouds,
-    TopicRows,
     choose_topics,
     collect_messages,
 )
 from graphslam.io.clock import usable_records
-from graphslam.io.cloud_logs import IMU_NOISE
+from graphslam.io.cloud_logs import CUT_SCAN, IMU_NOISE, cut_scans
+from graphslam.io.frame_tree import BASE_FRAMES, FrameTree, TopicRows, leaf
 from graphslam.io.odometry_noise import DEFAULT_NOISE, OdometryNoise
 from graphslam.io.planar_scans import unify_layout
+from graphslam.io.point_times import choose_point_clock
 
 FIX_SIGMA = 5.0
 """σ of a fix whose message says nothing of it [m]."""
+FAR = 1000.0
+"""No fix closer than this to the middle of all is left out as far from them [m]."""
+FEWEST_FIXES = 5
+"""Of fewer it is not decided which are far."""
 _MOST_FAR = 3600.0  # [s] between stamps of headers and of the bag, beyond which it is said
 
 
@@ -72,6 +76,7 @@ def read_bag(
     *,
     topics: BagTopics = ALL_TOPICS,
     base_frame: str | None = None,
+    odometry_frame: str | None = None,
     mount: tuple[float, float, float, float, float, float] | None = None,
     point_times: bool = True,
     max_range: float | None = None,
@@ -88,6 +93,8 @@ def read_bag(
         Which are read.
     base_frame : str, optional
         Frame of the robot.
+    odometry_frame : str, optional
+        Frame in which the transforms ``tf`` move the robot; they are then the odometry, before any topic.
     mount : (6,), optional
         Place of the scanner in the base, instead of what transforms say: x, y, z [m], roll, pitch, yaw [rad].
     point_times : bool
@@ -105,15 +112,16 @@ def read_bag(
     with ExitStack() as stack:
         bag = BagFiles(p, stack)
         chosen = choose_topics(bag, asked, notes, counter)
-        frames, rows, spool = collect_messages(bag, chosen, counter, point_times)
+        frames, rows, spool = collect_messages(bag, chosen, counter)
     frames.settle()
     made, streams = _BagLog(str(p), rows, frames, counter, notes), dict[str, Stream]()
-    if "odometry" not in rows and topics.odometry != "none" and (moving := made.moving()) is not None:
+    by_transforms = odometry_frame is not None or ("odometry" not in rows and topics.odometry != "none")
+    if by_transforms and (moving := made.moving(odometry_frame)) is not None:
         rows["odometry"] = moving
     planar = "laser" in chosen and "clouds" not in chosen
     base = made.base = base_frame or made.frame_of_base()
     if spool is not None:
-        streams["clouds"] = made.clouds(spool, made.place("clouds", mount))
+        streams["clouds"] = made.clouds(spool, mount, point_times)
     if "laser" in rows and "clouds" not in streams:
         streams["laser"] = made.laser(made.place("laser", mount), max_range)
     if "odometry" in rows:
@@ -125,12 +133,12 @@ def read_bag(
     if not streams:
         raise DataError("the bag has no usable messages", where=str(p), got=dict(counter.counts), wanted=WANTED)
     read = {k: len(rows[k].stamps) for k in streams}
-    lost = [] if mount else [k for k in ("clouds", "laser") if k in streams and not frames.know(base, rows[k].frame)]
+    scanners = [k for k in ("clouds", "laser") if k in streams and k not in made.moved]
+    lost = [] if mount else [k for k in scanners if not frames.know(base, rows[k].frame)]
     names = {k: t.name for k, t in chosen.items()}
     meta = {"source": p.name, "notes": notes, "base_frame": base, "topics": names, "unplaced": lost}
-    if "clouds" in rows:
-        timed = spool is not None and spool[1] is not None
-        meta["point_times"] = "used" if timed else "constant" if rows["clouds"].one_time else "none"
+    if made.point_times:
+        meta["point_times"] = made.point_times
     return SensorLog(name=p.stem, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
 
@@ -151,10 +159,17 @@ class _BagLog:
         self, where: str, rows: dict[str, TopicRows], frames: FrameTree, counter: DropCounter, notes: list[str]
     ) -> None:
         self.where, self.rows, self.frames, self.counter, self.notes = where, rows, frames, counter, notes
-        self.base = ""
+        self.base = self.point_times = ""
+        self.moved: list[str] = []
+        self._times: dict[str, Array] = {}
 
     def _stamps(self, kind: str) -> Array:
         """Stamps of headers; of the bag where headers have none."""
+        if kind not in self._times:
+            self._times[kind] = self._choose_stamps(kind)
+        return self._times[kind]
+
+    def _choose_stamps(self, kind: str) -> Array:
         r = self.rows[kind]
         t, b = np.array(r.stamps), np.array(r.bag_stamps)
         if np.mean(t <= 0.0) > 0.5 or (len(t) > 2 and np.ptp(t) == 0.0):
@@ -164,23 +179,26 @@ class _BagLog:
             self.notes.append(f"headers of {kind} are {np.median(t - b):.0f} s from the bag's clock")
         return t
 
-    def moving(self) -> TopicRows | None:
-        """Odometry out of the transforms, or None."""
-        found = [(k, r) for k, r in self.frames.moving.items() if k[0] in ODOMETRY_FRAMES and len(r.values) > 2]
-        if not found:
+    def moving(self, parent: str | None) -> TopicRows | None:
+        """Odometry from the transforms, or None."""
+        key = self.frames.odometry({self.rows[k].frame for k in ("clouds", "laser") if k in self.rows}, parent)
+        if key is None:
+            if parent is not None:
+                known = ", ".join(f"{a} → {b}" for a, b in self.frames.moving) or "none"
+                raise ConfigError(f"bag: no frame moves in odometry_frame {parent!r}; moving transforms: {known}")
             return None
-        (parent, child), rows = max(found, key=lambda f: len(f[1].values))
-        rows.frame, rows.child = parent, child
-        self.notes.append(f"odometry from the transform {parent} → {child}")
+        rows = self.frames.moving[key]
+        rows.frame, rows.child = key
+        self.notes.append(f"odometry from the transform {key[0]} → {key[1]}")
         return rows
 
     def frame_of_base(self) -> str:
         if "odometry" in self.rows and self.rows["odometry"].child:
             return self.rows["odometry"].child
-        known = {f for key in self.frames.fixed for f in key}
-        for name in ("base_link", "base_footprint", "base"):
-            if name in known:
-                return name
+        known = sorted({f for key in self.frames.fixed for f in key}, key=len)
+        for name in BASE_FRAMES:
+            if found := [f for f in known if leaf(f) == name]:
+                return found[0]
         return next((self.rows[k].frame for k in ("clouds", "laser", "imu") if k in self.rows), "base_link")
 
     def place(self, kind: str, mount: tuple[float, ...] | None) -> Array:
@@ -210,14 +228,21 @@ class _BagLog:
         keep = usable_records(times, bad, stream=kind, where=f"{self.where}, {kind}", drops=self.counter, limit=0.5)
         return times[keep], keep
 
-    def clouds(self, spool: tuple[FloatSpool, FloatSpool | None], place: Array) -> PointClouds:
+    def clouds(self, spool: CloudSpool, mount: tuple[float, ...] | None, timed: bool) -> PointClouds:
         counts = np.array(self.rows["clouds"].values, dtype=np.int64)
         if not counts.any():
             raise DataError("all clouds are empty", where=self.where, got=dict(self.counter.counts), wanted="points")
-        times, keep = self._kept("clouds", {"no point in it": counts == 0})
-        bounds = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        source = SpooledClouds(bounds, spool[0].map(), None if spool[1] is None else spool[1].map())
-        self.notes.append("points have times" if spool[1] is not None else "points have no times")
+        stamps, frame = self._stamps("clouds"), self.rows["clouds"].frame
+        fixed = mount is not None or self.frames.know(self.base, frame)
+        T = None if fixed else self.frames.moving_place(self.base, frame, stamps)
+        if T is not None:  # the driver has already put the points together in that frame
+            self.moved.append("clouds")
+            self.notes.append(f"clouds in {frame!r}, which moves: brought to {self.base!r} by the transforms")
+        clock, self.point_times, note = choose_point_clock(spool.spans if timed and T is None else (), stamps)
+        times, keep = self._kept("clouds", {"no point in it": counts == 0, CUT_SCAN: cut_scans(counts)})
+        self.notes.append(note)
+        source = SpooledClouds(spool, counts, stamps, clock, T)
+        place = self.place("clouds", mount) if T is None else np.array([0.0, 0, 0, 0, 0, 0, 1])
         return PointClouds(times=times, source=source, index=np.flatnonzero(keep), T_base_sensor=place)
 
     def laser(self, place: Array, max_range: float | None) -> LaserScans:
@@ -289,6 +314,12 @@ class _BagLog:
             "no place on Earth": ~np.asarray(place_ok),
             "latitude and longitude are 0": (g[:, :2] == 0.0).all(axis=1),
         }
+        no_height = ~finite_mask(g[:, 2])
+        flat = planar or float(np.mean(no_height[place_ok])) > 0.5 if place_ok.any() else planar
+        if not flat:
+            bad["altitude is not finite"] = np.asarray(no_height)
+        llh = np.where(finite_mask(g), g, 0.0)
+        bad[FAR_FIX] = far_fixes(llh, ~np.logical_or.reduce(list(bad.values())))
         wrong = np.logical_or.reduce(list(bad.values()))
         if wrong.all():
             for reason, mask in bad.items():
@@ -301,9 +332,7 @@ class _BagLog:
             self.counter.drop("gps", reason, int(mask.sum()))
         inner = usable_records(times[good], {}, stream="gps", where=f"{self.where}, gps", drops=self.counter, limit=0.5)
         keep = good[inner]
-        flat = planar or not np.all(finite_mask(g[keep, 2]))
-        heights = np.where(finite_mask(g[keep, 2]), g[keep, 2], 0.0)
-        llh = np.column_stack([g[keep, :2], heights])
+        llh = llh[keep]
         plane = TangentPlane(*llh[0].tolist())
         enu = plane.from_ecef(geodetic_to_ecef(llh))
         P = np.tile(FIX_SIGMA**2 * np.eye(3), (len(keep), 1, 1))
@@ -321,3 +350,23 @@ class _BagLog:
         lever = np.zeros(3) if place is None else place[:3]
         sigma = np.sqrt(P[:, 0, 0])
         return Gps(times=times[keep], positions=enu[:, :c], sigma=sigma, lever=lever[:c], covariances=P[:, :c, :c])
+
+
+def far_fixes(llh: Array, usable: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Fixes ``(n,)`` that are far from all others: receivers report such places before they have a solution.
+
+    Parameters
+    ----------
+    llh : (n, 3)
+        Latitude, longitude [deg], height [m].
+    usable : (n,)
+        Those that are compared.
+    """
+    far = np.zeros(len(llh), np.bool_)
+    rows = np.flatnonzero(usable)
+    if len(rows) < FEWEST_FIXES:
+        return far
+    x = geodetic_to_ecef(llh[rows])
+    away = np.linalg.norm(x - np.median(x, axis=0), axis=1)
+    far[rows] = away > max(FAR, 10.0 * float(np.quantile(away, 0.8)))
+    return far

@@ -18,6 +18,7 @@ not dropped: the nearest stamps that rise (isotonic regression), if none has to 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -40,6 +41,9 @@ from graphslam.io.source_probe import SourceProbe
 MAX_RANGE = 80.0
 """Ranges at or above it are no return, where lines state none [m]."""
 
+_LASER_PARAM = re.compile(r"PARAM (?:robot|laser)_(front|rear)_?laser_(fov|max|max_range) (\d+\.?\d*)\b")
+USUAL_BEAMS = (180, 181, 360, 361)
+"""Beams of scanners of 180° with steps of 1° and of half a degree."""
 _SPACING = 1e-3  # least time between mended stamps [s]
 _POSED = {"FLASER": 9, "RLASER": 9, "ROBOTLASER": 14, "RAWLASER": 3}  # words after ranges (and remissions)
 
@@ -57,6 +61,7 @@ def read_carmen(
     *,
     max_range: float | None = None,
     laser: str | None = None,
+    fov: float | None = None,
     noise: OdometryNoise = DEFAULT_NOISE,
     most_mended: float = 3.0,
 ) -> SensorLog:
@@ -72,6 +77,9 @@ def read_carmen(
         81.8 m and more.
     laser : str, optional
         Lines that are read, for instance ``ROBOTLASER1``; by default those of the tag that occurs most.
+    fov : float, optional
+        Field of view of scans in lines FLASER and RLASER, which do not state it [deg]. By default that of a line
+        PARAM, or 180°.
     noise : OdometryNoise
         Of the odometry; the logs state none.
     most_mended : float
@@ -83,13 +91,13 @@ def read_carmen(
         Streams ``laser``, ``odometry`` (one motion a scan; none if the log tells no pose) and, with a corrected log,
         ``reference``: a Trajectory of the base. It is the output of another SLAM, not truth.
     """
-    for what, values in (("max_range", [max_range or 1.0]), ("most_mended", [most_mended])):
-        if not all(np.isfinite(v) and v > 0 for v in values) or max_range == 0:
-            raise ConfigError(f"carmen: {what} is {values}; wanted positive numbers")
+    for what, value in (("max_range", max_range), ("most_mended", most_mended), ("fov", fov)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise ConfigError(f"carmen: {what} is {value}; wanted a positive number")
     raw, corrected = _files(Path(path))
     where = str(raw)
     counter = DropCounter()
-    scans = _scans(raw, counter, laser)
+    scans = _scans(raw, counter, laser, fov)
     reach = max_range or scans.max_range or MAX_RANGE
     ranges, poses = scans.ranges, scans.poses
     times, mended = mend_stamps(scans.stamps, most_mended, where=where)
@@ -126,6 +134,7 @@ def read_carmen(
         meta={
             "source": raw.name,
             "reference": says,
+            "assumed": scans.assumed,
             "odometry_sigmas": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(noise).items()},
         },
     )
@@ -187,6 +196,7 @@ class _Scans:
     poses: Array | None
     odom: list[tuple[float, float, float, float]]
     max_range: float | None
+    assumed: list[tuple[str, str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,13 +243,16 @@ def _parse(words: list[str]) -> _Line | str:
     return _Line((start, step, n), ranges.astype(np.float32), pose, stamp, reach if reach > 0 else None)
 
 
-def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
+def _scans(path: Path, drops: DropCounter, laser: str | None = None, fov: float | None = None) -> _Scans:
     rows: dict[str, list[tuple[int, list[str]]]] = {}
     odom: list[tuple[float, float, float, float]] = []
+    settings = _Settings()
     for at, line in enumerate(read_text(path).splitlines(), start=1):
         found = CARMEN_SCANS.match(line)
         if found:
             rows.setdefault(found[1], []).append((at, line.split()))
+        elif line.startswith("PARAM "):
+            settings.read(line)
         elif line.startswith("ODOM "):
             words = line.split()
             try:
@@ -277,7 +290,12 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
         )
     for reason, numbers_of in lost.items():
         drops.drop("laser", reason, len(numbers_of))
-    directions = {x.layout: _directions(x.layout) for x in lines}
+    layouts = {x.layout for x in lines}
+    beside = settings.rear if tag.startswith("RLASER") else settings.front
+    if fov is not None:
+        beside.fov = float(np.deg2rad(fov))
+    directions = {x: _directions(x, beside.fov) for x in layouts}
+    assumed = [] if tag[:6] not in ("FLASER", "RLASER") else [beside.in_words(max(layouts)[2])]
     ranges, beams, moved = unify_layout([(x.ranges, directions[x.layout]) for x in lines])
     drops.drop("laser", f"scan of other beams mapped to the usual {len(beams)} (kept)", moved)
     poses = [x.pose for x in lines if x.pose is not None]
@@ -288,13 +306,49 @@ def _scans(path: Path, drops: DropCounter, laser: str | None = None) -> _Scans:
         stamps=np.array([x.stamp for x in lines]),
         poses=np.array(poses) if poses else None,
         odom=odom,
-        max_range=float(np.median(reach)) if reach else None,
+        max_range=float(np.median(reach)) if reach else beside.max_range,
+        assumed=assumed,
     )
 
 
-def _directions(layout: tuple[float, float, int]) -> Array:
+def _directions(layout: tuple[float, float, int], fov: float | None) -> Array:
     start, step, n = layout
-    return np.asarray(start + step * np.arange(n, dtype=np.float64)) if step > 0 else beam_bearings(n)
+    if step > 0:
+        return np.asarray(start + step * np.arange(n, dtype=np.float64))
+    if fov is None or abs(fov - np.pi) < 0.01:
+        return beam_bearings(n)
+    return np.linspace(-0.5 * fov, 0.5 * fov, n)
+
+
+@dataclass
+class _Laser:
+    """What lines PARAM state of one laser: field of view [rad] and greatest range [m]."""
+
+    fov: float | None = None
+    max_range: float | None = None
+
+    def in_words(self, beams: int) -> tuple[str, str]:
+        fov = 180.0 if self.fov is None else float(np.rad2deg(self.fov))
+        by = "no line states it (reader option fov=)" if self.fov is None else "by a line PARAM"
+        return ("" if self.fov or beams in USUAL_BEAMS else "look"), f"field of view of the laser: {fov:g}°, {by}."
+
+
+class _Settings:
+    """Lines PARAM of the lasers, ``PARAM name value``."""
+
+    def __init__(self) -> None:
+        self.front, self.rear = _Laser(), _Laser()
+
+    def read(self, line: str) -> None:
+        found = _LASER_PARAM.match(line)
+        value = float(found[3]) if found else 0.0
+        if found is None or value <= 0.0:
+            return
+        laser = self.rear if found[1] == "rear" else self.front
+        if found[2] == "fov":
+            laser.fov = float(np.deg2rad(value)) if value > 2.0 * np.pi else value
+        else:
+            laser.max_range = value
 
 
 def _still(poses: Array) -> bool:

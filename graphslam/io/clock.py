@@ -18,6 +18,10 @@ from graphslam.core.log import DropCounter
 Mask = npt.NDArray[np.bool_]
 MAX_DROPPED = 0.05
 """Share of a stream's records that may be dropped."""
+BLOCK = 20
+"""So many records in a row whose stamps are out of order are no jitter:"""
+CLOCK_SET_BACK = "stamp after the clock was set back"
+"""… the clock was set back, or a second drive follows in the same recording."""
 STALE, STALE_TIMES = 20.0, 100.0
 """A first record that all others follow after so long [s], and so many times what is usual between them, is an old one
 that was handed out when the recording began (a latched message)."""
@@ -86,9 +90,16 @@ def usable_records(
     if len(out):
         kept_times = times[index[ordered]]
         repeated = np.isin(times[out], kept_times)
-        lost["repeated stamp"], lost["stamp out of order"] = np.zeros((2, n), dtype=np.bool_)
-        lost["repeated stamp"][out[repeated]] = True
-        lost["stamp out of order"][out[~repeated]] = True
+        late = out[~repeated]
+        blocks = np.split(late, np.flatnonzero(np.diff(late) > 1) + 1)
+        back = np.concatenate([b for b in blocks if len(b) >= BLOCK] or [late[:0]])
+        for reason, rows in (
+            ("repeated stamp", out[repeated]),
+            ("stamp out of order", np.setdiff1d(late, back)),
+            (CLOCK_SET_BACK, back),
+        ):
+            lost[reason] = np.zeros(n, dtype=np.bool_)
+            lost[reason][rows] = True
         keep[out] = False
     some = times[keep]
     if len(some) > 3 and some[1] - some[0] > max(STALE, STALE_TIMES * float(np.median(np.diff(some[1:])))):

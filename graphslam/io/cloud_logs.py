@@ -3,8 +3,8 @@
 The log has the stream ``clouds``, and ``odometry`` where there are poses (they are then also ``reference``). Without
 stamps scans are ``period`` apart. Clouds are decoded when they are asked for.
 
-Times of points (fields ``t``, ``time``, ``timestamp``, ``offset_time``, ``gps_time``) are taken in the unit that makes
-a scan last between 5 ms and 2 s, and for offsets from the stamp of the scan, or stamps on its clock.
+Times of points (fields ``t``, ``time``, ``timestamp``, ``offset_time``, ``gps_time``) have the unit that makes a scan
+last as long as scans are apart (:mod:`graphslam.io.point_times`).
 """
 
 from __future__ import annotations
@@ -30,26 +30,40 @@ from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
-from graphslam.io.cloud_files import BIN_COLUMNS, CloudData, bin_columns, count_points, read_cloud
+from graphslam.io.cloud_files import BIN_COLUMNS, bin_columns, count_points, read_cloud
 from graphslam.io.odometry_noise import constant_noise
-from graphslam.io.recognise import cloud_folder, is_kitti_poses, parse_numbers, pose_file
+from graphslam.io.point_times import PointClock, choose_point_clock
+from graphslam.io.recognise import (
+    CLOUD_ENDINGS,
+    cloud_folder,
+    first_rows,
+    is_kitti_poses,
+    is_stamped_matrices,
+    parse_numbers,
+    pose_file,
+)
 from graphslam.io.source_probe import SourceProbe, file_ending
 from graphslam.io.text_records import read_table
 
 Index = npt.NDArray[np.intp]
 PERIOD = 0.1
 """Seconds from scan to scan where nothing says it: lidars turn ten times a second."""
+NO_STAMPS = "no stamps"
 ODOMETRY_SIGMAS = (0.03, 0.005)
 """Stated σ of one motion between scans, per axis: metres, radians. Tables of poses state none."""
 IMU_NOISE = ImuNoise(
     gyro=2e-3, gyro_bias=0.02, gyro_walk=1e-4, accelerometer=2e-2, accelerometer_bias=0.2, accelerometer_walk=1e-3
 )
 """Of an IMU whose log states no noise: a MEMS unit of middle price."""
-_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
-_SWEEP = (0.005, 2.0)  # how long a scan lasts [s]
-_TIMED = {"none": "points without times", "constant": "times of points say nothing: as good as one time for all"}
 MOST_DECODED = 100
 """Clouds that are decoded when a folder is opened, evenly over it."""
+LEAST_COLUMNS = 7
+"""A table beside clouds with so many columns may hold a path or a sensor."""
+CUT_SCAN = "scan is cut: less than a quarter of the usual points, at an end of the log"
+CUT = 0.25
+"""Scans at the begin and the end of a log with less than this share of the usual points are cut."""
+COMPRESSED = (".laz", ".pcd")
+"""Their sizes do not tell how many points they hold."""
 LOOKED_AT = 5
 """BIN files, evenly over a folder, by whose content the number of their columns is told."""
 _KEPT = 8  # decoded clouds that are kept
@@ -66,12 +80,12 @@ class FileClouds:
         Factor on coordinates.
     stamps : (n,)
         Of the scans [s], for points that have stamps on the same clock.
-    point_times : bool
-        Are times of points used?
+    clock : PointClock or None
+        Unit of the times of points; None: they are not used.
     """
 
-    def __init__(self, paths: list[Path], columns: int, stamps: Array, point_times: bool) -> None:
-        self._paths, self._columns, self._stamps, self._timed = paths, columns, stamps, point_times
+    def __init__(self, paths: list[Path], columns: int, stamps: Array, clock: PointClock | None) -> None:
+        self._paths, self._columns, self._stamps, self._clock = paths, columns, stamps, clock
         self._cache: OrderedDict[int, tuple[Array, Array | None]] = OrderedDict()
         self._lock = threading.Lock()
         self.counts = np.array([max(p.stat().st_size // 12, 0) for p in paths], dtype=np.int64)
@@ -81,7 +95,7 @@ class FileClouds:
         with self._lock:
             if k not in self._cache:
                 c = read_cloud(self._paths[k], columns=self._columns)
-                ages = ages_of(c, float(self._stamps[k])) if self._timed else None
+                ages = None if self._clock is None else self._clock.ages(c.times, float(self._stamps[k]))
                 self._cache[k] = c.points, ages
                 while len(self._cache) > _KEPT:
                     self._cache.popitem(last=False)
@@ -98,25 +112,6 @@ class FileClouds:
     def packed(self) -> bytes:
         """See :class:`~graphslam.core.point_clouds.CloudSource`: digests of the files."""
         return b"".join(hashlib.blake2b(p.read_bytes(), digest_size=16).digest() for p in self._paths)
-
-
-def ages_of(cloud: CloudData, stamp: float) -> Array | None:
-    """Time from each point to the stamp of the scan ``(m,)`` [s]; None where they say nothing.
-
-    Times on the clock of the stamps are taken as they are, others as offsets from the stamp.
-    """
-    t = cloud.times
-    if t is None or len(t) < 2:
-        return None
-    span = float(np.ptp(t))
-    unit = next((u for u in _UNITS if _SWEEP[0] <= span * u <= _SWEEP[1]), None)
-    if unit is None:
-        return None
-    seconds = t * unit
-    if abs(float(np.median(seconds)) - stamp) <= 5.0 and abs(stamp) > 5.0:
-        return np.asarray(stamp - seconds)
-    offset = seconds if float(np.abs(seconds).min()) <= _SWEEP[1] else seconds - seconds.min()
-    return np.asarray(-offset)
 
 
 def read_clouds(
@@ -165,7 +160,7 @@ def read_clouds(
         table = pose_file(look)
     elif poses != "none":
         table = root / poses
-    folder = CloudFolder(look, sorted(files, key=number_in_name), columns, point_times)
+    folder = CloudFolder(look, in_order(files), columns, point_times)
     counter = DropCounter()
     beside = None if table is None else PoseTable.read(look, table, counter)
     log = folder.log(beside, scan_stamps(folder, beside, period), odometry_sigmas, {}, counter)
@@ -195,6 +190,8 @@ class PoseTable:
     ) -> PoseTable:
         if is_kitti_poses(look, file):
             return cls(file, read_table(file, 12)[0].reshape(-1, 3, 4), None, T_camera_lidar)
+        if is_stamped_matrices(look, file):
+            return cls(file, None, _stamped_matrices(file, counter))
         return cls(file, None, _tum(file, counter))
 
     def missing(self, n: int) -> dict[str, npt.NDArray[np.bool_]]:
@@ -263,28 +260,54 @@ class CloudFolder:
         """The log of the clouds, with stamps ``(n,)`` and where they are from, and with streams beside them."""
         noise = constant_noise(sigmas)
         root, n, (stamps, by) = self.look.path, len(self.files), stamped
+        by_log = not by.startswith(NO_STAMPS)
         good, empty = _good_files(self.files, self.columns, counter)
         bad = {"file is damaged": ~good, "no point in it": empty, **({} if poses is None else poses.missing(n))}
-        keep = np.flatnonzero(usable_records(stamps, bad, stream="clouds", where=str(root), drops=counter))
+        sizes = np.array([p.stat().st_size for p in self.files], dtype=np.int64)
+        cut = cut_scans(sizes) & (file_ending(self.files[0]) not in COMPRESSED)
+        counter.drop("clouds", CUT_SCAN, int(cut.sum()))
+        whole = np.flatnonzero(~cut)
+        bad = {reason: mask[whole] for reason, mask in bad.items()}
+        keep = whole[usable_records(stamps[whole], bad, stream="clouds", where=str(root), drops=counter)]
         if poses is not None:
             keep = poses.within(stamps, keep, counter)
         times = np.ascontiguousarray(stamps[keep])
         kept = [self.files[k] for k in keep]
-        source = FileClouds(kept, self.columns, times, self.point_times)
+        clock, timed, said = self._point_clock(kept, times if by_log else None)
+        source = FileClouds(kept, self.columns, times, clock)
         streams: dict[str, Stream] = {"clouds": PointClouds(times=times, source=source)}
         notes = [by, "no poses" if poses is None else f"odometry from {self.look.relative(poses.file)}"]
         if poses is not None:
             T = poses.at(times, keep)
             streams |= {"odometry": noise.odometry(times, T), "reference": Trajectory(times, T)}
         streams |= extra
-        first = source.ages(0)
-        timed = "used" if first is not None else "none"
-        if first is None and self.point_times and read_cloud(kept[0], columns=self.columns).times is not None:
-            timed = "constant"  # or in no unit that makes a scan last as long as scans do
-        notes.append(_TIMED[timed] if first is None else f"points of a scan over {np.ptp(first):.3f} s")
+        notes.append(said)
         read = {k: len(s.times) for k, s in streams.items() if k != "reference"} | {"clouds": n}
-        meta = {"source": root.name, "notes": notes, "point_times": timed}
+        assumed = [] if poses is None else [_assumed_noise(self.look.relative(poses.file), sigmas)]
+        meta = {"source": root.name, "notes": notes, "point_times": timed, "assumed": assumed + self._not_read(poses)}
         return SensorLog(name=root.name, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
+
+    def _not_read(self, poses: PoseTable | None) -> list[tuple[str, str]]:
+        """Tables beside the clouds that look like a path or a sensor and are not read."""
+        folders = {self.look.path, self.files[0].parent, self.files[0].parent.parent}
+        known = ("times.txt", "timestamps.txt", "calib.txt")
+        out = []
+        for p in self.look.texts:
+            if p.parent not in folders or p.name in known or (poses is not None and p == poses.file):
+                continue
+            rows = first_rows(self.look, p)
+            if len(rows) > 2 and min(map(len, rows)) >= LEAST_COLUMNS and file_ending(p) not in CLOUD_ENDINGS:
+                text = f"{self.look.relative(p)} is not read: a table of {len(rows[0])} columns, of no known kind."
+                out.append(("look", text))
+        return out
+
+    def _point_clock(self, files: list[Path], stamps: Array | None) -> tuple[PointClock | None, str, str]:
+        """Unit of the times of points, by some clouds evenly over the log; see :func:`choose_point_clock`."""
+        if not self.point_times:
+            return None, "none", "times of points are not used (option point_times)"
+        some = np.unique(np.linspace(0, len(files) - 1, LOOKED_AT).round().astype(int))
+        read = (read_cloud(files[k], columns=self.columns).times for k in some)
+        return choose_point_clock([float(np.ptp(t)) for t in read if t is not None and len(t) > 1], stamps)
 
 
 def scan_stamps(folder: CloudFolder, poses: PoseTable | None, period: float | None = None) -> tuple[Array, str]:
@@ -307,7 +330,7 @@ def scan_stamps(folder: CloudFolder, poses: PoseTable | None, period: float | No
             wanted="one pose a cloud, stamps in times.txt or in the names, or option poses=none",
         )  # fmt: skip
     every = period or PERIOD
-    return np.asarray(every * np.arange(n, dtype=np.float64)), f"no stamps: scans {every:g} s apart"
+    return np.asarray(every * np.arange(n, dtype=np.float64)), f"{NO_STAMPS}: scans {every:g} s apart"
 
 
 def embed_poses(poses: Array) -> Array:
@@ -325,20 +348,45 @@ def number_in_name(path: Path) -> tuple[list[tuple[int, int, str]], str]:
     return [(1, int(w), "") if w.isdigit() else (0, 0, w) for w in words], str(path)
 
 
+def in_order(files: list[Path]) -> list[Path]:
+    """Files by the stamps in their names, or else by the numbers in them."""
+    files = sorted(files, key=number_in_name)
+    t = _stamps_in_names(files)
+    return files if t is None else [files[k] for k in np.argsort(t, kind="stable")]
+
+
 def _stamps_in_names(files: list[Path]) -> Array | None:
-    """Stamps in names: seconds with a fraction, or so many digits that they are unix time in ms, µs or ns."""
+    """Stamps in names, one each: seconds with a fraction, or so many digits that they are unix time in ms, µs or ns.
+
+    A name without a point among names with one is a whole second: programs leave out ``.0``.
+    """
     found = [re.findall(r"\d+\.\d+|\d+", p.name[: -len(file_ending(p))]) for p in files]
     if any(not f for f in found):
         return None
     words = [max(f, key=len) for f in found]
-    if all("." in w for w in words):
+    fractions = sum("." in w for w in words)
+    if fractions == len(words) or (fractions > 0.5 * len(words) and all(len(f) == 1 for f in found)):
         factor = 1.0
     elif all(len(w) in (13, 16, 19) and len(w) == len(words[0]) for w in words):
         factor = {13: 1e-3, 16: 1e-6, 19: 1e-9}[len(words[0])]
     else:
         return None
     t = np.array([float(w) for w in words]) * factor
-    return t if np.all(np.diff(t) > 0) else None
+    return t if len(np.unique(t)) == len(t) else None
+
+
+def _assumed_noise(table: str, sigmas: tuple[float, float]) -> tuple[str, str]:
+    text = (
+        f"odometry: poses of {table}, which states no noise; σ of {sigmas[0]:g} m and {sigmas[1]:g} rad a scan assumed."
+    )
+    return "", text
+
+
+def cut_scans(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Which scans ``(n,)`` at the begin and the end of a log are cut: a recording begins and ends within a sweep."""
+    few = counts < CUT * float(np.median(counts))
+    inner = np.flatnonzero(~few)
+    return few & ((np.arange(len(counts)) < inner[0]) | (np.arange(len(counts)) > inner[-1])) if len(inner) else few
 
 
 def stamps_of_file(path: Path, n: int) -> Array | None:
@@ -368,21 +416,37 @@ def stamps_of_file(path: Path, n: int) -> Array | None:
 def _tum(path: Path, counter: DropCounter) -> Trajectory:
     """A TUM table, also with commas; rows that are not usable are dropped and counted."""
     rows = []
-    for line in read_text(path).lstrip("\ufeff").splitlines():
+    for line in read_text(path).splitlines():
         v = parse_numbers(line) if line.strip() and not line.lstrip().startswith(("#", "%")) else None
         if v is not None:
-            rows.append(v if len(v) == 8 else [np.nan] * 8)
+            rows.append(v[:8] if len(v) in (8, 9) else [np.nan] * 8)
     a = np.array(rows).reshape(-1, 8)
     norm = np.linalg.norm(np.where(finite_mask(a[:, 4:]), a[:, 4:], 0.0), axis=1)
     bad = {
-        "row is not 8 finite numbers": np.asarray(~finite_mask(a[:, 1:]).all(axis=1)),
-        "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.01,
+        "row is not 8 or 9 finite numbers": np.asarray(~finite_mask(a[:, 1:]).all(axis=1)),
+        "rotation is no unit quaternion": np.abs(norm - 1.0) > 0.05,
     }
     keep = usable_records(a[:, 0], bad, stream="poses", where=str(path), drops=counter)
     if keep.sum() < 2:
         raise DataError("holds too few poses", where=str(path), got=int(keep.sum()), wanted="2 or more")
     a = a[keep]
     return Trajectory(a[:, 0], np.column_stack([a[:, 1:4], se3.quat_normalize(a[:, 4:])]))
+
+
+def _stamped_matrices(path: Path, counter: DropCounter) -> Trajectory:
+    """A table of stamps [s or ns] and 3×4 matrices."""
+    rows = [v for line in read_text(path).splitlines() if (v := parse_numbers(line)) is not None and v]
+    a = np.array([v if len(v) == 13 else [np.nan] * 13 for v in rows])
+    times = a[:, 0] * 1e-9 if np.nanmedian(np.abs(a[:, 0])) > 1e17 else a[:, 0]
+    if np.all(times == np.round(times)) and np.nanmax(times) < 1e7:
+        raise DataError(
+            "poses are given by the numbers of scans, not by stamps", where=str(path), got=f"first {times[0]:.0f}",
+            wanted="a table with stamps [s] in the first column, or one row a scan; or option poses=none",
+        )  # fmt: skip
+    bad = {"row is not 13 finite numbers": np.asarray(~finite_mask(a).all(axis=1))}
+    keep = usable_records(times, bad, stream="poses", where=str(path), drops=counter)
+    M = a[keep, 1:].reshape(-1, 3, 4)
+    return Trajectory(times[keep], np.column_stack([M[:, :, 3], se3.matrix_to_quat(M[:, :, :3])]))
 
 
 def _good_files(

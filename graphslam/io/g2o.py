@@ -3,6 +3,8 @@
 ``VERTEX_SE2 id x y θ``, ``EDGE_SE2 i j x y θ`` + 6 information entries; ``VERTEX_SE3:QUAT id x y z qx qy qz qw``,
 ``EDGE_SE3:QUAT i j x y z qx qy qz qw`` + 21; ``FIX id …``; 2-D landmarks ``VERTEX_XY id x y``,
 ``EDGE_SE2_XY i l x y`` + 3, and GTSAM's ``BR i l bearing range σ_bearing σ_range``. Upper triangles row by row.
+Priors ``EDGE_PRIOR_SE2 id x y θ`` + 6 and ``EDGE_PRIOR_SE3:QUAT id parameter x y z qx qy qz qw`` + 21 become edges from
+one more vertex, which is held at the origin.
 
 g2o orders a 3-D information matrix translation first; a :class:`PoseNetwork` holds rotation first. The entries
 themselves are kept as they are, as GTSAM does: g2o's own residual uses the vector part of the quaternion, half the
@@ -12,6 +14,7 @@ offers both). Files end in blank lines and may be compressed.
 
 from __future__ import annotations
 
+import logging
 import os
 
 import numpy as np
@@ -23,6 +26,7 @@ from graphslam.core.reading import read_text
 from graphslam.io.network_builder import NetworkBuilder, upper_triangle
 from graphslam.io.text_records import Records, write_text
 
+log = logging.getLogger(__name__)
 # tag -> (integers, floats)
 LAYOUTS: dict[str, tuple[int, int]] = {
     "VERTEX_SE2": (1, 3),
@@ -33,9 +37,16 @@ LAYOUTS: dict[str, tuple[int, int]] = {
     "VERTEX_XY": (1, 2),
     "EDGE_SE2_XY": (2, 5),
     "BR": (2, 4),
+    "EDGE_PRIOR_SE2": (1, 9),
+    "EDGE_PRIOR_SE3:QUAT": (2, 28),
 }
-_2D = ("VERTEX_SE2", "EDGE_SE2", "VERTEX_XY", "EDGE_SE2_XY", "BR")
-_3D = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+IGNORED = (
+    *("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET", "VERTEX_TAG", "VERTEX_CAM", "DATA_TAG"),
+    *("ROBOTLASER1", "FLASER", "RLASER", "ODOM", "TRUEPOS", "MARKER", "VERTEX_ELLIPSE"),
+)
+"""Records without a measurement between vertices: parameters, tags, and the sensor data that g2o keeps beside them."""
+_2D = ("VERTEX_SE2", "EDGE_SE2", "EDGE_PRIOR_SE2", "VERTEX_XY", "EDGE_SE2_XY", "BR")
+_3D = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_PRIOR_SE3:QUAT")
 # g2o (translation, rotation) -> ours (rotation, translation); its own inverse
 _SWAP = np.array([3, 4, 5, 0, 1, 2])
 
@@ -61,7 +72,7 @@ def parse_g2o(
     path: str | os.PathLike[str], text: str, *, repair: bool = False, create_missing: bool = False
 ) -> PoseNetwork:
     """The same from the content of the file; ``path`` names it in errors."""
-    records = Records(path, text, LAYOUTS, ignored=("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET"))
+    records = Records(path, text, LAYOUTS, ignored=IGNORED)
     rows = records.rows
     in_3d = [tag for tag in _3D if len(rows[tag])]
     in_2d = [tag for tag in _2D if len(rows[tag])]
@@ -69,16 +80,30 @@ def parse_g2o(
         line = int(rows[in_3d[0]].lines[0])
         raise FormatError(f"{in_2d[0]} and {in_3d[0]} in one file", where=records.where(line), wanted="one dimension")
     build = NetworkBuilder(records.path, 3 if in_3d else 2, records.where, repair, create_missing)
-    vertices, edges = (rows[tag] for tag in (_3D if in_3d else _2D)[:2])
-    build.add_vertices(vertices.whole[:, 0], vertices.real, vertices.lines)
+    for tag, n in records.not_read.items():
+        log.info("%s: %d records %s hold no measurement and are not read", records.path, n, tag)
+    vertices, edges, priors = (rows[tag] for tag in (_3D if in_3d else _2D)[:3])
+    width, d = (7, 6) if in_3d else (3, 3)
+    ids, poses, lines = vertices.whole[:, 0], vertices.real, vertices.lines
+    fixed, fixed_lines = rows["FIX"].whole[:, 0], rows["FIX"].lines
+    pairs, values, at = edges.whole, edges.real, edges.lines
+    if len(priors):
+        build.create_missing |= not len(ids)  # a file of edges alone
+        named = np.concatenate([ids, edges.whole.ravel(), priors.whole[:, 0], rows["VERTEX_XY"].whole[:, 0]])
+        origin = int(np.setdiff1d(np.arange(len(named) + 1), named)[0])
+        ids, poses = np.append(ids, origin), np.vstack([poses, np.eye(width)[-1] * (width == 7)])
+        lines, fixed_lines = np.append(lines, priors.lines[:1]), np.append(fixed_lines, priors.lines[:1])
+        fixed = np.append(fixed, origin)
+        pairs = np.vstack([pairs, np.column_stack([np.full(len(priors), origin), priors.whole[:, 0]])])
+        values, at = np.vstack([values, priors.real]), np.concatenate([at, priors.lines])
+    build.add_vertices(ids, poses, lines)
     marks = rows["VERTEX_XY"]
     build.add_landmarks(marks.whole[:, 0], marks.real, marks.lines)
-    build.fixed = rows["FIX"].whole[:, 0], rows["FIX"].lines
-    width, d = (7, 6) if in_3d else (3, 3)
-    information = upper_triangle(edges.real[:, width:], d)
+    build.fixed = fixed, fixed_lines
+    information = upper_triangle(values[:, width:], d)
     if in_3d:
         information = information[:, _SWAP][:, :, _SWAP]
-    build.add_edges(edges.whole, edges.real[:, :width], information, edges.lines)
+    build.add_edges(pairs, values[:, :width], information, at)
     _read_landmarks(records, build)
     return build.build()
 

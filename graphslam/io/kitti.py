@@ -30,6 +30,10 @@ from graphslam.io.cloud_logs import (
 )
 from graphslam.io.recognise import is_kitti_poses, parse_numbers
 from graphslam.io.source_probe import SourceProbe
+from graphslam.io.text_records import read_table
+
+CAMERA_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Rotation from the axes of a lidar (x ahead, y left, z up) to those of a camera (x right, y down, z ahead)."""
 
 
 def read_kitti(
@@ -59,7 +63,6 @@ def read_kitti(
     counter = DropCounter()
     stamps: Array | None = None
     extra: dict[str, Stream] = {}
-    notes: list[str] = []
     if files and files[0].parent.name == "data":
         beside = files[0].parent.parent / "timestamps.txt"
         stamps = stamps_of_file(beside, len(files)) if beside.is_file() else None
@@ -71,13 +74,31 @@ def read_kitti(
     elif poses != "none":
         table = root / poses
     calibration = _calibration(look) if table is not None else None
+    assumed: list[tuple[str, str]] = []
     if table is not None and calibration is None:
-        notes.append("poses taken as those of the lidar: no calib.txt with Tr")
+        calibration, text = _without_tr(read_table(table, 12)[0].reshape(-1, 3, 4))
+        assumed.append(("look", f"{look.relative(table)}: no calib.txt with the line Tr; {text}"))
     folder = CloudFolder(look, sorted(files, key=number_in_name), BIN_COLUMNS, True)
     posed = None if table is None else PoseTable.read(look, table, counter, calibration)
     stamped = scan_stamps(folder, posed) if stamps is None else (stamps, "stamps of the files")
     log = folder.log(posed, stamped, odometry_sigmas, extra, counter)
-    return replace(log, meta={**log.meta, "notes": [*log.meta["notes"], *notes]})
+    return replace(log, meta={**log.meta, "assumed": [*log.meta["assumed"], *assumed]})
+
+
+def _without_tr(matrices: Array) -> tuple[Array | None, str]:
+    """``T_camera_lidar`` ``(7,)`` or None, and why, from the direction of motion: a vehicle drives ahead.
+
+    Ahead is z of a camera, and x of a lidar.
+    """
+    R, t = matrices[:-1, :, :3], matrices[:, :, 3]
+    moved = np.abs(np.einsum("kji,kj->ki", R, np.diff(t, axis=0)))
+    ahead = np.median(moved, axis=0) if len(moved) else np.zeros(3)
+    if ahead[2] > 2.0 * ahead[0]:
+        text = (
+            "the poses move along z, so they are used as those of a camera that looks ahead, at the place of the lidar."
+        )
+        return np.concatenate([np.zeros(3), se3.matrix_to_quat(CAMERA_AXES[None])[0]]), text
+    return None, "the poses move along x, so they are used as those of the lidar."
 
 
 def _calibration(look: SourceProbe) -> Array | None:

@@ -101,7 +101,7 @@ def separator_of(line: str) -> str | None:
 
 def header_of(line: str, number: int = 1) -> Header:
     """Columns by their names; a unit that is not known counts as a name that is not known."""
-    said = line.lstrip("\ufeff#% ").rstrip()
+    said = line.lstrip("#% ").rstrip()
     bare = re.sub(r"\s*[\[(]", "[", re.sub(r"[\])]", "]", said))  # "v [m/s]" and "v (m/s)" are one word
     sep = separator_of(bare)
     words = [w.strip().strip('"').lower() for w in (bare.split(sep) if sep else bare.split())]
@@ -128,7 +128,7 @@ def _header_in(lines: list[str]) -> Header | None:
         found = header_of(line, number)
         if found.odometry or found.sightings:
             return found
-        if line.strip() and not line.lstrip("\ufeff ").startswith(("#", "%")):
+        if line.strip() and not line.lstrip().startswith(("#", "%")):
             return None
     return None
 
@@ -230,7 +230,7 @@ def read_landmark_tables(
 
 def _read(path: Path, stream: str, counter: DropCounter) -> tuple[dict[str, Array], Header]:
     """Columns by our names, in SI units; NaN where a value is missing."""
-    lines = read_text(path).lstrip("\ufeff").splitlines()
+    lines = read_text(path).splitlines()
     header = _header_in(lines)
     if header is None:
         raise FormatError("has no header that is known", where=str(path), got=(lines or [""])[0][:80])

@@ -96,8 +96,8 @@ class NetworkBuilder:
         if self.dim == 2:
             return poses
         length = np.linalg.norm(poses[:, 3:], axis=1)
-        # a printed unit quaternion is off by its digits; one that is off by more than 1 % is something else
-        bad = np.flatnonzero(np.abs(length - 1.0) > 1e-2)
+        # a printed unit quaternion is off by its digits; one that is off by more than 5 % is something else
+        bad = np.flatnonzero(np.abs(length - 1.0) > 5e-2)
         if len(bad):
             raise FormatError(
                 "not a unit quaternion", where=self.where(int(lines[bad[0]])), got=poses[bad[0], 3:], wanted="length 1"

@@ -48,11 +48,8 @@ def read_network(
         other.add(tokens[0][:20])
         if number > _LINES:
             break
-    mark = (
-        "; it begins with a byte order mark: save it as UTF-8 without one" if any("\ufeff" in t for t in other) else ""
-    )
     raise FormatError(
-        f"not a pose network{mark}",
+        "not a pose network",
         where=str(path),
         got="records " + ", ".join(sorted(other)[:5]) if other else "an empty file",
         wanted="records of g2o (VERTEX_SE2, EDGE_SE3:QUAT …), TORO (VERTEX2, EDGE2 …) or iSAM (ODOMETRY …)",

@@ -41,16 +41,26 @@ def first_rows(look: SourceProbe, path: Path, most: int = 20) -> list[list[float
 
 
 def is_tum(look: SourceProbe, path: Path) -> bool:
-    """Rows of stamp, position and a unit quaternion?"""
+    """Rows of stamp, position and a unit quaternion, perhaps with the number of a pose behind them (RTAB-Map)?"""
     rows = first_rows(look, path)
-    return bool(rows) and all(len(r) == 8 and abs(math.hypot(*r[4:]) - 1.0) < 0.025 for r in rows)
+    return bool(rows) and all(len(r) in (8, 9) and abs(math.hypot(*r[4:8]) - 1.0) < 0.025 for r in rows)
 
 
 def is_kitti_poses(look: SourceProbe, path: Path) -> bool:
     """Rows of a 3×4 matrix with a rotation in it?"""
-    rows = first_rows(look, path)
+    return _matrices(first_rows(look, path), 0)
+
+
+def is_stamped_matrices(look: SourceProbe, path: Path) -> bool:
+    """Rows of a stamp or the number of a scan, and a 3×4 matrix with a rotation in it (MulRan, KITTI-360)?"""
+    return _matrices(first_rows(look, path), 1)
+
+
+def _matrices(rows: list[list[float]], first: int) -> bool:
     return bool(rows) and all(
-        len(r) == 12 and all(abs(math.hypot(*r[a : a + 3]) - 1.0) < 0.025 for a in (0, 4, 8)) for r in rows
+        len(r) == first + 12
+        and all(abs(math.hypot(*r[a : a + 3]) - 1.0) < 0.025 for a in (first, first + 4, first + 8))
+        for r in rows
     )
 
 
@@ -205,12 +215,12 @@ def _clouds(look: SourceProbe) -> ReaderMatch | None:
 
 
 def pose_file(look: SourceProbe) -> Path | None:
-    """A TUM or KITTI table of poses beside clouds."""
+    """A table of poses beside clouds: TUM, KITTI, or stamps with matrices."""
     some = [p for p in look.texts if file_ending(p) not in CLOUD_ENDINGS]
     clouds, _ = cloud_folder(look)
     beside = {look.path, *(c.parent for c in clouds[:1]), *(c.parent.parent for c in clouds[:1])}
     some = [p for p in some if p.parent in beside or p.parent.name.startswith("pose")]
-    good = [p for p in some if is_tum(look, p) or is_kitti_poses(look, p)]
+    good = [p for p in some if is_tum(look, p) or is_kitti_poses(look, p) or is_stamped_matrices(look, p)]
     first = ("poses.txt", "poses.tum", "odom_poses.txt", "trajectory.tum", "trajectory.txt", "odometry.txt")
     return min(good, key=lambda p: (p.name not in first, len(p.parts), p), default=None)
 

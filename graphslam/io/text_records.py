@@ -11,6 +11,7 @@ import gzip
 import lzma
 import os
 from array import array
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,12 +100,6 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     os.replace(temporary, p)
 
 
-def _unknown(tag: str) -> str:
-    """``unknown record``, and its cause where it is a byte order mark."""
-    mark = " (the file begins with a byte order mark; save it as UTF-8 without one)" if tag.startswith("\ufeff") else ""
-    return f"unknown record {tag[:40]!r}{mark}"
-
-
 @dataclass(frozen=True, slots=True)
 class Rows:
     """All records of one tag, in file order.
@@ -142,6 +137,8 @@ class Records:
     Attributes
     ----------
     rows : dict of str to Rows
+    not_read : Counter of str
+        Lines of the ignored tags.
     """
 
     def __init__(
@@ -152,7 +149,7 @@ class Records:
         *,
         ignored: tuple[str, ...] = (),
     ) -> None:
-        self.path = str(path)
+        self.path, self.not_read = str(path), Counter[str]()
         # Packed numbers, not lists of objects: a file may hold a million edges.
         raw = {
             tag: (array("q"), array("q"), array("d"), integers, 1 + integers + floats)
@@ -161,9 +158,10 @@ class Records:
         for number, tokens in tagged_lines(text):
             if tokens[0] not in raw:
                 if tokens[0] in ignored:
+                    self.not_read[tokens[0]] += 1
                     continue
                 raise FormatError(
-                    _unknown(tokens[0]),
+                    f"unknown record {tokens[0][:40]!r}",
                     where=self.where(number),
                     wanted="one of " + ", ".join(layouts),
                 )
@@ -184,7 +182,7 @@ class Records:
             except ValueError as error:
                 raise FormatError(f"{tokens[0]} record holds no number ({error})", where=self.where(number)) from None
             except OverflowError:
-                self._impossible(number, next(t for t in tokens[1:] if not 0 <= int(t) < 2**62))
+                self._impossible(number, next(t for t in tokens[1:] if not 0 <= int(t) < 2**63))
             if each:
                 lines.extend([number] * integers)
             else:
@@ -206,9 +204,9 @@ class Records:
                 where=self.where(int(rows.lines[bad[0]])),
                 wanted=f"finite numbers, at most {LARGEST:g}",
             )
-        bad = np.flatnonzero(((rows.whole < 0) | (rows.whole >= 2**62)).any(axis=1))
+        bad = np.flatnonzero((rows.whole < 0).any(axis=1))
         if len(bad):
-            value = next(v for v in rows.whole[bad[0]].tolist() if not 0 <= v < 2**62)
+            value = next(v for v in rows.whole[bad[0]].tolist() if v < 0)
             self._impossible(int(rows.lines[bad[0]]), value)
         return rows
 
@@ -217,7 +215,7 @@ class Records:
             "impossible vertex id",
             where=self.where(number),
             got=got,
-            wanted="whole numbers from 0 to 2⁶²; GTSAM keys with a letter have to be renumbered",
+            wanted="whole numbers from 0 to 2⁶³ - 1",
         )
 
     def where(self, number: int) -> str:
@@ -226,8 +224,8 @@ class Records:
 
 
 def tagged_lines(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Number, counted from 1, and words of every line that is neither blank nor begins with ``#``."""
+    """Number, counted from 1, and words before a ``#`` of every line that has some."""
     for number, line in enumerate(text.splitlines(), start=1):
-        tokens = line.split()
-        if tokens and tokens[0][0] != "#":
+        tokens = line.partition("#")[0].split()
+        if tokens:
             yield number, tokens

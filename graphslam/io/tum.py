@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 
@@ -17,12 +18,14 @@ from graphslam.core.geometry import Array, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.reading import finite_mask, read_text
 from graphslam.core.trajectory import Trajectory
+from graphslam.io.clock import MAX_DROPPED
 from graphslam.io.odometry_noise import constant_noise
 from graphslam.io.recognise import is_tum
 from graphslam.io.source_probe import SourceProbe
 
-# Files in the wild print quaternions with as few as three digits.
-_NORM_TOLERANCE = 1e-2
+log = logging.getLogger(__name__)
+_NORM_TOLERANCE = 5e-2
+"""Quaternions of files are normalised; some print three digits."""
 
 
 def embed_plane(poses: Array) -> Array:
@@ -82,6 +85,7 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
     _refuse(~np.all(finite_mask(data), axis=1), "not finite", where, lines, rows)
     norm = np.linalg.norm(data[:, 4:], axis=1)
     _refuse(np.abs(norm - 1.0) > _NORM_TOLERANCE, "rotation is no unit quaternion", where, lines, norm)
+    data, lines = _without_repeats(data, lines, where)
     _refuse(np.r_[False, np.diff(data[:, 0]) <= 0][: len(data)], "stamps do not increase", where, lines, data[:, 0])
     off_plane = np.any(data[:, 3:6] != 0.0, axis=1)
     if dim is None:
@@ -92,6 +96,16 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
     _refuse(off_plane, "pose leaves the plane z = 0", where, lines, rows)
     heading = wrap_angle(2.0 * np.arctan2(data[:, 6], data[:, 7]))
     return Trajectory(data[:, 0], np.column_stack([data[:, 1:3], heading]))
+
+
+def _without_repeats(data: Array, lines: list[int], where: str) -> tuple[Array, list[int]]:
+    """Rows without those that repeat the stamp before them, if these are few; the first one is kept."""
+    again = np.r_[False, np.diff(data[:, 0]) == 0][: len(data)]
+    if not again.any() or again.mean() > MAX_DROPPED:
+        return data, lines
+    first = lines[int(np.flatnonzero(again)[0])]
+    log.warning("%s:%d: %d poses that repeat the stamp before them are left out", where, first, again.sum())
+    return data[~again], [n for n, repeated in zip(lines, again) if not repeated]
 
 
 def _refuse(bad: np.ndarray, what: str, where: str, lines: list[int], got: object) -> None:

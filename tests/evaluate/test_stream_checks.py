@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graphslam.core.errors import DataError
 from graphslam.core.imu import GRAVITY
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
 from graphslam.core.records import VelocityControls
-from graphslam.evaluate.stream_checks import check_streams
+from graphslam.evaluate.stream_checks import check_streams, refuse_faulty
 from graphslam.evaluate.stream_checks_beams import check_beams
 from graphslam.evaluate.stream_checks_imu import check_imu, compare_turns
 from tests.faults import inject_grid as put
@@ -98,3 +99,32 @@ def test_clouds() -> None:
     ] == ["scans-repeated"]
     empty = PointClouds(times=times, source=ArrayClouds(points[:0], np.zeros(5, dtype=np.int64)))
     assert [f.code for f in check_beams(empty, "lidar", ALONE)] == ["scans-silent"]
+
+
+def test_losses_and_assumptions_of_the_reader_are_lines() -> None:
+    log = SensorLog(
+        name="log",
+        streams={},
+        read={"gps": 100, "laser": 100, "clouds": 100},
+        dropped={
+            "gps: far from all other fixes": 1,
+            "gps: no fix (status)": 60,
+            "laser: angles are impossible": 9,
+            "laser: stamp after the clock was set back": 40,
+            "clouds: point not finite": 5000,
+        },
+        meta={"assumed": [("look", "field of view assumed.")], "unplaced": ["clouds"]},
+    )
+    found = {n.finding.code: n for n in check_streams(log)}
+    assert set(found) == {"clock-set-back", "mounting-unknown", "assumed", "records-left-out"}
+    assert found["clock-set-back"].finding.level == "bad"
+    texts = [n.finding.text for n in check_streams(log) if n.finding.code == "records-left-out"]
+    assert any("1 of 100" in t and "outliers" in t for t in texts)
+    assert any("9 of 100" in t for t in texts)
+
+
+def test_stamps_in_another_unit_end_the_run() -> None:
+    wheels = VelocityControls(times=1e9 * 0.1 * np.arange(50), speed=np.ones(50), yaw_rate=np.zeros(50))
+    log = SensorLog(name="ns", streams={"wheels": wheels})
+    with pytest.raises(DataError, match=r"nanoseconds, wanted seconds"):
+        refuse_faulty(check_streams(log), log)

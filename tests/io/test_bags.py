@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError
 from graphslam.core.geometry import se2_between
 from graphslam.core.records import LaserScans
@@ -290,3 +291,120 @@ def test_a_message_whose_fields_do_not_fit(tmp_path: Path) -> None:
     log = load_recording(written(tmp_path, "ros2", messages))
     assert len(log["clouds"].times) == N - 1
     assert any(k.startswith("clouds: message cannot be decoded") for k in log.dropped)
+
+
+def timed(times, *, every: float = 0.1, n: int = N) -> list:
+    """Clouds whose 60 points have the times ``times(k)`` in a field of float64, or none where that is None."""
+    m = Messages()
+    return [
+        (
+            "/p",
+            "sensor_msgs/msg/PointCloud2",
+            T0 + every * k,
+            m.cloud(T0 + every * k, xyz, times=times(k), field="time"),
+        )
+        for k, xyz in enumerate(clouds()[:n])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("unit", "every", "sweep"),
+    [
+        (0.1, 0.1, 0.1),  # shares of a scan
+        (1e-5, 0.1, 0.1),  # ticks of 10 µs
+        (1e-3, 0.1, 0.05),  # ms, of a lidar twice as fast as its messages
+        (1.0, 1.0, 0.98),  # s, of a slow one
+    ],
+)
+def test_the_unit_of_point_times_follows_from_the_spacing_of_scans(tmp_path: Path, unit, every, sweep) -> None:
+    path = written(tmp_path, "ros2", timed(lambda k: np.linspace(0, sweep / unit, 60), every=every))
+    log = load_recording(path)
+    np.testing.assert_allclose(log["clouds"].ages(3), -np.linspace(0, sweep, 60), atol=1e-6 * sweep)
+    assert log.meta["point_times"] == "used"
+
+
+def test_times_of_points_that_fit_no_unit_are_not_used(tmp_path: Path) -> None:
+    log = load_recording(written(tmp_path, "ros2", timed(lambda k: np.linspace(0, 0.4, 60))))
+    assert log["clouds"].ages(3) is None
+    assert log.meta["point_times"] == "unclear"
+    assert any("span 0.4" in n for n in log.meta["notes"])
+
+
+def test_a_first_scan_that_is_cut_does_not_take_the_times_of_the_others(tmp_path: Path) -> None:
+    whole = np.linspace(0, 0.09, 60)
+    path = written(tmp_path, "ros2", timed(lambda k: np.zeros(60) if k == 0 else whole))
+    log = load_recording(path)
+    assert log["clouds"].ages(0) is None
+    np.testing.assert_allclose(log["clouds"].ages(1), -whole, atol=1e-7)
+
+
+def test_one_altitude_that_is_missing_costs_one_fix(tmp_path: Path) -> None:
+    m = Messages()
+    heights = 100.0 + np.arange(N)
+    heights[4] = np.nan
+    fixes = [
+        ("/fix", "sensor_msgs/msg/NavSatFix", T0 + k, m.fix(T0 + k, (50.0, 8.0, h), kind=2))
+        for k, h in enumerate(heights)
+    ]
+    log = load_recording(written(tmp_path, "ros2", fixes))
+    assert log.dropped["gps: altitude is not finite"] == 1
+    np.testing.assert_allclose(log["gps"].positions[:, 2], np.delete(heights, 4) - 100.0, atol=1e-6)
+
+
+def test_a_first_fix_that_is_far_from_all_others_is_not_the_origin(tmp_path: Path) -> None:
+    m = Messages()
+    fixes = []
+    for k in range(N):
+        place = (50.15, 8.0, 100.0) if k == 0 else (50.0 + 1e-5 * k, 8.0, 100.0)
+        fixes.append(("/fix", "sensor_msgs/msg/NavSatFix", T0 + k, m.fix(T0 + k, place, kind=2)))
+    log = load_recording(written(tmp_path, "ros2", fixes))
+    assert np.linalg.norm(log["gps"].positions, axis=1).max() < 20.0
+    assert len(log["gps"].times) == N - 1
+    assert log.dropped["gps: far from all other fixes"] == 1
+
+
+def moving_world(m: Messages, parent: str, child: str, cloud_frame: str) -> list:
+    """A lidar, and the way of its base as a transform; clouds in the frame of the base, or in that of the odometry."""
+    out = [("/tf_static", "tf2_msgs/msg/TFMessage", T0, m.transforms(T0, [(child, "lidar", MOUNT)]))]
+    for k, (pose, xyz) in enumerate(zip(poses() * [3, 3, 3, 1, 1, 1, 1], clouds())):
+        t = T0 + 0.1 * k
+        if cloud_frame == parent:
+            xyz = se3.quat_rotate(np.tile(pose[3:], (len(xyz), 1)), xyz) + pose[:3]
+        out += [
+            ("/points", "sensor_msgs/msg/PointCloud2", t, m.cloud(t, xyz, frame=cloud_frame)),
+            ("/tf", "tf2_msgs/msg/TFMessage", t, m.transforms(t, [(parent, child, pose)])),
+        ]
+    return out
+
+
+def test_clouds_in_the_frame_of_the_odometry_are_brought_to_the_base(tmp_path: Path) -> None:
+    log = load_recording(written(tmp_path, "ros2", moving_world(Messages(), "odom", "base_link", "odom")))
+    assert log.meta["unplaced"] == []
+    np.testing.assert_allclose(log["clouds"].T_base_sensor, [0, 0, 0, 0, 0, 0, 1])
+    for k in (0, 5, N - 1):
+        np.testing.assert_allclose(log["clouds"].cloud(k), clouds()[k], atol=1e-4)
+    assert any("which moves" in n for n in log.meta["notes"])
+
+
+@pytest.mark.parametrize(("parent", "child"), [("r1/odom", "r1/base_link"), ("start", "hull")])
+def test_odometry_from_transforms_of_other_names(tmp_path: Path, parent: str, child: str) -> None:
+    log = load_recording(written(tmp_path, "ros2", moving_world(Messages(), parent, child, "lidar")))
+    way = np.linalg.norm(log["odometry"].increments[1:, :3], axis=1).sum()
+    assert way == pytest.approx(0.3 * np.hypot(1, 0.1) * (N - 1), rel=1e-3)
+    assert log.meta["base_frame"] == child
+    np.testing.assert_allclose(log["clouds"].T_base_sensor, MOUNT, atol=1e-6)
+    with pytest.raises(ConfigError, match=f"moving transforms: {parent}"):
+        load_recording(tmp_path / "a", odometry_frame="nowhere")
+
+
+def test_a_joint_is_no_odometry(tmp_path: Path) -> None:
+    m = Messages()
+    turning = []
+    for k, xyz in enumerate(clouds()):
+        t, a = T0 + 0.1 * k, 0.2 * k
+        pose = np.array([0.1, 0, 0.5, 0, 0, np.sin(a / 2), np.cos(a / 2)])
+        turning += [
+            ("/points", "sensor_msgs/msg/PointCloud2", t, m.cloud(t, xyz)),
+            ("/tf", "tf2_msgs/msg/TFMessage", t, m.transforms(t, [("platform", "lidar", pose)])),
+        ]
+    assert "odometry" not in load_recording(written(tmp_path, "ros2", turning))

@@ -183,3 +183,23 @@ def test_recorded_logs_become_steps(data_dir: Path, name: str, scans: int, corre
         T = se2_compose(T, step)
     R = se2_between(reference.interpolate(a)[0], reference.interpolate(b)[0])
     assert np.linalg.norm(T[:2] - R[:2]) < 0.5
+
+
+def test_field_of_view_and_greatest_range_of_lines_param(tmp_path: Path) -> None:
+    text = lines(beams=541)
+    plain = read_carmen(write(tmp_path, text))
+    np.testing.assert_allclose(plain["laser"].bearings[[0, -1]], [-np.pi / 2, np.pi / 2])
+    assert plain.meta["assumed"] == [
+        ("look", "field of view of the laser: 180°, no line states it (reader option fov=).")
+    ]
+    params = [
+        "PARAM laser_front_laser_fov 270 1.0 host 1.0",
+        "PARAM robot_front_laser_max 30.0 1.0 host 1.0",
+        "PARAM simulator_laser_probability_of_random_max .0001 1.0 host 1.0",
+    ]
+    log = read_carmen(write(tmp_path, params + text))
+    np.testing.assert_allclose(np.rad2deg(log["laser"].bearings[[0, 270, -1]]), [-135, 0, 135], atol=1e-9)
+    assert log["laser"].max_range == 30.0
+    assert log.meta["assumed"] == [("", "field of view of the laser: 270°, by a line PARAM.")]
+    asked = read_carmen(tmp_path / "house.clf.bz2", fov=240.0)
+    np.testing.assert_allclose(np.rad2deg(asked["laser"].bearings[-1]), 120.0)

@@ -17,6 +17,7 @@ from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.io.isam_graph import read_isam_graph
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.multistart import canonical_start
+from graphslam.solve.network.solve import solve_network
 from tests.reference.gtsam_network import to_graph
 
 SE2 = """VERTEX_SE2 0 0 0 0
@@ -224,3 +225,39 @@ def test_anisotropic_landmark_noise_stays_cartesian(tmp_path: Path) -> None:
     both = put(tmp_path, text + "ODOMETRY 1 2 1 0 0 1 0 0 1 0 1\n", "m.txt")
     with pytest.raises(FormatError, match="for a pose and for a landmark; got 2"):
         read_isam_graph(both)
+
+
+def test_files_as_other_programs_write_them(tmp_path: Path) -> None:
+    """A byte order mark, comments behind records, tags and scans between them, quaternions of three digits."""
+    plain = read_g2o(put(tmp_path, SE2))
+    path = tmp_path / "other.g2o"
+    path.write_text(
+        "\ufeff" + SE2.replace("0.3 9", "0.3 9  # odometry") + "VERTEX_TAG 7 a b\nROBOTLASER1 0 1.5 2\n", "utf-8"
+    )
+    other = read_network(path)
+    assert np.array_equal(other.ids, plain.ids)
+    assert np.array_equal(other.information, plain.information)
+    rounded = read_g2o(put(tmp_path, SE3.replace("1.00001", "1.02")))
+    np.testing.assert_allclose(np.linalg.norm(rounded.poses[:, 3:], axis=1), 1.0)
+
+
+def test_keys_of_gtsam_are_ids(tmp_path: Path) -> None:
+    keys = [gtsam.symbol("x", k) for k in range(2)]
+    path = put(tmp_path, f"EDGE_SE2 {keys[0]} {keys[1]} 1 0 0 1 0 0 1 0 1\n")
+    assert read_g2o(path).ids.tolist() == keys
+    write_g2o(tmp_path / "b.g2o", read_g2o(path))
+    assert read_g2o(tmp_path / "b.g2o").ids.tolist() == keys
+
+
+def test_priors_are_edges_from_the_origin(tmp_path: Path) -> None:
+    prior = "EDGE_PRIOR_SE2 7 2 0 0.5 100 0 0 100 0 100\n"
+    net = read_g2o(put(tmp_path, SE2.replace("FIX 0\n", "") + prior))
+    origin = int(np.flatnonzero(net.fixed)[0])
+    assert net.poses[origin].tolist() == [0, 0, 0]
+    k = int(np.flatnonzero(net.edges[:, 0] == origin)[0])
+    assert net.ids[net.edges[k, 1]] == 7
+    assert net.measurements[k].tolist() == [2, 0, 0.5]
+    solved = solve_network(net).poses
+    np.testing.assert_allclose(solved[list(net.ids).index(7)], [2, 0, 0.5], atol=1e-9)
+    spatial = read_g2o(put(tmp_path, SE3 + f"EDGE_PRIOR_SE3:QUAT 1 0 3 0 0 0 0 0 1 {INFO3}\n"))
+    assert spatial.poses[np.flatnonzero(spatial.fixed)[0]].tolist() == [0, 0, 0, 0, 0, 0, 1]

@@ -93,3 +93,12 @@ def test_missing_binary_and_empty_files(tmp_path: Path) -> None:
         read_tum(tmp_path / "b.tum")
     (tmp_path / "e.tum").write_text("# nothing\n")
     assert len(read_tum(tmp_path / "e.tum")) == 0
+
+
+def test_a_repeated_stamp_costs_one_pose(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = [f"{0.1 * k:.1f} {k} 0 0 0 0 0 1" for k in range(40)]
+    path = tmp_path / "a.tum"
+    path.write_text("\n".join([*rows[:21], "2.0 77 0 0 0 0 0 1", *rows[21:]]) + "\n")
+    read = read_tum(path)
+    assert read.poses[:, 0].tolist() == list(range(40))
+    assert "a.tum:22: 1 poses that repeat" in caplog.text

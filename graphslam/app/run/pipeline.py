@@ -21,7 +21,7 @@ from graphslam.backend.back_end import Observer
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.record_source import RecordSource
-from graphslam.evaluate.stream_checks import StreamFinding, check_streams
+from graphslam.evaluate.stream_checks import StreamFinding, check_streams, refuse_faulty
 
 
 def run(
@@ -87,11 +87,12 @@ def run(
         log = load_log_source(source)
         clock.lap("load")
         bar.log_read(log)
+        seen = check_streams(log)
+        refuse_faulty(seen, log)
         options = RunOptions.for_log(log, frontend, solver, seed, config)
         if out is not None:
             options = options.with_digest(log)
         tell_stage(watch, "calibration")
-        seen = check_streams(log)
         log, options, said = options.calibrated(log)
         clock.lap("calibrate")
         with RunFolder.start(out, options.as_config(), resume=resume) as folder:

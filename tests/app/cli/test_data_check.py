@@ -212,7 +212,7 @@ def test_a_bag_without_transforms_and_a_bag_of_packets(tmp_path: Path) -> None:
         for t, pose in zip(small.stamps(), small.poses())
     ]
     write_mcap(tmp_path / "a.mcap", [*messages, *odometry])
-    assert "tf_static" in faults(checked(tmp_path / "a.mcap")[1])["place-unknown"]
+    assert "tf_static" in faults(checked(tmp_path / "a.mcap")[1])["mounting-unknown"]
     text = [("/velodyne_packets", "std_msgs/msg/String", t, m.text("raw")) for t in small.stamps()]
     code, lines = checked(write_mcap(tmp_path / "b.mcap", text))
     assert code == 1

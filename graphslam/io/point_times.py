@@ -1,0 +1,115 @@
+"""Times of the points of a scan: their unit, and whether they count from the scan or are stamps on its clock.
+
+Files and messages have a field of times, but do not state its unit. The unit is decided once for the whole log, from
+how long its scans last in it: a scan lasts about as long as scans are apart, and never much longer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphslam.core.geometry import Array
+
+UNITS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "ns": 1e-9}
+TICKS = {"ticks of 100 µs": 1e-4, "ticks of 10 µs": 1e-5, "ticks of 100 ns": 1e-7}
+"""Units [s] that some drivers use; taken only if a scan then lasts as long as scans are apart."""
+SWEEP = (0.005, 2.0)
+"""A scan lasts so long [s]."""
+FULL = (0.8, 1.05)
+"""A scan that lasts such a share of the time between scans fills it."""
+LONGEST = 1.25
+"""No scan lasts longer than such a share of the time between scans."""
+SAME_CLOCK = 5.0
+"""Times of points this close to the stamp of their scan are stamps on its clock [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointClock:
+    """Unit of the times of points.
+
+    Parameters
+    ----------
+    unit : float
+        Seconds in a unit of the field.
+    name : str
+        The unit in words.
+    lasts : float
+        Median duration of a scan [s].
+    """
+
+    unit: float
+    name: str
+    lasts: float
+
+    def ages(self, times: Array | None, stamp: float) -> Array | None:
+        """Time from each point to the stamp of its scan ``(m,)`` [s]; None without times, or one time for all.
+
+        Times within 5 s of the stamp are stamps on its clock, others are offsets from it.
+        """
+        if times is None or len(times) < 2 or np.ptp(times) == 0.0:
+            return None
+        seconds = times * self.unit
+        if abs(stamp) > SAME_CLOCK and abs(float(np.median(seconds)) - stamp) <= SAME_CLOCK:
+            return np.asarray(stamp - seconds)
+        offset = seconds if float(np.abs(seconds).min()) <= SWEEP[1] else seconds - seconds.min()
+        return np.asarray(-offset)
+
+
+def choose_point_clock(spans: Iterable[float], stamps: Array | None) -> tuple[PointClock | None, str, str]:
+    """Unit of the times of points of a log.
+
+    Parameters
+    ----------
+    spans : iterable of float
+        Latest less earliest time of each scan that has times, in the unit of the field.
+    stamps : (n,) or None
+        Of the scans [s]; None where the log states none.
+
+    Returns
+    -------
+    clock : PointClock or None
+        None: times are not used.
+    state : {"used", "none", "constant", "unclear"}
+    note : str
+        The same in words.
+    """
+    found = np.array([s for s in spans if np.isfinite(s)])
+    if not len(found):
+        return None, "none", "points without times"
+    span = float(np.median(found[found > 0])) if np.any(found > 0) else 0.0
+    if span == 0.0:
+        return None, "constant", "times of points say nothing: as good as one time for all"
+    apart = _spacing(stamps)
+    clock = _by_spacing(span, apart) if apart is not None else _by_sweep(span, SWEEP[1])
+    if clock is None:
+        of = "" if apart is None else f" of scans that are {apart:.3g} s apart"
+        wrong = f"times of points{of} span {span:.6g}: no unit fits; they are not used, scans are not deskewed"
+        return None, "unclear", wrong
+    taken = "" if clock.name in UNITS else f", read as {clock.name}"
+    return clock, "used", f"times of points{taken}: a scan lasts {clock.lasts:.3f} s"
+
+
+def _spacing(stamps: Array | None) -> float | None:
+    steps = np.diff(stamps) if stamps is not None else np.zeros(0)
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    return float(np.median(steps)) if len(steps) else None
+
+
+def _by_spacing(span: float, apart: float) -> PointClock | None:
+    units = UNITS | TICKS
+    if 0.9 <= span <= 1.001:
+        units = units | {"shares of the scan": apart}
+    for name, unit in units.items():
+        if FULL[0] * apart <= span * unit <= FULL[1] * apart:
+            return PointClock(unit, name, span * unit)
+    return _by_sweep(span, min(SWEEP[1], LONGEST * apart))
+
+
+def _by_sweep(span: float, longest: float) -> PointClock | None:
+    for name, unit in UNITS.items():
+        if SWEEP[0] <= span * unit <= longest:
+            return PointClock(unit, name, span * unit)
+    return None
