@@ -123,11 +123,9 @@ FAULTS: Mapping[str, a.Inject] = {**ODOMETRY, **SIGHTINGS, **GPS}
 
 
 def fault_worlds() -> dict[str, FaultWorld]:
-    """Two worlds a fault: without fixes and with fixes of white noise; of the receiver, with two kinds of robots."""
+    """A world a fault: without fixes, or with fixes of white noise where the fault is in the receiver."""
     out = {}
-    for j in range(2):
-        for k, name in enumerate(FAULTS):
-            number = FIRST + 4 * k + 2 * j  # even numbers are clean
-            gps = "white" if name in GPS or j else "none"
-            out[f"fault-{k:02d}{'ab'[j]}"] = FaultWorld(replace(draw_world(number, seconds=SECONDS), gps=gps), name)
+    for k, name in enumerate(FAULTS):
+        world = replace(draw_world(FIRST + 4 * k, seconds=SECONDS), gps="white" if name in GPS else "none")
+        out[f"fault-{k:02d}"] = FaultWorld(world, name)
     return out
