@@ -168,6 +168,7 @@ def test_there_are_notebooks() -> None:
         "11_your_lidar",
         "12_is_this_map_to_be_trusted",
         "13_everything_in_one_graph",
+        "14_check_points",
     } <= {p.stem for p in NOTEBOOKS}
 
 

@@ -289,10 +289,7 @@ def before_and_after(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     if not refined:
         before = {"objective": row["objective"], "nees": row["nees"], "ci": row["ci"]}
         return {"before": before, "after": dict.fromkeys(before)}
-    return {
-        "before": before,
-        "after": {"objective": row["objective_polished"], "nees": row["nees"], "ci": row["ci"]},
-    }
+    return {"before": before, "after": {"objective": row["objective_polished"], "nees": row["nees"], "ci": row["ci"]}}
 
 
 def comparison_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -14,9 +14,11 @@ from typing import Any
 
 from graphslam.app.folders.generations import check_same, read_consistently
 from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.control import control_facts, control_findings, left_out_of_refinement
 from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.maps import sensor_reach
+from graphslam.app.run.options import RunOptions
 from graphslam.app.run.run import Run
 from graphslam.app.run.run_inputs import read_inputs
 from graphslam.app.run.source import log_of_run
@@ -34,6 +36,7 @@ from graphslam.core.progress import Bar
 from graphslam.core.random import SeedTree
 from graphslam.core.record_source import RecordSource
 from graphslam.core.submap import Submap
+from graphslam.evaluate.check_points import check_points
 from graphslam.evidence.formats import load_npz
 from graphslam.graph.network import to_network
 from graphslam.io.g2o import write_g2o
@@ -71,7 +74,7 @@ class MinimumEntropyMap:
     refined_map : RunMap or None
         Its fused map.
     findings : list of Finding
-        What the refinement says of it.
+        What the refinement, control points and check points say of it.
     """
 
     choice: RankedAlternatives
@@ -121,7 +124,7 @@ def minimum_entropy_loops(run: Run, made: RunMap, *, progress: bool = True) -> M
         facts = {"matches": len(chosen) - taken, "loops": taken}
         alternatives.append(Alternative(name, back.graph, solution, candidate, facts))
     choice = rank_alternatives(alternatives, model=made.fused.grid.model, progress=progress)
-    return _refined(run, MinimumEntropyMap(choice, len(every) - len(choices)), run.submaps)
+    return _finished(run, MinimumEntropyMap(choice, len(every) - len(choices)), run.submaps)
 
 
 def minimum_entropy_topology(
@@ -171,19 +174,33 @@ def minimum_entropy_topology(
     )
     model = next(iter(told[0].grids.values())).model
     found = MinimumEntropyMap(rank_alternatives(alternatives, model=model, progress=progress), left_out)
-    return _refined(run, found, told[found.choice.best.number].submaps)
+    return _finished(run, found, told[found.choice.best.number].submaps)
 
 
-def _refined(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
-    """The chosen alternative refined by the scans of the run, where the run is refined; all are judged without that."""
+def _finished(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
+    """The chosen alternative refined, and held against check points; all are chosen among without either."""
     if run.folder is None:
         return found
-    values = read_options(run.folder)
+    found, options = _refined(run, run.folder, found, submaps), RunOptions.of_folder(run.folder)
+    graph, r, said = found.choice.best.alternative.graph, found.refined, list(found.findings)
+    if (rows := options.table("control")) is not None:
+        facts = control_facts(graph, rows)
+        said += control_findings({"control_points": facts})
+        said += [] if r is None else [left_out_of_refinement(0, facts["used"])]
+    if (rows := options.table("check")) is not None:
+        tested = check_points(graph, rows, None if r is None else (r.refinement, r.map.trajectory))
+        said += control_findings({"check_points": tested.facts()})
+    return replace(found, findings=said)
+
+
+def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
+    """The chosen alternative refined by the scans of the run, where the run is refined."""
+    values = read_options(folder)
     config: RefineConfig = build_config(RefineConfig, values.get("refine", {}), "refine")
-    taken, generation = read_consistently(run.folder, read_inputs) if config.use else (None, None)
+    taken, generation = read_consistently(folder, read_inputs) if config.use else (None, None)
     if taken is None or taken.scans is None:
         return found
-    check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
+    check_same((folder / "run.json", run.report.get("generation")), (folder / "taken.npz", generation))
     solution = found.choice.best.alternative.solution
     solved = make_global_map(solution, list(submaps), {}, 1)
     gps = None
@@ -198,7 +215,7 @@ def _refined(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> M
 
 
 def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]]]:
-    """How the graph of a run was made, and what makes the GPS and IMU of one graph more, as `built` takes them."""
+    """How the graph of a run was made, and what makes the GPS, IMU and control rows of one graph more."""
     values: Mapping[str, Any] = read_options(run.folder) if run.folder is not None else {}
     gps: GpsOptions = build_config(GpsOptions, values.get("gps", {}), "gps")
     if gps.use != "none" and run.fixes is None:
@@ -212,9 +229,13 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
         taken, generation = read_consistently(run.folder, read_inputs)
         check_same((run.folder / "run.json", run.report.get("generation")), (run.folder / "taken.npz", generation))
         feed = RecordSource(taken.log)
+    if run.folder is None and "control_points" in run.report:
+        raise MissingDataError("only its folder holds the control points of a run", wanted="a run with out=…")
+    control = None if run.folder is None else RunOptions.of_folder(run.folder).table("control")
 
     def streams() -> dict[str, Any]:
-        return {"fixes": run.fixes, "gps": gps, "imu": ImuSource(feed, imu) if feed and feed.names(Imu) else None}
+        source = ImuSource(feed, imu) if feed and feed.names(Imu) else None
+        return {"fixes": run.fixes, "gps": gps, "imu": source, "control": control}
 
     return build_config(BackEndConfig, values.get("backend", {}), "backend"), streams
 
@@ -253,6 +274,6 @@ def write_minimum_entropy(
     if found.refined_map is not None:
         value["refined_entropy"] = found.refined_map.fused.entropy()
     if found.findings:
-        value["refinement"] = [f.as_row() for f in found.findings]
+        value["findings"] = [f.as_row() for f in found.findings]
     OutputFiles(folder).write_json("clearest.json", {"format": "graphslam.clearest/1", **value})
     return [*made, folder / "clearest.tum", folder / "clearest.json"]

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from graphslam.backend.back_end import BackEnd, find_config
 from graphslam.backend.config import BackEndConfig, GpsOptions
 from graphslam.backend.streams import ImuSource
+from graphslam.core.control import ControlTable
 from graphslam.core.errors import ConfigError
 from graphslam.core.progress import Bar
 from graphslam.core.records import Gps
@@ -50,6 +51,7 @@ def build_back_end(
     fixes: Gps | None = None,
     gps: GpsOptions | None = None,
     imu: ImuSource | None = None,
+    control: ControlTable | None = None,
 ) -> BackEnd:
     """A back end with a graph of submaps, not yet at its optimum.
 
@@ -57,10 +59,10 @@ def build_back_end(
     ----------
     fixes : Gps, optional
         Those that count.
-    imu : ImuSource, optional
-        Of this graph alone.
+    imu, control : ImuSource, ControlTable, optional
+        Of this graph alone; control rows, which enter when the graph is finished.
     """
-    back = BackEnd(config, "batch", imu=imu)
+    back = BackEnd(config, "batch", imu=imu, control=control)
     if fixes is not None:
         back.add_gps(fixes, GpsOptions() if gps is None else gps)
     for s in submaps:
@@ -69,10 +71,6 @@ def build_back_end(
         else:  # where GPS begins is told by the graph as it is by then
             back.add(s)
     return back
-
-
-MOST = 16
-"""Choices that are solved at most."""
 
 
 LEAST_SUPPORT = 0.02
@@ -135,9 +133,7 @@ def solve_choice(
     *,
     loops: Sequence[LoopDecision] = (),
     decided: Sequence[LoopDecision] = (),
-    fixes: Gps | None = None,
-    gps: GpsOptions | None = None,
-    imu: ImuSource | None = None,
+    **streams: Any,
 ) -> BackEnd:
     """The graph of submaps with some of their matches and loops, solved to its optimum.
 
@@ -149,8 +145,8 @@ def solve_choice(
         With their measurements; those that are chosen become factors as they were in the run.
     decided : sequence of LoopDecision
         Matches that the run decided on with its loops: in the graph as loops are, where they are chosen.
-    fixes, gps, imu
-        See :func:`build_back_end`.
+    **streams
+        ``fixes``, ``gps``, ``imu`` and ``control`` of :func:`build_back_end`.
     """
     bare = []
     # two matches of one pair of submaps are told apart by their support
@@ -165,7 +161,7 @@ def solve_choice(
             else:
                 taken.append(loop)
         bare.append(replace(s, matches=tuple(kept), grid=None))
-    back = build_back_end(bare, replace(config, match_support=0.0, loops=False), fixes=fixes, gps=gps, imu=imu)
+    back = build_back_end(bare, replace(config, match_support=0.0, loops=False), **streams)
     back.solver.solve_to_optimum()
     if taken:
         graph = GraphLoops(back.graph, back.solver)
@@ -345,7 +341,7 @@ def solve_hypotheses(
     division : DivisionConfig, optional
         How maps are cut into pieces; give the sensor's reach.
     streams : callable
-        Makes ``fixes``, ``gps`` and ``imu`` of one graph more; see :func:`build_back_end`.
+        Makes ``fixes``, ``gps``, ``imu`` and ``control`` of one graph more; see :func:`build_back_end`.
     progress : bool
         Show a bar.
     """

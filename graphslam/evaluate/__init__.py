@@ -4,6 +4,7 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "consistency": "Consistency nees pose_error",
+    "check_points": "power_of_test",
     "gps": "gps_residuals move_to_gps_frame",
     "gps_repeatability": "fix_segments",
     "dead_reckoning_baseline": "dead_reckoned_path",

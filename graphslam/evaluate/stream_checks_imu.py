@@ -77,10 +77,7 @@ def _longest_runs(values: Array) -> tuple[int, int]:
 
 def _limits(imu: Imu, name: str) -> list[Finding]:
     out = []
-    for what, values, unit in (
-        ("gyro", imu.angular_rate, "rad/s"),
-        ("accelerometer", imu.specific_force, "m/s²"),
-    ):
+    for what, values, unit in (("gyro", imu.angular_rate, "rad/s"), ("accelerometer", imu.specific_force, "m/s²")):
         for axis in range(3):
             v = values[:, axis]
             if np.ptp(v) == 0.0:

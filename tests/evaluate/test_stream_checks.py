@@ -15,7 +15,7 @@ from graphslam.core.records import VelocityControls
 from graphslam.evaluate.stream_checks import check_streams, refuse_faulty
 from graphslam.evaluate.stream_checks_beams import check_beams
 from graphslam.evaluate.stream_checks_imu import check_imu, compare_turns
-from tests.faults import inject_grid as put
+from graphslam_studies.faults import scans as put
 from tests.faults.grid_worlds import ring_log
 from tests.reference.imu_drive import drive
 

@@ -11,7 +11,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.evaluate.bias_test import KINDS, BiasTest, bias_test_findings, sum_bias_windows
 from graphslam_frontends.landmarks.bias_score import PARAMETERS
-from tests.faults import inject_landmarks as inject
+from graphslam_studies.faults import landmarks as inject
 
 
 def reports(log: SensorLog, frontend: str) -> list[dict]:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tests.faults import inject_grid as put
+from graphslam_studies.faults import scans as put
 
 Outcome = Literal["refused", "dropped", "handled", "reported"]
 

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from graphslam.core.log import SensorLog
-from graphslam.core.records import Gps, LandmarkObservations
-from tests.faults import inject_landmarks as inject
+from graphslam.core.records import LandmarkObservations
+from graphslam_studies.faults import landmarks as inject
 
 Outcome = Literal["refused", "dropped and counted", "handled", "reported"]
 KNOWN: Mapping[str, Any] = {"frontend": {"association": "known"}}
@@ -67,40 +67,6 @@ class Row:
         return self.sensor, self.fault, self.name, f"{self.dim}-D", self.outcome, shows if self.shows else "—"
 
 
-def _gps(change: Any) -> inject.Inject:
-    return inject.gps(change)
-
-
-def _bursts(g: Gps, rng: np.random.Generator) -> Gps:
-    p = g.positions.copy()
-    for k in range(8, len(p) - 4, 14):
-        p[k : k + 4] += 15.0 * rng.standard_normal(2)
-    return replace(g, positions=p)
-
-
-def _correlated(sigma: float) -> Any:
-    """An error of 3 m that fades over 60 s, on top of the noise."""
-
-    def change(g: Gps, rng: np.random.Generator) -> Gps:
-        keep = float(np.exp(-np.median(np.diff(g.times)) / 60.0))
-        b, p = 3.0 * rng.standard_normal(2), g.positions.copy()
-        for k in range(len(p)):
-            p[k] += b
-            b = keep * b + np.sqrt(1.0 - keep**2) * 3.0 * rng.standard_normal(2)
-        return replace(g, positions=p, sigma=np.full(len(p), sigma))
-
-    return change
-
-
-def _ramp(g: Gps, _: Any) -> Gps:
-    """Off by 7 m within 20 s, and then for good."""
-    return replace(g, positions=g.positions + np.clip((g.times - 10.0) / 20.0, 0.0, 1.0)[:, None] * [6.0, 3.0])
-
-
-def _degrees(g: Gps, _: Any) -> Gps:
-    return replace(g, positions=np.array([11.5, 48.1]) + g.positions / np.array([74000.0, 111200.0]))
-
-
 def _no_sighting(z: LandmarkObservations, _: Any) -> LandmarkObservations:
     keep = np.zeros(len(z.ranges), dtype=bool)
     return replace(
@@ -140,7 +106,7 @@ WHEELS: list[tuple[str, inject.Inject]] = [
 SIGHTINGS: list[tuple[str, inject.Inject]] = [
     ("bearings mirrored", inject.mirrored()),
     ("bearings off by 10°", inject.bearing_offset(np.deg2rad(10.0))),
-    ("bearings in degrees", inject.bearings_in_degrees()),
+    ("bearings in degrees", inject.bearings_ininject.degrees()),
     ("ranges × 2", inject.ranges(2.0)),
     ("ranges × 1.05", inject.ranges(1.05)),
     ("ranges constant", inject.constant_ranges(7.0)),
@@ -177,23 +143,33 @@ KILOMETRES = ("ranges × 0.001", inject.ranges(0.001))
 HARDLY = "ranges hardly change while the robot drives"
 OF_FIXES = "chi2|consistency-test|gps-correlated|gps-errors"
 GPS: list[tuple[str, inject.Inject, Outcome, str]] = [
-    ("another time base", _gps(lambda g, _: replace(g, times=g.times + 1e6)), "reported", "gps-not-used"),
+    ("another time base", inject.gps(lambda g, _: replace(g, times=g.times + 1e6)), "reported", "gps-not-used"),
     (
         "stuck",
-        _gps(lambda g, _: replace(g, positions=np.tile(g.positions[0], (len(g.times), 1)))),
+        inject.gps(lambda g, _: replace(g, positions=np.tile(g.positions[0], (len(g.times), 1)))),
         "reported",
         "gps-stuck",
     ),
-    ("degrees of longitude and latitude", _gps(_degrees), "reported", "gps-scale"),
-    ("axes swapped", _gps(lambda g, _: replace(g, positions=g.positions[:, ::-1].copy())), "reported", "gps-mirrored"),
-    ("bursts of outliers", _gps(_bursts), "reported", OF_FIXES),
-    ("slow ramp", _gps(_ramp), "reported", OF_FIXES),
-    ("lag of 1 s", _gps(lambda g, _: replace(g, times=g.times + 1.0)), "reported", OF_FIXES),
-    ("error constant for 60 s, σ of the noise alone", _gps(_correlated(0.3)), "reported", OF_FIXES),
-    ("error constant for 60 s, σ of all of it", _gps(_correlated(3.0)), "reported", "gps-correlated"),
-    ("only at the start", _gps(lambda g, _: g.take(g.times < 5.0)), "reported", "gps-not-used"),
-    ("off by 1 km, constantly", _gps(lambda g, _: replace(g, positions=g.positions + [800.0, -600.0])), "handled", ""),
-    ("no fix at all", _gps(lambda g, _: g.take(slice(0, 0))), "reported", "gps-empty"),
+    ("degrees of longitude and latitude", inject.gps(inject.degrees), "reported", "gps-scale"),
+    (
+        "axes swapped",
+        inject.gps(inject.axes_swapped),
+        "reported",
+        "gps-mirrored",
+    ),
+    ("bursts of outliers", inject.gps(inject.bursts), "reported", OF_FIXES),
+    ("slow ramp", inject.gps(inject.ramp), "reported", OF_FIXES),
+    ("lag of 1 s", inject.gps(lambda g, _: replace(g, times=g.times + 1.0)), "reported", OF_FIXES),
+    ("error constant for 60 s, σ of the noise alone", inject.gps(inject.correlated(0.3)), "reported", OF_FIXES),
+    ("error constant for 60 s, σ of all of it", inject.gps(inject.correlated(3.0)), "reported", "gps-correlated"),
+    ("only at the start", inject.gps(lambda g, _: g.take(g.times < 5.0)), "reported", "gps-not-used"),
+    (
+        "off by 1 km, constantly",
+        inject.gps(inject.off_by_1_km),
+        "handled",
+        "",
+    ),
+    ("no fix at all", inject.gps(lambda g, _: g.take(slice(0, 0))), "reported", "gps-empty"),
 ]
 FIT = "calibration|residuals|sightings-not-used"
 

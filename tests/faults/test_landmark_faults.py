@@ -17,7 +17,7 @@ from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import se2_between, wrap_angle
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
-from tests.faults import inject_landmarks as inject
+from graphslam_studies.faults import landmarks as inject
 from tests.faults.landmark_rows import KNOWN, ROWS, Row, table
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "notes" / "faults.md"

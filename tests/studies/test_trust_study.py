@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from graphslam.core.geometry import se2_between
 from graphslam.core.random import SeedTree
-from graphslam_studies.trust import FULL, QUICK, WORDS, ScanWorld, honesty, run_trial, summary_table, world_table
+from graphslam_studies.trust import (
+    FULL,
+    QUICK,
+    WORDS,
+    ScanWorld,
+    confusion_table,
+    honesty,
+    run_trial,
+    summary_table,
+    world_table,
+)
+from graphslam_studies.trust_faults import FAULTS, fault_worlds
 from graphslam_studies.trust_worlds import TrustWorld, draw_world, lasting, world_log
 
 
@@ -16,7 +29,7 @@ def test_worlds_are_drawn_alike_again_and_half_of_them_are_clean():
     assert draw_world(7) == draw_world(7) != draw_world(8)
     drawn = [w for w in FULL.values() if isinstance(w, TrustWorld)]
     assert sum(w.clean for w in drawn) == len(drawn) // 2 >= 25
-    assert {w.kind for w in FULL.values() if not isinstance(w, TrustWorld)} == {"park", "laser", "garage", "lidar"}
+    assert {w.kind for w in FULL.values() if isinstance(w, ScanWorld)} == {"park", "laser", "garage", "lidar"}
     assert {w.gps for w in drawn} == {"none", "white", "rtk", "lasting", "lasting-white", "multipath"}
     assert {w.front_end for w in drawn} == {"rbpf-ekf", "ekf"}
     assert all(w.wrong != "nothing" for k, w in enumerate(drawn) if k % 2)
@@ -38,6 +51,46 @@ def test_a_log_states_what_its_data_sheets_say_and_not_what_is_true():
     lasts = lasting(np.random.default_rng(0), 20000, 1.0, 10.0, 2)
     assert np.std(lasts) == pytest.approx(1.0, abs=0.05)
     assert np.mean(lasts[1:] * lasts[:-1]) == pytest.approx(np.exp(-0.1), abs=0.05)
+
+
+def test_every_fault_changes_a_log_of_a_clean_world_and_keeps_its_truth():
+    worlds = fault_worlds()
+    assert {w.wrong for w in worlds.values()} == set(FAULTS)
+    for w in worlds.values():
+        clean, log = world_log(w.world, SeedTree(3)), w.log(3)
+        assert w.world.clean
+        assert not w.clean
+        assert np.array_equal(log.truth.trajectory.poses, clean.truth.trajectory.poses)
+        changed = [k for k in clean.streams if _digest(log[k]) != _digest(clean[k])]
+        part = w.wrong.split(":")[0]
+        known = {"GPS": ["gps"], "odometry": ["odometry"], "landmarks": ["landmarks"]}
+        assert changed == known.get(part, ["odometry", "landmarks"]), w.wrong
+
+
+def _digest(stream) -> list[bytes]:
+    return [
+        np.asarray(getattr(stream, f.name)).tobytes() for f in fields(stream) if f.name not in ("noise", "geometry")
+    ]
+
+
+def test_the_confusion_table_sets_truth_against_words():
+    known = {"a": FULL["world-800"], "b": FULL["fault-00"], "c": FULL["fault-01"]}
+    figures = {"a": (1.0, 0), "b": (2.5, 0), "c": (50.0, 4)}
+    rows = []
+    for world, (nees, word) in figures.items():
+        values = {"node": nees, "node_dof": 40.0, "joint": nees, "joint_dof": 60.0, "word": float(word)}
+        rows += [
+            {"world": world, "run": 0, "algorithm": "run", "submap": -1, "quantity": q, "value": v}
+            for q, v in values.items()
+        ]
+    rows.append({"world": "d", "run": 0, "algorithm": "run", "submap": -1, "quantity": "word", "value": 5.0})
+    known["d"] = FULL["fault-02"]
+    worlds = world_table(pd.DataFrame(rows), known)
+    assert worlds["true"].tolist() == ["consistent", "overconfident", "wrong", "refused"]
+    table = confusion_table(worlds, known).set_index(["worlds", "true"])
+    assert table.loc[("clean", "consistent"), "consistent"] == 1
+    assert table.loc[("fault", "overconfident"), "consistent"] == 1
+    assert table.loc[("fault", "wrong"), "wrong"] == table.loc[("fault", "refused"), "refused"] == 1
 
 
 def test_honesty_of_errors_that_are_as_stated(rng):

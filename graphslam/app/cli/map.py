@@ -49,9 +49,7 @@ def map_command(
         help="Make only the terrain: where a vehicle can drive (re-reads the log along the solved path).",
     ),
     surface: bool = typer.Option(
-        False,
-        "--surface",
-        help="Make only the surface, as PLY, GLB and OBJ (re-reads the log along the solved path).",
+        False, "--surface", help="Make only the surface, as PLY, GLB and OBJ (re-reads the log along the solved path)."
     ),
     voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
     colour: str = typer.Option(
@@ -114,7 +112,7 @@ def _clearest(found: MinimumEntropyMap) -> tuple[dict[str, Any], str]:
             "constraints"
         )
     if found.findings:
-        value["refinement"] = [f.as_row() for f in found.findings]
+        value["findings"] = [f.as_row() for f in found.findings]
         text += "".join(f"\nchosen map: {f.text}" for f in found.findings)
     if found.refined_map is not None:
         value["refined_entropy"] = found.refined_map.fused.entropy()

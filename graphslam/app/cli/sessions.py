@@ -31,9 +31,7 @@ def merge_command(
     ),
     tolerance: float = typer.Option(0.5, help="Largest distance of matching landmarks after alignment [m]."),
     surface: bool = typer.Option(
-        False,
-        "--surface",
-        help="Dense 3-D submaps: also write the surface of all sessions (re-reads their logs).",
+        False, "--surface", help="Dense 3-D submaps: also write the surface of all sessions (re-reads their logs)."
     ),
     voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
     colour: str = typer.Option("session", help="With --surface: session, height, piece, or sigma."),

@@ -35,8 +35,7 @@ def solve_command(
     ),
     out: Path | None = typer.Option(None, help="g2o file to write the solution to."),
     starts: str | None = typer.Option(
-        None,
-        help="Initial values: all, or names such as chordal,tree. Default: one, and others only in case of doubt.",
+        None, help="Initial values: all, or names such as chordal,tree. Default: one, and others only in case of doubt."
     ),
     certify: bool = typer.Option(
         False, "--certify", help="Check whether the solution is certified as the global optimum."

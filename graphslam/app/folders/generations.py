@@ -65,7 +65,6 @@ _READ = (
 )
 """Names, as shell patterns, that our readers follow and our writers write to."""
 _NUMBER = re.compile(r"\d{6,}")
-_LINK_NAMES = re.compile(r"(\.\./)*current/.+")
 T = TypeVar("T")
 
 

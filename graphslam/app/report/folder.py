@@ -9,14 +9,7 @@ from typing import Any, Literal, TypeVar
 
 import pandas as pd
 
-from graphslam.app.run.files import (
-    read_events,
-    read_ledger,
-    read_merge_report,
-    read_metrics,
-    read_options,
-    read_report,
-)
+from graphslam.app.run.files import read_events, read_ledger, read_merge_report, read_metrics, read_options, read_report
 from graphslam.core.atomic import read_json
 from graphslam.core.errors import GraphSlamError, MissingDataError, RunFolderError
 from graphslam.evaluate.metrics import is_time

@@ -47,11 +47,7 @@ _PARTS = {
     "times": times_section,
     "missing": problems_section,  # last: the others note what they did not find
 }
-_TITLES = {
-    "run": "Report of a run",
-    "interrupted": "Report of an unfinished run",
-    "merged": "Report of a merge",
-}
+_TITLES = {"run": "Report of a run", "interrupted": "Report of an unfinished run", "merged": "Report of a merge"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -167,6 +167,11 @@ class Run:
         return headline_of_json(self.report.get("verdict")) or Finding("", "headline", "No verdict.")
 
     @property
+    def points_of_survey(self) -> int:
+        """Control rows and check rows that were used."""
+        return int(self.report.get("control_points", {}).get("used", 0)) + len(self.check_points)
+
+    @property
     def check_points(self) -> pd.DataFrame:
         """Check points, a row each: ``line``, ``name``, ``place``, ``frame``, ``error`` [m] and its predicted
         ``sigma`` [m], ``nis``, ``dof``; none where the run had no check rows. The test of all of them together is in

@@ -140,11 +140,7 @@ class RunSurface:
 
 
 def surface_of_run(
-    run: Run,
-    *,
-    log: str | Path | SensorLog | None = None,
-    config: SurfaceConfig | None = None,
-    progress: bool = True,
+    run: Run, *, log: str | Path | SensorLog | None = None, config: SurfaceConfig | None = None, progress: bool = True
 ) -> RunSurface:
     """Read the log of a run once more, along its solved path; for the errors see
     :func:`graphslam.app.run.terrain.terrain_of_run`."""

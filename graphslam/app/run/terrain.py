@@ -107,11 +107,7 @@ class RunTerrain:
 
 
 def terrain_of_run(
-    run: Run,
-    *,
-    log: str | Path | SensorLog | None = None,
-    sensor_height: float | None = None,
-    progress: bool = True,
+    run: Run, *, log: str | Path | SensorLog | None = None, sensor_height: float | None = None, progress: bool = True
 ) -> RunTerrain:
     """Read the log of a run once more, along its solved path: its point clouds, or else the lines of a laser.
 

@@ -121,15 +121,19 @@ def merge(
 def _opened(runs: Sequence[Run | str | Path]) -> list[Run]:
     if len(runs) < 2:
         raise ConfigError(f"{len(runs)} runs to merge; wanted at least two")
-    return [r if isinstance(r, Run) else read_run_folder(r) for r in runs]
+    opened = [r if isinstance(r, Run) else read_run_folder(r) for r in runs]
+    for name, r in zip(_names(opened), opened):
+        if r.points_of_survey:
+            logger.warning(
+                "%s: its %d control and check rows are not used in the merged map; to do: test the run by them, and for"
+                " the frame of the survey apply T_control_map of the first run (run.json, control_points)",
+                name, r.points_of_survey,
+            )  # fmt: skip
+    return opened
 
 
 def _merged(
-    opened: list[Run],
-    by: By = "auto",
-    solver: str = "batch",
-    gate: float = IDENTITY_GATE,
-    tolerance: float = TOLERANCE,
+    opened: list[Run], by: By = "auto", solver: str = "batch", gate: float = IDENTITY_GATE, tolerance: float = TOLERANCE
 ) -> MergedMap | MergedSubmaps:
     with one_blas_thread():
         if all(run_is_dense(r) for r in opened):
@@ -202,6 +206,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
                 "name": s.name,
                 "source": s.run.name,
                 "submaps": len(s.keys),
+                "points_not_used": s.run.points_of_survey,
                 "T_world_first_base": solution.poses[s.first_node].tolist(),
                 "common_landmarks": None if s.alignment is None else len(s.alignment.pairs),
                 "rejected": None if s.alignment is None else s.alignment.rejected,

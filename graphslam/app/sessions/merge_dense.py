@@ -95,13 +95,7 @@ class MergedSubmaps:
         return f"MergedSubmaps({len(self.sessions)} sessions, {len(self.graph.submaps)} submaps)"
 
 
-def merge_dense(
-    runs: Sequence[Run],
-    names: Sequence[str],
-    *,
-    by: By = "auto",
-    solver: str = "batch",
-) -> MergedSubmaps:
+def merge_dense(runs: Sequence[Run], names: Sequence[str], *, by: By = "auto", solver: str = "batch") -> MergedSubmaps:
     """Merge runs of dense submaps into one graph, and solve it as one problem.
 
     The first base of the first run is fixed. Every other run hangs on one that is in already: by GPS where both have
@@ -164,12 +158,7 @@ def merge_dense(
 
 
 def _tie(
-    graph: FactorGraph,
-    solver: Any,
-    known: DenseSession,
-    known_node: int,
-    new: DenseSession,
-    by: By,
+    graph: FactorGraph, solver: Any, known: DenseSession, known_node: int, new: DenseSession, by: By
 ) -> ConnectedSession:
     both = all(s.fixes is not None and s.T_gps_base is not None for s in (known, new))
     if by == "gps" or (by == "auto" and both):
@@ -257,6 +246,7 @@ def _said(s: PlacedSession) -> dict[str, Any]:
         "name": s.name,
         "source": s.run.name,
         "submaps": len(s.session.submaps),
+        "points_not_used": s.run.points_of_survey,
         "refined": s.session.refined,
         "T_world_first_base": s.T_world_base.tolist(),
         "hangs_on": None if a is None else a.known.name,

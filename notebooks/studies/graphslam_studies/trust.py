@@ -2,8 +2,9 @@
 
 Worlds are drawn: robots among landmarks (:mod:`graphslam_studies.trust_worlds`: route, landmarks, robot, noise,
 receiver), and robots with scans (:class:`ScanWorld`: a park with a building, garages, lidars). Half of the landmark
-worlds are as stated; the others have one or two errors that are not stated. ``graphslam.run`` maps each with its
-default options: front end, calibration, refinement and loop closures are chosen as for a newcomer's log.
+worlds are as stated; the others have one or two errors that are not stated, or a fault of ``docs/faults.md``
+(:mod:`graphslam_studies.trust_faults`). ``graphslam.run`` maps each with its default options: front end, calibration,
+refinement and loop closures are chosen as for a newcomer's log.
 
 Among landmarks the score has nothing in common with what it judges: it is made here of the simulator's poses and the
 covariances that the graph reports. With fixes poses are scored in the frame of the fixes, else in that of the first
@@ -13,8 +14,9 @@ Quantities
 ----------
 ``node``: NEES of the nodes, each by itself, over its dimension, mean; ``node_dof``: the degrees of freedom of this mean
 (errors of nodes are correlated: ``n² / ‖C‖²``); ``joint``, ``joint_dof``: NEES/n of all nodes together; ``rms`` of
-their positions [m]; ``word``: index into :data:`WORDS`; ``clean``. Worlds with scans
-are scored by the run's own NEES of its nodes or of its refined path (``nees_per_dof``), as ``joint`` and ``node``.
+of their positions [m]; ``word``: index into :data:`WORDS`, alone where the log is refused; ``clean``. Worlds with
+scans are scored by the run's own NEES of its nodes or of its refined path (``nees_per_dof``), as ``joint`` and
+``node``.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from graphslam.app.run.run import Run
 from graphslam.app.run.summary import verdict_word
 from graphslam.app.run.verdict import RunMetrics, covariance_assessment
 from graphslam.app.worlds import mesh_world, simulate
+from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_log
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
@@ -39,11 +42,15 @@ from graphslam_studies.evaluate.intervals import share_interval
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, whole
 from graphslam_studies.sim.lidar import drawn_imu, drawn_lidar, simulate_lidar
+from graphslam_studies.trust_faults import FaultWorld, fault_worlds
 from graphslam_studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log
 
-WORDS = ("consistent", "overconfident", "conservative", "not tested", "wrong")
+WORDS = ("consistent", "overconfident", "conservative", "not tested", "wrong", "refused")
+"""Of a verdict; the last: there is no map."""
 WRONG = 1.5
 """NEES/n from which on a map must not be called consistent or conservative."""
+LARGE = 9.0
+"""NEES/n from which on a map is wrong: errors of three standard deviations on average."""
 WORLDS_DRAWN = range(800, 860)
 """Worlds of the study. Of those before some were looked at while rules and defaults were made: they judge no more."""
 
@@ -86,6 +93,9 @@ class ScanWorld:
         if self.kind == "laser":
             made = replace(made, streams={k: v for k, v in made.streams.items() if k != "landmarks"})
         return replace(made, name="trust")
+
+
+World = TrustWorld | ScanWorld | FaultWorld
 
 
 def scored(found: Run, log: SensorLog) -> dict[str, float]:
@@ -156,36 +166,43 @@ def word_without_truth(found: Run) -> int:
     return WORDS.index(verdict_word(lines, [], covariance_assessment(figures))[0])
 
 
-def run_trial(w: TrustWorld | ScanWorld, seed: int) -> Iterator[Measurement]:
+def run_trial(w: World, seed: int) -> Iterator[Measurement]:
     """All figures of one run (see the module)."""
-    log = w.log(seed) if isinstance(w, ScanWorld) else world_log(w, SeedTree(seed))
-    found = run(log, seed=seed, progress=False)
+    log = world_log(w, SeedTree(seed)) if isinstance(w, TrustWorld) else w.log(seed)
+    yield Measurement("run", "clean", float(w.clean))
+    try:
+        found = run(log, seed=seed, progress=False)
+    except GraphSlamError:
+        yield Measurement("run", "word", float(WORDS.index("refused")))
+        return
     for quantity, value in scored(found, log).items():
         yield Measurement("run", quantity, value)
     yield Measurement("run", "word", float(word_without_truth(found)))
-    yield Measurement("run", "clean", float(w.clean))
 
 
-class TrustStudy(WorldsStudy[TrustWorld | ScanWorld]):
+class TrustStudy(WorldsStudy[World]):
     """See the module."""
 
     run_one = staticmethod(run_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``worlds``: a row each, truth beside words; ``summary``: is it ever green where it must not be."""
-        worlds = world_table(table, {**self.full, **self.quick})
-        return {"summary": summary_table(worlds), "worlds": worlds}
+        """``confusion``: truth against words; ``summary``: is it ever green where it must not be; ``worlds``."""
+        known = {**self.full, **self.quick}
+        worlds = world_table(table, known)
+        return {"confusion": confusion_table(worlds, known), "summary": summary_table(worlds), "worlds": worlds}
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
         """Honesty of all runs."""
         return draw_runs(table, {"joint": "NEES/n of all nodes"}, folder)
 
 
-def world_table(table: pd.DataFrame, known: dict[str, TrustWorld | ScanWorld]) -> pd.DataFrame:
+def world_table(table: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
     """A row a world: what is wrong with it, NEES/n pooled over its runs, and how often each word was said.
 
     ``bad map`` where the nodes, each by itself or all together, have more than :data:`WRONG`, and more than chance
-    (97.5 %) gives honest runs: a mean over a dozen correlated errors of few runs is above 1.5 now and then.
+    (97.5 %) gives honest runs: a mean over a dozen correlated errors of few runs is above 1.5 now and then. ``true``
+    is what a verdict that knew the truth would say: ``wrong`` from :data:`LARGE` on, ``conservative`` where both are
+    below 1/1.5, and below chance.
     """
     out = []
     for world in table["world"].unique():
@@ -194,15 +211,32 @@ def world_table(table: pd.DataFrame, known: dict[str, TrustWorld | ScanWorld]) -
         if not len(figures["word"]):
             continue
         row: dict[str, object] = {"world": world, "what is wrong": known[world].wrong, "gps": known[world].gps}
-        wrong = False
+        bad, large, small = False, False, True
         for q in ("node", "joint"):
-            dof = figures[f"{q}_dof"]
-            mean = float(np.sum(figures[q] * dof) / np.sum(dof))
-            wrong |= mean > max(WRONG, float(stats.chi2.ppf(0.975, np.sum(dof)) / np.sum(dof)))
+            dof = float(np.sum(figures[f"{q}_dof"]))
+            mean = float(np.sum(figures[q] * figures[f"{q}_dof"]) / dof) if dof else np.nan
+            low, high = stats.chi2.ppf([0.025, 0.975], dof) / dof if dof else (np.nan, np.nan)
+            bad |= mean > max(WRONG, high)
+            large |= mean > max(LARGE, high)
+            small &= mean < min(1.0 / WRONG, low)
             row[q] = mean
-        row["bad map"], row["clean"] = wrong, known[world].clean
+        row["true"] = "wrong" if large else "overconfident" if bad else "conservative" if small else "consistent"
+        if np.isnan(mean):
+            row["true"] = "refused"
+        row["bad map"], row["clean"] = bad, known[world].clean
         out.append(row | {word: int(np.sum(figures["word"] == k)) for k, word in enumerate(WORDS)})
     return pd.DataFrame(out)
+
+
+def confusion_table(worlds: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
+    """What is true (rows) against what was said (columns), of clean worlds, of those with errors, and with faults."""
+    rows = []
+    kind = [
+        "clean" if known[w].clean else "fault" if isinstance(known[w], FaultWorld) else "error" for w in worlds["world"]
+    ]
+    for (name, true), own in worlds.groupby([pd.Series(kind, worlds.index), "true"]):
+        rows.append({"worlds": name, "true": true, **{word: int(own[word].sum()) for word in WORDS}})
+    return pd.DataFrame(rows)
 
 
 def summary_table(worlds: pd.DataFrame) -> pd.DataFrame:
@@ -224,11 +258,12 @@ def summary_table(worlds: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-FULL: dict[str, TrustWorld | ScanWorld] = {f"world-{k:03d}": draw_world(k) for k in WORLDS_DRAWN}
+FULL: dict[str, World] = {f"world-{k:03d}": draw_world(k) for k in WORLDS_DRAWN}
+FULL |= fault_worlds()
 FULL |= {
     f"{kind}-{k}": ScanWorld(kind=kind, number=k) for kind in ("park", "laser", "garage", "lidar") for k in range(8)
 }
-QUICK: dict[str, TrustWorld | ScanWorld] = {f"quick-{k:02d}": draw_world(k, seconds=80.0) for k in (4, 9, 22, 31)}
+QUICK: dict[str, World] = {f"quick-{k:02d}": draw_world(k, seconds=80.0) for k in (4, 9, 22, 31)}
 STUDY = TrustStudy(
     "trust",
     "what a run without truth says of its covariances, beside what is true, in worlds that are drawn",

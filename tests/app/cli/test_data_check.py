@@ -16,7 +16,7 @@ from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.log import SensorLog
 from graphslam.core.records import Gps
 from graphslam.io.log_store import save_log
-from tests.faults import inject_grid as put
+from graphslam_studies.faults import scans as put
 from tests.faults.grid_worlds import ring_log
 from tests.io import small_sources as small
 from tests.io.bag_worlds import Messages, write_mcap

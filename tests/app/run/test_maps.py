@@ -13,6 +13,7 @@ import pytest
 from graphslam.app.hypotheses import minimum_entropy_loops, minimum_entropy_topology
 from graphslam.app.run import config as cfg
 from graphslam.app.run.maps import sensor_reach
+from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
@@ -20,19 +21,22 @@ from graphslam.app.worlds import simulate
 from graphslam.backend.config import BackEndConfig
 from graphslam.backend.hypotheses import choices_of_matches, solve_choice
 from graphslam.core.config import build_config, read_toml
+from graphslam.core.control import control_lines
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.poses import SE3, remove_roll_pitch
 from graphslam.core.submap import Match
 from graphslam.evidence.formats import load_npz
+from graphslam.graph.factors.control import ControlRecord
 from graphslam.io.log_store import save_log
 from graphslam.io.tum import read_tum
 from graphslam.maps.fuse import fuse_pieces
-from graphslam.maps.run_map import floor_bands, make_run_map, nodes_by_submap
+from graphslam.maps.run_map import RunMap, floor_bands, make_run_map, nodes_by_submap
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.ring_hall import ring_hall
 from tests.app.cli.test_cli import graphslam, refused
 from tests.reference.small_maps import same_map
+from tests.reference.surveyed import surveyed
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +143,43 @@ def test_the_folder_gives_the_same_map_again(finished: Run, tmp_path: Path) -> N
     higher = graphslam("map", folder, "--low", "1.0", "--high", "0.5")
     assert higher.returncode == 1
     assert "low < high" in higher.stderr
+
+
+def test_control_rows_hold_every_alternative_and_check_rows_test_the_chosen_one(finished: Run, tmp_path: Path) -> None:
+    assert finished.folder is not None
+    assert finished.truth_path is not None
+    folder = tmp_path / "run"
+    shutil.copytree(finished.folder, folder)
+    path, rng = finished.truth_path, np.random.default_rng(1)
+    a, b = (float(f(path.times)) for f in (np.min, np.max))
+    lines = []
+    for name, n in (("control", 4), ("check", 9)):
+        times = np.linspace(a + 2.0, b - 2.0, n).tolist()
+        rows = surveyed(zip(times, path.interpolate(np.array(times))[:, :3]), rng, 0.02)
+        lines.append(f'{name} = {{ source = "rows", rows = {json.dumps(control_lines(rows)["rows"])} }}')
+    config = folder / "config.toml"
+    config.write_text(config.read_text().replace("[run]\n", "\n".join(["[run]", *lines, ""]), 1))
+    done = graphslam("map", folder, "--minimum-entropy", "--json")
+    assert done.returncode == 0, done.stderr
+    said = {f["code"]: f["text"] for f in json.loads(done.stdout)["findings"]}
+    assert "4 rows used; their frame (survey)" in said["control-points"]
+    assert "m at 9 rows" in said["check-points"]
+    assert json.loads((folder / "clearest.json").read_text())["findings"] == json.loads(done.stdout)["findings"]
+    found = minimum_entropy_loops(*map_of_folder(folder), progress=False)
+    for j in found.choice.order:
+        held = [r for r in j.alternative.graph.records.values() if isinstance(r, ControlRecord)]
+        assert len(held) == 4
+    told = minimum_entropy_topology(read_run_folder(folder), 2, log=finished.log, progress=False)
+    assert {f.code for f in told.findings} >= {"control-points"}
+    with pytest.raises(MissingDataError, match="only its folder holds"):
+        minimum_entropy_loops(
+            replace(finished, folder=None, report={**finished.report, "control_points": {}}), found_map(finished)
+        )
+
+
+def found_map(run: Run) -> RunMap:
+    assert run.fused is not None
+    return run.fused
 
 
 def test_every_choice_of_matches_is_solved_before_it_is_ranked(finished: Run) -> None:

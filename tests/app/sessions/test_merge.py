@@ -16,6 +16,7 @@ from graphslam.core.errors import ConfigError, DataError, RunFolderError
 from graphslam.core.geometry import se2_between
 from graphslam.io.tum import read_tum
 from tests.pictures import full_pictures
+from tests.reference.surveyed import surveyed
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +95,18 @@ def test_a_run_joins_by_way_of_another(runs):
 def _renamed(run, new):
     submaps = [s.with_ids(new(s.landmarks.ids)) for s in run.submaps]
     return replace(run, submaps=submaps, map=replace(run.map, landmark_ids=new(run.map.landmark_ids)))
+
+
+def test_points_of_a_run_that_a_merge_does_not_use_are_said(runs, merged, log, caplog):
+    a, b = runs[1].map.trajectory.times[[0, -1]]
+    times = np.linspace(a + 1.0, b - 1.0, 4)
+    rows = surveyed(zip(times.tolist(), log.truth.trajectory.interpolate(times)[:, :2]), np.random.default_rng(2), 0.02)
+    second = graphslam.run(log.slice(a, b), config={"control": rows, "check": rows[:3]}, progress=False)
+    assert [s["points_not_used"] for s in merged.report["sessions"]] == [0, 0]
+    with caplog.at_level("WARNING"):
+        together = graphslam.merge([runs[0], second])
+    assert [s["points_not_used"] for s in together.report["sessions"]] == [0, 7]
+    assert "landmark-field-2: its 7 control and check rows are not used in the merged map; to do:" in caplog.text
 
 
 def test_what_cannot_be_merged_is_refused(runs):

@@ -11,7 +11,7 @@ from graphslam.core.log import SensorLog
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_check import MotionCheck, check_motion, motion_findings
 from graphslam_frontends.odometry.step_config import StepConfig
-from tests.faults import inject_grid as put
+from graphslam_studies.faults import scans as put
 from tests.faults.grid_worlds import RANGE, ring_log
 
 CONFIG = StepConfig(max_range=RANGE, most_points=240)

@@ -16,7 +16,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Odometry, VelocityControls
 from graphslam_frontends.odometry.motion import HEADING_UNKNOWN, MotionNoise, dead_reckoned_increments
 from graphslam_frontends.odometry.motion_gaps import MotionGap, dead_reckon_over_gaps
-from tests.faults import inject_landmarks as inject
+from graphslam_studies.faults import landmarks as inject
 
 
 def log_of(motion: VelocityControls | Odometry) -> SensorLog:

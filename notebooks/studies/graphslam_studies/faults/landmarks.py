@@ -274,3 +274,45 @@ def gps(change: Callable[[Gps, np.random.Generator], Gps]) -> Inject:
         return with_stream(log, "gps", change(log["gps"], np.random.default_rng(11)))
 
     return inject
+
+
+def bursts(g: Gps, rng: np.random.Generator) -> Gps:
+    """Four fixes of fourteen are off together, by 15 m or so."""
+    p = g.positions.copy()
+    for k in range(8, len(p) - 4, 14):
+        p[k : k + 4] += 15.0 * rng.standard_normal(2)
+    return replace(g, positions=p)
+
+
+def correlated(sigma: float) -> Any:
+    """An error of 3 m that fades over 60 s, on top of the noise."""
+
+    def change(g: Gps, rng: np.random.Generator) -> Gps:
+        keep = float(np.exp(-np.median(np.diff(g.times)) / 60.0))
+        b, p = 3.0 * rng.standard_normal(2), g.positions.copy()
+        for k in range(len(p)):
+            p[k] += b
+            b = keep * b + np.sqrt(1.0 - keep**2) * 3.0 * rng.standard_normal(2)
+        return replace(g, positions=p, sigma=np.full(len(p), sigma))
+
+    return change
+
+
+def ramp(g: Gps, _: Any) -> Gps:
+    """Off by 7 m within 20 s, and then for good."""
+    return replace(g, positions=g.positions + np.clip((g.times - 10.0) / 20.0, 0.0, 1.0)[:, None] * [6.0, 3.0])
+
+
+def degrees(g: Gps, _: Any) -> Gps:
+    """Longitude and latitude, read as metres."""
+    return replace(g, positions=np.array([11.5, 48.1]) + g.positions / np.array([74000.0, 111200.0]))
+
+
+def axes_swapped(g: Gps, _: Any) -> Gps:
+    """North and east are mixed up: a mirror image."""
+    return replace(g, positions=g.positions[:, ::-1].copy())
+
+
+def off_by_1_km(g: Gps, _: Any) -> Gps:
+    """A base station at a wrong place."""
+    return replace(g, positions=g.positions + [800.0, -600.0])
