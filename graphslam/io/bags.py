@@ -59,7 +59,10 @@ _MOST_FAR = 3600.0  # [s] between stamps of headers and of the bag, beyond which
 
 @dataclass(frozen=True, slots=True)
 class BagTopics:
-    """Topics of a bag by kind; ``none`` leaves a kind out, None takes the one with most messages, raw ones first."""
+    """Topics of a bag by kind; ``none`` leaves a kind out, None takes the one with most messages, raw ones first.
+
+    Odometry may also be ``tf:FRAME``: the transform that moves in this frame.
+    """
 
     clouds: str | None = None
     laser: str | None = None
@@ -76,7 +79,6 @@ def read_bag(
     *,
     topics: BagTopics = ALL_TOPICS,
     base_frame: str | None = None,
-    odometry_frame: str | None = None,
     mount: tuple[float, float, float, float, float, float] | None = None,
     point_times: bool = True,
     max_range: float | None = None,
@@ -93,8 +95,6 @@ def read_bag(
         Which are read.
     base_frame : str, optional
         Frame of the robot.
-    odometry_frame : str, optional
-        Frame in which the transforms ``tf`` move the robot; they are then the odometry, before any topic.
     mount : (6,), optional
         Place of the scanner in the base, instead of what transforms say: x, y, z [m], roll, pitch, yaw [rad].
     point_times : bool
@@ -109,14 +109,16 @@ def read_bag(
         raise ConfigError(f"bag: max_range is {max_range}; wanted a positive number")
     p, counter, notes = Path(path), DropCounter(), list[str]()
     asked: dict[str, str | None] = asdict(topics)
+    frame_asked = (topics.odometry or "").partition("tf:")[2] or None
+    if frame_asked is not None:
+        asked["odometry"] = "none"
     with ExitStack() as stack:
         bag = BagFiles(p, stack)
         chosen = choose_topics(bag, asked, notes, counter)
         frames, rows, spool = collect_messages(bag, chosen, counter)
     frames.settle()
     made, streams = _BagLog(str(p), rows, frames, counter, notes), dict[str, Stream]()
-    by_transforms = odometry_frame is not None or ("odometry" not in rows and topics.odometry != "none")
-    if by_transforms and (moving := made.moving(odometry_frame)) is not None:
+    if "odometry" not in rows and topics.odometry != "none" and (moving := made.moving(frame_asked)) is not None:
         rows["odometry"] = moving
     planar = "laser" in chosen and "clouds" not in chosen
     base = made.base = base_frame or made.frame_of_base()
@@ -185,7 +187,7 @@ class _BagLog:
         if key is None:
             if parent is not None:
                 known = ", ".join(f"{a} → {b}" for a, b in self.frames.moving) or "none"
-                raise ConfigError(f"bag: no frame moves in odometry_frame {parent!r}; moving transforms: {known}")
+                raise ConfigError(f"bag: no frame moves in {parent!r} (option odometry); moving transforms: {known}")
             return None
         rows = self.frames.moving[key]
         rows.frame, rows.child = key

@@ -394,7 +394,7 @@ def test_odometry_from_transforms_of_other_names(tmp_path: Path, parent: str, ch
     assert log.meta["base_frame"] == child
     np.testing.assert_allclose(log["clouds"].T_base_sensor, MOUNT, atol=1e-6)
     with pytest.raises(ConfigError, match=f"moving transforms: {parent}"):
-        load_recording(tmp_path / "a", odometry_frame="nowhere")
+        load_recording(tmp_path / "a", odometry="tf:nowhere")
 
 
 def test_a_joint_is_no_odometry(tmp_path: Path) -> None:
