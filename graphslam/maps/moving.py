@@ -145,6 +145,26 @@ class MovedObjects:
         return out
 
 
+def static_submaps(submaps: Sequence[Submap], bases: Array) -> tuple[list[Submap], tuple[int, int]]:
+    """Submaps without the points that are on things that moved.
+
+    Parameters
+    ----------
+    submaps, bases
+        As for :func:`moving_points`.
+
+    Returns
+    -------
+    submaps : list of Submap
+    moving : (int, int)
+        Number of points that were removed, and of all.
+    """
+    if bases.shape[1] != 7 or all(s.cloud is None for s in submaps):
+        return list(submaps), (0, 0)
+    moving = moving_points(submaps, bases)
+    return without_moving(submaps, moving), (sum(int(m.sum()) for m in moving), sum(len(m) for m in moving))
+
+
 def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Submap]:
     """The submaps with clouds and grids made without the points that moved; the others as they are."""
     out = []
