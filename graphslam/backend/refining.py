@@ -11,7 +11,6 @@ import numpy as np
 
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding
-from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
@@ -23,8 +22,7 @@ from graphslam.graph.ledger import EXCLUSIVE, Ledger
 from graphslam.graph.sensors.control import CONTROL_ROWS
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.maps.global_map import GlobalMap
-from graphslam.maps.moving import moving_points, without_moving
-from graphslam.maps.refined import base_frames, refined_map, refined_submaps
+from graphslam.maps.refined import refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
 from graphslam.refine.refine import Refinement, refine_by_scans
 from graphslam.refine.revisit_constraints import FAR, tangent_lengths
@@ -128,14 +126,13 @@ def refine_run(
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
-        drawn, moved = _static_submaps(drawn, base_frames(refined))
     except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
         logger.warning("refinement failed: %s", error)
         return None, [
             Finding("look", "refine-failed", f"refinement: failed — {error}. The graph's path is the result.")
         ]
     wrong = None if graph is None else wrong_loops(graph, refined)
-    return RefinedRun(found, refined, drawn, path), [*refinement_findings(found, wrong, fixes), *moved]
+    return RefinedRun(found, refined, drawn, path), refinement_findings(found, wrong, fixes)
 
 
 def _input(r: Refinement) -> list[Finding]:
@@ -153,16 +150,6 @@ def _input(r: Refinement) -> list[Finding]:
         "is better. Use its path, or reduce its assumed noise."
     )
     return [Finding("bad", "input-better", text)]
-
-
-def _static_submaps(submaps: list[Submap], bases: Array) -> tuple[list[Submap], list[Finding]]:
-    """Submaps without what moved, where they carry clouds, and how much that was."""
-    if not submaps or bases.shape[1] != 7 or any(s.cloud is None for s in submaps):
-        return submaps, []
-    moving = moving_points(submaps, bases[:-1])
-    gone, every = sum(int(m.sum()) for m in moving), sum(len(m) for m in moving)
-    text = f"moving objects: {gone} of {every} points ({gone / max(every, 1):.1%}) — removed from the map."
-    return without_moving(submaps, moving), [Finding("", "moving", text)] if gone else []
 
 
 def wrong_loops(graph: FactorGraph, m: GlobalMap) -> list[tuple[int, int, float, float]]:

@@ -191,20 +191,6 @@ def fill_grid(grid: G, pieces: GridPieces) -> G:
     return grid
 
 
-def move_grids(grids: Sequence[GridTree]) -> None:
-    """Move grids into a pool of their own, the same for all, as large as they need it.
-
-    A pool keeps the memory of maps that died. After a particle filter that is many times what is left alive; its memory
-    is free as soon as no other grid lives in it. What grids shared is no longer shared.
-    """
-    pools: dict[int, GridPool] = {}
-    for grid in grids:
-        levels = grid.pool.levels
-        if levels not in pools:
-            pools[levels] = GridPool(levels)
-        grid.replace_contents(fill_grid(grid.empty(pools[levels]), grid_pieces(grid)))
-
-
 def find_overlap(pieces: GridPieces) -> str | None:
     """What is impossible about pieces of an unknown source, or None: order, alignment, overlaps."""
     for name, rows in (("bricks", pieces.bricks), ("cubes", pieces.cubes)):

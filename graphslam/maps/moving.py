@@ -4,15 +4,11 @@ A car leaves points in every scan that saw it, at another place each time. Where
 through. A point is on something that moved where at least two neighbours know its place as free, with nothing occupied
 beside, and more of them than support it; and where it has company. The ground is left alone: rows of it that are grazed
 by beams to farther ground look the same. What moves away and never lets its place be seen stays.
-
-Without clouds, :func:`seen_through_voxels` asks moments instead of submaps: evidence adds up beam by beam, so a person
-who stands for a second before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them.
-Where every moment has one vote, they do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -74,14 +70,14 @@ def moving_points(submaps: Sequence[Submap], bases: Array) -> list[Mask]:
         near = np.linalg.norm(cloud.points - cloud.origins[cloud.scan], axis=1) < REACH
         others = [j for j in range(max(k - NEIGHBOURS, 0), min(k + NEIGHBOURS + 1, len(submaps))) if j != k]
         around = [world, *(_world(bases[j], other.points) for j in others if (other := clouds[j]) is not None)]
-        asked = np.flatnonzero(near & ~_ground(world, np.concatenate(around)))
+        asked = np.flatnonzero(near & ~near_ground(world, np.concatenate(around)))
         free, supported = np.zeros(len(asked), np.int64), np.zeros(len(asked), np.int64)
         for j in others:
             grid = submaps[j].grid
             if not isinstance(grid, EvidenceGrid):
                 continue
             T = np.asarray(se3.se3_between(bases[j], bases[k]))
-            says = _says(grid, _world(T, cloud.points[asked]), FREE)
+            says = known_state(grid, _world(T, cloud.points[asked]), FREE)
             free += says < 0
             supported += says > 0
         moved = np.zeros(len(cloud), np.bool_)
@@ -131,7 +127,7 @@ class MovedObjects:
         out[rows[near]] = True
         if not near.any():
             return out
-        stands = cell[rows[~_ground(points[rows], points[rows])]]
+        stands = cell[rows[~near_ground(points[rows], points[rows])]]
         raised = np.zeros(self.near.shape, np.bool_)
         raised[stands[:, 0], stands[:, 1]] = True
         things, many = label(binary_dilation(raised, np.ones((3, 3))), np.ones((3, 3)))  # over gaps of three cells
@@ -143,6 +139,26 @@ class MovedObjects:
             reach = COMPANY_RADIUS / self.cell
             out[ask] = cKDTree(whole).query(cell[ask], distance_upper_bound=reach)[0] < reach
         return out
+
+
+def static_submaps(submaps: Sequence[Submap], bases: Array) -> tuple[list[Submap], tuple[int, int]]:
+    """Submaps without the points that are on things that moved.
+
+    Parameters
+    ----------
+    submaps, bases
+        As for :func:`moving_points`.
+
+    Returns
+    -------
+    submaps : list of Submap
+    moving : (int, int)
+        Number of points that were removed, and of all.
+    """
+    if bases.shape[1] != 7 or all(s.cloud is None for s in submaps):
+        return list(submaps), (0, 0)
+    moving = moving_points(submaps, bases)
+    return without_moving(submaps, moving), (sum(int(m.sum()) for m in moving), sum(len(m) for m in moving))
 
 
 def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Submap]:
@@ -164,38 +180,11 @@ def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Su
     return out
 
 
-def seen_through_voxels(grid: EvidenceGrid, moments: Iterable[EvidenceGrid]) -> tuple[Array, Mask]:
-    """Occupied voxels of a map that more moments saw through than were stopped by.
-
-    Parameters
-    ----------
-    grid : EvidenceGrid
-        In space, z up.
-    moments : iterable of EvidenceGrid
-        Of single moments (one to a few seconds of scans each), in the lattice of the map. They need only half of
-        :data:`FREE`, since few beams pass a voxel in one.
-
-    Returns
-    -------
-    centres : (n, 3)
-        Of the occupied voxels [m].
-    moved : (n,) bool
-    """
-    occupied = np.asarray(grid.occupied_cloud())
-    free, stopped = np.zeros(len(occupied), np.int64), np.zeros(len(occupied), np.int64)
-    for moment in moments:
-        says = _says(moment, occupied, 0.5 * FREE)
-        free += says < 0
-        rows = np.flatnonzero(says > 0)
-        stopped[rows[moment.occupied_at(occupied[rows])]] += 1
-    return occupied, (free >= LEAST_FREE) & (free > stopped) & ~_ground(occupied, occupied)
-
-
 def _world(T: Array, points: Array) -> Array:
     return np.asarray(se3.se3_transform(T[None], points))
 
 
-def _says(grid: EvidenceGrid, points: Array, free: float) -> npt.NDArray[np.int64]:
+def known_state(grid: EvidenceGrid, points: Array, free: float) -> npt.NDArray[np.int64]:
     """Of points ``(n, 3)`` in a grid: -1 free with nothing occupied beside, 1 occupied there or beside, 0 neither."""
     known = grid.log_odds_at(points)
     out = np.zeros(len(points), np.int64)
@@ -208,7 +197,7 @@ def _says(grid: EvidenceGrid, points: Array, free: float) -> npt.NDArray[np.int6
     return out
 
 
-def _ground(points: Array, around: Array) -> Mask:
+def near_ground(points: Array, around: Array) -> Mask:
     """Which points lie little above the lowest one around them."""
     cell = np.floor(around[:, :2] / GROUND_CELL).astype(np.int64)
     first = cell.min(axis=0) - 1

@@ -23,6 +23,7 @@ from graphslam.maps.contradictions import NOTHING, Contradictions, find_contradi
 from graphslam.maps.export import storeys
 from graphslam.maps.fuse import FusedMap, fuse_pieces, reach_of
 from graphslam.maps.global_map import GlobalMap
+from graphslam.maps.moving import static_submaps
 from graphslam.maps.pieces import DivisionConfig, PieceId
 from graphslam.maps.submaps import DividedSubmaps, divide_submaps
 
@@ -77,6 +78,8 @@ class RunMap:
         Of the submaps' clouds at the solved poses [m]; None where they have none.
     passes : Contradictions
         What submaps say of others that came to the same place by another way.
+    moving : (int, int)
+        Points of the submaps' clouds on things that moved, which are left out, and points in all.
     coarsened : int
         Of the voxels of the submaps so many make an edge of one of the map: 1 unless it would be too wide for any pool.
     knows_space : bool
@@ -95,6 +98,7 @@ class RunMap:
     knows_space: bool = True
     coarsened: int = 1
     passes: Contradictions = NOTHING
+    moving: tuple[int, int] = (0, 0)
 
     def said(self) -> str:
         """What became of a map too wide for its voxels, in words; empty where nothing did."""
@@ -171,6 +175,8 @@ def make_run_map(
 ) -> RunMap:
     """Fuse the maps of a run's submaps: along the open chain first, then moved to where the graph has them.
 
+    What moved is left out (:func:`~graphslam.maps.moving.static_submaps`).
+
     Parameters
     ----------
     submaps : sequence of Submap
@@ -193,6 +199,7 @@ def make_run_map(
     division = DivisionConfig() if reach is None else DivisionConfig(reach=reach + REACH_MARGIN)
     level_nodes = m.dim == 3 and _levelled(m.base_poses)
     begin = time.perf_counter()
+    submaps, moving = static_submaps(submaps, m.base_poses[:-1])
     divided = divide_submaps(
         [_one_piece(s, nodes) for s in submaps],
         every=None,
@@ -229,6 +236,7 @@ def make_run_map(
         knows_space,
         coarsened,
         find_contradictions(divided.pieces, at, model),
+        moving,
     )
 
 

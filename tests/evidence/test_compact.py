@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from graphslam.core.errors import GridError
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.compact import CompactReport, compact_grids, move_grids
+from graphslam.evidence.compact import CompactReport, compact_grids
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.evidence.pool import GridPool
@@ -147,32 +143,3 @@ def test_grids_of_other_pools_are_refused() -> None:
     grids = [grid_of_map({(0, 0, 0): 1}), grid_of_map({(0, 0, 0): 1})]
     with pytest.raises(GridError, match="different pools"):
         compact_grids(grids)
-
-
-def test_moved_maps_are_the_same_and_the_old_pool_is_free(rng: np.random.Generator, tmp_path: Path) -> None:
-    """Of many maps in a pool two go on, and only they need memory."""
-    first = scanned_grid(rng)
-    second = first.copy()
-    second.write_bricks([[3, -2, 1]], np.full((1, 512), 7, np.int16))
-    second.lock()
-    dying = [grid_of_map({(i, 9, 3): i + 1}, pool=first.pool) for i in range(40)]
-    old, before = weakref.ref(first.pool), [map_of_grid(g) for g in (first, second)]
-    for k, g in enumerate((first, second)):
-        g.save(tmp_path / f"{k}.npz")
-    bytes_used = first.pool.used_bytes
-    move_grids([first, second])
-    del dying
-    gc.collect()
-    assert old() is None
-    assert first.pool is second.pool
-    check_pool(first.pool, [first, second])
-    assert [map_of_grid(g) for g in (first, second)] == before
-    assert second.locked
-    assert not first.locked
-    assert first.pool.nbytes < 8 * bytes_used
-    for k, g in enumerate((first, second)):
-        g.save(tmp_path / f"{k}-moved.npz")
-        assert (tmp_path / f"{k}-moved.npz").read_bytes() == (tmp_path / f"{k}.npz").read_bytes()
-    first.insert_scan([[0.4, 0.0, 0.0]])
-    assert map_of_grid(first) != before[0]
-    assert map_of_grid(second) == before[1]

@@ -5,8 +5,11 @@ import pytest
 
 from graphslam.core.dense import CloudMap
 from graphslam.core.submap import Submap
+from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.moving import MovedObjects, moving_points, without_moving
+from graphslam.maps.run_map import make_run_map
 from graphslam.sim.raycast import RayCaster
 
 SUBMAPS, SCANS = 12, 4
@@ -98,6 +101,22 @@ def test_its_voxels_are_gone_from_the_maps(made):
     assert after < 0.05 * before
     assert kept > 0.99 * stood
     assert sum(s.report.get("points_moved", 0) for s in left) == sum(m.sum() for m in moving_points(submaps, bases))
+
+
+def test_the_fused_map_is_without_it_whatever_path_it_is_of(made):
+    submaps, bases, truth = made
+    poses = np.concatenate([bases, [[0.5 * SUBMAPS, 0, 0, 0, 0, 0, 1]]])
+    times, none = np.arange(SUBMAPS + 1.0), np.zeros(0, np.int64)
+    solved = GlobalMap(
+        Trajectory(times, poses), times, poses, np.zeros((len(poses), 6, 6)), none, np.zeros((0, 2)),
+        np.zeros((0, 2, 2)), none,
+    )  # fmt: skip
+    fused = make_run_map(submaps, solved)
+    gone, every = fused.moving
+    assert every == sum(len(m) for m in truth)
+    assert gone == sum(m.sum() for m in moving_points(submaps, bases))
+    on = np.concatenate([bases[k, :3] + s.cloud.points[m] for k, (s, m) in enumerate(zip(submaps, truth))])
+    assert fused.fused.grid.occupied_at(on[on[:, 2] > -0.4]).mean() < 0.05
 
 
 def test_submaps_without_free_space_are_left_alone(made):

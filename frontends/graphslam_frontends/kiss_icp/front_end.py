@@ -135,7 +135,7 @@ class KissIcpOdometry(LidarOdometry):
         bridge: Array | None,
         told: Array | None,
         time: float,
-        by_gyro: bool,
+        by_imu: bool,
     ) -> tuple[Array, NormalEquations | None, ScanResult]:
         points, self.off = self._unbent(raw, predicted, time)[chosen], np.zeros(6)
         if len(points) < FEW:

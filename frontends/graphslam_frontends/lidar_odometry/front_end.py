@@ -578,7 +578,8 @@ def _findings(
             text += "Constant velocity is assumed there, with a matching covariance."
         out.append(Finding("bad" if alone > 0.5 * n else "look", "scans-lost", text))
     if report["scans_unheld"] > 0.5 * n:
-        by = "constant velocity" if not any(f.seen.bridged for f in own) else wheels
+        by = "constant velocity" if report.get("scans_aided", 0) < 0.5 * n else imu
+        by = wheels if any(f.seen.bridged for f in own) else by
         text = (
             f"unobservable directions in submap {key}: {report['scans_unheld']} of {n} scans, as in a corridor or on a "
             f"plain — the path along them is that of {by}."

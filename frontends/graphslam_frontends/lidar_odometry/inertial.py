@@ -43,6 +43,11 @@ FASTEST = 3.0
 """σ of the velocity before anything is known of it [m/s]."""
 MOSTLY = 0.8
 """Share of the scans at which gravity must be seen, to be told along a path."""
+FARTHEST = 5.0
+"""A match is refused where it is so many σ, and as many times as far as matches are by the median, off the place where
+readings lead, and …"""
+MISSED_FORCE = 0.5
+"""… by more than this acceleration would [m/s²]: a lever that is 0.1 m off, at 2 rad/s."""
 ON_ITS_SIDE = np.deg2rad(60.0)
 """Pitch beyond which roll is ill defined."""
 GRAVITY_SIGMA = (1.0, 0.2)
@@ -207,6 +212,7 @@ class InertialPredictor:
         self.cov = np.diag([0.0, FASTEST**2, GRAVITY_SIGMA[0] ** 2])
         self.kept: deque[tuple[float, Array]] = deque()
         self.missed: deque[tuple[float, float]] = deque(maxlen=COMPARED)
+        self.shifts: deque[float] = deque(maxlen=COMPARED)
         self.known = False
         self._up: Array | None = None
 
@@ -232,6 +238,17 @@ class InertialPredictor:
         last, pose = self.kept[-1]
         way = self.readings.way(last, np.array([time]), self.bias)
         return None if way is None else np.asarray(se3.se3_compose(pose, way.poses(self.velocity, self.gravity)[0]))
+
+    def reach(self, time: float) -> float:
+        """Distance from where :meth:`ahead` leads that a match may be off [m]: so many σ, and what the unit may miss.
+
+        Where most matches are farther off than that, the forces are wrong, not the matches.
+        """
+        dt = time - self.kept[-1][0]
+        moved = np.array([0.0, dt, 0.5 * dt**2])
+        own = self.readings.doubt(np.array([dt]), float(np.sqrt(self.bias_var)))[0]
+        sigma = np.sqrt(3.0 * (own + moved @ self.cov @ moved))
+        return FARTHEST * max(float(sigma), float(np.median(self.shifts or 0.0))) + 0.5 * MISSED_FORCE * dt**2
 
     def within(self, time: float, ages: Array) -> Array | None:
         """``T_now_then`` ``(m, 7)`` of the body at a time, and so many seconds ``(m,)`` before; None: not known."""

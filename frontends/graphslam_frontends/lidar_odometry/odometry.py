@@ -107,6 +107,8 @@ SUSPICIOUS = 0.7
 """Share of the running median of the overlap below which a scan is looked for far and wide."""
 
 
+MOST_WEAK = 3
+"""Directions, of those that surfaces hold least, along which a match gives way to an IMU."""
 GYRO_OFF = 0.15
 """A match that is turned further than this from what a gyro says [rad] is another place that looks alike: rooms look
 alike when turned by a right angle. A bias of 0.005 rad/s, large for a cheap gyro, turns by this in 30 s."""
@@ -439,7 +441,7 @@ class LidarOdometry:
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
             self.agreeing.append(float(np.trace(np.linalg.solve(E, G.T @ G))) / 6.0)
             M *= LASTING * float(np.mean(self.agreeing))
-            F = observable_gradient(fit.H, fit.every)
+            F = observable_gradient(fit.H, fit.every, seen.unheld)
             H, M = F @ H, F @ M @ F.T
         self.errors.step(self.pose, motion, Q, H, M, self._bent(raw), self.off)
 
@@ -460,7 +462,7 @@ class LidarOdometry:
         bridge: Array | None,
         told: Array | None,
         time: float,
-        by_gyro: bool,
+        by_imu: bool,
     ) -> tuple[Array, NormalEquations | None, ScanResult]:
         """Pose of a scan, the fit there, and what came of it.
 
@@ -475,12 +477,15 @@ class LidarOdometry:
             Covariance of that motion; None: of an even one, as scans saw it lately.
         time : float
             [s]
-        by_gyro : bool
-            A gyro says how ``predicted`` is turned: matches that are turned otherwise are refused.
+        by_imu : bool
+            An IMU says where ``predicted`` is and how it is turned: matches elsewhere are refused.
         """
+        inertial = self.inertial if by_imu else None
+        reach = np.inf if inertial is None else inertial.reach(time)
 
-        def turned_alike(pose: Array) -> bool:
-            return not by_gyro or float(np.linalg.norm(se3.se3_log(se3.se3_between(predicted, pose))[:3])) < GYRO_OFF
+        def alike(pose: Array, reach: float = reach) -> bool:
+            off = np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
+            return inertial is None or bool(np.linalg.norm(off[:3]) < GYRO_OFF and np.linalg.norm(off[3:]) < reach)
 
         points = self._unbent(raw, predicted, time)[chosen]
         stands = predicted if bridge is None else bridge
@@ -494,16 +499,17 @@ class LidarOdometry:
             searched = True
             tried = [(coarse.overlap, start)]
             tried += self._search(points, few, (predicted, self.anchor), self.near_rotations, 2, top)
-            alike = [x for x in tried if turned_alike(x[1])]
-            start = max(alike, key=lambda x: x[0])[1] if alike else predicted
+            near = [x for x in tried if alike(x[1])]
+            start = max(near, key=lambda x: x[0])[1] if near else predicted
+        start = start if alike(start) else predicted
         pose, points, fit = self._finish(raw, chosen, start, time)
         state = "matched"
         few_of_it = len(self.overlaps) >= 3 and fit.overlap < SUSPICIOUS * np.median(self.overlaps)
         if few_of_it or self._late(time):
             searched = True
             found = self._search(points, few, (predicted, self.anchor), self.wide_rotations, 6, self.levels)
-            alike = [x for x in found if turned_alike(x[1])]
-            overlap, best = max(alike, key=lambda x: x[0]) if alike else (0.0, start)
+            near = [x for x in found if alike(x[1])]
+            overlap, best = max(near, key=lambda x: x[0]) if near else (0.0, start)
             if overlap > BETTER * fit.overlap:
                 start = best
                 pose, points, fit = self._finish(raw, chosen, start, time)
@@ -515,13 +521,18 @@ class LidarOdometry:
                 )
                 spread = self.spread if told is None else told
                 state = "new space" if fits and not _far(stands, pose, spread) else "lost"
-        if not turned_alike(pose):
-            state = "lost"
-        if state == "lost":
-            return stands, None, ScanResult(len(points), fit.overlap, 6, state, searched)
+        free, (pose, unheld) = pose, self._hold(pose, stands, fit)
+        if inertial is not None and state != "lost":
+            inertial.shifts.append(float(np.linalg.norm(se3.se3_between(predicted, pose)[:3])))
+            while not alike(pose) and alike(pose, np.inf) and unheld < MOST_WEAK:
+                # what holds a scan least lets it slide: along a wall, say
+                pose, unheld = self._hold(free, stands, fit, unheld + 1)
+                at_it = self.levels[-1].fit(self._unbent(raw, pose, time)[chosen], *split_pose(pose), SCALE)
+                state = "matched" if at_it.overlap > SUSPICIOUS * fit.overlap else "lost"
+        if state == "lost" or not alike(pose):
+            return stands, None, ScanResult(len(points), fit.overlap, 6, "lost", searched)
         if fit.known < LITTLE:
             return start if bridge is None else bridge, None, ScanResult(len(points), fit.overlap, 6, state, searched)
-        free, (pose, unheld) = pose, self._hold(pose, stands, fit)
         if unheld and bridge is None and len(self.missed) < 3:
             # nobody knows yet how it moves: rest is believed where the scan fits there as well
             points = self._unbent(raw, pose, time)[chosen]
@@ -600,9 +611,9 @@ class LidarOdometry:
                 out.append((fit.overlap, pose))
         return out
 
-    def _hold(self, pose: Array, predicted: Array, fit: NormalEquations) -> tuple[Array, int]:
-        """Take the prediction along directions that no surface holds, and tell how many these are."""
-        P = observable_projection(fit.H, fit.every)
+    def _hold(self, pose: Array, predicted: Array, fit: NormalEquations, least: int = 0) -> tuple[Array, int]:
+        """Take the prediction along directions that no surface holds, ``least`` of them or more; and their number."""
+        P = observable_projection(fit.H, fit.every, least)
         unheld = 6 - round(float(np.trace(P)))
         if unheld:
             xi = P @ np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
@@ -617,7 +628,7 @@ def _far(predicted: Array, pose: Array, spread: Array) -> bool:
     return bool(np.linalg.norm(off[:3]) > NEAR[0] + turn or np.linalg.norm(off[3:]) > NEAR[1] + shift)
 
 
-def observable_projection(H: Array, every: Array) -> Array:
+def observable_projection(H: Array, every: Array, least: int = 0) -> Array:
     """Projection ``(6, 6)`` of motions onto the directions that surfaces hold.
 
     Parameters
@@ -626,16 +637,22 @@ def observable_projection(H: Array, every: Array) -> Array:
         Information of a scan.
     every : (6, 6)
         What the same points would say with surfaces turned anyhow.
+    least : int
+        Number of the weakest directions that are left out anyhow.
     """
     values, V, B = _directions(H, every)
-    U = V[:, values > PRETENDED]
+    U = V[:, max(int(np.sum(values <= PRETENDED)), least) :]
     return np.asarray(U @ U.T @ B)
 
 
-def observable_gradient(H: Array, every: Array) -> Array:
-    """What ``(6, 6)`` takes a gradient to that part of it that is not pretended by noise of the normals."""
+def observable_gradient(H: Array, every: Array, least: int = 0) -> Array:
+    """What ``(6, 6)`` takes a gradient to that part of it that is not pretended by noise of the normals.
+
+    Nothing is left of it along the ``least`` weakest directions.
+    """
     values, V, B = _directions(H, every)
     share = np.maximum(1.0 - PRETENDED / np.maximum(values, 1e-9), 0.0)
+    share[:least] = 0.0
     return np.asarray(B @ (V * share) @ V.T)
 
 

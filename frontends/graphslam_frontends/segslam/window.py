@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.poses import group_of
 from graphslam_frontends.grid.weights import evenly_spaced_indices
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.segmentation import LookAheadWindow, gather_window
@@ -61,11 +60,3 @@ def gather_look_ahead(steps: Steps, step: int, seconds: float) -> LookAheadScan:
         steps.odometry.increments[rows.start : rows.stop], [steps.scan(k) for k in rows], steps.max_range
     )
     return LookAheadScan(step=step, last=last, full=bool(steps.times[-1] >= until - slack), window=window)
-
-
-def deskew_to_now(steps: Steps, poses: Array, step: int, target: int) -> Array:
-    """Poses ``(n, 7)`` or ``(n, 3)`` at a later step, by dead reckoning from where the filter is."""
-    group, out = group_of(poses), np.asarray(poses)
-    for k in range(step + 1, target + 1):
-        out = group.compose(out, np.broadcast_to(steps.odometry.increments[k], out.shape))
-    return out

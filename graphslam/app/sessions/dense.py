@@ -25,6 +25,8 @@ from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.inter_session_loops import SessionMap
+from graphslam.maps.moving import static_submaps
+from graphslam.maps.refined import base_frames
 
 SPACING = 3.0
 """Of the nodes of a run that has none inside its submaps [m]: places to be tied are needed."""
@@ -36,14 +38,15 @@ def run_is_dense(run: Run) -> bool:
 
 
 def submaps_with_maps(run: Run) -> list[Submap]:
-    """The submaps of a run with their dense maps, along its refined path where it has one."""
-    submaps = refined_submaps_of(run) or list(run.submaps)
+    """The submaps of a run with their dense maps, without what moved, along its refined path where it has one."""
+    refined = refined_submaps_of(run)
+    submaps = refined or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
         submaps = read_submaps(run.folder, load_grid=load_spilled)
     without = [s.key for s in submaps if not has_dense_view(s)]
     if without:
         raise DataError(f"submaps {without} have no map", where=run.name, wanted="evidence grids or clouds")
-    return submaps
+    return static_submaps(submaps, (base_frames(run.map) if refined else run.map.base_poses)[:-1])[0]
 
 
 def back_end_config(run: Run) -> BackEndConfig:

@@ -3,12 +3,14 @@
 ``gone``: share of the voxels in which only things that move were met, that are not occupied in the map. ``lost``:
 share of those occupied in a map drawn without these things that are not occupied in the map drawn with them. Both maps
 are drawn along the path that the run found. ``evidence``: the beams added up. ``outvoted``: besides, without voxels
-that more moments saw through than were stopped by (:func:`graphslam.maps.moving.seen_through_voxels`).
+that more moments saw through than were stopped by: evidence adds up beam by beam, so a person who stands for a second
+before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them. Where every moment has one
+vote, they do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from time import process_time
 
@@ -22,7 +24,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.se3 import se3_transform
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.maps.moving import seen_through_voxels
+from graphslam.maps.moving import FREE, LEAST_FREE, Mask, known_state, near_ground
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.scan_window.front_end import ScanWindow
@@ -32,6 +34,33 @@ from graphslam_studies.sim.campus import simulate_campus
 
 ALL = 1_000_000
 """Beams of a step: every one of them is scored."""
+
+
+def seen_through_voxels(grid: EvidenceGrid, moments: Iterable[EvidenceGrid]) -> tuple[Array, Mask]:
+    """Occupied voxels of a map that more moments saw through than were stopped by.
+
+    Parameters
+    ----------
+    grid : EvidenceGrid
+        In space, z up.
+    moments : iterable of EvidenceGrid
+        Of single moments (one to a few seconds of scans each), in the lattice of the map. They need only half of
+        :data:`~graphslam.maps.moving.FREE`, since few beams pass a voxel in one.
+
+    Returns
+    -------
+    centres : (n, 3)
+        Of the occupied voxels [m].
+    moved : (n,) bool
+    """
+    occupied = np.asarray(grid.occupied_cloud())
+    free, stopped = np.zeros(len(occupied), np.int64), np.zeros(len(occupied), np.int64)
+    for moment in moments:
+        says = known_state(moment, occupied, 0.5 * FREE)
+        free += says < 0
+        rows = np.flatnonzero(says > 0)
+        stopped[rows[moment.occupied_at(occupied[rows])]] += 1
+    return occupied, (free >= LEAST_FREE) & (free > stopped) & ~near_ground(occupied, occupied)
 
 
 def run_moving_trial(config: CampusTrialConfig, seed: int) -> list[Measurement]:

@@ -14,10 +14,12 @@ from graphslam.core.imu import GRAVITY, Imu, ImuNoise
 from graphslam.core.random import SeedTree
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.io.submap_file import submap_arrays, submap_from_arrays
+from graphslam_frontends.lidar_odometry import inertial as inertial_module
 from graphslam_frontends.lidar_odometry import odometry as odometry_module
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, start_odometry
 from graphslam_frontends.lidar_odometry.inertial import (
+    FARTHEST,
     ImuReadings,
     InertialMotion,
     align_with_gravity,
@@ -228,17 +230,19 @@ def wrong(log, what):
         return replace(imu, angular_rate=imu.angular_rate[:, [1, 2, 0]])
     if what == "late":
         return replace(imu, times=imu.times + 0.4)
+    if what == "forces":  # in g: where they lead is wrong, and matches are not
+        return replace(imu, specific_force=imu.specific_force / GRAVITY)
     return imu.take(np.r_[0:600, 1000 : len(imu.times)])  # a gap of two seconds
 
 
-@pytest.mark.parametrize("what", ["degrees", "axes", "late", "gap"])
+@pytest.mark.parametrize("what", ["degrees", "axes", "late", "forces", "gap"])
 def test_a_wrong_unit_does_no_harm(logs, plain, what):
     log = logs[0]
     alone = errors(plain[0][0], log)
     poses, odometry = follow(log, wrong(log, what))
     off = errors(poses, log)
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 1.2 * np.linalg.norm(alone[:, 3:], axis=1).max() + 0.01
-    assert odometry.inertial.believed == (what == "gap")
+    assert odometry.inertial.believed == (what in ("forces", "gap"))
 
 
 def test_a_wrong_unit_is_a_line_of_the_report(logs):
@@ -363,6 +367,16 @@ def test_scans_may_be_stamped_when_they_begin(paths):
 def test_a_place_that_looks_alike_when_turned_is_refused_by_the_gyro(monkeypatch, limit, fooled):
     """Rooms look alike when turned by a right angle: the search once turned this path by 90° against its own gyro."""
     monkeypatch.setattr(odometry_module, "GYRO_OFF", limit)
+    monkeypatch.setattr(inertial_module, "FARTHEST", 1e6)  # or its place would be refused
     log = ScanWorld(kind="lidar", number=91, seconds=70.0).log(7)
     path, _ = follow(log, log["imu"])
     assert (float(np.abs(errors(path, log)[:, :3]).max()) > 1.0) == fooled
+
+
+@pytest.mark.parametrize(("limit", "fooled"), [(FARTHEST, False), (1e6, True)])
+def test_a_match_that_slides_along_a_wall_is_held_by_the_imu(monkeypatch, limit, fooled):
+    """Walls that hold a scan barely more than noise of their normals once moved this path by metres, scan by scan."""
+    monkeypatch.setattr(inertial_module, "FARTHEST", limit)
+    log = ScanWorld(kind="lidar", number=10, seconds=82.0).log(1)
+    path, _ = follow(log, log["imu"])
+    assert (float(np.abs(errors(path, log)[:, 3:]).max()) > 0.8) == fooled

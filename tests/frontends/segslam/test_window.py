@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry
-from graphslam_frontends.segslam.window import deskew_to_now, gather_look_ahead
+from graphslam_frontends.segslam.window import gather_look_ahead
 from tests.frontends.grid_world import ring
 
 
@@ -32,7 +32,6 @@ def test_points_ahead_lie_where_the_true_motion_puts_them(dim: int) -> None:
         expected.append(group.transform(np.broadcast_to(T, (int(returns.sum()), group.size)), p[returns]))
     np.testing.assert_allclose(ahead.window.points, np.concatenate(expected), atol=1e-9)
     assert ahead.window.beams == 5 * 40
-    np.testing.assert_allclose(deskew_to_now(steps, truth[7:8], 7, 12), truth[12:13], atol=1e-9)
     near = ahead.source(25, 3.0)
     assert len(near) == 25
     assert np.linalg.norm(near, axis=1).max() <= 3.0
