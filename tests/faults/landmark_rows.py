@@ -106,7 +106,7 @@ WHEELS: list[tuple[str, inject.Inject]] = [
 SIGHTINGS: list[tuple[str, inject.Inject]] = [
     ("bearings mirrored", inject.mirrored()),
     ("bearings off by 10°", inject.bearing_offset(np.deg2rad(10.0))),
-    ("bearings in degrees", inject.bearings_ininject.degrees()),
+    ("bearings in degrees", inject.bearings_in_degrees()),
     ("ranges × 2", inject.ranges(2.0)),
     ("ranges × 1.05", inject.ranges(1.05)),
     ("ranges constant", inject.constant_ranges(7.0)),
