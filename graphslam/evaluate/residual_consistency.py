@@ -31,6 +31,10 @@ LASTING = "correlated: overconfident"
 JUDGED_WITH = {"path": ("gps", "control", "distance")}
 """Factors that measure nothing by themselves: points of a path are there for the fixes or control points, and share
 their residuals; the first class that a graph has."""
+NOT_TESTED = {"tie": 0, "levelled": 2}
+"""Classes made of the poses, or of the gravity, that other factors hold already: their residuals are small whatever the
+covariances are, and test nothing. With each the unknowns that it determines alone: levelled bases the tilt of the
+frame."""
 LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
@@ -101,6 +105,11 @@ class ClassConsistency:
         return self.dof / (1.0 if self.whiteness is None else self.whiteness.tau)
 
     @property
+    def tested(self) -> bool:
+        """Are the residuals independent of those of other classes?"""
+        return self.name not in NOT_TESTED
+
+    @property
     def ratio(self) -> float:
         """χ²/dof; ``nan`` for a class whose every row went into the unknowns."""
         return self.chi2 / self.dof if self.dof > 1e-6 * self.rows else float("nan")
@@ -114,7 +123,9 @@ class ClassConsistency:
         """
         low, high, verdict = float("nan"), float("nan"), "no redundancy"
         w = self.whiteness
-        if np.isfinite(self.ratio):
+        if not self.tested:
+            verdict = "not tested"
+        elif np.isfinite(self.ratio):
             low, high, verdict = two_sided_bounds(self.ratio, self.independent, self.confidence)
             verdict = LASTING if w is not None and w.lasting() else verdict
         return {

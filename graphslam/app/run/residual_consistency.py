@@ -32,7 +32,7 @@ from graphslam.evaluate.metrics import Metrics
 from graphslam.evaluate.residual_consistency import ClassConsistency, class_consistency
 from graphslam.graph.factor_graph import FactorGraph
 
-OF_THE_MAP = ("submap", "lasting", "dense-submap", "match", "loop", "tie")
+OF_THE_MAP = ("submap", "lasting", "dense-submap", "match", "loop")
 """Classes of factors whose χ² covers motion and sightings."""
 MOST_FORETOLD = {2: 1000, 3: 300}
 """Withheld fixes whose prediction is looked at, spread evenly over the run, by dimension of the graph."""
@@ -89,6 +89,8 @@ class ResidualConsistency:
     def _evidence(self, submaps: Sequence[Submap]) -> list[ConsistencyTest]:
         out = short_window_tests(sum_bias_windows([s.report for s in submaps]))
         for name, c in self.classes.items():
+            if not c.tested:
+                continue
             of: Of = "map" if name in OF_THE_MAP else "fixes" if name == "gps" else "other"
             chi2, dof = c.chi2, c.dof
             if name == "gps" and "gps-bias" in self.classes:  # a bias for each fix takes up what the fix says
@@ -144,7 +146,7 @@ def check_residual_consistency(
     classes = class_consistency(graph)
     for name, c in classes.items():
         row = c.as_row()
-        if not np.isfinite(c.ratio):
+        if not np.isfinite(c.ratio) or not c.tested:
             continue
         out.add(f"honesty_{name}_chi2_per_dof", c.ratio, "", "one")
         out.add(f"honesty_{name}_dof", c.dof)
