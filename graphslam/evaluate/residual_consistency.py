@@ -32,9 +32,8 @@ JUDGED_WITH = {"path": ("gps", "control", "distance")}
 """Factors that measure nothing by themselves: points of a path are there for the fixes or control points, and share
 their residuals; the first class that a graph has."""
 NOT_TESTED = {"tie": 0, "levelled": 2}
-"""Classes made of the poses, or of the gravity, that other factors hold already: their residuals are small whatever the
-covariances are, and test nothing. With each the unknowns that it determines alone: levelled bases the tilt of the
-frame."""
+"""Classes made of poses or gravity that other factors contain already: their small residuals test nothing. With each
+the number of unknowns that it determines alone: levelled bases the tilt of the frame."""
 LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
@@ -121,11 +120,9 @@ class ClassConsistency:
         wide rather than narrow. Residuals that are alike from one to the next are overconfident whatever their size:
         a map that follows errors that last has small residuals.
         """
-        low, high, verdict = float("nan"), float("nan"), "no redundancy"
+        low, high, verdict = float("nan"), float("nan"), "no redundancy" if self.tested else "not tested"
         w = self.whiteness
-        if not self.tested:
-            verdict = "not tested"
-        elif np.isfinite(self.ratio):
+        if self.tested and np.isfinite(self.ratio):
             low, high, verdict = two_sided_bounds(self.ratio, self.independent, self.confidence)
             verdict = LASTING if w is not None and w.lasting() else verdict
         return {

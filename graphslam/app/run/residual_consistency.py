@@ -88,9 +88,7 @@ class ResidualConsistency:
 
     def _evidence(self, submaps: Sequence[Submap]) -> list[ConsistencyTest]:
         out = short_window_tests(sum_bias_windows([s.report for s in submaps]))
-        for name, c in self.classes.items():
-            if not c.tested:
-                continue
+        for name, c in ((n, c) for n, c in self.classes.items() if c.tested):
             of: Of = "map" if name in OF_THE_MAP else "fixes" if name == "gps" else "other"
             chi2, dof = c.chi2, c.dof
             if name == "gps" and "gps-bias" in self.classes:  # a bias for each fix takes up what the fix says

@@ -280,9 +280,8 @@ def whole_chi2(figures: RunMetrics) -> tuple[float, float] | None:
         r for r in class_rows(figures) if is_finite_number(r.get("dof")) and is_finite_number(r.get("chi2_per_dof"))
     ]
     tested = [r for r in rows if r.get("class") not in NOT_TESTED]
-    # without the others the graph has as many residuals fewer, and the unknowns that these alone determine
-    others = [float(r.get("rows", 0)) - NOT_TESTED[r["class"]] for r in rows if r not in tested]
-    dof = sum(float(r["dof"]) for r in rows) - sum(max(n, 0.0) for n in others)
+    less = sum(max(float(r.get("rows", 0)) - NOT_TESTED[r["class"]], 0.0) for r in rows if r not in tested)
+    dof = sum(float(r["dof"]) for r in rows) - less  # of the graph without the others
     return (sum(float(r["chi2"]) for r in tested if is_finite_number(r.get("chi2"))), dof) if dof > 0.5 else None
 
 
