@@ -32,8 +32,7 @@ JUDGED_WITH = {"path": ("gps", "control", "distance")}
 """Factors that measure nothing by themselves: points of a path are there for the fixes or control points, and share
 their residuals; the first class that a graph has."""
 NOT_TESTED = {"tie": 0, "levelled": 2}
-"""Classes made of poses or gravity that other factors contain already: their small residuals test nothing. With each
-the number of unknowns that it determines alone: levelled bases the tilt of the frame."""
+"""Classes made of poses or gravity of other factors: small residuals test nothing; with the unknowns of each alone."""
 LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
@@ -104,11 +103,6 @@ class ClassConsistency:
         return self.dof / (1.0 if self.whiteness is None else self.whiteness.tau)
 
     @property
-    def tested(self) -> bool:
-        """Are the residuals independent of those of other classes?"""
-        return self.name not in NOT_TESTED
-
-    @property
     def ratio(self) -> float:
         """χ²/dof; ``nan`` for a class whose every row went into the unknowns."""
         return self.chi2 / self.dof if self.dof > 1e-6 * self.rows else float("nan")
@@ -120,9 +114,13 @@ class ClassConsistency:
         wide rather than narrow. Residuals that are alike from one to the next are overconfident whatever their size:
         a map that follows errors that last has small residuals.
         """
-        low, high, verdict = float("nan"), float("nan"), "no redundancy" if self.tested else "not tested"
+        low, high, verdict = (
+            float("nan"),
+            float("nan"),
+            "no redundancy" if self.name not in NOT_TESTED else "not tested",
+        )
         w = self.whiteness
-        if self.tested and np.isfinite(self.ratio):
+        if self.name not in NOT_TESTED and np.isfinite(self.ratio):
             low, high, verdict = two_sided_bounds(self.ratio, self.independent, self.confidence)
             verdict = LASTING if w is not None and w.lasting() else verdict
         return {

@@ -99,10 +99,8 @@ class GraphLoops:
         """A between-factor of declared ``shared-scan`` evidence."""
         s = self.graph.submaps[int(self.places.submap[loop.j])]
         used = EvidenceUse(["match"], s.interval, "shared-scan")
-        group = TIE if loop.source == TIE else GROUP
-        return self.graph.add_between(
-            loop.i, loop.j, loop.T_ij, loop.covariance, evidence=used, robust=robust, group=group
-        )
+        g = TIE if loop.source == TIE else GROUP
+        return self.graph.add_between(loop.i, loop.j, loop.T_ij, loop.covariance, evidence=used, robust=robust, group=g)
 
     def remove_loop(self, factor_id: int) -> None:
         """See :class:`~graphslam.loops.loops.LoopGraph`."""

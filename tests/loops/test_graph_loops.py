@@ -117,7 +117,7 @@ def test_ties_are_a_class_of_their_own_that_tests_nothing() -> None:
         T = group_of(x).between(x[i], x[j])
         ours.add_loop(replace(loop_of(poses[::3], i, j, rng), T_ij=T, source="tie"), RobustKernel())
     classes = class_consistency(ours.graph)
-    assert {k: c.tested for k, c in classes.items()} == {"dense-submap": True, "loop": True, "tie": False}
+    assert set(classes) == {"dense-submap", "loop", "tie"}
     assert classes["tie"].as_row()["verdict"] == "not tested"
     assert classes["tie"].factors == 10
     out = Metrics()
