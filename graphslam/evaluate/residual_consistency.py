@@ -31,6 +31,7 @@ LASTING = "correlated: overconfident"
 JUDGED_WITH = {"path": ("gps", "control", "distance")}
 """Factors that measure nothing by themselves: points of a path are there for the fixes or control points, and share
 their residuals; the first class that a graph has."""
+NOT_TESTED = {"tie": 0, "levelled": 2}  # made of poses or gravity of other factors; unknowns that each alone has
 LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 
@@ -112,9 +113,9 @@ class ClassConsistency:
         wide rather than narrow. Residuals that are alike from one to the next are overconfident whatever their size:
         a map that follows errors that last has small residuals.
         """
-        low, high, verdict = float("nan"), float("nan"), "no redundancy"
-        w = self.whiteness
-        if np.isfinite(self.ratio):
+        low = high = float("nan")
+        w, verdict = self.whiteness, "not tested" if self.name in NOT_TESTED else "no redundancy"
+        if self.name not in NOT_TESTED and np.isfinite(self.ratio):
             low, high, verdict = two_sided_bounds(self.ratio, self.independent, self.confidence)
             verdict = LASTING if w is not None and w.lasting() else verdict
         return {
@@ -161,8 +162,7 @@ def class_consistency(graph: FactorGraph, *, confidence: float = 0.95) -> dict[s
         again = w * h if sandwich is None else float(np.sum(H_free * sandwich[np.ix_(c, c)]))
         dof = record.rows - 2.0 * w * h + again
         name = next((n for n in JUDGED_WITH.get(record.group, ()) if n in classes), record.group)
-        own = float(name == record.group)  # points of a path are no fixes
-        sums.setdefault(name, []).append((record.rows, w * h, dof, float(d2), float(w), own))
+        sums.setdefault(name, []).append((record.rows, w * h, dof, float(d2), float(w), float(name == record.group)))
     series = _series(graph, covariance)
     out = {}
     for name, rows in sums.items():

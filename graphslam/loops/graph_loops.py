@@ -15,6 +15,7 @@ from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.relative import relative_poses
+from graphslam.loops.candidates import TIE
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints, Places, places_at_nodes
 
@@ -98,9 +99,8 @@ class GraphLoops:
         """A between-factor of declared ``shared-scan`` evidence."""
         s = self.graph.submaps[int(self.places.submap[loop.j])]
         used = EvidenceUse(["match"], s.interval, "shared-scan")
-        return self.graph.add_between(
-            loop.i, loop.j, loop.T_ij, loop.covariance, evidence=used, robust=robust, group=GROUP
-        )
+        g = TIE if loop.source == TIE else GROUP
+        return self.graph.add_between(loop.i, loop.j, loop.T_ij, loop.covariance, evidence=used, robust=robust, group=g)
 
     def remove_loop(self, factor_id: int) -> None:
         """See :class:`~graphslam.loops.loops.LoopGraph`."""

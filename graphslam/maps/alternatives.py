@@ -22,7 +22,7 @@ from graphslam.maps.fuse import FusedMap
 from graphslam.maps.minimum_entropy import MapHypothesis, rank_by_entropy
 from graphslam.solve.solution import Solution
 
-TIES = ("match", "loop")
+TIES = ("match", "loop", "tie")
 """Classes of factors that close loops."""
 
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from graphslam.app.run.residual_consistency import ResidualConsistency
+from graphslam.app.run.verdict import RunMetrics, whole_chi2
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
+from graphslam.evaluate.metrics import Metrics, solution_metrics
+from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.noise import RobustKernel
@@ -95,6 +101,38 @@ def test_undo_gives_the_evidence_back() -> None:
     assert d.factor_id not in ours.graph.records
     np.testing.assert_allclose(ours.graph.values.poses, before, atol=1e-6)
     ours.add_loop(loop_of(poses[::3], 2, 18, np.random.default_rng(1)), RobustKernel("huber", 3.0))
+
+
+def test_ties_are_a_class_of_their_own_that_tests_nothing() -> None:
+    """They were made of the poses of the chain: their small residuals must not pass for a sign of small errors."""
+    poses = square_poses(3, nodes=73)
+    rng = np.random.default_rng(2)
+    ours = graph_of(submaps_of(poses, rng))
+    x = ours.graph.values.poses
+    ours.add_loop(loop_of(poses[::3], 2, 18, rng), RobustKernel())
+    ours.solve()
+    alone = class_consistency(ours.graph)
+    for i in range(3, 13):
+        j = i + 10
+        T = group_of(x).between(x[i], x[j])
+        ours.add_loop(replace(loop_of(poses[::3], i, j, rng), T_ij=T, source="tie"), RobustKernel())
+    classes = class_consistency(ours.graph)
+    assert set(classes) == {"dense-submap", "loop", "tie"}
+    assert classes["tie"].as_row()["verdict"] == "not tested"
+    assert classes["tie"].factors == 10
+    out = Metrics()
+    solution_metrics(out, ours.solver.solution(), 0)
+    keys = {r["key"] for r in out.rows}
+    assert {"tie_chi2", "loop_chi2_per_dof"} <= keys
+    assert "tie_chi2_per_dof" not in keys
+    # of the whole graph as many degrees of freedom are tested as without them
+    whole = whole_chi2(RunMetrics({"graph": {"classes": [c.as_row() for c in classes.values()]}}, {}))
+    assert whole is not None
+    assert whole[1] == pytest.approx(sum(c.dof for c in alone.values()), abs=1e-6)
+    # no test of covariances is made of them; of the same residuals of a class that measures, one is
+    for name, said in (("tie", False), ("loop", True)):
+        found = ResidualConsistency({name: replace(classes["tie"], name=name)}, None, None).evidence([])
+        assert any(t.name == f"χ² of {name}" for t in found) == said
 
 
 def test_places_of_a_graph_are_those_of_its_submaps() -> None:

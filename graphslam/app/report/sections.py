@@ -222,7 +222,8 @@ def graph_section(folder: ReportFolder) -> Markup:
     parts.append(
         remark(
             "dof: number of scalars minus the unknowns determined by the class. χ²: without robust kernels. Weights: "
-            "of the kernels. Above the bounds the assumed noise is too small, below them too large."
+            "of the kernels. Above the bounds the assumed noise is too small, below them too large. Not tested: "
+            "factors made of poses or of gravity that other factors contain already; their residuals are always small."
         )
     )
     return page_section("graph", "Graph", *parts)

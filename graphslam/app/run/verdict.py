@@ -28,7 +28,7 @@ from graphslam.evaluate.covariance_assessment import (
     detection_power,
 )
 from graphslam.evaluate.intervals import by_chance, two_sided_width
-from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
+from graphslam.evaluate.residual_consistency import LASTING, NOT_TESTED, two_sided_bounds
 from graphslam.evaluate.stream_checks import StreamFinding
 from graphslam.maps.contradictions import LOOK
 
@@ -275,12 +275,14 @@ def class_rows(figures: RunMetrics) -> list[dict[str, Any]]:
 
 
 def whole_chi2(figures: RunMetrics) -> tuple[float, float] | None:
-    """χ² and degrees of freedom of all classes that have any; None where that is not known."""
+    """χ² and degrees of freedom of all classes that test anything; None where there are none, or not known."""
     rows = [
         r for r in class_rows(figures) if is_finite_number(r.get("dof")) and is_finite_number(r.get("chi2_per_dof"))
     ]
-    dof = sum(float(r["dof"]) for r in rows)
-    return (sum(float(r["chi2"]) for r in rows if is_finite_number(r.get("chi2"))), dof) if dof > 0 else None
+    tested = [r for r in rows if r.get("class") not in NOT_TESTED]
+    less = sum(max(float(r.get("rows", 0)) - NOT_TESTED[r["class"]], 0.0) for r in rows if r not in tested)
+    dof = sum(float(r["dof"]) for r in rows) - less  # of the graph without the others
+    return (sum(float(r["chi2"]) for r in tested if is_finite_number(r.get("chi2"))), dof) if dof > 0.5 else None
 
 
 @dataclass(frozen=True, slots=True)
