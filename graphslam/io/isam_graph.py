@@ -17,6 +17,7 @@ noise is asked for as information or its square root, that is meant of landmarks
 
 from __future__ import annotations
 
+import logging
 import os
 from typing import Literal, get_args
 
@@ -30,6 +31,9 @@ from graphslam.io.network_builder import NetworkBuilder, edge_labels, sighting_l
 from graphslam.io.text_records import Records
 
 Noise = Literal["auto", "covariance", "information", "sqrt-information", "toro"]
+UNKNOWN_TURN = 0.5
+"""A measured turn of this standard deviation says hardly anything [rad]: the columns probably mean something else."""
+log = logging.getLogger(__name__)
 LAYOUTS: dict[str, tuple[int, int]] = {
     "VERTEX2": (1, 3),
     "EDGE2": (2, 9),
@@ -99,12 +103,21 @@ def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
     for name, places in patterns.items():
         wanted = np.isin(np.arange(6), places)
         if (nonzero == wanted).all():
+            turn = float(np.sqrt(np.median(columns[:, 5])))
+            if name == "covariance" and turn > UNKNOWN_TURN:
+                log.warning(
+                    "%s: noise columns are read as covariances, as GTSAM does, so that σ of a turn is "
+                    "%.0f degrees. Programs that use iSAM write the square root of the information: "
+                    "--noise sqrt-information",
+                    records.path,
+                    np.rad2deg(turn),
+                )
             return name
     odd = np.flatnonzero((nonzero != np.isin(np.arange(6), [0, 3, 5])).any(axis=1))
     raise FormatError(
         "the meaning of the noise columns is not clear from the numbers",
         where=records.where(int(lines[odd[0]])),
-        wanted='in Python, noise="covariance", "information", "sqrt-information" or "toro"',
+        wanted="--noise covariance, information, sqrt-information or toro (in Python noise=…)",
     )
 
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from graphslam.app.cli import app
 from graphslam.core.errors import ConfigError, CovarianceError, FormatError, MissingDataError
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.gtsam_values import to_gtsam
@@ -261,3 +263,15 @@ def test_priors_are_edges_from_the_origin(tmp_path: Path) -> None:
     np.testing.assert_allclose(solved[list(net.ids).index(7)], [2, 0, 0.5], atol=1e-9)
     spatial = read_g2o(put(tmp_path, SE3 + f"EDGE_PRIOR_SE3:QUAT 1 0 3 0 0 0 0 0 1 {INFO3}\n"))
     assert spatial.poses[np.flatnonzero(spatial.fixed)[0]].tolist() == [0, 0, 0, 0, 0, 0, 1]
+
+
+def test_noise_columns_that_say_nothing_of_the_turn_raise_a_doubt(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = "EDGE2 0 1 1 0 0.1 10 0 0 10 0 50\nEDGE2 1 2 1 0 0.1 10 0 0 10 0 50\n"
+    path = put(tmp_path, text, "isam.txt")
+    assert read_network(path).information[0, 2, 2] == pytest.approx(1 / 50)
+    assert "--noise sqrt-information" in caplog.text
+    asked = CliRunner().invoke(app, ["solve", str(path), "--noise", "sqrt-information", "--json"])
+    assert asked.exit_code == 0, asked.output
+    assert read_network(path, noise="sqrt-information").information[0, 2, 2] == pytest.approx(2500)

@@ -25,6 +25,9 @@ def solve_command(
         ..., help="Pose-graph file (.g2o, .graph or .txt, also .xz, .gz, .bz2), or DATA-SET/FILE."
     ),
     solver: str = typer.Option("lm", help="Name of the solver: lm, isam2, gnc or pcg."),
+    noise: str = typer.Option(
+        "auto", help="Noise columns of TORO and iSAM files: covariance, information, sqrt-information or toro."
+    ),
     repair: bool = typer.Option(
         False,
         "--repair",
@@ -57,7 +60,14 @@ def solve_command(
         path = found
     names = None if starts is None else "all" if starts == "all" else starts.split(",")
     value = solve_network_file(
-        path, solver, repair=repair, create_missing=create_missing, out=out, starts=names, certificate=certify
+        path,
+        solver,
+        noise=cast(Any, noise),
+        repair=repair,
+        create_missing=create_missing,
+        out=out,
+        starts=names,
+        certificate=certify,
     )
     print_result(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
 
