@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
+from graphslam.core.markup import html_element, join_parts
+
 Level = Literal["good", "look", "bad", ""]
 """``good``: checked and right. ``look``: may be wrong. ``bad``: wrong, the map is not to be trusted. Empty: a fact."""
 LEVELS: tuple[Level, ...] = ("", "good", "look", "bad")
@@ -43,6 +45,17 @@ class Finding:
         return cls(cast(Level, row["level"]), row["code"], row["text"])
 
 
+class Findings(list[Finding]):
+    """Lines of a verdict, which print as text and show as a list in a notebook."""
+
+    def __str__(self) -> str:
+        return "\n".join(f"{f.level or '-':4}  {f.text}" for f in self)
+
+    def _repr_html_(self) -> str:
+        rows = [html_element("li", html_element("b", f"{f.level or 'info'}: "), f.text) for f in self]
+        return html_element("ul", join_parts(rows))
+
+
 def worst_level(findings: Iterable[Finding]) -> Level:
     """The level that weighs most among the findings."""
     return max((f.level for f in findings), key=LEVELS.index, default="")
@@ -59,7 +72,7 @@ def headline_of_json(value: Any) -> Finding | None:
     return Finding.from_row({"level": said.get("level"), "code": "headline", "text": said.get("headline")})
 
 
-def findings_of_json(value: Any) -> list[Finding]:
+def findings_of_json(value: Any) -> Findings:
     """Findings of the JSON object that :func:`verdict_json` makes; what is none of ours is left out."""
     lines = value.get("lines") if isinstance(value, Mapping) else None
-    return [f for row in (lines if isinstance(lines, list) else []) if (f := Finding.from_row(row))]
+    return Findings(f for row in (lines if isinstance(lines, list) else []) if (f := Finding.from_row(row)))

@@ -5,6 +5,7 @@ Pages and the tables that notebooks show are made with it, and with nothing else
 
 from __future__ import annotations
 
+import base64
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -70,6 +71,12 @@ def html_element(tag: str, *children: Any, **attributes: Any) -> Markup:
     return Markup(
         _template(_ELEMENT).render(tag=tag, attributes=said, children=inside, void=tag in ("img", "meta", "br"))
     )
+
+
+def inline_picture(png: bytes, caption: str) -> Markup:
+    """A PNG inside the page."""
+    src = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    return html_element("figure", html_element("img", src=src, alt=caption), html_element("figcaption", caption))
 
 
 def join_parts(parts: Iterable[Any], between: str = "") -> Markup:

@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from graphslam.core.findings import Finding
+from graphslam.core.findings import Finding, Findings
 from graphslam.core.json_file import json_values
 from graphslam.core.progress import Bar, printable
 
@@ -34,7 +34,7 @@ def text_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None 
 
 def verdict_text(headline: Finding, findings: Sequence[Finding]) -> list[str]:
     """Lines of a verdict: what all of it says, then each finding behind its level."""
-    return [f"verdict: {headline.text}", *(f"  {f.level or '-':4}  {f.text}" for f in findings)]
+    return [f"verdict: {headline.text}", *(f"  {line}" for line in str(Findings(findings)).splitlines())]
 
 
 def _cell(value: Any) -> str:

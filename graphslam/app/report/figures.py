@@ -8,11 +8,11 @@ import numpy as np
 
 from graphslam.app.report.curves import chart_of
 from graphslam.app.report.folder import ReportFolder
-from graphslam.app.report.markup import inline_picture, missing_note, page_section, remark
+from graphslam.app.report.markup import missing_note, page_section, remark
 from graphslam.app.run.files import read_map, read_merged_dense
 from graphslam.backend.sessions import SESSION
 from graphslam.core.errors import DataError, GraphSlamError
-from graphslam.core.markup import Markup, join_parts
+from graphslam.core.markup import Markup, inline_picture, join_parts
 from graphslam.evaluate.consistency import Consistency, nees
 from graphslam.evaluate.path_consistency import map_errors
 from graphslam.io.submap_store import read_truth

@@ -37,12 +37,6 @@ def page_section(name: str, title: str, *parts: Any) -> Markup:
     return html_element("section", html_element("h2", title), join_parts(parts, "\n"), id=name)
 
 
-def inline_picture(png: bytes, caption: str) -> Markup:
-    """A PNG inside the page."""
-    src = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-    return html_element("figure", html_element("img", src=src, alt=caption), html_element("figcaption", caption))
-
-
 def compact_json(value: Any) -> str:
     """A value as one line of JSON."""
     return json.dumps(value, ensure_ascii=False, default=str)

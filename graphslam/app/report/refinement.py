@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
-from graphslam.app.report.markup import inline_picture, missing_note, page_section, remark
-from graphslam.core.markup import Markup, html_table, is_numeric, pair_list
+from graphslam.app.report.markup import missing_note, page_section, remark
+from graphslam.core.markup import Markup, html_table, inline_picture, is_numeric, pair_list
 
 MEANING = {
     "scale": ("wheel scale, distance too long by", "share"),

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from graphslam.core.findings import Finding, findings_of_json, headline_of_json
+from graphslam.core.findings import Finding, Findings, findings_of_json, headline_of_json
 from graphslam.core.geometry import se2_transform
 from graphslam.core.log import SensorLog, Truth
 from graphslam.core.map_truth import MapTruth
-from graphslam.core.markup import html_element, html_frame, join_parts
+from graphslam.core.markup import Markup, html_element, html_frame, inline_picture, join_parts
 from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
@@ -157,8 +157,8 @@ class Run:
         return metric_value(self.metrics, key)
 
     @property
-    def verdict(self) -> list[Finding]:
-        """Findings on the run: solved, consistent, complete, all requested data used."""
+    def verdict(self) -> Findings:
+        """Findings on the run: solved, consistent, complete, all requested data used. ``print(run.verdict)``."""
         return findings_of_json(self.report.get("verdict"))
 
     @property
@@ -252,9 +252,25 @@ class Run:
     def _repr_html_(self) -> str:
         where = f" in {self.folder.name}" if self.folder else ""
         said = f"{where}: {len(self.submaps)} submaps, {len(self.map.landmarks)} landmarks"
+        weighty = Findings(f for f in self.verdict if f.level in ("look", "bad"))
+        figures = html_frame(self.metrics[["key", "value", "unit"]])
         return join_parts(
-            [html_element("b", f"Run of {self.name}"), said, html_frame(self.metrics[["key", "value", "unit"]])]
+            [
+                html_element("p", html_element("b", self.headline.text)),
+                html_element("p", html_element("b", f"Run of {self.name}"), said),
+                weighty._repr_html_(),
+                self._picture(),
+                html_element("details", html_element("summary", f"{len(self.metrics)} figures"), figures),
+            ]
         )
+
+    def _picture(self) -> Markup | None:
+        """The map as a small picture; None without a path."""
+        from graphslam.plots.save import figure_png
+
+        if len(self.map.trajectory) < 2:
+            return None
+        return inline_picture(figure_png(self.plot()), f"Map of {self.name}")
 
 
 def metric_value(metrics: pd.DataFrame, key: str) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import tomllib
 from dataclasses import replace
@@ -229,3 +230,12 @@ def test_association_file_names_every_landmark(result):
     a = read_npz(result.folder / "association.npz", fmt="graphslam.association/1")
     assert len(a["ids"]) == sum(len(s.landmarks) for s in result.submaps)
     assert set(a["ids"]) == set(result.map.landmark_ids)
+
+
+def test_a_run_shows_its_verdict_first_and_a_picture(result) -> None:
+    shown = result._repr_html_()
+    assert shown.index(html.escape(result.headline.text, quote=True)[:40]) < shown.index("data:image/png;base64,")
+    assert "<details>" in shown
+    lines = str(result.verdict).splitlines()
+    assert len(lines) == len(result.verdict)
+    assert lines[0].endswith(result.verdict[0].text)
