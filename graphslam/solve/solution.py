@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from graphslam.solve.network.certificate import Certificate
 
 
+def _name_of(name: str | int) -> str:
+    return name if isinstance(name, str) else f"x{operator.index(name)}"
+
+
 @dataclass(frozen=True, repr=False)
 class Solution:
     """A solved graph, independent of what happens to the graph afterwards.
@@ -155,11 +159,11 @@ class Solution:
         name : str or int
             Such as ``"x3"``, ``"l17"``, ``"datum"``, ``"bias0"``; a number k is the pose ``"xk"``.
         """
-        return self.covariance.marginal(name if isinstance(name, str) else f"x{operator.index(name)}")
+        return self.covariance.marginal(_name_of(name))
 
-    def joint_marginal(self, names: Iterable[str]) -> Array:
-        """Joint covariance of several variables in that order."""
-        return self.covariance.joint(names)
+    def joint_marginal(self, names: Iterable[str | int]) -> Array:
+        """Joint covariance of several variables in that order, named as in :meth:`marginal`."""
+        return self.covariance.joint(map(_name_of, names))
 
     def node_covariances(self) -> Array:
         """``(m + 1, d, d)``, right tangent; zeros for the fixed first base."""

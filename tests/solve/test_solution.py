@@ -36,6 +36,7 @@ def test_marginals_are_blocks_of_the_dense_inverse(solved):
     for names in (["x3"], [landmark], ["datum"], ["x8", landmark, "x1"]):
         c = lay.columns_of(names)
         np.testing.assert_allclose(solution.joint_marginal(names), P[np.ix_(c, c)], rtol=1e-7, atol=1e-12)
+    np.testing.assert_array_equal(solution.joint_marginal([1, 2]), solution.joint_marginal(["x1", "x2"]))
     for k, C in enumerate(solution.node_covariances()[1:]):
         np.testing.assert_allclose(C, P[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-7, atol=1e-12)
     for r, C in enumerate(solution.landmark_covariances()):
