@@ -33,7 +33,7 @@ _VERBS = {
     "find_loops": "graphslam.loops.find_loops",
     "relax_skeleton": "graphslam.skeleton.relax",
 }
-_LISTS = dict.fromkeys(("front_ends", "solvers", "joiners", "worlds"), "graphslam.app.verbs")
+_LISTS = dict.fromkeys(("front_ends", "solvers", "joiners", "worlds", "options"), "graphslam.app.verbs")
 _TYPES = {
     "SensorLog": "graphslam.core.log",
     **dict.fromkeys(("LaserScans", "LandmarkObservations", "Odometry", "Gps"), "graphslam.core.records"),

@@ -43,6 +43,7 @@ from graphslam.app.sessions.localise import localise as localise
 from graphslam.app.sessions.merge import merge as merge
 from graphslam.app.verbs import open_run as open_run
 from graphslam.app.verbs import open_study as open_study
+from graphslam.app.verbs import options as options
 from graphslam.app.verbs import refine_path as refine_path
 from graphslam.skeleton.relax import relax_skeleton as relax_skeleton
 from graphslam.app.verbs import run as run

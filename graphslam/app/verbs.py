@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -12,6 +13,7 @@ import pandas as pd
 
 from graphslam.app import compare as comparing
 from graphslam.app.machine import one_blas_thread
+from graphslam.app.option_table import option_rows
 from graphslam.app.run.calibration import calibrate_log as calibrate_log
 from graphslam.app.run.front_ends import front_end_names, recommended_options
 from graphslam.app.run.local_maps import first_particles as first_particles
@@ -48,7 +50,18 @@ from graphslam_frontends.odometry.step_config import StepConfig
 __all__ = [
     *("calibrate_log", "compare", "find_study", "first_particles", "front_ends"),
     *("join_submaps", "joiners", "load", "local_maps"),
-    *("open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "solvers", "study", "worlds"),
+    *(
+        "open_run",
+        "open_study",
+        "options",
+        "refine_path",
+        "run",
+        "simulate",
+        "solve_file",
+        "solvers",
+        "study",
+        "worlds",
+    ),
 ]
 
 
@@ -94,6 +107,29 @@ def worlds() -> list[str]:
     True
     """
     return sorted({*WORLDS, *MESH_WORLDS, *plugins(GROUP)})
+
+
+def options(frontend: str | None = None) -> pd.DataFrame:
+    """Options of a front end, or of every run: a table of ``option``, ``type``, ``default`` and ``meaning``.
+
+    They are set by ``config={"frontend": {"particles": 40}}`` of :func:`run`, and by ``--set frontend.particles=40``.
+
+    Returns
+    -------
+    DataFrame
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such front end.
+
+    Examples
+    --------
+    >>> table = gs.options("rbpf-ekf").set_index("option")
+    >>> table.loc["frontend.particles", "default"]
+    '40'
+    """
+    return pd.DataFrame([dataclasses.asdict(row) for row in option_rows(frontend)])
 
 
 def open_run(path: str | Path) -> Run:

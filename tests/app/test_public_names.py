@@ -17,7 +17,7 @@ VERBS = {
     *("localise", "merge", "open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "study"),
     *("calibrate_log", "relax_skeleton", "to_open3d"),
 }
-LISTS = {"front_ends", "joiners", "solvers", "worlds"}
+LISTS = {"front_ends", "joiners", "options", "solvers", "worlds"}
 STREAMS = {
     *("Gps", "Imu", "LandmarkObservations", "LaserScans", "Odometry", "PointClouds", "PointObservations", "RangeScans"),
     *("SteeringControls", "VelocityControls"),

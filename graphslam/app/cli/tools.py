@@ -1,4 +1,4 @@
-"""``graphslam solve``, ``relax``, ``eval``, ``doctor``."""
+"""``graphslam solve``, ``relax``, ``eval``, ``options``, ``doctor``."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def add_tool_commands(app: typer.Typer) -> None:
     app.command("solve")(solve_command)
     app.command("relax")(relax_command)
     app.command("eval")(evaluate_command)
+    app.command("options")(options_command)
     app.command("doctor")(doctor_command)
 
 
@@ -126,6 +127,20 @@ def evaluate_command(
         typer.echo(f"no relative error: {error}; choose another --delta", err=True)
     rows = [{"error": k, **v} for k, v in value.items() if v]
     print_result(value, text_table(rows), as_json=as_json)
+
+
+def options_command(
+    frontend: str | None = typer.Argument(None, help="Front end. Default: the options that every run has."),
+    as_json: bool = JSON,
+) -> None:
+    """List the options of a run or of a front end: name, default and meaning of each."""
+    from dataclasses import asdict
+
+    from graphslam.app.option_table import option_rows
+
+    rows = option_rows(frontend)
+    text = "\n".join(f"{r.option} = {r.default}\n    {r.meaning}" for r in rows)
+    print_result({"options": [asdict(r) for r in rows]}, text, as_json=as_json)
 
 
 def doctor_command(

@@ -67,6 +67,11 @@ def _kind(name: str | type[FrontEnd]) -> tuple[Any, Any]:
     return kind, typing.get_type_hints(kind)["config"]
 
 
+def config_of(name: str) -> Any:
+    """Configuration class of a front end, a dataclass."""
+    return _kind(name)[1]
+
+
 def make_front_end(
     front: FrontEndLike | Sequence[FrontEndLike], options: Mapping[str, Any], where: str = "frontend"
 ) -> FrontEnd:
