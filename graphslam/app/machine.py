@@ -6,9 +6,7 @@ than they give. The order of their sums would also depend on the machine, and th
 
 from __future__ import annotations
 
-import os
 import platform
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,20 +40,6 @@ def one_blas_thread() -> Iterator[None]:
             _open.remove(mine)
             if not _open:
                 _limits.pop().restore_original_limits()
-
-
-def hold_one_thread() -> None:
-    """Hold BLAS, OpenMP and numba of this process to one thread, for good: for a worker among workers.
-
-    Libraries that are loaded already are told; those that come later read the environment.
-    """
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
-    if (numba := sys.modules.get("numba")) is not None:
-        numba.set_num_threads(1)  # its variable may not change any more once its threads run
-    else:
-        os.environ["NUMBA_NUM_THREADS"] = "1"
-    threadpool_limits(limits=1)
 
 
 class Stopwatch:

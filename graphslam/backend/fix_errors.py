@@ -15,7 +15,6 @@ bend after them. Where no kernel was asked for, none go.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +29,6 @@ from graphslam.graph.factors.gps import BiasPriorRecord, GpsBatch, GpsRecord
 from graphslam.graph.noise import whitener
 from graphslam.graph.sensors.gps import FixErrors, GpsFactors
 
-logger = logging.getLogger(__name__)
 GATE = 8.0
 """Twice the gain in log-likelihood: for two more parameters white noise exceeds it once in 50 logs."""
 WILD = 4.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,7 +21,6 @@ from graphslam.graph.sensors import sensor_kinds
 from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.registry import Solver
 
-logger = logging.getLogger(__name__)
 Mask = npt.NDArray[np.bool_]
 
 CHECKED_AFTER = 30.0

@@ -1,8 +1,7 @@
-"""Gaussians in moment and in information form, and the chi-square numbers that judge them.
+"""Gaussians, and the chi-square numbers that judge them.
 
-Moment form is dense and carries a mean; information form is sparse and carries ``(Λ, η)`` with ``Λ x = η``
-(Combined SLAM eq. 13). Headings are components that live on the circle: functions that take differences or means
-accept ``angular``, the indices of those components.
+Headings are components that live on the circle: functions that take differences or means accept ``angular``, the
+indices of those components.
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 from scipy import special
 
 from graphslam.core.errors import CovarianceError
@@ -102,12 +99,6 @@ class Gaussian:
         angular = tuple(int(k) for k in np.flatnonzero(np.isin(ix, self.angular)))
         return Gaussian(self.mean[ix], self.covariance[np.ix_(ix, ix)], angular)
 
-    def to_information(self) -> Information:
-        """Information form of the same Gaussian."""
-        L = np.linalg.inv(self.covariance)
-        L = 0.5 * (L + L.T)
-        return Information(sp.csc_matrix(L), L @ self.mean)
-
     def kl_from(self, other: Gaussian) -> float:
         """Kullback–Leibler divergence ``KL(self ‖ other)`` in nats."""
         n = len(self.mean)
@@ -118,43 +109,6 @@ class Gaussian:
         assert sign_o > 0
         trace = np.trace(np.linalg.solve(other.covariance, self.covariance))
         return float(0.5 * (trace + d @ np.linalg.solve(other.covariance, d) - n + logdet_o - logdet_s))
-
-
-@dataclass(frozen=True, slots=True)
-class Information:
-    """A Gaussian in sparse information form: ``matrix`` ``(n, n)`` CSC and ``vector`` ``(n,)`` with ``Λ x = η``."""
-
-    matrix: sp.csc_matrix
-    vector: Array
-
-    def factor(self) -> spla.SuperLU:
-        """Sparse factorisation with a symmetric fill-reducing ordering."""
-        try:
-            return spla.splu(
-                sp.csc_matrix(self.matrix),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-        except RuntimeError as error:
-            raise CovarianceError(f"information matrix cannot be factorised ({error})", got=self.matrix.shape) from None
-
-    def mean(self) -> Array:
-        """State ``x = Λ⁻¹ η`` (Combined SLAM eq. 13)."""
-        return np.asarray(self.factor().solve(self.vector))
-
-    def covariance_block(self, indices: ArrayLike) -> Array:
-        """Joint covariance of the components ``indices`` by sparse solves (Algorithm 1); never the whole inverse."""
-        ix = np.asarray(indices, dtype=np.intp)
-        E = np.zeros((self.matrix.shape[0], len(ix)))
-        E[ix, np.arange(len(ix))] = 1.0
-        block = self.factor().solve(E)[ix]
-        return np.asarray(0.5 * (block + block.T))
-
-    def to_gaussian(self, angular: tuple[int, ...] = ()) -> Gaussian:
-        """Dense moment form."""
-        P = np.linalg.inv(self.matrix.toarray())
-        return Gaussian(P @ self.vector, 0.5 * (P + P.T), angular)
 
 
 def moment_match(

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core.errors import DataError, GeometryError
-from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.geometry import Array
 from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
 
@@ -116,37 +115,3 @@ class Imu:
             specific_force=self.specific_force[index],
             attitude=None if self.attitude is None else self.attitude[index],
         )
-
-
-def usable_readings(
-    times: ArrayLike, angular_rate: ArrayLike, specific_force: ArrayLike
-) -> tuple[npt.NDArray[np.intp], dict[str, int]]:
-    """Records of raw readings that an :class:`Imu` can be made of, and how many are left out for which reason.
-
-    A record is left out if a number in it is not finite, or if its stamp is not after those of all records kept before
-    it: late packets and repeated ones. Give the reasons to a :class:`~graphslam.core.log.DropCounter`.
-
-    Parameters
-    ----------
-    times : (n,)
-    angular_rate, specific_force : (n, 3)
-
-    Returns
-    -------
-    rows : (k,) int
-    dropped : dict of str to int
-
-    Examples
-    --------
-    >>> rows, dropped = usable_readings([0.0, 0.2, 0.1, 0.3], np.zeros((4, 3)), np.ones((4, 3)))
-    >>> rows.tolist(), dropped
-    ([0, 1, 3], {'time does not increase': 1})
-    """
-    t, w, f = (np.asarray(a, dtype=np.float64) for a in (times, angular_rate, specific_force))
-    if t.ndim != 1 or w.shape != (len(t), 3) or f.shape != (len(t), 3):
-        raise GeometryError("IMU readings do not fit", got=(t.shape, w.shape, f.shape), wanted="(n,), (n, 3), (n, 3)")
-    finite = np.flatnonzero(finite_mask(t) & np.all(finite_mask(w) & finite_mask(f), axis=1))
-    latest = np.maximum.accumulate(np.concatenate([[-np.inf], t[finite]]))[:-1]
-    rows = finite[t[finite] > latest]
-    dropped = {"not finite": len(t) - len(finite), "time does not increase": len(finite) - len(rows)}
-    return rows, {reason: n for reason, n in dropped.items() if n}

@@ -190,16 +190,6 @@ class Consistency:
         known = np.isfinite(self.nees)
         return float(np.mean(self.index[known] < 1.0))
 
-    @property
-    def coverage_bounds(self) -> tuple[float, float]:
-        """Two-sided binomial bounds of :attr:`coverage` for a consistent estimator, by number of independent units."""
-        n = self.runs if self.unit == "run" else self.count
-        a = (1.0 - self.confidence) / 2.0
-        from scipy import stats  # takes half a second to load
-
-        binom = stats.binom(n, self.confidence)
-        return float(binom.ppf(a) / n), float(binom.ppf(1.0 - a) / n)
-
     def curve(self) -> tuple[Array, Array, Array]:
         """Mean over the runs of ``D²/n`` per column, with its lower and upper bounds, each ``(k,)``.
 

@@ -312,27 +312,6 @@ class LoopConsistency:
         bad = np.where(known, other, 0.0) > chi2_quantile(self.confidence, 3)
         return np.asarray(bad.sum(axis=1) / np.maximum(known.sum(axis=1), 1))
 
-    def worst_pairs(self, n: int = 20) -> pd.DataFrame:
-        """The ``n`` most inconsistent pairs: both loops, D², its p-value, and how much each is to blame."""
-        i, j = np.triu_indices(len(self.d2), 1)
-        d2 = self.d2[i, j]
-        order = np.argsort(np.where(np.isfinite(d2), -d2, np.inf), kind="stable")[:n]
-        order = order[np.isfinite(d2[order])]
-        i, j = i[order], j[order]
-        a, b, blame = self.loops.a, self.loops.b, self.blame()
-        return pd.DataFrame(
-            {
-                "a": a[i],
-                "b": b[i],
-                "c": a[j],
-                "d": b[j],
-                "d2": d2[order],
-                "p": special.chdtrc(3, d2[order]),
-                "blame_ab": blame[i],
-                "blame_cd": blame[j],
-            }
-        )
-
     def table(self) -> pd.DataFrame:
         """One row a loop: submaps, shared landmarks, error of its cycle, D², blame."""
         e = self.loops.errors

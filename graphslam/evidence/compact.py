@@ -18,7 +18,7 @@ from graphslam.evidence.batch import make_unique
 from graphslam.evidence.cube_kernels import UNSEEN, build_tree, find_states, list_pieces, share_cubes
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE, FAN, MAX_LEVELS, UNKNOWN
-from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES, GridPool
+from graphslam.evidence.pool import GridPool
 from graphslam.evidence.tree_kernels import BRICKS_USED, NODES_USED
 
 Ints = npt.NDArray[np.int64]
@@ -41,11 +41,6 @@ class CompactReport:
 
     nodes: int = 0
     bricks: int = 0
-
-    @property
-    def freed_bytes(self) -> int:
-        """Memory for other grids [bytes]."""
-        return self.nodes * NODE_BYTES + self.bricks * BRICK_BYTES
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,10 +19,8 @@ from graphslam.evidence.layout import (
     BRICK_EDGE,
     BRICK_VOXELS,
     LARGEST_VOXEL,
-    LIMIT,
     MAX_LEVELS,
     SMALLEST_VOXEL,
-    STEP,
     UNKNOWN,
     half_edge,
 )
@@ -129,68 +127,6 @@ def _checked_bounds(bounds: npt.ArrayLike, dim: int) -> tuple[Ints, Ints]:
     layer[1, 2] = 1  # a 2-D grid is the layer k = 0
     layer[:, :dim] = box
     return layer[0], layer[1]
-
-
-def from_dense(dense: DenseGrid, *, model: BeamModel | None = None, pool: GridPool | None = None) -> EvidenceGrid:
-    """A grid of a dense array, 2-D or 3-D as the array is.
-
-    Parameters
-    ----------
-    dense : DenseGrid
-        float32 and float64 are log-odds, rounded to the nearest multiple of `layout.STEP`; int16 is taken as it is.
-    """
-    values: npt.NDArray[Any] = np.asarray(dense.values)
-    dim = values.ndim
-    first = np.asarray(dense.first_voxel)
-    if dim not in (2, 3) or first.shape != (dim,) or first.dtype.kind not in "iu":
-        raise GridError(
-            "impossible shape of a dense grid",
-            got=f"values {values.shape}, first voxel {first.shape} {first.dtype}",
-            wanted="(nx, ny) and (2,), or (nx, ny, nz) and (3,) integers",
-        )
-    steps: npt.NDArray[np.int16] = (
-        _steps_of(values).reshape(values.shape if dim == 3 else (*values.shape, 1)).transpose(2, 1, 0)
-    )
-    grid = EvidenceGrid(dense.voxel_size, model=model, pool=pool, dim=dim)
-    low = np.zeros(3, np.int64)
-    low[:dim] = first
-    high = low + np.array(steps.shape[::-1])
-    if steps.size == 0:
-        return grid
-    check_reach(int(max(-low.min(), high.max())), grid.pool, "dense grid")
-
-    first_brick, end_brick = low // BRICK_EDGE, -(-high // BRICK_EDGE)
-    nbx, nby, nbz = (end_brick - first_brick).tolist()
-    for bz in range(nbz):  # a slab of bricks at a time, so that little memory is needed
-        slab = np.full((BRICK_EDGE, nby * BRICK_EDGE, nbx * BRICK_EDGE), UNKNOWN, np.int16)
-        z0 = int(first_brick[2] + bz) * BRICK_EDGE - int(low[2])  # row of the array at the slab's foot
-        z = slice(max(z0, 0), min(z0 + BRICK_EDGE, steps.shape[0]))
-        x, y = (int(low[a] - first_brick[a] * BRICK_EDGE) for a in (0, 1))
-        slab[z.start - z0 : z.stop - z0, y : y + steps.shape[1], x : x + steps.shape[2]] = steps[z]
-        parts = slab.reshape(BRICK_EDGE, nby, BRICK_EDGE, nbx, BRICK_EDGE)
-        by, bx = np.nonzero((parts != UNKNOWN).any(axis=(0, 2, 4)))
-        if len(by):
-            rows = parts.transpose(1, 3, 0, 2, 4)[by, bx].reshape(-1, BRICK_VOXELS)
-            grid.write_bricks(np.stack([bx, by, np.full(len(by), bz)], axis=1) + first_brick, rows)
-    return grid
-
-
-def _steps_of(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
-    """Values of an array in units of `layout.STEP`."""
-    if values.dtype == np.int16:
-        return values
-    if values.dtype not in (np.float32, np.float64):
-        raise GridError("impossible type of a dense grid", got=values.dtype, wanted="int16, float32 or float64")
-    with np.errstate(invalid="ignore"):
-        steps = np.rint(values * values.dtype.type(1 / STEP))
-        bad = np.abs(steps) > LIMIT  # NaN is not
-    if bad.any():
-        at = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise GridError(f"log-odds of voxel {at} cannot be held", got=values[at], wanted=f"at most ±{LIMIT * STEP}")
-    out = np.full(values.shape, UNKNOWN, np.int16)
-    known = ~np.isnan(values)
-    out[known] = steps[known].astype(np.int16)
-    return out
 
 
 # --- npz ---------------------------------------------------------------------------------------------------------

@@ -22,9 +22,6 @@ LIMIT = 32767
 STEP = 1.0 / 2048.0
 """Log-odds of one unit; a power of two, so that float32 holds every value exactly. The range is ±16."""
 
-LINE_VOXELS = 32
-"""Voxels of one cache line; ``brick_lines`` has a bit for each line of a brick that holds an occupied voxel."""
-LINES = BRICK_VOXELS // LINE_VOXELS
 
 FREE, HIT = 1, 2
 """Marks a scan leaves on a voxel; a hit wins."""

@@ -27,7 +27,6 @@ from graphslam.evidence.kernels import kernel
 RAYS, NOT_FINITE, ZERO_LENGTH, OUTSIDE, CUT, BRICKS, NEED_SLOTS = 0, 1, 2, 3, 4, 5, 6
 TALLY = 7
 
-LANES = 16  # the literal stands in the loops: a known number of turns is what lets them be vectorised
 # bits of the three coordinates in the integer of a voxel; those of a brick lie 9 lower
 MASK_X = 0b111 | (0x3F << 9) | (0x1FF << 27)
 MASK_Y = (0b111 << 3) | (0x3F << 15) | (0x1FF << 36)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.evidence.grid_tree import GridTree
@@ -83,19 +82,3 @@ def measure_memory(grids: GridTree | Sequence[GridTree]) -> MemoryUse:
             pool.brick_ref, np.zeros(n, np.int32), np.zeros(b, np.int32),
         )  # fmt: skip
     return MemoryUse(int(begins[-1]), found, int(private[0]), int(private[1]))
-
-
-def shared_bricks(grid: GridTree, others: Sequence[GridTree]) -> npt.NDArray[np.bool_]:
-    """Which bricks of a grid are bricks of others too, not merely equal ``(n,)``; ordered as its `brick_coordinates`.
-
-    Parameters
-    ----------
-    others : sequence of EvidenceGrid
-        Of the same pool.
-    """
-    if any(g.pool is not grid.pool for g in others):
-        raise GridError("grids of different pools share nothing", wanted="one pool")
-    with grid.pool.lock:
-        mine = grid.packed_bricks()[:, 1]
-        theirs = [g.packed_bricks()[:, 1] for g in others if g is not grid]
-    return np.isin(mine, np.concatenate(theirs)) if theirs else np.zeros(len(mine), np.bool_)

@@ -30,8 +30,6 @@ from graphslam.evidence.tree_kernels import (
 NODE_BYTES = 4 * CHILDREN + 4 + 8
 BRICK_BYTES = 2 * BRICK_VOXELS + 4 + 2
 
-Ints = npt.NDArray[np.int64]
-
 
 class RootBox:
     """Owner of one tree; grids that were copied from each other hold the same box until one of them writes."""

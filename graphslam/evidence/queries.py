@@ -42,7 +42,6 @@ __all__ = [
     "CastResult",
     "cast_beams",
     "cast_grids",
-    "endpoint_log_odds",
     "endpoint_probability",
     "known_at",
     "log_odds_at",
@@ -194,30 +193,6 @@ def _cast(
 
         _share(run, len(grids), threads)
     return CastResult(ranges, status, ends if voxels else None)
-
-
-def endpoint_log_odds(
-    grids: Sequence[GridTree], poses: Any, points: Any, *, threads: int = 1
-) -> npt.NDArray[np.float32]:
-    """Log-odds of the voxels that points of one scan fall in, in many grids.
-
-    Parameters
-    ----------
-    grids : sequence of EvidenceGrid
-        P of them, of one pool and voxel size; one may stand there several times.
-    poses : (P, 7), (P, 4, 4), or (P, 3) in 2-D
-        ``T_grid_scan`` of each.
-    points : (n, 3) or (n, 2)
-        In the frame of the scan [m].
-    threads : int
-        The result is the same for any number.
-
-    Returns
-    -------
-    (P, n) float32
-        Exact; NaN where nothing is known, outside the cube, and for points that are not finite.
-    """
-    return _look_up(grids, _rows(grids, poses), points, _log_odds_table(), False, threads)
 
 
 def endpoint_probability(

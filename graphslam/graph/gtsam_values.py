@@ -10,7 +10,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.se3 import matrix_to_quat
-from graphslam.graph.factors.batch import gtsam_poses, gtsam_value, read_value
+from graphslam.graph.factors.batch import gtsam_value, read_value
 from graphslam.graph.variables import KINDS, Values, gtsam_key, key_name, split_name
 
 
@@ -24,16 +24,6 @@ def insert_values(out: gtsam.Values, names: Iterable[str], values: Values, row_o
     """Insert variables of ``values`` into GTSAM's."""
     for name in names:
         out.insert(gtsam_key(name), gtsam_value(value_of(values, name, row_of), name, values.dim))
-
-
-def to_gtsam(values: Values, *, held: bool = False) -> gtsam.Values:
-    """All free variables as GTSAM values; with ``held`` the first pose, too."""
-    out, layout = gtsam.Values(), values.layout()
-    first, begin = gtsam_key("x0"), 0 if held else 1
-    for k, pose in enumerate(gtsam_poses(values.poses[begin:]), begin):
-        out.insert(first + k, pose)
-    insert_values(out, (n for n in layout.names() if n[0] != "x"), values, layout.row_of)
-    return out
 
 
 def from_gtsam(estimate: gtsam.Values, like: Values, row_of: Mapping[int, int] | None = None) -> Values:

@@ -26,7 +26,6 @@ import numpy as np
 from graphslam.core.errors import ConfigError, FormatError
 from graphslam.core.geometry import Array
 from graphslam.core.network import Ids, Labels, PoseNetwork
-from graphslam.core.reading import read_text
 from graphslam.io.network_builder import NetworkBuilder, edge_labels, sighting_labels, upper_triangle
 from graphslam.io.text_records import Records
 
@@ -44,10 +43,15 @@ LAYOUTS: dict[str, tuple[int, int]] = {
 _TORO = np.array([0, 1, 4, 2, 5, 3])
 
 
-def read_isam_graph(
-    path: str | os.PathLike[str], *, noise: Noise = "auto", repair: bool = False, create_missing: bool = False
+def parse_isam_graph(
+    path: str | os.PathLike[str],
+    text: str,
+    *,
+    noise: Noise = "auto",
+    repair: bool = False,
+    create_missing: bool = False,
 ) -> PoseNetwork:
-    """Read a TORO or iSAM graph.
+    """Read a TORO or iSAM graph from the content of its file; ``path`` names it in errors.
 
     Parameters
     ----------
@@ -59,18 +63,6 @@ def read_isam_graph(
     create_missing : bool
         Make vertices that only edges name, where others are given, instead of refusing them.
     """
-    return parse_isam_graph(path, read_text(path), noise=noise, repair=repair, create_missing=create_missing)
-
-
-def parse_isam_graph(
-    path: str | os.PathLike[str],
-    text: str,
-    *,
-    noise: Noise = "auto",
-    repair: bool = False,
-    create_missing: bool = False,
-) -> PoseNetwork:
-    """The same from the content of the file; ``path`` names it in errors."""
     if noise not in get_args(Noise):
         raise ConfigError(f"unknown noise format {noise!r}; known: {', '.join(get_args(Noise))}")
     records = Records(path, text, LAYOUTS)

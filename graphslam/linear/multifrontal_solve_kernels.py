@@ -16,7 +16,6 @@ from graphslam.linear.product_kernels import BLOCK, subtract_product
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @njit

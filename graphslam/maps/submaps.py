@@ -47,14 +47,6 @@ class DividedSubmaps:
         poses = path.interpolate(np.array(list(self.times.values())))
         return dict(zip(self.times, remove_roll_pitch(poses) if self.level_nodes else poses))
 
-    def from_bases(self, bases: dict[int, Array]) -> dict[PieceId, Array]:
-        """``T_world_node`` from ``T_world_base`` by key: submaps that stay rigid."""
-        missing = sorted({name[0] for name in self.pieces} - set(bases))  # type: ignore[index]
-        if missing:
-            raise DataError("submaps have no pose", got=missing)
-        group = SE3 if next(iter(self.pieces.values())).dim == 3 else SE2
-        return {name: group.compose(bases[name[0]], self.local[name]) for name in self.pieces}  # type: ignore[index]
-
 
 def divide_submaps(
     submaps: Sequence[Submap],

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core import se3
 from graphslam.core.gaussian import chi2_quantile
@@ -21,8 +20,6 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.graph.sensors.gps import GpsConfig, arm_jacobian, greatest_distance, start_datum
 from graphslam.refine.motion import MotionModel, MotionTerms, States
-
-Index = npt.NDArray[np.int64]
 
 FARTHEST = 3.0
 """A fix between nodes that are farther apart is left out: nobody knows the antenna's way between them [m]."""

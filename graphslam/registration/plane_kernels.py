@@ -11,7 +11,6 @@ from graphslam.core.jit import njit
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 class PlanePairs(NamedTuple):

@@ -143,7 +143,7 @@ def register(
     that end within 0.3 m and 2°, the worse of the halls and directions): 0.5 m and 5° off 1.0 in three dimensions and
     in two, 1 m and 10° 0.9 and 0.95, 2 m and 10° 0.6 and 0.75, 4 m 0. Farther off, search first
     (:func:`~graphslam.registration.search.correlative_search`). One pillar period off it ends there, sometimes with a
-    fitness that no gate tells from the right one: match several starts, and look at :func:`fitness_margin`.
+    fitness that no gate tells from the right one: match several starts.
     """
     config = RegistrationConfig() if config is None else config
     start = check_pose(T_target_source, target.dim, what="start of a registration")
@@ -216,18 +216,6 @@ def distinct_registrations(
         if all(shift >= apart[0] or turn >= apart[1] for shift, turn in moves):
             kept.append(r)
     return kept
-
-
-def fitness_margin(results: list[Registration]) -> float:
-    """Fitness of the best of :func:`register_starts` less that of the next at another place, 1.5 m or more away.
-
-    1 where there is no other; NaN where there is none at all.
-    """
-    if not results:
-        return float("nan")
-    best = results[0]
-    others = [r for r in results[1:] if _moved(best.T_target_source, r.T_target_source)[0] >= 1.5]
-    return best.best_fitness - max((r.best_fitness for r in others), default=best.best_fitness - 1.0)
 
 
 def failed_gates(result: Registration, config: RegistrationConfig) -> str:

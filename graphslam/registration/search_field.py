@@ -83,11 +83,3 @@ class SearchField:
             split = whole.reshape(z // sz, sz, y // sy, sy, x // sx, sx)
             self._phases[steps] = np.ascontiguousarray(split.transpose(1, 3, 5, 0, 2, 4))
         return self._phases[steps]
-
-    def value_at(self, points: Any) -> Array:
-        """The field, 0 … 1, at points ``(m, dim)`` in the frame of the map [m]; 0 outside it."""
-        c = self._cells(finite_points(points))
-        inside = np.all((c >= 0) & (c < self.values.shape[::-1]), axis=1)
-        out = np.zeros(len(c))
-        out[inside] = self.values[tuple(c[inside].T[::-1])] / 255.0
-        return out

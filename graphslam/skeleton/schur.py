@@ -8,7 +8,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array
@@ -17,8 +16,6 @@ from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import landmark_kernels as kernels
 from graphslam.skeleton.landmark_kernels import Poses, Sightings
 from graphslam.skeleton.problem import SkeletonProblem
-
-Index = npt.NDArray[np.int64]
 
 PARTS = 2
 """Ranges of poses whose sums over landmarks are kept apart and added in order: results depend on it, not on threads."""

@@ -9,7 +9,6 @@ dimension exceed once in ``1 / (1 - confidence)``.
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,8 +26,6 @@ from graphslam.graph.noise import NO_KERNEL
 from graphslam.solve.batch import BatchSolver, LevenbergConfig, optimise_problem
 from graphslam.solve.solution import Solution
 from graphslam.solve.sparse import SparseProblem
-
-logger = logging.getLogger(__name__)
 
 BELIEVED = frozenset({"submap", "dense-submap", "levelled", "imu", "declination"})
 """Classes of factors that are never outliers here; priors are none either."""

@@ -9,7 +9,6 @@ import pytest
 from graphslam.core.geometry import se2_between
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
@@ -21,6 +20,7 @@ from graphslam.solve.isam2 import Isam2Solver
 from graphslam_studies.io.slsjf import read_slsjf_local_maps
 from tests.reference.graph_chain import make_chain, make_gps
 from tests.reference.gtsam_optimum import optimise_with_gtsam
+from tests.reference.gtsam_twin import to_gtsam
 
 
 def build(rng, *, gps: bool, robust: RobustKernel, update=lambda g: None) -> FactorGraph:

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from graphslam.app.cli import app
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import Submap
-from graphslam.io.joined_map import read_joined
 from graphslam.io.submap_store import write_submaps
 from graphslam.join.registry import join_by_method
 from graphslam_studies.sim.local_maps import simulate_local_maps
@@ -30,7 +29,7 @@ def joined(folder: Path, out: Path, *options: str) -> tuple[dict, np.ndarray]:
     done = CliRunner().invoke(app, ["join", str(folder), "--json", "--polish", "--out", str(out), *options])
     assert done.exit_code == 0, done.output
     (row,) = json.loads(done.stdout)["methods"]
-    return row, read_joined(out)["poses"]
+    return row, np.load(out / "joined.npz")["poses"]
 
 
 def test_cluster_and_workers_join_the_same_map(store: tuple[Path, list[Submap]], tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ from graphslam.app.worlds import MESH_WORLDS, mesh_of, mesh_world, world_of, wri
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.se3 import se3_transform
-from graphslam.io.log_folder import read_log_mesh
 from graphslam.sim.raycast import RayCaster
+from tests.reference.ply import read_mesh
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_a_log_knows_its_world(log: SensorLog, tmp_path: Path) -> None:
     root = write_simulated(log, tmp_path / "log")
     back = gs.load(root)
     assert np.array_equal(world_of(back).vertices, mesh_world("garage", seed=2).vertices)
-    vertices, triangles = read_log_mesh(root)
+    vertices, triangles = read_mesh(root / "mesh.ply")
     assert vertices.tobytes() == mesh_of(log)[0].tobytes()
     assert np.array_equal(triangles, mesh_of(log)[1])
     assert back["scanner"].ranges.tobytes() == log["scanner"].ranges.tobytes()

@@ -29,11 +29,11 @@ from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
 from graphslam.core.point_clouds import PointClouds
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam_frontends.lidar_odometry.front_end import start_odometry
 from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.scan_window.relative_covariance import relative_covariance
 from graphslam_studies.sim.lidar import drawn_imu, drawn_lidar, simulate_lidar
+from tests.reference.lidar_start import start_odometry
 
 PACKS = ("lidar3d-hku1", "lidar3d-hku-mb", "lidar3d-balm-hall", "lidar3d-kitti-0005")
 PIECE = 3.0

@@ -33,13 +33,14 @@ from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
 from graphslam.loops.map_overlap_test import Witness
 from graphslam.loops.measure import Loop, LoopMeasurer
-from graphslam.loops.places import ChainRelativePoses, Places
+from graphslam.loops.places import Places
 from graphslam.registration.place_descriptor import concatenate_descriptors, describe_places, descriptor_similarity
 from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.segslam.segslam import run_segslam
 from graphslam_frontends.segslam.submaps import common_ancestor_chain, drift_by_path, submaps_of_segments
 from graphslam_studies import segslam_building, segslam_garage, segslam_mine
 from graphslam_studies.segslam_trial import GridTrial
+from tests.reference.chain_poses import ChainRelativePoses
 from tests.reference.loop_network import LoopNetwork
 from tests.reference.loop_places import loop_places
 from tests.reference.wrong_submap_loops import KINDS, inject_wrong_loops

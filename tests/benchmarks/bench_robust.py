@@ -24,12 +24,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from graphslam.core.network import PoseNetwork
 from graphslam.core.random import SeedTree
-from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
+from graphslam.graph.gtsam_values import from_gtsam
 from graphslam.graph.network import network_values
 from graphslam.io.network_file import read_network
 from graphslam.solve.network.solve import solve_network
 from graphslam.solve.network.start import odometry_start
 from tests.reference.gtsam_network import to_graph
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.plain_network import edge_costs
 from tests.reference.wrong_loops import WrongLoops, add_wrong_loops, is_odometry
 

@@ -100,12 +100,12 @@ def large(who: str, n: str, dim: str) -> dict[str, Any]:
     import gtsam
     import numpy as np
 
-    from graphslam.graph.gtsam_values import to_gtsam
     from graphslam.graph.network import network_values
     from graphslam.solve.network.solve import solve_network
     from graphslam.solve.network.start import chordal_start
     from tests.reference.grid_world import grid_world
     from tests.reference.gtsam_network import to_graph
+    from tests.reference.gtsam_twin import to_gtsam
 
     network = grid_world(int(n), np.random.default_rng(0), dim=int(dim))
     begin = time.process_time()

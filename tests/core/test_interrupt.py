@@ -10,7 +10,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from graphslam.core.interrupt import defer_interrupts, watch_interrupts
+from graphslam.core.interrupt import defer_interrupts
+from graphslam_studies.montecarlo.interrupt import watch_interrupts
 
 
 @pytest.fixture(autouse=True)

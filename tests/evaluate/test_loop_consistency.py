@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import se2_adjoint, se2_between, se2_compose, se2_exp, se2_inverse, se2_log, se2_transform
@@ -112,10 +111,6 @@ def test_matrix_equals_one_pair_at_a_time(rng):
             e = loops.errors[i] - loops.errors[j]
             assert got.d2[i, j] == pytest.approx(e @ np.linalg.solve(D @ S @ D.T, e), rel=1e-5)
             assert got.d2[j, i] == got.d2[i, j]
-    worst = got.worst_pairs(5)
-    off = got.d2[np.triu_indices(len(loops), 1)]
-    assert worst["d2"].tolist() == sorted(off, reverse=True)[:5]
-    assert np.allclose(worst["p"], stats.chi2.sf(worst["d2"], 3))
     assert len(got.table()) == len(loops)
 
 

@@ -14,7 +14,7 @@ import pytest
 from graphslam.core.errors import FormatError, GridError
 from graphslam.core.submap import Submap
 from graphslam.evidence.beams import BeamModel
-from graphslam.evidence.formats import DenseGrid, from_dense, known_bounds, load_npz, to_dense
+from graphslam.evidence.formats import known_bounds, load_npz, to_dense
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import STEP, UNKNOWN
 from graphslam.evidence.map_server import save_map_server
@@ -48,9 +48,6 @@ def test_dense_array_holds_every_voxel(rng: np.random.Generator, dtype: Any) -> 
         assert np.array_equal(dense.values, np.where(wanted == UNKNOWN, np.nan, wanted * STEP), equal_nan=True)
     else:
         assert np.array_equal(dense.values, wanted)
-    back = from_dense(dense)
-    check_pool(back.pool, [back])
-    assert map_of_grid(back) == voxels
 
 
 def test_dense_of_any_box(rng: np.random.Generator) -> None:
@@ -69,26 +66,10 @@ def test_dense_of_any_box(rng: np.random.Generator) -> None:
         assert (dense.values == UNKNOWN).all()
 
 
-@pytest.mark.parametrize("dtype", [np.int16, np.float32])
-@pytest.mark.parametrize("dim", [2, 3])
-def test_scanned_grid_comes_back_to_the_last_bit(rng: np.random.Generator, dim: int, dtype: Any) -> None:
-    grid = scanned_grid(rng, dim=dim)
-    dense = to_dense(grid, dtype=dtype)
-    assert dense.values.ndim == dim
-    assert dense.first_voxel.shape == dense.origin.shape == (dim,)
-    back = from_dense(dense, model=grid.model, pool=grid.pool)
-    assert back.dim == dim
-    assert map_of_grid(back) == map_of_grid(grid)
-    check_pool(grid.pool, [grid, back])
-    again = to_dense(back, dtype=dtype)
-    assert np.array_equal(again.values, dense.values, equal_nan=dtype == np.float32)
-
-
 def test_dense_of_nothing() -> None:
     for dim in (2, 3):
         dense = to_dense(EvidenceGrid(0.5, dim=dim))
         assert dense.values.shape == (0,) * dim
-        assert map_of_grid(from_dense(dense)) == {}
 
 
 def test_bounds_of_a_cube_are_found_without_its_bricks() -> None:
@@ -105,29 +86,6 @@ def test_impossible_dense_wishes_are_refused(rng: np.random.Generator) -> None:
         to_dense(grid, bounds=[[-4000] * 3, [4000] * 3])
     with pytest.raises(GridError, match="impossible type"):
         to_dense(grid, dtype=np.int32)
-    at0 = np.zeros(3, np.int64)
-    for values, first, message in (
-        (np.zeros(3, np.int16), at0[:1], "impossible shape"),
-        (np.zeros((2, 2, 2), np.int16), at0[:2], "impossible shape"),
-        (np.zeros((2, 2, 2), np.int16), np.zeros(3), "impossible shape"),
-        (np.zeros((2, 2, 2), np.int64), at0, "impossible type"),
-        (np.full((2, 2, 2), np.inf), at0, r"voxel \(0, 0, 0\) cannot be held; got inf"),
-        (np.full((1, 1, 1), -16.0), at0, "cannot be held"),
-        (np.zeros((2, 2, 2), np.int16), at0 + 4095, "levels=6"),
-    ):
-        with pytest.raises(GridError, match=message):
-            from_dense(DenseGrid(values, first, 0.1), pool=GridPool(5))
-    with pytest.raises(GridError, match="voxel size"):
-        from_dense(DenseGrid(np.zeros((1, 1, 1), np.int16), at0, -0.1))
-
-
-def test_log_odds_are_rounded_to_the_nearest_step() -> None:
-    values = np.array([[[0.3, -0.3, 15.9995, np.nan, -0.0002]]])
-    grid = from_dense(DenseGrid(values, np.zeros(3, np.int64), 0.1))
-    assert map_of_grid(grid) == {(0, 0, 0): 614, (0, 0, 1): -614, (0, 0, 2): 32767, (0, 0, 4): 0}
-
-
-# --- npz ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("levels", [2, 5, 7])

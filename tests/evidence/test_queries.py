@@ -14,7 +14,7 @@ from graphslam.evidence.compact import compact_grids
 from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 from graphslam.evidence.pool import GridPool
-from graphslam.evidence.queries import endpoint_log_odds, endpoint_probability
+from graphslam.evidence.queries import endpoint_probability
 from tests.reference.evidence_twin import EvidenceTwin
 
 V = 0.25
@@ -68,19 +68,16 @@ def test_end_points_of_many_grids(rng: np.random.Generator, dim: int) -> None:
         poses.append(rng.normal(0, 0.5, 3) if dim == 2 else se3_exp(rng.normal(0, 0.4, 6)))
     points = rng.normal(0, 1.5, (80, dim))
     points[7, 1] = np.nan
-    log_odds = endpoint_log_odds(grids, poses, points)
     nearest = endpoint_probability(grids, poses, points, unknown=0.3)
     smooth = endpoint_probability(grids, poses, points, interpolation="trilinear", unknown=0.3)
     move = se2_transform if dim == 2 else se3_transform
     for g, (twin, pose) in enumerate(zip(twins, poses)):
         for k, p in enumerate(move(pose, points)):
             if k == 7:
-                assert np.isnan([log_odds[g, k], nearest[g, k], smooth[g, k]]).all()
+                assert np.isnan([nearest[g, k], smooth[g, k]]).all()
                 continue
             u = np.append(p, 0.5 * V)[:3] / V
             voxel = tuple(np.floor(u).astype(int).tolist())
-            value = twin.values.get(voxel)
-            assert np.isnan(log_odds[g, k]) if value is None else log_odds[g, k] == value / 2048.0
             assert nearest[g, k] == pytest.approx(probability(twin, voxel, 0.3), abs=1e-6)
             low = np.floor(u - 0.5).astype(int)
             share = u - 0.5 - low
@@ -89,10 +86,9 @@ def test_end_points_of_many_grids(rng: np.random.Generator, dim: int) -> None:
                 weight = np.prod(np.where(corner, share, 1.0 - share))
                 total += weight * probability(twin, tuple((low + corner).tolist()), 0.3)
             assert smooth[g, k] == pytest.approx(total, abs=1e-6)
-    assert np.isfinite(log_odds).sum() > 50
-    for call in (endpoint_log_odds, endpoint_probability):
-        assert call(grids, poses, points).tobytes() == call(grids, poses, points, threads=2).tobytes()
-    assert endpoint_log_odds([], np.zeros((0, 7)), points).shape == (0, 80)
+    again = endpoint_probability(grids, poses, points, unknown=0.3, threads=2)
+    assert nearest.tobytes() == again.tobytes()
+    assert endpoint_probability([], np.zeros((0, 7)), points).shape == (0, 80)
 
 
 def test_trilinear_is_smooth_and_nearest_at_the_centres(rng: np.random.Generator) -> None:
@@ -118,11 +114,11 @@ def test_impossible_questions_are_refused(rng: np.random.Generator) -> None:
     with pytest.raises(ConfigError, match="unknown"):
         endpoint_probability([grid], pose, point, unknown=1.5)
     with pytest.raises(GridError, match="wrong shape"):
-        endpoint_log_odds([grid], pose, np.zeros((1, 2)))
+        endpoint_probability([grid], pose, np.zeros((1, 2)))
     with pytest.raises(GridError, match="differ in number"):
-        endpoint_log_odds([grid], np.repeat(pose, 2, 0), point)
+        endpoint_probability([grid], np.repeat(pose, 2, 0), point)
     with pytest.raises(GeometryError, match="quaternion"):
-        endpoint_log_odds([grid], np.zeros((1, 7)), point)
+        endpoint_probability([grid], np.zeros((1, 7)), point)
     with pytest.raises(GridError, match="box 1"):
         grid.box_query(np.zeros((2, 3)), [[1.0, 1, 1], [1, -1, 1]])
     with pytest.raises(GridError, match="box 0"):

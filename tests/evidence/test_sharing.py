@@ -9,9 +9,9 @@ from graphslam.core.errors import GridError
 from graphslam.evidence.batch import SERIAL_BATCH, update_grids
 from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.grid import EvidenceGrid
-from graphslam.evidence.memory import shared_bricks
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.scratch import LINE, aligned_empty, aligned_zeros
+from graphslam_studies.plots.evidence import shared_bricks
 from tests.reference.evidence_pool import assert_same, check_pool
 from tests.reference.evidence_twin import EvidenceTwin
 

@@ -57,16 +57,12 @@ from graphslam.io.catalog import load_recording
 from graphslam.io.cloud_logs import read_clouds
 from graphslam.io.euroc import read_euroc
 from graphslam.io.g2o import read_g2o
-from graphslam.io.joined_map import read_joined, write_joined
 from graphslam.io.kitti import read_kitti
 from graphslam.io.landmark_tables import read_landmark_tables
-from graphslam.io.log_folder import read_log_mesh, write_log_folder
 from graphslam.io.log_store import load_log, save_log
-from graphslam.io.mesh_file import read_mesh, write_mesh
 from graphslam.io.network_file import read_network
 from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, write_truth
 from graphslam.io.tum import read_tum, read_tum_log, write_tum
-from graphslam.join.submap_solver import SubmapEstimate
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
 from graphslam_frontends.odometry.bias_sigmas import LEAST
@@ -172,12 +168,6 @@ def read_a_log(root: Path) -> Any:
     log = load_log(root)
     log._repr_html_()
     return log, [list(s) for s in log.streams.values() if isinstance(s, PointClouds)]
-
-
-def log_with_mesh(root: Path) -> None:
-    write_log_folder(
-        SensorLog(name="log", streams={"wheels": a_log()["wheels"]}), root, mesh=(np.eye(3), np.array([[0, 1, 2]]))
-    )
 
 
 def some_submaps() -> list[Submap]:
@@ -410,12 +400,6 @@ def study_folder(root: Path) -> None:
         values = [Measurement("EIF", q, 1.0 + k, submap=j) for q in ("pose_nees", "rms") for j in range(2)]
         folder.write_trial("A", k, k, [*values, Measurement("EIF", "seconds", 0.1, timing=True)], source="abc")
     folder.write_trial("A", 9, 9, error="broke", details="here")
-
-
-def joined(root: Path) -> None:
-    A = sp.csc_matrix(np.diag(np.arange(1.0, 24.0)))  # 5 free poses, 4 landmarks
-    estimate = SubmapEstimate(np.zeros((6, 3)), np.arange(4), rng().normal(size=(4, 2)), A, 0.0, None, 1, True, 0.0)
-    write_joined(root, TIMES, estimate, "vector")
 
 
 def network(lines: str, name: str, pack: Callable[[bytes], bytes] | None = None) -> Callable[[Path], None]:
@@ -654,10 +638,6 @@ def read_octree(ending: str) -> Callable[[Path], Any]:
     return read
 
 
-def mesh(root: Path) -> None:
-    write_mesh(root / "mesh.ply", rng().normal(size=(5, 3)), np.array([[0, 1, 2], [2, 3, 4]]))
-
-
 def clouds_of(ending: str, table: str) -> Callable[[Path], None]:
     """A folder of a few clouds of one format."""
 
@@ -715,7 +695,6 @@ RANGES = frozenset({"ranges", "sigmas", "max_range"})
 
 READERS: dict[str, Reader] = {
     "log-store": Reader(a_log_folder, read_a_log, RANGES),
-    "log-mesh": Reader(log_with_mesh, read_log_mesh),
     "submap-store": Reader(submap_store, read_store),
     "run": Reader(run_folder, read_run, NO_FIGURE | LOOPS),
     "refined-run": Reader(refined_run, read_refined, NO_FIGURE | LOOPS, slow=3),
@@ -725,7 +704,6 @@ READERS: dict[str, Reader] = {
     "run-config": Reader(just_config, read_config, frozenset({"*"})),
     "merged": Reader(merged_folder, read_merged),
     "study": Reader(study_folder, open_study, frozenset({"value", "table", "timings"}), slow=1),
-    "joined": Reader(joined, read_joined),
     "g2o-2d": Reader(network(G2O_2D, "a.g2o"), lambda p: read_network(p / "a.g2o")),
     "g2o-polar": Reader(network(G2O_POLAR, "a.g2o"), lambda p: read_g2o(p / "a.g2o", repair=True)),
     "g2o-3d": Reader(network(G2O_3D, "a.g2o.xz", lzma.compress), lambda p: read_network(p / "a.g2o.xz")),
@@ -749,7 +727,6 @@ READERS: dict[str, Reader] = {
     "evidence": Reader(evidence, read_evidence),
     "octomap-bt": Reader(octomap("bt"), read_octree("bt")),
     "octomap-ot": Reader(octomap("ot"), read_octree("ot")),
-    "mesh": Reader(mesh, lambda p: read_mesh(p / "mesh.ply")),
     "tum-log": Reader(tum, read_tum_log),
     "carmen-robotlaser": Reader(lambda p: small.carmen(p / "a.log", mixed=True) and None, read_carmen, RANGES),
     "carmen-rawlaser": Reader(lambda p: small.carmen(p / "a.log", "RAWLASER1") and None, read_carmen, RANGES),

@@ -19,11 +19,10 @@ from graphslam.app.run.loops import loops_of_run
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import FormatError, GraphSlamError, RunFolderError, UnknownNameError
-from graphslam.io.log_folder import read_log_mesh
 from graphslam.io.log_store import load_log
 from graphslam.io.submap_store import read_submaps
 from graphslam_studies.montecarlo.study import open_study
-from tests.faults.readers import a_log_folder, log_with_mesh, run_folder, study_folder, submap_store
+from tests.faults.readers import a_log_folder, run_folder, study_folder, submap_store
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted([*ROOT.glob("graphslam/**/*.py"), *ROOT.glob("frontends/**/*.py")])
@@ -86,12 +85,11 @@ def test_links_lead_nowhere_else(tmp_path: Path) -> None:
     for place, file, read in (
         ("log", "log/gps.npz", lambda: load_log(tmp_path / "log")),
         ("log", "log/log.json", lambda: load_log(tmp_path / "log")),
-        ("mesh", "mesh/mesh.ply", lambda: read_log_mesh(tmp_path / "mesh")),
         ("run", "run/submaps/000001.npz", lambda: read_submaps(tmp_path / "run")),
     ):
         shutil.rmtree(tmp_path / place, ignore_errors=True)
         (tmp_path / place).mkdir()
-        {"log": a_log_folder, "mesh": log_with_mesh, "run": submap_store}[place](tmp_path / place)
+        {"log": a_log_folder, "run": submap_store}[place](tmp_path / place)
         read()
         moved = tmp_path / f"outside-{place}"
         os.rename(tmp_path / file, moved)

@@ -11,13 +11,14 @@ from graphslam.core.geometry import se2_between, se2_log
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
+from tests.reference.plain_gps import gps_residual
 
 
 def rich_graph(rng) -> FactorGraph:

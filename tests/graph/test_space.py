@@ -18,7 +18,7 @@ from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose, pose_array
 from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
-from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
+from graphslam.graph.gtsam_values import from_gtsam
 from graphslam.graph.network import to_network
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms, whitener
 from graphslam.graph.sensors.gps import GpsConfig
@@ -27,6 +27,7 @@ from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.gtsam_optimum import optimise_with_gtsam
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.space_chain import DenseChain, dense_chain
 
 C = np.diag([1e-4, 2e-4, 4e-4, 1e-2, 2e-2, 3e-2])

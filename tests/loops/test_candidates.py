@@ -23,7 +23,8 @@ from graphslam.loops.candidates import (
     proximity_candidates,
     thin_candidates,
 )
-from graphslam.loops.places import ChainRelativePoses, Places, chain_increments
+from graphslam.loops.places import Places
+from tests.reference.chain_poses import ChainRelativePoses, chain_increments
 from tests.reference.loop_places import loop_places
 
 D3 = np.diag([1e-6, 1e-6, 4e-6, 1e-4, 1e-4, 2.5e-5])

@@ -44,12 +44,6 @@ def test_at_the_chain_pieces_are_the_submaps(run: tuple[Steps, list[Submap]]) ->
     assert a.known_volume() == pytest.approx(b.known_volume(), rel=1e-5)
     points = b.occupied_cloud()
     assert np.mean(a.values_at(points) == b.values_at(points)) > 0.9999
-    # bases alone place them there, too
-    bases = {m.key: rigid.poses[m.key, 0] for m in submaps}
-    again = divided.from_bases(bases)
-    assert all(np.allclose(again[n], divided.poses[n], atol=1e-12) for n in divided.pieces)
-    with pytest.raises(DataError, match="no pose"):
-        divided.from_bases({})
 
 
 def test_the_map_is_clearer_at_the_true_poses(run: tuple[Steps, list[Submap]]) -> None:

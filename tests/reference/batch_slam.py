@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+import scipy.sparse.linalg as spla
 
-from graphslam.core.gaussian import Information
 from graphslam.core.geometry import (
     rotation2,
     se2_adjoint,
@@ -121,7 +121,7 @@ def batch_slam(log: SensorLog, first: int = 0, last: int | None = None, *, itera
         A, g = sp.csc_matrix(J.T @ J), -(J.T @ res)
         while True:
             damped = A + sp.diags_array(damping * A.diagonal(), format="csc") if damping else A
-            step = Information(sp.csc_matrix(damped), g).mean()
+            step = spla.spsolve(sp.csc_matrix(damped), g, permc_spec="MMD_AT_PLUS_A")
             X2 = X.copy()
             X2[1:] = se2_compose(X[1:], se2_exp(step[: 3 * k].reshape(-1, 3)))
             L2 = L + step[3 * k :].reshape(-1, 2)

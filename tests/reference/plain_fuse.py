@@ -82,38 +82,3 @@ def nearest_owner(
     d = (places - centre) * [1.0, 1.0, stretch]
     k = int(np.argmin(np.sum(d**2, axis=1)))
     return int(nodes[k]) if np.linalg.norm(places[k] - centre) <= reach else -1
-
-
-def plain_disagreement(
-    a: Piece, T_a: Any, b: Piece, T_b: Any, occupied: int, free: int, slack: int
-) -> tuple[int, int, int, int, int]:
-    """Overlap, agreeing, contradicting, free and sure voxels of two pieces, each looked up in the other."""
-    group = SE3 if a.dim == 3 else SE2
-    overlap = agreeing = contradicting = both_free = sure = 0
-    up = slack if a.dim == 3 else 0
-    for one, T_one, other, T_other in ((a, T_a, b, T_b), (b, T_b, a, T_a)):
-        base_one = matrix(group.compose(np.asarray(T_one, float), group.inverse(one.T_base_node)))
-        base_other = matrix(group.compose(np.asarray(T_other, float), group.inverse(other.T_base_node)))
-        M = np.linalg.inv(base_other) @ base_one
-        theirs = voxels_of(other.coordinates, other.values)
-        for voxel, value in voxels_of(one.coordinates, one.values).items():
-            is_sure = value >= occupied or value <= free
-            sure += is_sure
-            centre = [(i + 0.5) * one.voxel_size for i in voxel]
-            i, j, k = (math.floor(x / one.voxel_size) for x in (M @ [*centre, 1.0])[:3])
-            if (i, j, k) not in theirs:
-                continue
-            overlap += 1
-            if not is_sure:
-                continue
-            if value <= free:
-                both_free += theirs[i, j, k] <= free
-                continue
-            around = itertools.product(
-                range(i - slack, i + slack + 1), range(j - slack, j + slack + 1), range(k - up, k + up + 1)
-            )
-            if any(theirs.get(v, UNKNOWN) >= occupied for v in around):
-                agreeing += 1
-            elif theirs[i, j, k] <= free:
-                contradicting += 1
-    return overlap, agreeing, contradicting, both_free, sure

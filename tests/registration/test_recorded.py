@@ -9,7 +9,7 @@ import pytest
 
 from graphslam.core import se3
 from graphslam.registration.config import RegistrationConfig, RegistrationGates
-from graphslam.registration.register import fitness_margin, register, register_starts
+from graphslam.registration.register import register, register_starts
 from graphslam.registration.search import correlative_search, offset_pose
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
@@ -79,7 +79,6 @@ def test_recorded_loop_is_found_from_seven_metres_off(data_dir: Path) -> None:
     results = register_starts(Target(last, voxel=0.3), Target(first, voxel=0.3), [s.T for s in starts], config)
     assert [r.accepted for r in results].count(True) == 1
     assert results[0].accepted, results[0].why
-    assert fitness_margin(results) > 0.2
     # the odometry came back with an error of a few centimetres
     e = se3.se3_log(se3.se3_between(end, results[0].T_target_source))
     assert np.linalg.norm(e[3:]) < 0.1

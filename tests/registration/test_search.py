@@ -38,6 +38,15 @@ def coarse() -> SearchField:
     return SearchField(map_of(hall(), np.random.default_rng(5)), cell=0.4, sigma=0.6)
 
 
+def value_at(field: SearchField, points: np.ndarray) -> np.ndarray:
+    """The field, 0 … 1, at points ``(m, dim)`` in the frame of the map; 0 outside it."""
+    c = field._cells(points)
+    inside = np.all((c >= 0) & (c < field.values.shape[::-1]), axis=1)
+    out = np.zeros(len(c))
+    out[inside] = field.values[tuple(c[inside].T[::-1])] / 255.0
+    return out
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_field_is_the_distance_to_the_nearest_occupied_cell(dim: int, rng: np.random.Generator) -> None:
     points = rng.uniform(-1.0, 1.3, (12, dim))
@@ -47,8 +56,6 @@ def test_field_is_the_distance_to_the_nearest_occupied_cell(dim: int, rng: np.ra
     expected = slow_field(points, field._low, field.values.shape, 0.25, 0.3)
     assert np.array_equal(field.values, expected)
     assert 0 < np.mean(field.values > 0) < 1
-    assert np.all(field.value_at(points) == 1.0)
-    assert np.all(field.value_at(points + 50.0) == 0.0)
 
 
 @pytest.mark.parametrize("steps", [(0.2, 0.2, 0.2, 0.11), (0.4, 0.4, 0.4, 0.07), (0.4, 0.2, 0.6, 0.2)])
@@ -159,7 +166,7 @@ def test_a_coarse_look_first_finds_what_the_whole_search_finds(
     assert found[0].score > whole.score - 0.05
     # what is scored coarsely is not what is reported: scores are those of the fine field
     p = evenly_spaced(voxel_downsample(scan, field.cell), 300)
-    assert found[0].score == pytest.approx(field.value_at(transform_points(found[0].T, p)).mean(), abs=0.01)
+    assert found[0].score == pytest.approx(value_at(field, transform_points(found[0].T, p)).mean(), abs=0.01)
 
 
 def test_refined_starts_are_nearer(pillars: tuple[BoxWorld, SearchField]) -> None:

@@ -18,7 +18,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import VelocityControls
 from graphslam.core.se3 import quat_multiply, quat_rotate, se3_compose, se3_transform, so3_exp
 from graphslam.io.log_digest import log_digest
-from graphslam.io.log_folder import read_log_folder
+from graphslam.io.log_store import load_log
 from graphslam.sim.crawler_sensors import scan_rays, true_inertia
 from graphslam.sim.raycast import RayCaster
 from graphslam_studies.sim.campus import campus_motion, empty_scans, movers_of, pan_angle, slip_wheels
@@ -431,7 +431,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
 
 def test_a_log_comes_back_from_disk_with_its_truth_and_the_place(noisy: SensorLog, tmp_path: Path) -> None:
     write_simulated(noisy, tmp_path / "log")
-    back = read_log_folder(tmp_path / "log")
+    back = load_log(tmp_path / "log")
     assert log_digest(back) == log_digest(noisy)
     for name, labels in noisy.truth.moving.items():
         got = back.truth.moving[name]

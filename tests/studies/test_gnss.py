@@ -16,7 +16,6 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.attitude import DOWN
 from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
 from graphslam.graph.factors.gps import level_datum_pose
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from graphslam_studies.graph.gnss import PseudorangeConfig, add_odometer, add_pseudoranges, antenna_positions
@@ -25,6 +24,7 @@ from graphslam_studies.graph.pseudorange import ClockRecord, PseudorangeRecord, 
 from graphslam_studies.sim.satellites import PLANE, SatelliteConfig, simulate_satellites
 from graphslam_studies.smartloc import errors, score_of, solve_street
 from tests.graph.factors.test_gps_space import LEVER, built, fixes_along
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.space_chain import dense_chain
 
 SHORT = SatelliteConfig(seconds=12.0, satellites=7)

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from graphslam.app.machine import hold_one_thread
 from graphslam.core.errors import ConfigError, DataError
 from graphslam_studies.evaluate.tables import (
     consistency_of,
@@ -23,7 +22,7 @@ from graphslam_studies.evaluate.tables import (
     summarise,
     values_of,
 )
-from graphslam_studies.montecarlo.executors import Job, execute
+from graphslam_studies.montecarlo.executors import Job, execute, hold_one_thread
 from graphslam_studies.montecarlo.trials import (
     COLUMNS,
     Measurement,

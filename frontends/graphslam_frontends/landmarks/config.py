@@ -100,22 +100,16 @@ DELAYED = DelayedInitialisation()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FilterConfig:
-    """What a particle filter over one map needs, whatever becomes of the map."""
+class SightingConfig:
+    """What every filter over a map of landmarks needs."""
 
-    particles: int = 40
-    """Number of particles N."""
-    proposal: Literal["2.0", "1.0"] = "2.0"
-    """FastSLAM 2.0 (EKF proposal, measurement in the proposal) or 1.0 (motion prior)."""
-    association: Literal["likelihood", "known"] = "likelihood"
-    """Per-particle maximum likelihood, or the identities in the log."""
     gate: float = 11.8
     """χ² gate of an association (2 dof: 99.7 %; the same tail for an observation of one channel)."""
     gate_new: float = 30.0
     """An observation farther than this from every landmark founds a new one; between the gates it is ignored."""
     outlier_gate: float = 0.0
     """With known association: an observation with d² above this (χ², 2 dof; the same tail where it has one channel) is
-    an outlier to that particle and not used; 0 = use all."""
+    an outlier (to that particle) and not used; 0 = use all."""
     confirm_hits: int = 3
     """A feature is provisional until it has been seen this often."""
     drop_misses: int = 5
@@ -124,8 +118,6 @@ class FilterConfig:
     """A provisional feature goes if it is not confirmed this many scans after its birth."""
     max_range: float = 45.0
     """Observations beyond are not used [m]."""
-    ess_fraction: float = 0.5
-    """Systematic resampling when N_eff < ess_fraction · N. Never switch it off inside a submap."""
     longest_gap: float = 60.0
     """Longest time without a record of the motion that is bridged [s]
     (:mod:`graphslam_frontends.odometry.motion_gaps`)."""
@@ -134,23 +126,40 @@ class FilterConfig:
     noise: RangeBearingNoise | None = None
     """Observation noise in the filter; None: the log's sigmas."""
     min_hits: int = 1
-    """Landmarks handed over were seen at least this often under the winning association."""
+    """Landmarks handed over were seen at least this often (under the winning association)."""
     detector: TreeDetectorConfig = field(default_factory=TreeDetectorConfig)
     """Tree detector, used when the log holds raw scans instead of landmark observations."""
 
     def __post_init__(self) -> None:
-        if self.particles < 1:
-            raise ConfigError(f"particles = {self.particles}; wanted ≥ 1")
         if not self.longest_gap >= 0:
             raise ConfigError(f"longest_gap = {self.longest_gap}; wanted ≥ 0 s")
-        if self.proposal not in ("1.0", "2.0"):
-            raise ConfigError(f"proposal = {self.proposal!r}; known: 1.0, 2.0")
-        if self.association not in ("likelihood", "known"):
-            raise ConfigError(f"association = {self.association!r}; known: likelihood, known")
         if not 0 < self.gate <= self.gate_new:
             raise ConfigError(f"gates must satisfy 0 < gate ≤ gate_new, got {self.gate} and {self.gate_new}")
         if not self.outlier_gate >= 0:
             raise ConfigError(f"outlier_gate = {self.outlier_gate}; wanted ≥ 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilterConfig(SightingConfig):
+    """What a particle filter over one map needs, whatever becomes of the map."""
+
+    particles: int = 40
+    """Number of particles N."""
+    proposal: Literal["2.0", "1.0"] = "2.0"
+    """FastSLAM 2.0 (EKF proposal, measurement in the proposal) or 1.0 (motion prior)."""
+    association: Literal["likelihood", "known"] = "likelihood"
+    """Per-particle maximum likelihood, or the identities in the log."""
+    ess_fraction: float = 0.5
+    """Systematic resampling when N_eff < ess_fraction · N. Never switch it off inside a submap."""
+
+    def __post_init__(self) -> None:
+        SightingConfig.__post_init__(self)
+        if self.particles < 1:
+            raise ConfigError(f"particles = {self.particles}; wanted ≥ 1")
+        if self.proposal not in ("1.0", "2.0"):
+            raise ConfigError(f"proposal = {self.proposal!r}; known: 1.0, 2.0")
+        if self.association not in ("likelihood", "known"):
+            raise ConfigError(f"association = {self.association!r}; known: likelihood, known")
         if not 0 < self.ess_fraction <= 1:
             raise ConfigError(f"ess_fraction = {self.ess_fraction}; wanted in (0, 1]")
 

@@ -247,11 +247,7 @@ class Ekf(FrontEnd):
         yield from data.reach(0)
         if data.done:
             require_bearings(data.prepared, feed.name)
-        key, scan, t_start = 0, 0, data.prepared.t_start
-        if after is not None:
-            t_start, key = after.interval[1], after.key + 1
-            while (yield from data.reach(scan)) and data.prepared.observations.times[scan] <= t_start:
-                scan += 1
+        key, scan, t_start = yield from data.resume(after)
         while (yield from data.reach(scan)):
             submap, scan = yield from self._build(data, key, scan, t_start)
             yield submap

@@ -8,55 +8,22 @@ from typing import Literal
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam_frontends.detectors.trees import TreeDetectorConfig
-from graphslam_frontends.landmarks.config import RangeBearingNoise, StoppingConfig
-from graphslam_frontends.odometry.motion import MotionNoise
+from graphslam_frontends.landmarks.config import RangeBearingNoise, SightingConfig, StoppingConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EkfFilterConfig:
+class EkfFilterConfig(SightingConfig):
     """What an EKF over one map needs, whatever becomes of the map."""
 
     association: Literal["known", "nearest", "jcbb"] = "nearest"
     """Identities in the log, gated nearest neighbour, or joint compatibility by branch and bound."""
-    gate: float = 11.8
-    """χ² gate of an association with 2 dof (99.7 %); other degrees of freedom use the same probability."""
-    gate_new: float = 30.0
-    """An observation farther than this from every landmark founds a new one; between the gates it is ignored."""
-    outlier_gate: float = 0.0
-    """With known association: an observation with d² above this (χ², 2 dof; the same tail where it has one channel) is
-    an outlier and not used; 0 = use all."""
     max_nodes: int = 20_000
     """Joint compatibility: hypotheses tested per scan; the best one so far is taken then, and the scan counted."""
-    confirm_hits: int = 3
-    """A feature is provisional until it has been seen this often."""
-    drop_misses: int = 5
-    """A provisional feature goes after this many scans in which it should have been seen and was not."""
-    drop_scans: int = 10
-    """A provisional feature goes if it is not confirmed this many scans after its birth."""
-    max_range: float = 45.0
-    """Observations beyond are not used [m]."""
-    longest_gap: float = 60.0
-    """Longest time without a record of the motion that is bridged [s]
-    (:mod:`graphslam_frontends.odometry.motion_gaps`)."""
-    motion: MotionNoise = field(default_factory=MotionNoise)
-    """Noise of the dead-reckoning increments."""
-    noise: RangeBearingNoise | None = None
-    """Observation noise in the filter; None: the log's sigmas."""
-    min_hits: int = 1
-    """Landmarks handed over were seen at least this often."""
-    detector: TreeDetectorConfig = field(default_factory=TreeDetectorConfig)
-    """Tree detector, used when the log holds raw scans instead of landmark observations."""
 
     def __post_init__(self) -> None:
+        SightingConfig.__post_init__(self)
         if self.association not in ("known", "nearest", "jcbb"):
             raise ConfigError(f"association = {self.association!r}; known: known, nearest, jcbb")
-        if not self.longest_gap >= 0:
-            raise ConfigError(f"longest_gap = {self.longest_gap}; wanted ≥ 0 s")
-        if not 0 < self.gate <= self.gate_new:
-            raise ConfigError(f"gates must satisfy 0 < gate ≤ gate_new, got {self.gate} and {self.gate_new}")
-        if not self.outlier_gate >= 0:
-            raise ConfigError(f"outlier_gate = {self.outlier_gate}; wanted ≥ 0")
         for name in ("max_nodes", "confirm_hits", "drop_misses", "drop_scans", "min_hits"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted ≥ 1")

@@ -20,7 +20,6 @@ from graphslam_frontends.landmarks.config import DelayedInitialisation
 from graphslam_frontends.landmarks.range_only_kernels import FIT_LENGTH, circle_starts, trilaterate_kernel
 from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult
 
-Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 _ROUNDS = 3  # a swap moves the path, so the others are looked at again
 _APART = 1.0  # a rival this near [m] is the landmark itself

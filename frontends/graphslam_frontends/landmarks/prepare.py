@@ -18,6 +18,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LandmarkObservations, LaserScans, Odometry
+from graphslam.core.submap import Submap
 from graphslam_frontends.detectors.trees import TreeDetectorConfig, detect_trees
 from graphslam_frontends.landmarks.config import RangeBearingNoise
 from graphslam_frontends.odometry.motion import Motion, MotionNoise, motion_stream, motion_stream_name
@@ -193,6 +194,16 @@ class LogPreparation:
             if not self.advance():
                 yield None
         return scan < len(self.prepared)
+
+    def resume(self, after: Submap | None) -> Generator[None, None, tuple[int, int, float]]:
+        """Key, first scan and start [s] of the submap behind ``after``; None: of the first one."""
+        yield from self.reach(0)
+        if after is None:
+            return 0, 0, self.prepared.t_start
+        scan, t_start = 0, after.interval[1]
+        while (yield from self.reach(scan)) and self.prepared.observations.times[scan] <= t_start:
+            scan += 1
+        return after.key + 1, scan, t_start
 
     def advance(self) -> bool:
         """Make ready what has come; False: that was nothing."""

@@ -73,14 +73,7 @@ class RbpfEkf(FrontEnd):
         To look at; with pooled filters those of the one that decides.
         """
         data = LogPreparation(feed, self.config, drops if drops is not None else DropCounter())
-        yield from data.reach(0)
-        if after is None:
-            key, scan, t_start = 0, 0, data.prepared.t_start
-        else:
-            t_start, scan = after.interval[1], 0
-            while (yield from data.reach(scan)) and data.prepared.observations.times[scan] <= t_start:
-                scan += 1
-            key = after.key + 1
+        key, scan, t_start = yield from data.resume(after)
         while (yield from data.reach(scan)):
             submap, particles, scan = yield from self._build(data, key, scan, t_start, seed.child(key))
             yield submap, particles

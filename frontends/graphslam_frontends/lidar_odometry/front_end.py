@@ -420,19 +420,6 @@ class _Wheels(_Heard):
         return self.reckoned
 
 
-def start_odometry(clouds: PointClouds, config: LidarOdometryConfig, imu: Imu | None = None) -> LidarOdometry:
-    """LiDAR odometry at its start.
-
-    With an IMU, the first scans are followed to learn its bias, the velocity and gravity, and whether it is to be
-    believed; then they are to be followed anew, so that not even the first of them is bent.
-    """
-    streams: dict[str, Stream] = {"clouds": clouds} if imu is None else {"clouds": clouds, "imu": imu}
-    unit = Unit(RecordSource(SensorLog(name="clouds", streams=streams)), None if imu is None else "imu", config)
-    for _ in unit.rehearse("clouds"):
-        pass
-    return unit.odometry()
-
-
 def _step(odometry: LidarOdometry, clouds: Any, k: int) -> ScanResult:
     points = se3.se3_transform(clouds.T_base_sensor, clouds.cloud(k))
     return odometry.step(points, float(clouds.times[k]), clouds.ages(k))

@@ -35,10 +35,9 @@ from graphslam_frontends.odometry.dead_reckoned_path import (
     tangent_of_state,
 )
 from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
-from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.gaps import Gaps, find_gaps
 
-__all__ = ["DeadReckoningNoise", "DriftModel", "imu_wheel_increments", "integrate_imu_and_wheels"]
+__all__ = ["DeadReckoningNoise", "integrate_imu_and_wheels"]
 
 _STEEPEST = float(np.deg2rad(80.0))  # heading means nothing on a wall
 FILTER_TIME = 5.0
@@ -77,13 +76,6 @@ class DeadReckoningNoise:
             positive = name == "floor_position"
             if not (np.isfinite(value) and (value > 0 if positive else value >= 0)):
                 raise ConfigError(f"dead reckoning: {name} = {value}; wanted {'> 0' if positive else '≥ 0'}")
-
-
-def imu_wheel_increments(
-    imu: Imu, wheels: VelocityControls, times: npt.ArrayLike, noise: DeadReckoningNoise | None = None
-) -> Odometry:
-    """The increments of :func:`integrate_imu_and_wheels`, with the covariance of what is new in each."""
-    return integrate_imu_and_wheels(imu, wheels, times, noise).odometry
 
 
 def integrate_imu_and_wheels(

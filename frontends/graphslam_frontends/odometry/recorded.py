@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.core.errors import DataError
-from graphslam.core.geometry import Array
+from graphslam.core.errors import ConfigError, DataError
+from graphslam.core.geometry import Array, se2_exp, se2_log
 from graphslam.core.log import DropCounter
 from graphslam.core.poses import group_of
 from graphslam.core.records import Odometry, check_times
@@ -184,3 +184,12 @@ def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise) -> Odomet
         P[live] = back @ P[live] @ np.swapaxes(back, -1, -2) + added[first[live] + m]
     covariances[1:] += 0.5 * (P + np.swapaxes(P, -1, -2))
     return Odometry(times=t, increments=increments, covariances=covariances)
+
+
+def without_yaw_per_metre(odometry: Odometry, rate: float, *, where: str = "odometry") -> Odometry:
+    """The odometry without a turn of ``rate`` [rad/m] for each metre driven."""
+    if odometry.increments.shape[1] != 3:
+        raise ConfigError(f"{where}: yaw_per_metre is for odometry in the plane")
+    xi = se2_log(odometry.increments)
+    xi[:, 2] -= rate * np.hypot(xi[:, 0], xi[:, 1])
+    return replace(odometry, increments=se2_exp(xi))

@@ -45,7 +45,7 @@ class StepConfig:
     """σ of an error of its distances that lasts, a share of them."""
     yaw_per_metre: float = 0.0
     """What recorded odometry in the plane turns too much for each metre driven: taken out [rad/m]. Wheels of unequal
-    size do that; :func:`graphslam_frontends.odometry.calibration.yaw_per_metre` finds it from scans."""
+    size do that."""
     match_scans: bool = False
     """In the plane: fuse the motion with matches of neighbouring scans
     (:mod:`graphslam_frontends.odometry.scan_matching`)."""

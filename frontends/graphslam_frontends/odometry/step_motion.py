@@ -15,13 +15,19 @@ from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.grid.motion import roll_pitch_of
-from graphslam_frontends.odometry.calibration import without_yaw_per_metre
 from graphslam_frontends.odometry.dead_reckoning import integrate_imu_and_wheels
-from graphslam_frontends.odometry.drift import IntervalCovariance
 from graphslam_frontends.odometry.gaps import Gaps, find_gaps
 from graphslam_frontends.odometry.motion import steering_odometry, velocity_odometry
-from graphslam_frontends.odometry.recorded import RecordedErrors, add_yaw_bias, bridge_gap, chain_odometry, cut_odometry
+from graphslam_frontends.odometry.recorded import (
+    RecordedErrors,
+    add_yaw_bias,
+    bridge_gap,
+    chain_odometry,
+    cut_odometry,
+    without_yaw_per_metre,
+)
 from graphslam_frontends.odometry.step_config import StepConfig
+from graphslam_frontends.odometry.steps import IntervalCovariance
 
 TILT_TIME = 10.0
 """Time over which errors of the roll and pitch of recorded odometry stay alike [s]."""

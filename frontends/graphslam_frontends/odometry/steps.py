@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +14,17 @@ from graphslam.core.geometry import Array
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.records import Odometry, check_times
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.drift import IntervalCovariance
 from graphslam_frontends.odometry.gaps import Gaps
+
+
+class IntervalCovariance(Protocol):
+    """Knows how far off dead reckoning may be over an interval of steps, errors that last included."""
+
+    def between(
+        self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
+    ) -> tuple[Array, Array]:
+        """Motion from step ``start`` to step ``end``, and its covariance in the right tangent."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

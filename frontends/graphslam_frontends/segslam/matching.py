@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
@@ -80,9 +79,6 @@ class RecentCache(dict[K, V]):
         """Drop all others."""
         for key in [k for k in self if not alive(k)]:
             del self[key]
-
-
-Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

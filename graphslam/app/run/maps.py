@@ -7,7 +7,6 @@ from a run folder alone (``graphslam map``).
 from __future__ import annotations
 
 import gc
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from graphslam.core.heap import trim_heap
 from graphslam.maps.coarse import drawable_map
 from graphslam.maps.export import save_maps, save_points
 from graphslam.maps.run_map import RunMap
-
-logger = logging.getLogger(__name__)
 
 
 def write_run_map(folder: OutputFiles, run_map: RunMap, generation: str | None = None) -> list[Path]:

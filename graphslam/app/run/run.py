@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from graphslam.core.findings import Finding, Findings, findings_of_json, headline_of_json
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from graphslam.maps.run_map import RunMap
     from graphslam.solve.solution import Solution
 
-Ints = npt.NDArray[np.int64]
 _MAX_STRETCH = 2.5
 """A dead-reckoned path this many times larger than the map is not drawn: the map would be a dot."""
 

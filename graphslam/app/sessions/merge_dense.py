@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -33,7 +32,6 @@ from graphslam.plots.paths import plot_paths
 from graphslam.solve.registry import make_solver
 from graphslam.solve.solution import Solution
 
-logger = logging.getLogger(__name__)
 By = Literal["auto", "places", "gps"]
 
 

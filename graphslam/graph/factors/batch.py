@@ -12,7 +12,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from itertools import starmap
 from typing import Any, ClassVar, Protocol, Self
 
 import gtsam
@@ -22,7 +21,7 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.core.se3 import matrix_to_quat, quat_normalize, quat_to_matrix
+from graphslam.core.se3 import matrix_to_quat, quat_normalize
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, robust_terms
 from graphslam.graph.variables import KINDS, Values, VariableLayout, gtsam_key, split_name
 
@@ -317,15 +316,6 @@ def gtsam_pose(pose: Array) -> Any:
         return gtsam.Pose2(*pose)
     x, y, z, w = quat_normalize(pose[3:])
     return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
-
-
-def gtsam_poses(poses: Array) -> list[Any]:
-    """:func:`gtsam_pose` of many ``(n, 3|7)``."""
-    if poses.shape[1] == 3:
-        return list(starmap(gtsam.Pose2, poses.tolist()))
-    T = np.zeros((len(poses), 4, 4))
-    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = quat_to_matrix(quat_normalize(poses[:, 3:])), poses[:, :3], 1.0
-    return list(map(gtsam.Pose3, T))
 
 
 def pose_array(pose: Any) -> Array:

@@ -30,13 +30,12 @@ import numpy.typing as npt
 
 from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import level_poses
-from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, se3_transform, skew, so3_exp
+from graphslam.core.se3 import quat_multiply, quat_normalize, quat_to_matrix, skew, so3_exp
 from graphslam.graph.factors.attitude import level_turn, node_rotation_position, skew_of, up_turn
 from graphslam.graph.factors.batch import UniformBatch, safe_factor, unit_noise
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, whitener
 from graphslam.graph.variables import Values, gtsam_key
 
-Index = npt.NDArray[np.int64]
 Terms = Callable[[gtsam.Values, "list[Array] | None"], Array]
 
 
@@ -141,13 +140,6 @@ class BiasPriorRecord:
     def label(self) -> str:
         """Name for messages."""
         return f"prior on bias{self.bias} (factor {self.factor_id})"
-
-
-def gps_residual(pose: Array, datum: Array, bias: Array, arm: Array, z: Array) -> Array:
-    """``arm - x⁻¹ T_gps_world⁻¹ (z - bias)``; every argument broadcasts over leading axes."""
-    p_world = (z - bias - datum[..., :2])[..., None, :] @ rotation2(datum[..., 2])
-    q = (p_world[..., 0, :] - pose[..., :2])[..., None, :] @ rotation2(pose[..., 2])
-    return np.asarray(arm - q[..., 0, :])
 
 
 def gps_terms(x: Array, datum: Array, bias: Array, arm: Array, z: Array) -> tuple[Array, Array]:
@@ -258,12 +250,6 @@ def level_datum_pose(datum: Array, tilt: Array | None = None) -> Array:
     if tilt is not None:
         pose[3:] = quat_normalize(quat_multiply(pose[3:], so3_exp(-np.append(tilt, 0.0))))
     return pose
-
-
-def gps_predicted_in_space(values: Values, node: Index, arm: Array) -> Array:
-    """Where the GPS frame has the antennas ``(k, 3)`` of nodes ``(k,)``, biases left aside."""
-    assert values.datum is not None
-    return se3_transform(level_datum_pose(values.datum, values.tilt), se3_transform(values.poses[node], arm))
 
 
 class GpsBatch(UniformBatch):

@@ -23,19 +23,7 @@ from graphslam.graph.sensors.pending import PendingMeasurement, PendingMeasureme
 class BeaconConfig:
     """How distances to beacons enter the graph.
 
-    Parameters
-    ----------
-    sigma : float or None
-        Standard deviation of a distance [m] in place of the stream's own.
-    every : float
-        At most one distance to each beacon in so many seconds.
-    least : int
-        Distances to a beacon before it gets a place.
-    spread : float
-        Places from which it was heard must not lie on one line: the smaller extent of them is at least this share of
-        the larger one, or else the beacon waits.
-    robust : RobustKernel
-        Kernel on each distance.
+    Places from which a beacon was heard must not lie on one line, or else it waits.
     """
 
     sigma: float | None = None

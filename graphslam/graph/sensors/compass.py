@@ -22,22 +22,8 @@ from graphslam.graph.sensors.pending import PendingMeasurement, PendingMeasureme
 class CompassConfig:
     """How a compass enters the graph.
 
-    Parameters
-    ----------
-    sigma : float or None
-        Standard deviation of a reading [rad] in place of the stream's own.
-    every : float
-        At most one reading in so many seconds: what disturbs a compass lasts, so that readings close to each other are
-        wrong together.
-    declination : float or None
-        Magnetic declination [rad], positive where magnetic north is east of true north. With it, and with GPS in the
-        graph, the zero of the compass is tied to the GPS frame; else it is found from the map alone.
-    declination_sigma : float
-        [rad]
-    hard_iron : float or None
-        Standard deviation [rad] of the deviation by iron on the robot, which is then estimated; None: there is none.
-    robust : RobustKernel
-        Kernel on each reading.
+    What disturbs a compass lasts, so that readings close to each other are wrong together. With a declination, and with
+    GPS in the graph, the zero of the compass is tied to the GPS frame; else it is found from the map alone.
     """
 
     sigma: float | None = None

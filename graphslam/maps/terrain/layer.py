@@ -4,8 +4,7 @@ What was seen while a node was the last one is summed up in that node's level fr
 each range band. A world cell takes what the piece says of the cell that its middle lies in; all sums are of whole
 numbers. So a map whose pieces were moved one by one is, bit for bit, the map that is made anew at the same poses.
 
-Statements are relative to the ground of their own line and do not feel a change of tilt; how far nodes were tilted
-since their pieces were made is told by :meth:`TerrainLayer.most_tilt`.
+Statements are relative to the ground of their own line and do not feel a change of tilt.
 """
 
 from __future__ import annotations
@@ -130,14 +129,6 @@ class TerrainLayer:
             self.poses[name] = T
         return len(moved)
 
-    def most_tilt(self) -> float:
-        """Largest change of roll and pitch of a node since its piece was made [rad]."""
-        tilts = [
-            math.acos(float(np.clip(_up(self.poses[n]) @ _up(piece.pose), -1.0, 1.0)))
-            for n, piece in self.pieces.items()
-        ]
-        return max(tilts, default=0.0)
-
     def pyramid(self) -> Pyramid:
         """All pieces at their poses."""
         if self._made is None:
@@ -175,10 +166,6 @@ def _placed(T: Array) -> tuple[float, float, float, int]:
 def _yaw(T: Array) -> float:
     x = se3.quat_rotate(T[None, 3:], np.array([[1.0, 0.0, 0.0]]))[0]
     return math.atan2(x[1], x[0])
-
-
-def _up(T: Array) -> Array:
-    return np.asarray(se3.quat_rotate(T[None, 3:], np.array([[0.0, 0.0, 1.0]]))[0])
 
 
 def _in_frame(lines: ScanLines, pose: Array) -> ScanLines:

@@ -25,7 +25,6 @@ SCALE = 256
 WEIGHTS = 9
 """Of a band."""
 DEFAULT = Path(__file__).with_name("tables.json")
-Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

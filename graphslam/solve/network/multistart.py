@@ -13,8 +13,7 @@ from graphslam.core.errors import IndeterminateError, UnknownNameError
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.factor_arrays import FactorArrays
-from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.network import network_of, network_values
+from graphslam.graph.network import network_values
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import SAME, Optimum, descend_to_minimum
 from graphslam.solve.network.start import (
@@ -252,23 +251,3 @@ def _better(a: Any, b: Any) -> bool:
 def _agreed(reports: list[StartReport], lowest: float) -> bool:
     same = [r for r in reports if r.status == "converged" and r.objective <= lowest * (1.0 + SAME)]
     return len(same) >= 2
-
-
-def solve_from(graph: FactorGraph, *starts: str) -> str:
-    """Take a graph of relative poses to the lowest objective that is reached from its present values and other starts.
-
-    Parameters
-    ----------
-    starts : str
-        Keys of :data:`STARTS`; if not given, those that are worth trying.
-
-    Returns
-    -------
-    str
-        Which start won; ``"present"`` are the graph's values.
-    """
-    network = network_of(graph.flat(), graph.values)
-    names = starts or tuple(n for n in default_starts(network) if n != "file")  # the graph's values are that
-    found = best_of_starts(network, names, flat=graph.flat(), given={"present": graph.values})
-    graph.set_values(found.best.values)
-    return found.start

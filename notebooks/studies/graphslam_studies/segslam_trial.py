@@ -30,7 +30,6 @@ from graphslam.sim.ring_hall import ring_hall
 from graphslam.sim.world import DRAWN, World
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_error_model import PASSED, FilterDrift
-from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
@@ -44,6 +43,7 @@ from graphslam_frontends.segslam.config import (
 from graphslam_frontends.segslam.result import SegSlamResult
 from graphslam_frontends.segslam.segslam import run_segslam
 from graphslam_studies.evaluate import segslam_judge as judge
+from graphslam_studies.frontends.drift import DriftModel
 from graphslam_studies.frontends.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy

@@ -20,9 +20,9 @@ from graphslam.evidence.memory import measure_memory
 from graphslam_frontends.base import FrontEnd
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_error_model import ErrorPassThrough
-from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.scan_use import dead_reckoning_covariance
 from graphslam_frontends.odometry.steps import Steps
+from graphslam_studies.frontends.drift import DriftModel
 from graphslam_studies.frontends.rbpf_grid import RbpfResult, rbpf_submap, run_rbpf
 from tests.frontends.grid_world import ring, true_end
 

@@ -17,7 +17,7 @@ from graphslam.io.submap_file import submap_arrays, submap_from_arrays
 from graphslam_frontends.lidar_odometry import inertial as inertial_module
 from graphslam_frontends.lidar_odometry import odometry as odometry_module
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
-from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, start_odometry
+from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig
 from graphslam_frontends.lidar_odometry.inertial import (
     FARTHEST,
     ImuReadings,
@@ -30,6 +30,7 @@ from graphslam_frontends.lidar_odometry.inertial import (
 from graphslam_frontends.lidar_odometry.odometry import GYRO_OFF
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 from graphslam_studies.trust import ScanWorld
+from tests.reference.lidar_start import start_odometry
 
 NOISE = ImuNoise(
     gyro=3e-4,

@@ -20,10 +20,8 @@ from graphslam_frontends.odometry.dead_reckoned_path import (
 )
 from graphslam_frontends.odometry.dead_reckoning import (
     DeadReckoningNoise,
-    imu_wheel_increments,
     integrate_imu_and_wheels,
 )
-from graphslam_frontends.odometry.drift import calibrate_drift
 from graphslam_frontends.odometry.gaps import find_gaps
 from tests.reference.imu_drive import NOISE, STILL, drive
 
@@ -46,7 +44,6 @@ def test_without_noise_it_is_the_truth(gives_attitude: bool) -> None:
     assert np.abs(off).max() < (1e-4 if gives_attitude else 5e-3)
     assert np.linalg.norm(motion(truth, 0, 100, False)[:3]) > 10.0
     assert np.abs(r.tilt - euler(truth)[:, :2]).max() < (1e-6 if gives_attitude else 1e-3)
-    np.testing.assert_array_equal(r.odometry.increments, imu_wheel_increments(d.imu, d.wheels, TIMES, NOISE).increments)
 
 
 def test_increments_chain_to_the_poses() -> None:
@@ -233,21 +230,3 @@ def test_one_time_is_a_path_without_motion() -> None:
     T, C = r.between(0, 0)
     np.testing.assert_allclose(T, [0, 0, 0, 0, 0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(C, np.diag(r.floor**2), atol=1e-15)
-
-
-def test_drift_model_of_the_motion_noise() -> None:
-    """Calibrated on the noise alone, the model covers what the same noise does on average, at every length."""
-    d = drive(np.random.default_rng(6))
-    r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
-    length = np.cumsum(np.linalg.norm(r.odometry.increments[:, :3], axis=1))
-    model = calibrate_drift(r, length, lengths=(3.0, 6.0, 12.0, 24.0), level=True)
-    assert model.dim == 3
-    for metres in (5.0, 10.0, 20.0):
-        stated = []
-        for i in range(0, 101, 7):
-            j = int(np.searchsorted(length, length[i] + metres))
-            if j < len(length):
-                stated.append(np.diag(r.covariance(i, j, level_start=True, level_end=True)))
-        mean, said = np.mean(stated, axis=0), np.diag(model.covariance(metres))
-        for rows in ([2], [3, 4], [5]):  # heading; the model knows no shape, so x and y together; z
-            assert 0.5 < said[rows].sum() / mean[rows].sum() < 2.0

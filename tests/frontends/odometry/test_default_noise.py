@@ -19,7 +19,7 @@ from graphslam_frontends.grid import filter_error_model
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter_error_model import FilterDrift
 from graphslam_frontends.grid.motion import motion_covariance, walk_tilt_errors
-from graphslam_frontends.odometry.drift import DriftModel
+from graphslam_studies.frontends.drift import DriftModel
 from tests.reference.garage_exits import Ends, read
 
 STEP = 0.4

@@ -13,12 +13,12 @@ from graphslam.core.records import Barometer
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.barometer import BarometerBatch, BarometerRecord
 from graphslam.graph.factors.batch import gtsam_factor
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.io.log_store import load_log, save_log
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.app.run.test_imu_run import made as logged
 from tests.app.run.test_imu_run import solved
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.imu_ring import ring
 
 SIGMA = 0.1

@@ -16,13 +16,13 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.compass import CompassRecord, DeclinationRecord, DeviationPriorRecord
 from graphslam.graph.factors.range import BeaconRangeRecord, RangeRecord
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.sensors.beacons import trilaterate
 from graphslam.graph.sensors.compass import CompassConfig
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.gtsam_optimum import optimise_with_gtsam
+from tests.reference.gtsam_twin import to_gtsam
 
 SIGMA = {2: np.array([0.05, 0.05, 0.02]), 3: np.array([0.002, 0.002, 0.02, 0.05, 0.05, 0.05])}
 KINDS = (CompassRecord, DeclinationRecord, DeviationPriorRecord, RangeRecord, BeaconRangeRecord)

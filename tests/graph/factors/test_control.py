@@ -10,12 +10,12 @@ from graphslam.core.se3 import se3_transform
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.control import ControlBatch, ControlRecord, DistanceBatch, DistanceRecord
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.sensors.control import ControlFactors
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.graph_chain import make_chain, make_gps
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.imu_ring import ring
 from tests.reference.surveyed import T_SURVEY_WORLD, surveyed, table
 

@@ -10,12 +10,12 @@ from graphslam.core.records import Gps
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import BiasPriorBatch, BiasPriorRecord, level_datum_pose
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.graph.factors.test_gps_space import DATUM, built, fixes_along
 from tests.graph.factors.test_gps_uneven import TILTED, uneven
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.space_chain import dense_chain
 
 LASTING = GpsConfig(bias_sigma=0.5, bias_time=20.0, baseline=2.0)

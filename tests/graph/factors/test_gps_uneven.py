@@ -13,7 +13,6 @@ from graphslam.evaluate.gps_innovation import gps_innovations
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.gps import GpsBatch, GpsRecord, antenna_terms, level_datum_pose
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
@@ -21,6 +20,7 @@ from graphslam_studies.graph.gnss import add_odometer, add_pseudoranges
 from graphslam_studies.graph.pseudorange import PseudorangeRecord
 from graphslam_studies.sim.satellites import PLANE, SatelliteConfig, simulate_satellites
 from tests.graph.factors.test_gps_space import DATUM, LEVER, built, fixes_along
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.space_chain import dense_chain
 
 TILTED = np.array([[0.09, 0.05, 0.0], [0.05, 0.25, 0.1], [0.0, 0.1, 4.0]])

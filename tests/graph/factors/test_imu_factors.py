@@ -18,7 +18,6 @@ from graphslam.graph.factors.batch import gtsam_factor, gtsam_pose
 from graphslam.graph.factors.imu.config import ImuConfig, places_on_nodes
 from graphslam.graph.factors.imu.preintegration import preintegrate
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.graph.sensors.imu import ImuFactors
@@ -26,6 +25,7 @@ from graphslam.graph.variables import gtsam_key, key_name
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference.gtsam_optimum import optimise_with_gtsam
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.imu_ring import MOUNT, NOISE, Ring, ring, true_readings
 
 EVERY = ("imu", "gyro", "imu-bias", "imu-gravity")

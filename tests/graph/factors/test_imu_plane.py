@@ -16,12 +16,12 @@ from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.factors.imu.plane import LEAN, LEAN_TIME
 from graphslam.graph.factors.imu.records import ForceRecord, GyroRecord, ImuBiasRecord, ImuRecord
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.sensors.imu import ImuFactors
 from graphslam.solve.batch import BatchSolver
 from graphslam.solve.isam2 import Isam2Solver
 from tests.reference import imu_plane, imu_ring
 from tests.reference.gtsam_optimum import optimise_with_gtsam
+from tests.reference.gtsam_twin import to_gtsam
 
 T = np.arange(-10, 2420) / 100
 RUNS = 60

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError, GeometryError
+from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import chi2_mean_bounds
-from graphslam.core.imu import GRAVITY, Imu, usable_readings
+from graphslam.core.imu import GRAVITY, Imu
 from graphslam.graph.factors.imu.preintegration import longest_pause, mean_force, preintegrate
 from tests.reference.imu_ring import MOUNT, NOISE, ring, true_unit, true_velocity, unit_on
 from tests.reference.slow_preintegration import slow_preintegrate
@@ -129,24 +129,6 @@ def test_what_it_refuses(rng):
         replace(imu.take(slice(0, 3)), times=[0.0, 1.0, 0.5])
     sure = preintegrate(replace(imu, noise=replace(NOISE, gyro_walk=0.0, gyro_bias=0.0)), [0.1], [0.9])
     assert np.linalg.eigvalsh(sure.covariance[0]).min() > 0
-
-
-def test_raw_readings_are_cleaned_and_counted(rng):
-    """Late, repeated and broken records; what is left makes an IMU that is that of the good records."""
-    imu, _ = unit_on(np.arange(0, 100) / 100, rng)
-    order = np.arange(100)
-    order[[40, 41]] = [41, 40]
-    order = np.insert(order, 60, 59)
-    rate, force = imu.angular_rate[order], imu.specific_force[order].copy()
-    force[10, 1] = np.nan
-    rows, dropped = usable_readings(imu.times[order], rate, force)
-    assert dropped == {"not finite": 1, "time does not increase": 2}
-    np.testing.assert_array_equal(order[rows], np.delete(np.arange(100), [10, 40]))
-    with pytest.raises(DataError, match="time does not increase at record 41"):
-        replace(imu, times=imu.times[order[:100]])
-    replace(imu, times=imu.times[order][rows], angular_rate=rate[rows], specific_force=force[rows])
-    with pytest.raises(GeometryError, match="do not fit"):
-        usable_readings(imu.times, rate, force)
 
 
 def test_pauses():

@@ -8,10 +8,10 @@ import pytest
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.sighting import SightingRecord
-from graphslam.graph.gtsam_values import to_gtsam
 from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.variables import Values
+from tests.reference.gtsam_twin import to_gtsam
 from tests.solve.network.test_model import random_network
 
 

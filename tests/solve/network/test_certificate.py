@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from graphslam.app.solve_file import solve_network_file
-from graphslam.core.errors import SolverError, UnknownNameError
 from graphslam.core.network import PoseNetwork
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.network import network_values, problem_of_network
@@ -26,7 +25,6 @@ from graphslam.solve.network.certificate import (
     isotropic,
     residual_matrix,
 )
-from graphslam.solve.network.multistart import solve_from
 from graphslam.solve.network.solve import solve_network
 from graphslam.solve.sparse import SparseProblem
 from tests.reference.plain_network import exp
@@ -105,7 +103,7 @@ def test_a_wound_up_ring_is_a_local_minimum_and_refused() -> None:
     assert str(straight.certificate) == "certified"
 
 
-def test_a_graph_of_a_run_is_judged_and_started_elsewhere_too(rng: np.random.Generator) -> None:
+def test_a_graph_of_a_run_is_judged_too(rng: np.random.Generator) -> None:
     net, wound = twisted_ring(20, 1)
     graph = FactorGraph(2)
     cov = np.linalg.inv(net.information)
@@ -115,16 +113,8 @@ def test_a_graph_of_a_run_is_judged_and_started_elsewhere_too(rng: np.random.Gen
     assert solver.solution().converged
     assert solver.solution().objective == pytest.approx(20 * (2 * np.pi / 20) ** 2, rel=1e-6)
     assert solver.solution().certificate().verdict == "not certified"
-    assert solve_from(graph) == "chordal"
-    assert solver.solution().objective < 1e-12
-    assert solver.solution().certificate().verdict == "certified"
-    with pytest.raises(UnknownNameError, match="unknown start 'hope'"):
-        solve_from(graph, "hope")
-    # with factors of other kinds neither applies, and both say so
     graph.add_range(2, 9, 4.0, 0.3, evidence="shared-scan")
     assert "other kinds (range)" in str(solver.solution().certificate())
-    with pytest.raises(SolverError, match=r"other kinds \(range\)"):
-        solve_from(graph)
 
 
 def test_what_cannot_be_judged_says_why(rng: np.random.Generator) -> None:

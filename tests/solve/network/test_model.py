@@ -13,13 +13,14 @@ from graphslam.core import se3
 from graphslam.core.errors import IndeterminateError
 from graphslam.core.geometry import Array, se2_between
 from graphslam.core.network import PoseNetwork
-from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
+from graphslam.graph.gtsam_values import from_gtsam
 from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import gtsam_key
 from graphslam.solve.network.diagnose import check_determined, check_full_rank
 from graphslam.solve.network.start import chordal_start, landmarks_from, odometry_start, tree_start
 from tests.reference.gtsam_network import to_graph
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.plain_network import (
     Layout,
     compose,

@@ -15,7 +15,7 @@ from graphslam.core.geometry import align_se2, se2_transform
 from graphslam.core.network import PoseNetwork
 from graphslam.core.poses import SE2
 from graphslam.core.random import SeedTree
-from graphslam.graph.gtsam_values import from_gtsam, to_gtsam
+from graphslam.graph.gtsam_values import from_gtsam
 from graphslam.graph.network import network_values, problem_of_network
 from graphslam.io.catalog import load_recording
 from graphslam.io.network_file import read_network
@@ -23,6 +23,7 @@ from graphslam.solve.network.consensus import loop_consensus, odometry_edges
 from graphslam.solve.network.robust import truncated_cost
 from graphslam.solve.network.solve import solve_network
 from tests.reference.gtsam_network import to_graph
+from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.huber import huber_least_squares
 from tests.reference.plain_network import edge_costs
 from tests.reference.wrong_loops import add_wrong_loops, is_odometry

@@ -29,7 +29,6 @@ from graphslam_frontends.grid.ancestry import Ancestry
 from graphslam_frontends.grid.config import GridFilterConfig
 from graphslam_frontends.grid.filter import FilterCounts, GridFilter, GridParticles
 from graphslam_frontends.grid.filter_error_model import PASSED, ErrorPassThrough, interpolate_covariances
-from graphslam_frontends.odometry.drift import DriftModel
 from graphslam_frontends.odometry.scan_use import (
     dead_reckoning_covariance,
     unobserved_covariance,
@@ -40,6 +39,7 @@ from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.segslam.covariance import exit_covariance
 from graphslam_frontends.stepwise import StepwiseFrontEnd
+from graphslam_studies.frontends.drift import DriftModel
 
 KNOTS = 33
 """Places along the path at which errors that are passed on are worked out; between them they are interpolated."""

@@ -6,8 +6,10 @@ An outcome is a value: a trial that raised, or whose process died, is an outcome
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import signal
+import sys
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -15,6 +17,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Literal
+
+from threadpoolctl import threadpool_limits
 
 from graphslam.core.cluster import connect_cluster
 from graphslam.core.errors import ConfigError, GraphSlamError
@@ -248,3 +252,17 @@ def _dask(jobs: Sequence[Job], address: str, prepare: Callable[[], object] | Non
             client.cancel(list(futures))
     finally:
         client.close()
+
+
+def hold_one_thread() -> None:
+    """Hold BLAS, OpenMP and numba of this process to one thread, for good: for a worker among workers.
+
+    Libraries that are loaded already are told; those that come later read the environment.
+    """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    if (numba := sys.modules.get("numba")) is not None:
+        numba.set_num_threads(1)  # its variable may not change any more once its threads run
+    else:
+        os.environ["NUMBA_NUM_THREADS"] = "1"
+    threadpool_limits(limits=1)

@@ -12,15 +12,15 @@ from typing import Any
 import pandas as pd
 
 from graphslam.app.folders.generations import new_generation
-from graphslam.app.machine import hold_one_thread, one_blas_thread, versions
+from graphslam.app.machine import one_blas_thread, versions
 from graphslam.core.errors import ConfigError, GraphSlamError, UnknownNameError
-from graphslam.core.interrupt import watch_interrupts
 from graphslam.core.markup import html_element, html_frame, html_table, join_parts
 from graphslam.core.plugins import plugins
 from graphslam.core.progress import Bar
 from graphslam_studies.montecarlo.definition import GROUP, StudyDefinition, find_study, fingerprint, source_digest
-from graphslam_studies.montecarlo.executors import Executor, Job, execute
+from graphslam_studies.montecarlo.executors import Executor, Job, execute, hold_one_thread
 from graphslam_studies.montecarlo.folder import StudyFolder
+from graphslam_studies.montecarlo.interrupt import watch_interrupts
 from graphslam_studies.montecarlo.trials import Measurement, check_measurements, trial_seed
 
 logger = logging.getLogger(__name__)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 
+from graphslam.core.errors import GridError
 from graphslam.evidence.grid import EvidenceGrid
+from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE
-from graphslam.evidence.memory import shared_bricks
 from graphslam.plots import style
 
 
@@ -44,3 +46,19 @@ def plot_sharing(
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     ax.set_title(title or f"{int((~shared).sum())} of {len(at)} bricks its own")
     return ax
+
+
+def shared_bricks(grid: GridTree, others: Sequence[GridTree]) -> npt.NDArray[np.bool_]:
+    """Which bricks of a grid are bricks of others too, not merely equal ``(n,)``; ordered as its `brick_coordinates`.
+
+    Parameters
+    ----------
+    others : sequence of EvidenceGrid
+        Of the same pool.
+    """
+    if any(g.pool is not grid.pool for g in others):
+        raise GridError("grids of different pools share nothing", wanted="one pool")
+    with grid.pool.lock:
+        mine = grid.packed_bricks()[:, 1]
+        theirs = [g.packed_bricks()[:, 1] for g in others if g is not grid]
+    return np.isin(mine, np.concatenate(theirs)) if theirs else np.zeros(len(mine), np.bool_)
