@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -13,8 +14,9 @@ from graphslam.core.errors import ConfigError
 class RefineConfig:
     """How the solved path is refined by the scans themselves."""
 
-    use: bool = True
-    """Refine the solved path of runs whose front end works on scans; false: the path of the graph is the result."""
+    use: Literal[True, False, "always"] = True
+    """Refine the solved path of runs whose front end works on scans (``lidar-odometry``: only where they contradict the
+    graph; always: also elsewhere); false: the path of the graph is the result."""
     reach: float | None = None
     """Chunks whose centres are nearer than this may see the same surfaces [m]; None: the range that three quarters of
     the returns of the log stay below, 10 m at least and 30 m at most."""
@@ -32,6 +34,8 @@ class RefineConfig:
     """Of so many beams in the log at most surfaces are made; more are thinned evenly, which bounds the memory."""
 
     def __post_init__(self) -> None:
+        if self.use not in (True, False, "always"):
+            raise ConfigError(f"refine: use = {self.use!r}; wanted true, false or always")
         for name in ("reach", "spacing", "turn"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):

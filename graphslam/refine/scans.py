@@ -32,7 +32,8 @@ FIELDS: dict[str, Field] = {
     "ages": floats("q", optional=True),
     "tilt": floats("n", "t", optional=True),
 }
-"""``scalars``: max_range, tilt_sigma, tilt_time, then the lasting errors in their order."""
+LASTING = ("yaw_bias", "yaw_walk", "scale", "direction", "clock", "tilt", "bend", "turn")
+"""``scalars``: max_range, tilt_sigma, tilt_time, these lasting errors, ``matched`` (0 where missing)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +59,8 @@ class Scans:
         Roll and pitch by gravity [rad].
     tilt_sigma, tilt_time : float
         Of their fading error [rad], [s].
+    matched : bool
+        The odometry was made by matching these scans one after the other.
     """
 
     times: Array
@@ -73,6 +76,7 @@ class Scans:
     tilt_sigma: float = 0.0
     tilt_time: float = 1.0
     name: str = "scans"
+    matched: bool = False
 
     @classmethod
     def of(cls, steps: Steps) -> Scans:
@@ -81,20 +85,14 @@ class Scans:
         odometry = steps.odometry
         if steps.recorded is not None:  # scans mended it: they may not be counted in its σ as well as by themselves
             odometry = replace(odometry, covariances=steps.recorded.covariances)
+        same = ("times", "offsets", "returns", "max_range", "tilt", "tilt_sigma", "tilt_time", "name", "matched")
         return cls(
-            times=steps.times,
             odometry=odometry,
-            offsets=steps.offsets,
             points=steps.points.astype(np.float32, copy=False),
             origins=steps.origins.astype(np.float32, copy=False),
-            returns=steps.returns,
             ages=None if steps.ages is None else steps.ages.astype(np.float32),
-            max_range=steps.max_range,
             lasting=bias_sigmas(steps),
-            tilt=steps.tilt,
-            tilt_sigma=steps.tilt_sigma,
-            tilt_time=steps.tilt_time,
-            name=steps.name,
+            **{k: getattr(steps, k) for k in same},
         )
 
     def __len__(self) -> int:
@@ -117,8 +115,7 @@ class Scans:
 
     def save(self, file: Path) -> None:
         """Write ``scans.npz``."""
-        l = self.lasting
-        lasting = [l.yaw_bias, l.yaw_walk, l.scale, l.direction, l.clock, l.tilt, l.bend, l.turn]
+        lasting = [getattr(self.lasting, k) for k in LASTING]
         arrays: dict[str, Any] = {
             "format": SCANS_FORMAT,
             "times": self.times,
@@ -128,7 +125,7 @@ class Scans:
             "points": self.points,
             "origins": self.origins,
             "returns": self.returns,
-            "scalars": np.array([self.max_range, self.tilt_sigma, self.tilt_time, *lasting]),
+            "scalars": np.array([self.max_range, self.tilt_sigma, self.tilt_time, *lasting, self.matched]),
         }
         if self.ages is not None:
             arrays["ages"] = self.ages
@@ -142,8 +139,8 @@ class Scans:
         a = read_npz(file, fmt=SCANS_FORMAT, fields=FIELDS)
         s = a["scalars"]
         try:
-            if len(s) != 11 or not np.all(s >= 0) or s[0] <= 0:
-                raise DataError("scalars are impossible", got=s.tolist(), wanted="11 numbers, ≥ 0, the range > 0")
+            if len(s) not in (11, 12) or not np.all(s >= 0) or s[0] <= 0:
+                raise DataError("scalars are impossible", got=s.tolist(), wanted="11 or 12 numbers, ≥ 0, the range > 0")
             d = {3: 2, 7: 3}.get(a["increments"].shape[1])
             if d is None or a["points"].shape != a["origins"].shape or a["points"].shape[1] != d:
                 raise DataError("points and increments do not fit", got=(a["increments"].shape, a["points"].shape))
@@ -162,17 +159,9 @@ class Scans:
                 tilt=a.get("tilt"),
                 tilt_sigma=float(s[1]),
                 tilt_time=float(s[2]),
-                lasting=BiasSigmas(
-                    yaw_bias=float(s[3]),
-                    yaw_walk=float(s[4]),
-                    scale=float(s[5]),
-                    direction=float(s[6]),
-                    clock=float(s[7]),
-                    tilt=float(s[8]),
-                    bend=float(s[9]),
-                    turn=float(s[10]),
-                ),
+                lasting=BiasSigmas(**dict(zip(LASTING, s[3:11].tolist()))),
                 name=name,
+                matched=bool(np.any(s[11:])),
             )
         except (DataError, GeometryError) as error:
             raise FormatError(error.what, where=str(file), got=error.got, wanted=error.wanted) from None

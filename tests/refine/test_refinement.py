@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.backend.refining import refinement_findings, wrong_loops
+from graphslam.backend.refining import _nothing_new, refinement_findings, wrong_loops
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
@@ -187,6 +187,14 @@ def test_scans_are_read_as_written(drives, tmp_path):
     for name in ("times", "offsets", "points", "origins", "returns", "ages", "tilt"):
         np.testing.assert_array_equal(getattr(back, name), getattr(scans, name))
     assert back.lasting == scans.lasting
+
+
+def test_matched_scans_refine_a_graph_only_if_they_contradict_it(drives):
+    found = drives[0][3]
+    sound = replace(found, refused=found.refused[:0], reckoned=found.agreement[0] + 0.005)
+    assert _nothing_new(sound)
+    assert not _nothing_new(replace(sound, reckoned=found.agreement[0] + 0.02))
+    assert not _nothing_new(replace(sound, refused=np.array([[0, 1]])))
 
 
 def test_what_cannot_be_refined_is_refused(drives):

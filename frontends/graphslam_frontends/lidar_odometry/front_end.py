@@ -606,4 +606,5 @@ def _steps(
         uses=uses,
         name=log.name,
         truth=log.truth.trajectory if log.truth is not None else None,
+        matched=True,
     )

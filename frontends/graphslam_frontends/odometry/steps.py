@@ -64,6 +64,8 @@ class Steps:
         What was noticed when scans and motion were put beside each other.
     recorded : Odometry or None
         The motion without what scans say of it, where ``odometry`` holds that too.
+    matched : bool
+        The odometry was made by matching these scans one after the other.
     """
 
     times: Array
@@ -85,6 +87,7 @@ class Steps:
     gaps: Gaps = field(default_factory=Gaps)
     findings: tuple[Finding, ...] = ()
     recorded: Odometry | None = None
+    matched: bool = False
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -100,10 +103,8 @@ class Steps:
             a = np.ascontiguousarray(given, dtype=np.float32 if given.dtype == np.float32 else np.float64)
             if a.shape != (q, d):
                 raise GeometryError(f"{what} have the wrong shape", where=self.name, got=a.shape, wanted=(q, d))
-            if not np.all(np.isfinite(a)):
-                raise DataError(
-                    f"{what} are not finite", where=f"{self.name}, beam {np.argwhere(~np.isfinite(a))[0][0]}"
-                )
+            if not np.all(ok := np.isfinite(a)):
+                raise DataError(f"{what} are not finite", where=f"{self.name}, beam {np.argwhere(~ok)[0][0]}")
             set_(self, what, a)
         returns = np.ascontiguousarray(self.returns)
         if returns.shape != (q,) or returns.dtype != np.bool_:

@@ -7,6 +7,7 @@ from typing import Any
 
 from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import missing_note, page_section, remark
+from graphslam.app.report.sections import verdict_lines
 from graphslam.core.markup import Markup, html_table, inline_picture, is_numeric, pair_list
 
 MEANING = {
@@ -20,12 +21,14 @@ MEANING = {
     "turn": ("wheel turn error per radian", "share"),
 }
 """Systematic errors: in words, and their unit."""
-BEFORE_AFTER = (
-    ("path error, aligned [m]", "path_rmse_aligned_graph", "path_rmse_aligned"),
-    ("share of scan points that agree", "refine_agreement_graph", "refine_agreement"),
-    ("entropy of the fused map [nat m³, in the plane nat m²]", "map_entropy_graph", "map_entropy"),
-    ("known volume of the fused map [m³, in the plane m²]", "map_known_volume_graph", "map_known_volume"),
+PATHS = ("odometry", "graph", "refined")
+CANDIDATES = (
+    ("path error, aligned [m]", "", "path_rmse_aligned_graph", "path_rmse_aligned"),
+    ("share of scan points that agree", "refine_agreement_odometry", "refine_agreement_graph", "refine_agreement"),
+    ("entropy of the fused map [nat m³, in the plane nat m²]", "", "map_entropy_graph", "map_entropy"),
+    ("known volume of the fused map [m³, in the plane m²]", "", "map_known_volume_graph", "map_known_volume"),
 )
+"""What is compared, and the metrics of each of the paths."""
 
 
 def refinement_section(folder: ReportFolder) -> Markup:
@@ -35,12 +38,11 @@ def refinement_section(folder: ReportFolder) -> Markup:
     if folder.kind != "run":
         return page_section("refinement", title, remark("Only for finished single runs."))
     if not found:
-        return page_section(
-            "refinement", title, remark("No refinement; the path is that of the graph. See the verdict.")
-        )
+        why = [remark(f.text) for f in verdict_lines(folder)[1] if f.code.startswith("refine-")]
+        return page_section("refinement", title, remark("No refined path; the path is that of the graph."), *why)
     m = folder.values()
-    rows = [{"what": w, "graph": m[a], "refined": m[b]} for w, a, b in BEFORE_AFTER if a in m and b in m]
-    parts: list[Any] = [html_table(rows, {"what": "", "graph": "graph", "refined": "refined"})] if rows else []
+    rows = [{"": w} | {p: m.get(k) for p, k in zip(PATHS, keys)} for w, *keys in CANDIDATES if keys[-1] in m]
+    parts: list[Any] = [html_table(rows, ("", *PATHS))] if rows else []
     parts += [_constants(found), *_bias(found)]
     rounds = found.get("rounds") or []
     columns = {

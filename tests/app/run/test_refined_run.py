@@ -109,7 +109,7 @@ def test_the_path_is_refined_and_the_folder_has_both(finished: Run) -> None:
     assert again_read.report["refine"]["rounds"][-1]["pairs"] == finished.metric("refine_pairs")
     page = make_report(finished.folder)
     assert "refine" not in " ".join(page.problems)
-    for text in ("Refinement by scans", "wheel scale", "Yaw rate bias at its knots", "scan-pairs"):
+    for text in ("Refinement by scans", "wheel scale", "Yaw rate bias at its knots", "scan-pairs", ">odometry<"):
         assert text in page.html, text
 
 

@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 
 import graphslam as gs
+from graphslam.app.report.report import make_report
 from graphslam.app.worlds import mesh_world
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.random import SeedTree
 from graphslam.io.log_store import load_log, save_log
+from graphslam.refine.config import RefineConfig
+from graphslam.refine.scans import Scans
+from graphslam.sim.ring_hall import ring_hall
 from graphslam_frontends.lidar_odometry.front_end import LidarFrontEnd, LidarFrontEndConfig, LidarSubmapConfig
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
@@ -85,12 +89,34 @@ def test_times_of_points_are_stored_with_a_log(log, tmp_path):
     assert log["clouds"].ages(5).max() > 0.09
 
 
-def test_a_run_ends_with_a_refined_path_and_a_map(log, tmp_path):
-    options = {"submap": {"length": 2.0, "points": 500}}
-    run = gs.run(log, frontend="lidar-odometry", out=tmp_path / "run", config={"frontend": options}, progress=False)
-    assert run.metrics.set_index("key")["value"]["path_rmse_aligned"] < 0.03
-    assert (tmp_path / "run" / "trajectory_graph.tum").exists()
-    assert (tmp_path / "run" / "map.ply").exists()
+def test_scans_that_the_odometry_matched_are_refined_only_if_forced(log, tmp_path):
+    """The odometry has matched them already; verdict and report say that the path of the graph is the result."""
+    options = {"frontend": {"submap": {"length": 2.0, "points": 500}}}
+    run = gs.run(log, frontend="lidar-odometry", out=tmp_path / "run", config=options, progress=False)
+    assert run.refined is None
+    line = next(f for f in run.verdict if f.code == "refine-nothing-new")
+    assert line.level == ""
+    assert "Scan agreement: odometry" in line.text
+    assert "has matched the same scans" in make_report(run.folder).html
+    assert not (run.folder / "trajectory_graph.tum").exists()
+    assert (run.folder / "map.ply").exists()
+    assert Scans.load(run.folder / "scans.npz").matched
+    options |= {"refine": {"use": "always"}, "map": {"fuse": False}}
+    forced = gs.run(log, frontend="lidar-odometry", config=options, progress=False)
+    assert forced.refined is not None
+    assert forced.metric("path_rmse_aligned") < 0.03
+    assert forced.metric("path_rmse_aligned_graph") == pytest.approx(run.metric("path_rmse_aligned"))
+    with pytest.raises(ConfigError, match="true, false or always"):
+        RefineConfig(use="sometimes")
+
+
+def test_scans_of_two_traversals_agree_more_after_a_refinement():
+    drive = simulate_lidar(ring_hall(seed=9), 2, LidarConfig(rate=2.0, points=3000, lines=32))
+    options = {"frontend": {"submap": {"points": 500}}, "map": {"fuse": False}, "refine": {"use": "always"}}
+    run = gs.run(drive, frontend="lidar-odometry", config=options, progress=False)
+    assert run.refined is not None
+    assert run.metric("refine_pairs_passes") > 0.2 * run.metric("refine_pairs")
+    assert run.metric("refine_agreement") > run.metric("refine_agreement_graph") + 0.004
 
 
 def test_lost_scans_are_a_line_of_the_verdict(log):
