@@ -213,7 +213,7 @@ def test_log_that_makes_no_sense(tmp_path: Path) -> None:
         read_victoria_park(made.write(tmp_path / "degrees"))
     made = Made()
     made.gps[20:, 0] -= 4.9
-    with pytest.raises(DataError, match=r"GPS\.txt.*out of order"):
+    with pytest.raises(DataError, match=r"GPS\.txt.*clock was set back"):
         read_victoria_park(made.write(tmp_path / "backwards"))
 
 
