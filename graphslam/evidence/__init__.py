@@ -4,7 +4,6 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "grid": "EvidenceGrid",
-    "memory": "shared_bricks",
     "batch": "update_grids",
 }
 __getattr__, __dir__, __all__ = lazy_exports(__name__, _EXPORTS)

@@ -316,7 +316,7 @@ def test_a_stream_that_is_no_imu_is_refused(logs):
 
 
 def test_a_run_has_its_map_upright_and_its_graph_counts_the_readings(logs):
-    options = {"imu": {"use": "auto"}, "map": {"fuse": False}}
+    options = {"imu": {"use": "auto"}, "map": {"fuse": False}, "refine": {"use": "always"}}
     run = gs.run(logs[0], frontend="lidar-odometry", config=options, progress=False)
     kinds = set(zip(run.graph.ledger.table()["stream"], run.graph.ledger.table()["kind"]))
     assert {("imu", "aid"), ("imu", "measurement"), ("clouds", "measurement")} <= kinds

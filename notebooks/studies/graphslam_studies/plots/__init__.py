@@ -4,7 +4,7 @@ from graphslam.core.lazy_exports import lazy_exports
 
 _EXPORTS = {
     "comparison": "plot_comparison",
-    "evidence": "plot_sharing",
+    "evidence": "plot_sharing shared_bricks",
     "gap": "plot_convergence plot_gap_along plot_tree_gap",
     "gps": "plot_gps_vectors",
     "knobs": "knob",
