@@ -72,7 +72,7 @@ def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
 
 
 def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: Any = np.int16) -> DenseGrid:
-    """A map, or a box of it, as an array. :func:`from_dense` gives the same map back, to the last bit.
+    """A map, or a box of it, as an array, to the last bit.
 
     Parameters
     ----------

@@ -208,8 +208,8 @@ def endpoint_probability(
 
     Parameters
     ----------
-    grids, poses, points, threads
-        As in :func:`endpoint_log_odds`.
+    grids, poses, points
+        P grids; ``T_grid_scan`` ``(P, 7)``, ``(P, 4, 4)`` or ``(P, 3)``; ``(n, 3 | 2)`` in the frame of the scan [m].
     interpolation : {"nearest", "trilinear"}
         The voxel a point lies in, or between the centres of the eight around it (of the four in 2-D), which is smooth
         in the pose.

@@ -29,7 +29,7 @@ def read_network(
     Parameters
     ----------
     noise : str
-        Meaning of TORO/iSAM noise columns (:func:`graphslam.io.isam_graph.read_isam_graph`); g2o says it itself.
+        Meaning of TORO/iSAM noise columns (:func:`graphslam.io.isam_graph.parse_isam_graph`); g2o says it itself.
     repair : bool
         Project indefinite matrices to positive definite ones instead of refusing them.
     create_missing : bool
