@@ -25,8 +25,8 @@ def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
     objective, g = _linearised(problem, poses, *blocks)
     for _ in range(iterations):
         step = -g
-        # the end of a long way without GPS: what holds it at all may be less than rounding makes of the odometry
-        blocks[0][-1] += 1e-12 * np.diag(np.diag(blocks[0][-1]))
+        # a long way without GPS: what holds its end at all may be less than rounding makes of the odometry
+        np.einsum("nii->ni", blocks[0])[:] *= 1.0 + 1e-12
         bad = kernels.solve_chain(*blocks, step)
         if bad >= 0:
             raise IndeterminateError(f"pose {bad} of the chain is not constrained", (f"x{bad}",))
