@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -50,18 +49,8 @@ from graphslam_frontends.odometry.step_config import StepConfig
 __all__ = [
     *("calibrate_log", "compare", "find_study", "first_particles", "front_ends"),
     *("join_submaps", "joiners", "load", "local_maps"),
-    *(
-        "open_run",
-        "open_study",
-        "options",
-        "refine_path",
-        "run",
-        "simulate",
-        "solve_file",
-        "solvers",
-        "study",
-        "worlds",
-    ),
+    *("open_run", "open_study", "options", "refine_path", "run", "simulate"),
+    *("solve_file", "solvers", "study", "worlds"),
 ]
 
 
@@ -112,7 +101,7 @@ def worlds() -> list[str]:
 def options(frontend: str | None = None) -> pd.DataFrame:
     """Options of a front end, or of every run: a table of ``option``, ``type``, ``default`` and ``meaning``.
 
-    They are set by ``config={"frontend": {"particles": 40}}`` of :func:`run`, and by ``--set frontend.particles=40``.
+    Set them by ``config={"frontend": {"particles": 40}}`` of :func:`run`, or by ``--set frontend.particles=40``.
 
     Returns
     -------
@@ -129,7 +118,7 @@ def options(frontend: str | None = None) -> pd.DataFrame:
     >>> table.loc["frontend.particles", "default"]
     '40'
     """
-    return pd.DataFrame([dataclasses.asdict(row) for row in option_rows(frontend)])
+    return pd.DataFrame([asdict(row) for row in option_rows(frontend)])
 
 
 def open_run(path: str | Path) -> Run:

@@ -31,7 +31,9 @@ LASTING = "correlated: overconfident"
 JUDGED_WITH = {"path": ("gps", "control", "distance")}
 """Factors that measure nothing by themselves: points of a path are there for the fixes or control points, and share
 their residuals; the first class that a graph has."""
-NOT_TESTED = {"tie": 0, "levelled": 2}  # made of poses or gravity of other factors; unknowns that each alone has
+NOT_TESTED = {"tie": 0, "levelled": 2}
+"""Classes made of poses or of gravity that other factors hold already: their residuals are small whatever the
+covariances are. With each the number of unknowns that it alone determines: levelled bases the tilt of the frame."""
 LONGEST_SERIES = 1200
 """Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
 

@@ -87,16 +87,17 @@ def _gyro(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
 
 def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding]:
     """Points without times, or with one time for all, on a robot that moves while it scans."""
+    state = log.meta.get("point_times")
     k = next((k for k in range(len(clouds)) if len(clouds.cloud(k))), None)
-    if k is None or clouds.ages(k) is not None:
-        return []
+    if k is None or state in ("used", "unclear") or clouds.ages(k) is not None:
+        return []  # what is unclear is among the assumptions of the reader
     odometry = next((s for s in log.streams.values() if isinstance(s, Odometry) and len(s.times) > 2), None)
     moved = float("nan")
     if odometry is not None:
         way = np.linalg.norm(odometry.increments[1:, : group_of(odometry.increments).dim], axis=1)
         period = min(float(np.median(np.diff(clouds.times))), 0.1)
         moved = float(np.percentile(way / np.diff(odometry.times), 75)) * period
-    stuck = log.meta.get("point_times") == "constant"
+    stuck = state == "constant"
     if not stuck and not moved > BENT:
         return []
     said = "the same for all points of a scan" if stuck else "none"
@@ -172,7 +173,7 @@ def refuse_faulty(found: list[StreamFinding], log: SensorLog) -> None:
 
 LOST = 0.05
 """Share of the records of a stream that a reader leaves out above which it is a line of the verdict."""
-EXPECTED_LOSSES = ("no fix (status)", CLOCK_SET_BACK, *ORDER)
+EXPECTED_LOSSES = ("no fix (status)", "observations of other robots", CLOCK_SET_BACK, *ORDER)
 """Reasons that are no fault of a log, or that :func:`check_clocks` names."""
 
 

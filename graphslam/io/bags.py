@@ -46,7 +46,7 @@ from graphslam.io.cloud_logs import CUT_SCAN, IMU_NOISE, cut_scans
 from graphslam.io.frame_tree import BASE_FRAMES, FrameTree, TopicRows, leaf
 from graphslam.io.odometry_noise import DEFAULT_NOISE, OdometryNoise
 from graphslam.io.planar_scans import unify_layout
-from graphslam.io.point_times import choose_point_clock
+from graphslam.io.point_times import PointTimes, choose_point_times
 
 FIX_SIGMA = 5.0
 """σ of a fix whose message says nothing of it [m]."""
@@ -138,9 +138,9 @@ def read_bag(
     scanners = [k for k in ("clouds", "laser") if k in streams and k not in made.moved]
     lost = [] if mount else [k for k in scanners if not frames.know(base, rows[k].frame)]
     names = {k: t.name for k, t in chosen.items()}
-    meta = {"source": p.name, "notes": notes, "base_frame": base, "topics": names, "unplaced": lost}
-    if made.point_times:
-        meta["point_times"] = made.point_times
+    meta: dict[str, Any] = {"source": p.name, "notes": notes, "base_frame": base, "topics": names, "unplaced": lost}
+    if made.point_times is not None:
+        meta |= {"point_times": made.point_times.state, "assumed": made.point_times.assumed()}
     return SensorLog(name=p.stem, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
 
@@ -161,7 +161,8 @@ class _BagLog:
         self, where: str, rows: dict[str, TopicRows], frames: FrameTree, counter: DropCounter, notes: list[str]
     ) -> None:
         self.where, self.rows, self.frames, self.counter, self.notes = where, rows, frames, counter, notes
-        self.base = self.point_times = ""
+        self.base = ""
+        self.point_times: PointTimes | None = None
         self.moved: list[str] = []
         self._times: dict[str, Array] = {}
 
@@ -240,10 +241,10 @@ class _BagLog:
         if T is not None:  # the driver has already put the points together in that frame
             self.moved.append("clouds")
             self.notes.append(f"clouds in {frame!r}, which moves: brought to {self.base!r} by the transforms")
-        clock, self.point_times, note = choose_point_clock(spool.spans if timed and T is None else (), stamps)
+        self.point_times = choose_point_times(spool.spans if timed and T is None else (), stamps)
         times, keep = self._kept("clouds", {"no point in it": counts == 0, CUT_SCAN: cut_scans(counts)})
-        self.notes.append(note)
-        source = SpooledClouds(spool, counts, stamps, clock, T)
+        self.notes.append(self.point_times.note)
+        source = SpooledClouds(spool, counts, stamps, self.point_times.clock, T)
         place = self.place("clouds", mount) if T is None else np.array([0.0, 0, 0, 0, 0, 0, 1])
         return PointClouds(times=times, source=source, index=np.flatnonzero(keep), T_base_sensor=place)
 
@@ -316,10 +317,13 @@ class _BagLog:
             "no place on Earth": ~np.asarray(place_ok),
             "latitude and longitude are 0": (g[:, :2] == 0.0).all(axis=1),
         }
-        no_height = ~finite_mask(g[:, 2])
-        flat = planar or float(np.mean(no_height[place_ok])) > 0.5 if place_ok.any() else planar
+        no_height = np.asarray(~finite_mask(g[:, 2]))
+        unknown = int(no_height[place_ok].sum())
+        flat = planar or 2 * unknown > int(place_ok.sum())
         if not flat:
-            bad["altitude is not finite"] = np.asarray(no_height)
+            bad["altitude is not finite"] = no_height
+        elif not planar:
+            self.notes.append(f"heights of gps are not used: {unknown} of {int(place_ok.sum())} are not finite")
         llh = np.where(finite_mask(g), g, 0.0)
         bad[FAR_FIX] = far_fixes(llh, ~np.logical_or.reduce(list(bad.values())))
         wrong = np.logical_or.reduce(list(bad.values()))

@@ -32,7 +32,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import usable_records
 from graphslam.io.cloud_files import BIN_COLUMNS, bin_columns, count_points, read_cloud
 from graphslam.io.odometry_noise import constant_noise
-from graphslam.io.point_times import PointClock, choose_point_clock
+from graphslam.io.point_times import PointClock, PointTimes, choose_point_times
 from graphslam.io.recognise import (
     CLOUD_ENDINGS,
     cloud_folder,
@@ -273,18 +273,19 @@ class CloudFolder:
             keep = poses.within(stamps, keep, counter)
         times = np.ascontiguousarray(stamps[keep])
         kept = [self.files[k] for k in keep]
-        clock, timed, said = self._point_clock(kept, times if by_log else None)
-        source = FileClouds(kept, self.columns, times, clock)
+        timed = self._point_times(kept, times if by_log else None)
+        source = FileClouds(kept, self.columns, times, timed.clock)
         streams: dict[str, Stream] = {"clouds": PointClouds(times=times, source=source)}
         notes = [by, "no poses" if poses is None else f"odometry from {self.look.relative(poses.file)}"]
         if poses is not None:
             T = poses.at(times, keep)
             streams |= {"odometry": noise.odometry(times, T), "reference": Trajectory(times, T)}
         streams |= extra
-        notes.append(said)
+        notes.append(timed.note)
         read = {k: len(s.times) for k, s in streams.items() if k != "reference"} | {"clouds": n}
         assumed = [] if poses is None else [_assumed_noise(self.look.relative(poses.file), sigmas)]
-        meta = {"source": root.name, "notes": notes, "point_times": timed, "assumed": assumed + self._not_read(poses)}
+        assumed += [*timed.assumed(), *self._not_read(poses)]
+        meta = {"source": root.name, "notes": notes, "point_times": timed.state, "assumed": assumed}
         return SensorLog(name=root.name, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
     def _not_read(self, poses: PoseTable | None) -> list[tuple[str, str]]:
@@ -301,13 +302,13 @@ class CloudFolder:
                 out.append(("look", text))
         return out
 
-    def _point_clock(self, files: list[Path], stamps: Array | None) -> tuple[PointClock | None, str, str]:
-        """Unit of the times of points, by some clouds evenly over the log; see :func:`choose_point_clock`."""
+    def _point_times(self, files: list[Path], stamps: Array | None) -> PointTimes:
+        """Unit of the times of points, by some clouds evenly over the log; see :func:`choose_point_times`."""
         if not self.point_times:
-            return None, "none", "times of points are not used (option point_times)"
+            return PointTimes("none", "times of points are not used (option point_times)")
         some = np.unique(np.linspace(0, len(files) - 1, LOOKED_AT).round().astype(int))
         read = (read_cloud(files[k], columns=self.columns).times for k in some)
-        return choose_point_clock([float(np.ptp(t)) for t in read if t is not None and len(t) > 1], stamps)
+        return choose_point_times([float(np.ptp(t)) for t in read if t is not None and len(t) > 1], stamps)
 
 
 def scan_stamps(folder: CloudFolder, poses: PoseTable | None, period: float | None = None) -> tuple[Array, str]:
@@ -409,8 +410,12 @@ def stamps_of_file(path: Path, n: int) -> Array | None:
             out.append(v[-1] if len(v) <= 2 else v[0])
     if len(out) != n:
         raise DataError("stamps and clouds differ in number", where=str(path), got=len(out), wanted=n)
-    t = np.array(out)
-    return t * 1e-9 if n and np.nanmedian(np.abs(t)) > 1e17 else t
+    return _seconds(np.array(out))
+
+
+def _seconds(stamps: Array) -> Array:
+    """Stamps in seconds, or in nanoseconds of unix time, as seconds."""
+    return stamps * 1e-9 if len(stamps) and np.nanmedian(np.abs(stamps)) > 1e17 else stamps
 
 
 def _tum(path: Path, counter: DropCounter) -> Trajectory:
@@ -437,7 +442,7 @@ def _stamped_matrices(path: Path, counter: DropCounter) -> Trajectory:
     """A table of stamps [s or ns] and 3×4 matrices."""
     rows = [v for line in read_text(path).splitlines() if (v := parse_numbers(line)) is not None and v]
     a = np.array([v if len(v) == 13 else [np.nan] * 13 for v in rows])
-    times = a[:, 0] * 1e-9 if np.nanmedian(np.abs(a[:, 0])) > 1e17 else a[:, 0]
+    times = _seconds(a[:, 0])
     if np.all(times == np.round(times)) and np.nanmax(times) < 1e7:
         raise DataError(
             "poses are given by the numbers of scans, not by stamps", where=str(path), got=f"first {times[0]:.0f}",

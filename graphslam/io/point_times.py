@@ -58,7 +58,32 @@ class PointClock:
         return np.asarray(-offset)
 
 
-def choose_point_clock(spans: Iterable[float], stamps: Array | None) -> tuple[PointClock | None, str, str]:
+@dataclass(frozen=True, slots=True)
+class PointTimes:
+    """What a reader does with the times of points of a log.
+
+    Parameters
+    ----------
+    state : {"used", "none", "constant", "unclear"}
+    note : str
+        The same in words.
+    clock : PointClock or None
+        Their unit; None: they are not used.
+    doubtful : bool
+        The unit is unusual, or none fits: the note is a line of the verdict.
+    """
+
+    state: str
+    note: str
+    clock: PointClock | None = None
+    doubtful: bool = False
+
+    def assumed(self) -> list[tuple[str, str]]:
+        """Level and text of a line of the verdict, where there is one."""
+        return [("look", f"{self.note}. Write them in s, ms, µs or ns.")] if self.doubtful else []
+
+
+def choose_point_times(spans: Iterable[float], stamps: Array | None) -> PointTimes:
     """Unit of the times of points of a log.
 
     Parameters
@@ -67,29 +92,22 @@ def choose_point_clock(spans: Iterable[float], stamps: Array | None) -> tuple[Po
         Latest less earliest time of each scan that has times, in the unit of the field.
     stamps : (n,) or None
         Of the scans [s]; None where the log states none.
-
-    Returns
-    -------
-    clock : PointClock or None
-        None: times are not used.
-    state : {"used", "none", "constant", "unclear"}
-    note : str
-        The same in words.
     """
     found = np.array([s for s in spans if np.isfinite(s)])
     if not len(found):
-        return None, "none", "points without times"
+        return PointTimes("none", "points without times")
     span = float(np.median(found[found > 0])) if np.any(found > 0) else 0.0
     if span == 0.0:
-        return None, "constant", "times of points say nothing: as good as one time for all"
+        return PointTimes("constant", "times of points say nothing: as good as one time for all")
     apart = _spacing(stamps)
     clock = _by_spacing(span, apart) if apart is not None else _by_sweep(span, SWEEP[1])
     if clock is None:
         of = "" if apart is None else f" of scans that are {apart:.3g} s apart"
-        wrong = f"times of points{of} span {span:.6g}: no unit fits; they are not used, scans are not deskewed"
-        return None, "unclear", wrong
-    taken = "" if clock.name in UNITS else f", read as {clock.name}"
-    return clock, "used", f"times of points{taken}: a scan lasts {clock.lasts:.3f} s"
+        note = f"times of points{of} span {span:.6g}: no unit fits; they are not used, scans are not deskewed"
+        return PointTimes("unclear", note, doubtful=True)
+    usual = clock.name in UNITS
+    how = "" if usual else f", read as {clock.name} because a scan then lasts as long as scans are apart"
+    return PointTimes("used", f"times of points{how}: a scan lasts {clock.lasts:.3f} s", clock, doubtful=not usual)
 
 
 def _spacing(stamps: Array | None) -> float | None:

@@ -11,7 +11,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.imu import GRAVITY
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
-from graphslam.core.records import VelocityControls
+from graphslam.core.records import Odometry, VelocityControls
 from graphslam.evaluate.stream_checks import check_streams, refuse_faulty
 from graphslam.evaluate.stream_checks_beams import check_beams
 from graphslam.evaluate.stream_checks_imu import check_imu, compare_turns
@@ -128,3 +128,15 @@ def test_stamps_in_another_unit_end_the_run() -> None:
     log = SensorLog(name="ns", streams={"wheels": wheels})
     with pytest.raises(DataError, match=r"nanoseconds, wanted seconds"):
         refuse_faulty(check_streams(log), log)
+
+
+def test_records_that_came_together_say_nothing_of_a_speed() -> None:
+    """As a reader mends stamps that fall back: a tenth of the records a millisecond behind the one before."""
+    times = 0.1 * np.arange(400)
+    times[10::10] = times[9::10][: len(times[10::10])] + 1e-3
+    increments = np.tile([0.05, 0.0, 0.05], (400, 1))
+    odometry = Odometry(times=times, increments=increments, covariances=np.tile(1e-4 * np.eye(3), (400, 1, 1)))
+    assert codes(SensorLog(name="late", streams={"odometry": odometry})) == []
+    dense = replace(odometry, times=1e-3 * np.arange(400), increments=10 * increments)
+    (found,) = check_streams(SensorLog(name="dense", streams={"odometry": dense}))
+    assert (found.finding.level, found.finding.code) == ("look", "stamps-dense")  # and a map is made nevertheless

@@ -321,13 +321,16 @@ def test_the_unit_of_point_times_follows_from_the_spacing_of_scans(tmp_path: Pat
     log = load_recording(path)
     np.testing.assert_allclose(log["clouds"].ages(3), -np.linspace(0, sweep, 60), atol=1e-6 * sweep)
     assert log.meta["point_times"] == "used"
+    assert bool(log.meta["assumed"]) == (unit not in (1.0, 1e-3))  # an unusual unit is a line of the verdict
 
 
 def test_times_of_points_that_fit_no_unit_are_not_used(tmp_path: Path) -> None:
     log = load_recording(written(tmp_path, "ros2", timed(lambda k: np.linspace(0, 0.4, 60))))
     assert log["clouds"].ages(3) is None
     assert log.meta["point_times"] == "unclear"
-    assert any("span 0.4" in n for n in log.meta["notes"])
+    ((level, text),) = log.meta["assumed"]
+    assert level == "look"
+    assert "span 0.4: no unit fits" in text
 
 
 def test_a_first_scan_that_is_cut_does_not_take_the_times_of_the_others(tmp_path: Path) -> None:

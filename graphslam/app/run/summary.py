@@ -49,9 +49,6 @@ ADVICE: dict[str, str] = {
     "gps-clock": "bring the GPS fixes onto the clock of the other streams",
     "clock-jump": "cut the log at the jump of its clock",
     "clock-set-back": "cut the log where its stamps go back, and map the parts one by one",
-    "mounting-unknown": "give the mounting of the scanner (mount=)",
-    "records-left-out": "check why records of the log are unusable",
-    "assumed": "check what was assumed because the log does not state it",
     "stamps-order": "give the time stamps of the measurements, in order",
     "clocks-disagree": "correct the offset between the clocks",
     "scans-unit": "give the ranges in metres",
@@ -141,6 +138,10 @@ ADVICE: dict[str, str] = {
     "chi2": "find the factor class with the largest χ²/dof",
     "map-*": "check the findings on the fused map",
     "certificate": "try other initial values: the optimum may not be the global one",
+    "mounting-unknown": "give the mounting of the scanner (mount=)",
+    "records-left-out": "check why records of the log are unusable",
+    "assumed": "check what was assumed because the log does not state it",
+    "stamps-dense": "give the time stamps of the measurements",
 }
 """Next step for a finding, by its code. Of several findings of one level the earliest in this list counts: causes
 come before their effects."""

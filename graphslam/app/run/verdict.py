@@ -279,10 +279,14 @@ def whole_chi2(figures: RunMetrics) -> tuple[float, float] | None:
     rows = [
         r for r in class_rows(figures) if is_finite_number(r.get("dof")) and is_finite_number(r.get("chi2_per_dof"))
     ]
-    tested = [r for r in rows if r.get("class") not in NOT_TESTED]
-    less = sum(max(float(r.get("rows", 0)) - NOT_TESTED[r["class"]], 0.0) for r in rows if r not in tested)
-    dof = sum(float(r["dof"]) for r in rows) - less  # of the graph without the others
-    return (sum(float(r["chi2"]) for r in tested if is_finite_number(r.get("chi2"))), dof) if dof > 0.5 else None
+    chi2 = dof = 0.0
+    for r in rows:
+        dof += float(r["dof"])
+        if r["class"] in NOT_TESTED:  # without it the graph has fewer residuals, and fewer unknowns
+            dof -= max(float(r.get("rows", 0)) - NOT_TESTED[r["class"]], 0.0)
+        elif is_finite_number(r.get("chi2")):
+            chi2 += float(r["chi2"])
+    return (chi2, dof) if dof > 0.5 else None  # less than one degree of freedom is rounding
 
 
 @dataclass(frozen=True, slots=True)

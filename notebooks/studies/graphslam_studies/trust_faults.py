@@ -1,6 +1,6 @@
 """Faults of the study ``trust``: those of ``docs/faults.md`` that can be put into a drawn world, one at a time.
 
-The world is clean but for the fault, and nobody is told of it. What the faults do to a log is in
+The world is clean but for the fault, and the run does not know of it. What the faults do to a log is in
 :mod:`graphslam_studies.faults`.
 """
 

@@ -1,6 +1,6 @@
 """Faults put into a log of a scanner, wheels and an IMU: each a function from a log to a log.
 
-No log that comes out has truth: the run that is given it must judge itself.
+The logs have no ground truth: the run has only its own tests.
 """
 
 from __future__ import annotations

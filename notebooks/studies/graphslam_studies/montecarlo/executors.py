@@ -257,7 +257,7 @@ def _dask(jobs: Sequence[Job], address: str, prepare: Callable[[], object] | Non
 def hold_one_thread() -> None:
     """Hold BLAS, OpenMP and numba of this process to one thread, for good: for a worker among workers.
 
-    Libraries that are loaded already are told; those that come later read the environment.
+    Libraries that are loaded already get the limit; later ones read the environment.
     """
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
