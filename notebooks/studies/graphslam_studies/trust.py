@@ -200,9 +200,9 @@ def world_table(table: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
     """A row a world: what is wrong with it, NEES/n pooled over its runs, and how often each word was said.
 
     ``bad map`` where the nodes, each by itself or all together, have more than :data:`WRONG`, and more than chance
-    (97.5 %) also occurs in consistent runs: a mean over a dozen correlated errors of few runs is above 1.5 now and then.
-    ``true`` is what a verdict that knew the truth would say: ``wrong`` from :data:`LARGE` on, ``conservative`` where both
-    are below 1/1.5, and below chance.
+    explains (97.5 %): a mean over a dozen correlated errors of few runs is above 1.5 now and then.
+    ``true`` is what a verdict that knew the truth would say: ``wrong`` from :data:`LARGE` on, ``conservative`` where
+    both are below 1/1.5, and below chance.
     """
     out = []
     for world in table["world"].unique():
