@@ -42,7 +42,7 @@ STAGES: list[tuple[Any, str, str]] = [
     (BackEnd, "finish", "loops, solved"),
     (refining, "refine_by_scans", "refinement"),
     (refining, "refined_submaps", "submaps drawn anew"),
-    (refining, "_static_submaps", "things that moved"),
+    (run_map, "static_submaps", "things that moved"),
     (run_map, "divide_submaps", "pieces"),
     (run_map, "fuse_pieces", "fused, open chain"),
     (run_map.FusedMap, "move", "moved"),
