@@ -75,6 +75,8 @@ CHUNK_TIME = 10.0
 """… the longest time of such a chunk, for robots that stand still [s] …"""
 CHUNK_TURN = 0.5
 """… and in the plane the greatest turn within it [rad]; a scanner that looks one way soon sees other walls."""
+AGREEMENT_NOISE = 0.01
+"""Shares of agreeing points of two paths that differ by less than this do not rank the paths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +124,29 @@ class AttemptComparison:
     kept: float
     left: float
     taken: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ScanCheck:
+    """Do the scans contradict a path? Measured before anything is refined.
+
+    Parameters
+    ----------
+    odometry, start : float
+        Share of the points of passes and neighbours that lie on the surfaces of the others, along the path of the
+        odometry and along the path that was checked, to the same noise.
+    refused : (m, 2)
+        Steps that the path draws together although the scans between contradict it.
+    """
+
+    odometry: float
+    start: float
+    refused: Index
+
+    @property
+    def contradicted(self) -> bool:
+        """Do the scans agree better along the odometry, or does the path draw steps together wrongly?"""
+        return len(self.refused) > 0 or self.odometry > self.start + AGREEMENT_NOISE
 
 
 @dataclass(frozen=True)
@@ -239,7 +264,34 @@ def refine_by_scans(
     progress : callable, optional
         Told each round in words.
     """
-    config = config or RefineConfig()
+    work, nodes = _begin(steps, start, config or RefineConfig(), gps, progress)
+    return _at_all_steps(work.run(), steps, start, nodes)
+
+
+def refine_if_contradicted(
+    steps: Scans,
+    start: Array,
+    config: RefineConfig | None = None,
+    *,
+    progress: Callable[[str], Any] | None = None,
+) -> Refinement | ScanCheck:
+    """Refine a path only if its scans contradict it: otherwise the check alone, at about a third of the time.
+
+    For scans that the odometry behind the path has already matched. Parameters as of :func:`refine_by_scans`.
+    """
+    work, nodes = _begin(steps, start, config or RefineConfig(), None, progress)
+    check = work.check()
+    return _at_all_steps(work.run(), steps, start, nodes) if check.contradicted else check
+
+
+def _begin(
+    steps: Scans,
+    start: Array,
+    config: RefineConfig,
+    gps: tuple[Gps, GpsConfig] | None,
+    progress: Callable[[str], Any] | None,
+) -> tuple[_Refiner, Index]:
+    """A refiner of the steps that are nodes, and which steps these are."""
     g = steps.group
     if start.shape != (len(steps), g.size) or not np.all(np.isfinite(start)):
         raise GeometryError(
@@ -248,10 +300,9 @@ def refine_by_scans(
     if len(steps) < 3:
         raise DataError("too few steps to refine", where=steps.name, got=len(steps), wanted="≥ 3")
     nodes = find_nodes(steps, config.spacing, config.turn)
-    few = 3 <= len(nodes) < len(steps)
-    if not few:
+    if len(nodes) < 3:
         nodes = np.arange(len(steps), dtype=np.int64)
-    some = thin_beams(scans_at(steps, nodes) if few else steps, config.most_beams)
+    some = thin_beams(scans_at(steps, nodes) if len(nodes) < len(steps) else steps, config.most_beams)
     work = _Refiner(some, start[nodes], config, gps, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
@@ -262,8 +313,12 @@ def refine_by_scans(
             got=f"{len(steps)} steps in one piece",
             wanted="≥ 2 pieces",
         )
-    found = work.run()
-    if not few:
+    return work, nodes
+
+
+def _at_all_steps(found: Refinement, steps: Scans, start: Array, nodes: Index) -> Refinement:
+    """A refinement of some steps, with the steps between them along the odometry."""
+    if len(nodes) == len(steps):
         return found
     poses, covariances, between = path_between(steps, nodes, found.poses, found.covariances, found.scales)
     return replace(
@@ -276,6 +331,13 @@ def refine_by_scans(
         nodes=nodes,
         between=between,
     )
+
+
+def agreeing_share(found: SurfacePairs, r: Array, noise: Array) -> float:
+    """Share of the source points with a surface within reach that lie on it, to three times their σ."""
+    near = np.maximum(1.0 - r**2 / (9.0 * found.once @ noise), 0.0)
+    weight = 1.0 / found.spent[:, 1]
+    return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,6 +398,7 @@ class _Refiner:
         self.length = float(steps.path_length[-1])
         self.reach = config.reach if config.reach is not None else _reach(steps)
         self.most = max(FEWEST, round(self.reach / CHUNK_LENGTH))
+        self.guided: tuple[RevisitConstraints, npt.NDArray[np.bool_]] | None = None
 
     def first_states(self) -> States:
         """No lasting errors; fixes as they lie at the path."""
@@ -344,12 +407,11 @@ class _Refiner:
 
     def run(self) -> Refinement:
         """All rounds; from the odometry's path once more where the start turns out to be wrong."""
-        self.neighbours()
-        guides, taken = self.follow_guides()
+        guides, taken = self.neighbours_and_guides()
         self.all_passes(self.config.distances)
         other = None
         assert self.surfaces is not None
-        odometry = self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
+        odometry = self.odometry_path()
         self.reckoned = self.agreement_along(odometry)
         contradicted = np.any(~taken & guides.far(self.poses))
         if contradicted or self.reckoned > self.agreement(self.cloud, self.surfaces, self.poses, self.noise):
@@ -363,6 +425,24 @@ class _Refiner:
             return found
         self.tell("the odometry alone agrees better; its path is the result")
         return self.initial_result(found, odometry)
+
+    def check(self) -> ScanCheck:
+        """Do the scans contradict the start? Only if it brings passes together are neighbours compared for it."""
+        odometry_path = self.odometry_path()
+        pairs = [self.pairs_along(self.start)]
+        if not np.allclose(odometry_path, self.start, rtol=0.0, atol=1e-6):  # otherwise the graph changed nothing
+            pairs.append(self.pairs_along(odometry_path))
+        noise = np.min([pair_noise(found, r) for found, r in pairs], axis=0)
+        shares = [agreeing_share(found, r, noise) for found, r in pairs]
+        check = ScanCheck(shares[-1], shares[0], np.zeros((0, 2), np.int64))
+        if check.contradicted or not len(self.find_guides()):
+            return check
+        guides, taken = self.neighbours_and_guides()
+        return replace(check, refused=guides.steps[~taken & guides.far(self.poses)])
+
+    def odometry_path(self) -> Array:
+        """Poses of the odometry alone, from where the start begins."""
+        return self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
 
     def initial_result(self, found: Refinement, odometry: Array) -> Refinement:
         """The path of the odometry, as sure as motion and gravity say without any scan."""
@@ -398,7 +478,7 @@ class _Refiner:
         The path at which the scans agree better is kept.
         """
         first = self.attempt()
-        self.poses = self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
+        self.poses = self.odometry_path()
         self.states = self.first_states()
         self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
         self.cloud = self.problem.cloud = self.raw
@@ -509,9 +589,20 @@ class _Refiner:
         self.poses, self.states = self.problem.moved(self.poses, self.states, step)
         return solved
 
+    def neighbours_and_guides(self) -> tuple[RevisitConstraints, npt.NDArray[np.bool_]]:
+        """The first rounds, once: neighbours, then the guides and which of them the scans between allow."""
+        if self.guided is None:
+            self.neighbours()
+            self.guided = self.follow_guides()
+        return self.guided
+
+    def find_guides(self) -> RevisitConstraints:
+        """Steps of different passes that the start brings together."""
+        return find_revisit_constraints(self.cloud, self.start, 0.5 * self.reach)
+
     def follow_guides(self) -> tuple[RevisitConstraints, npt.NDArray[np.bool_]]:
         """Bring passes together as the start has them where the scans between allow it; which of the guides they do."""
-        guides = find_revisit_constraints(self.cloud, self.start, 0.5 * self.reach)
+        guides = self.find_guides()
         if not len(guides):
             return guides, np.zeros(0, bool)
         assert self.surfaces is not None
@@ -532,10 +623,10 @@ class _Refiner:
         self.tell(f"{len(guides)} guides, {int(taken.sum())} of them agree with the scans between")
         return guides, taken
 
-    def agreement(self, cloud: ScanReturns, surfaces: Surfaces, poses: Array, noise: Array) -> float:
-        """Share of the source points with a surface within reach that lie on it, to three times their σ.
+    def pairs(self, cloud: ScanReturns, surfaces: Surfaces, poses: Array) -> tuple[SurfacePairs, Array]:
+        """Pairs found anew at a path, among surfaces made there, and their residuals [m].
 
-        The pairs are found anew at this path, among surfaces made there: nothing is kept of how it came about.
+        Nothing is kept of how the path came about.
         """
         found = match_surfaces(
             cloud,
@@ -547,14 +638,19 @@ class _Refiner:
             within=self.motion.within,
             least_share=0.0,
         )
-        r = surface_residuals(found.pairs, cloud, surfaces, poses)
-        near = np.maximum(1.0 - r**2 / (9.0 * found.once @ noise), 0.0)
-        weight = 1.0 / found.spent[:, 1]
-        return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
+        return found, surface_residuals(found.pairs, cloud, surfaces, poses)
+
+    def agreement(self, cloud: ScanReturns, surfaces: Surfaces, poses: Array, noise: Array) -> float:
+        """Share of the points that lie on the surfaces of others along a path."""
+        return agreeing_share(*self.pairs(cloud, surfaces, poses), noise)
+
+    def pairs_along(self, poses: Array) -> tuple[SurfacePairs, Array]:
+        """Pairs of the raw scans at another path, with surfaces made there."""
+        return self.pairs(self.raw, find_surfaces(self.raw, poses, SURFACE), poses)
 
     def agreement_along(self, poses: Array) -> float:
-        """The same of the raw scans at another path, with surfaces made there."""
-        return self.agreement(self.raw, find_surfaces(self.raw, poses, SURFACE), poses, self.noise)
+        """Share of the points of the raw scans that agree along another path."""
+        return agreeing_share(*self.pairs_along(poses), self.noise)
 
     def result(self, refused: Index, other: AttemptComparison | None) -> Refinement:
         """Covariances at the end, and all that was found."""

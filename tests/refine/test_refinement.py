@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphslam.backend.refining import _nothing_new, refinement_findings, wrong_loops
+from graphslam.backend.refining import refinement_findings, wrong_loops
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.poses import SE3
 from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.nodes import scans_at
-from graphslam.refine.refine import _Refiner, refine_by_scans
+from graphslam.refine.refine import Refinement, ScanCheck, _Refiner, refine_by_scans, refine_if_contradicted
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import find_surfaces
 from graphslam.registration.surfaces import SURFACE
@@ -189,12 +189,24 @@ def test_scans_are_read_as_written(drives, tmp_path):
     assert back.lasting == scans.lasting
 
 
-def test_matched_scans_refine_a_graph_only_if_they_contradict_it(drives):
-    found = drives[0][3]
-    sound = replace(found, refused=found.refused[:0], reckoned=found.agreement[0] + 0.005)
-    assert _nothing_new(sound)
-    assert not _nothing_new(replace(sound, reckoned=found.agreement[0] + 0.02))
-    assert not _nothing_new(replace(sound, refused=np.array([[0, 1]])))
+def test_matched_scans_refine_a_graph_only_if_they_contradict_it():
+    """A right path is only checked; a bent one is refined as it is without the check."""
+    scans, start, truth = court_scans(41)
+    u = SE3.between(truth[:-1], truth[1:])
+    scans = replace(
+        scans, odometry=replace(scans.odometry, increments=np.concatenate([scans.odometry.increments[:1], u]))
+    )
+    right = SE3.compose(SE3.compose(start[0], SE3.inverse(truth[0])), truth)
+    check = refine_if_contradicted(scans, right)
+    assert isinstance(check, ScanCheck)
+    assert abs(check.start - check.odometry) < 0.001
+    assert check.start > 0.8
+    refined = refine_if_contradicted(scans, start)
+    assert isinstance(refined, Refinement)
+    plain = refine_by_scans(scans, start)
+    np.testing.assert_allclose(refined.poses, plain.poses, atol=1e-9)
+    np.testing.assert_allclose(refined.covariances, plain.covariances, rtol=1e-6, atol=1e-12)
+    assert ScanCheck(0.90, 0.905, np.array([[0, 9]])).contradicted
 
 
 def test_what_cannot_be_refined_is_refused(drives):
