@@ -1,9 +1,9 @@
-"""A run for other programs: evaluation, globe, GIS, navigation."""
+"""A run for other programs: evaluation, globe, GIS, navigation; a table of writers, and those of plug-ins."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,16 @@ from graphslam.app.folders.lock import lock_folder
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
-from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
+from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.extras import import_extra
 from graphslam.core.gaussian import ellipse_rings, largest_sigmas
 from graphslam.core.geodesy import check_geodetic, enu_to_geodetic
 from graphslam.core.geometry import Array, se2_transform
 from graphslam.core.plan_view import plan_pose
+from graphslam.core.plugins import load_plugin
 from graphslam.core.se3 import se3_transform
-from graphslam.core.trajectory import Trajectory
 from graphslam.io.autoware import write_autoware
-from graphslam.io.geographic import WRITERS, GeographicMap
+from graphslam.io.geographic import GeographicMap, write_geojson, write_kml
 from graphslam.io.tum import embed_plane, write_kitti, write_tum
 from graphslam.maps.export import save_maps
 from graphslam.maps.run_map import RunMap
@@ -99,11 +99,64 @@ def parse_datum(text: str) -> tuple[float, float]:
     return latitude, longitude
 
 
-PATHS: dict[str, tuple[str, Callable[[str | os.PathLike[str], Trajectory], None]]] = {
-    "tum": ("path.tum", write_tum),
-    "kitti": ("path.kitti.txt", write_kitti),
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What a user says of an export: ``(latitude, longitude)`` of the datum [deg], heading [deg], confidence."""
+
+    datum: tuple[float, float] | None = None
+    heading: float | None = None
+    confidence: float = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Writer:
+    """A format that runs are exported to; own ones are registered under the entry point ``graphslam.writers``.
+
+    Parameters
+    ----------
+    write : callable (run, path, options)
+        Writes a finished :class:`~graphslam.app.run.run.Run`.
+    file : str or None
+        Default name in the folder of the run; None: it writes a folder, which the user must name.
+    needs_datum : bool
+    """
+
+    write: Callable[[Run, Path, WriteOptions], Any]
+    file: str | None
+    needs_datum: bool = False
+
+
+def _globe(write: Callable[[Path, GeographicMap], Any], file: str) -> Writer:
+    def written(run: Run, path: Path, o: WriteOptions) -> None:
+        assert o.datum is not None
+        write(path, geographic_map(run, o.datum, heading=o.heading, confidence=o.confidence))
+
+    return Writer(written, file, needs_datum=True)
+
+
+def _floor_plans(run: Run, path: Path, _: WriteOptions) -> None:
+    made = _dense_map(run)
+    save_maps(made.fused.grid, path, bands=made.bands)
+
+
+def _tiles(run: Run, path: Path, o: WriteOptions) -> None:
+    points = map_points(run)
+    if o.datum is not None:
+        check_geodetic(*o.datum)
+        T = map_to_enu(run, o.heading)
+        T = embed_plane(T[None])[0] if len(T) == 3 else T
+        points = se3_transform(T, points)
+    write_autoware(path, points, datum=o.datum)
+
+
+WRITERS = {
+    "tum": Writer(lambda run, path, _: write_tum(path, run.map.trajectory), "path.tum"),
+    "kitti": Writer(lambda run, path, _: write_kitti(path, run.map.trajectory), "path.kitti.txt"),
+    "kml": _globe(write_kml, "map.kml"),
+    "geojson": _globe(write_geojson, "map.geojson"),
+    "nav2": Writer(_floor_plans, None),
+    "autoware": Writer(_tiles, None),
 }
-FORMATS = (*PATHS, *WRITERS, "nav2", "autoware")
 
 
 def export(
@@ -124,6 +177,7 @@ def export(
         Of the origin of the GPS frame; of the first base in a run without GPS [deg, WGS 84]. KML and GeoJSON need it;
         an Autoware map lies about it, or in its own frame without.
     format : str
+        One of those below, or the name of an own :class:`Writer`.
         ``tum`` or ``kitti``: the path at full rate, in the frame of the first base (what evo reads). ``kml``,
         ``geojson``: path, landmarks with ellipses, fixes. ``nav2``: floor plans (map_server). ``autoware``: the map's
         points in tiles, with ``map_projector_info.yaml``.
@@ -158,54 +212,29 @@ def export(
     >>> gs.export("runs/field", (-33.8886, 151.1892), heading=90.0, format="geojson").name
     'map.geojson'
     """
-    if format not in FORMATS:
-        raise UnknownNameError("format", format, FORMATS)
-    if format in WRITERS and datum is None:
+    writer: Writer = WRITERS.get(format) or load_plugin("graphslam.writers", "format", format, WRITERS)
+    if writer.needs_datum and datum is None:
         raise ConfigError(
             f"{format} needs a datum: latitude and longitude of the GPS frame's origin, or of the first base"
         )
+    options = WriteOptions(datum, heading, confidence)
     opened = run if isinstance(run, Run) else read_run_folder(run)
     home = opened.folder
-    if format in ("nav2", "autoware"):
-        if out is None:
-            raise ConfigError(f"{format} writes a folder: name it (out)")
-        return _write_dense(opened, Path(out), format, datum, heading)
+    if out is None and writer.file is None:
+        raise ConfigError(f"{format} writes a folder: name it (out)")
     if out is None and home is None:
         raise ConfigError("this run has no folder; give a file name (out)")
-
-    def write(target: Path, what: Run) -> None:
-        if format in PATHS:
-            PATHS[format][1](target, what.map.trajectory)
-        elif datum is not None:
-            WRITERS[format](target, geographic_map(what, datum, heading=heading, confidence=confidence))
-
-    default = PATHS[format][0] if format in PATHS else f"map.{format}"
-    name = default if out is None else None if home is None else name_inside(home, out)
+    name = writer.file if out is None else None if home is None or writer.file is None else name_inside(home, out)
     if home is None or name is None:
-        write(Path(out or ""), opened)
+        writer.write(opened, Path(out or ""), options)
         return Path(out or "")
     with lock_folder(home):
         if not isinstance(run, Run):
             opened = read_run_folder(home)  # as it is now that nobody else changes it
         with new_generation(home) as new:
-            write(new.path / name, opened)
+            writer.write(opened, new.path / name, options)
             new.adopt()
     return home / name
-
-
-def _write_dense(run: Run, out: Path, format: str, datum: tuple[float, float] | None, heading: float | None) -> Path:
-    """The fused map of a run as floor plans, or as a cloud in tiles."""
-    made = _dense_map(run)
-    if format == "nav2":
-        save_maps(made.fused.grid, out, bands=made.bands)
-        return out
-    points = map_points(run)
-    if datum is not None:
-        check_geodetic(*datum)
-        T = map_to_enu(run, heading)
-        T = embed_plane(T[None])[0] if len(T) == 3 else T
-        points = se3_transform(T, points)
-    return write_autoware(out, points, datum=datum)
 
 
 def _dense_map(run: Run) -> RunMap:

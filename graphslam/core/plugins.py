@@ -5,6 +5,7 @@ A distribution registers what it brings under one of these groups; names are tho
 * ``graphslam.studies``: Monte-Carlo studies (:func:`graphslam.study`);
 * ``graphslam.worlds``: simulated worlds (:func:`graphslam.simulate`);
 * ``graphslam.readers``: readers of data sets (:func:`graphslam.load`);
+* ``graphslam.writers``: formats that runs are exported to (:func:`graphslam.export`);
 * ``graphslam.frontends``: front ends (:func:`graphslam.run`);
 * ``graphslam.identities``: published identities of the landmarks of a log, by its name: a function of the observations;
 * ``graphslam.presets``: packages of recommended settings, ``SOURCE.FRONTEND.toml``;

@@ -173,7 +173,3 @@ def write_geojson(path: str | os.PathLike[str], content: GeographicMap) -> None:
 
 def _pairs(points: Array) -> list[list[float]]:
     return [[round(float(lon), _DIGITS), round(float(lat), _DIGITS)] for lat, lon in points]
-
-
-WRITERS = {"kml": write_kml, "geojson": write_geojson}
-"""Writers by format."""
