@@ -13,6 +13,7 @@ from graphslam.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from graphslam.app.hypotheses import MinimumEntropyMap
+    from graphslam.app.run.layer import Layer
 
 CANDIDATES = (
     *("verdict", "choice", "support", "withdrawn", "submaps", "matches", "loops", "objective", "chi2", "dof"),
@@ -70,18 +71,20 @@ def map_command(
     """Make the fused map of a finished run again from its folder, with other options."""
     from graphslam.app.run.remake_map import remake_map
 
+    if terrain and surface:
+        raise ConfigError("--terrain and --surface exclude each other; give one of them")
+    if (terrain or surface) and (grid or minimum_entropy or hypotheses):
+        what = "terrain" if terrain else "surface"
+        raise ConfigError(f"--{what} makes only the {what}; remove --grid, --minimum-entropy and --hypotheses")
     if terrain:
-        if grid or minimum_entropy or hypotheses:
-            raise ConfigError("--terrain makes only the terrain; remove --grid, --minimum-entropy and --hypotheses")
-        if surface:
-            raise ConfigError("--terrain and --surface exclude each other; give one of them")
-        _make_terrain(run, log, sensor_height, as_json)
-        return
+        from graphslam.app.run.terrain import Terrain
+
+        return _make_layer(run, Terrain(sensor_height), log, as_json)
     if surface:
-        if grid or minimum_entropy or hypotheses:
-            raise ConfigError("--surface makes only the surface; remove --grid, --minimum-entropy and --hypotheses")
-        _make_surface(run, log, voxel, colour, as_json)
-        return
+        from graphslam.app.run.surface import Surface
+        from graphslam.maps.surface.piece import SurfaceConfig
+
+        return _make_layer(run, Surface(SurfaceConfig(voxel=voxel), colour), log, as_json)
     made = remake_map(
         run, grid=grid, minimum_entropy=minimum_entropy, hypotheses=hypotheses, log=log, low=low, high=high,
         progress=not as_json,
@@ -120,28 +123,13 @@ def _clearest(found: MinimumEntropyMap) -> tuple[dict[str, Any], str]:
     return value, text
 
 
-def _make_terrain(run: Path, log: str | None, sensor_height: float | None, as_json: bool) -> None:
-    from graphslam.app.run.remake_map import remake_terrain
+def _make_layer(run: Path, layer: Layer, log: str | None, as_json: bool) -> None:
+    from graphslam.app.run.layer import make_layer
 
-    found, files, figures = remake_terrain(run, log=log, sensor_height=sensor_height, progress=not as_json)
+    found, files, figures = make_layer(run, layer, log=log, progress=not as_json)
     facts = found.facts()
     rows = [{"what": k, "value": v} for k, v in facts.items() if isinstance(v, (int, float, str))]
-    rows += [{"what": f"cells {k}", "value": v} for k, v in facts["cells"].items()]
-    facts |= {"files": [str(p) for p in files], "figures": [str(p) for p in figures]}
-    print_result(
-        facts, f"{text_table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json
-    )
-
-
-def _make_surface(run: Path, log: str | None, voxel: float, colour: str, as_json: bool) -> None:
-    from graphslam.app.run.remake_map import remake_surface
-    from graphslam.maps.surface.piece import SurfaceConfig
-
-    found, files, figures = remake_surface(
-        run, log=log, config=SurfaceConfig(voxel=voxel), colour=colour, progress=not as_json
-    )
-    facts = found.facts()
-    rows = [{"what": k, "value": v} for k, v in facts.items() if isinstance(v, (int, float, str))]
+    rows += [{"what": f"cells {k}", "value": v} for k, v in facts.get("cells", {}).items()]
     facts |= {"files": [str(p) for p in files], "figures": [str(p) for p in figures]}
     print_result(
         facts, f"{text_table(rows)}\n\nwritten: {', '.join(p.name for p in (*files, *figures))}", as_json=as_json

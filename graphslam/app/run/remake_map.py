@@ -18,16 +18,13 @@ from graphslam.app.run.files import read_options
 from graphslam.app.run.maps import draw_run_map, sensor_reach, write_run_map
 from graphslam.app.run.outputs import read_run_folder, refined_submaps_of
 from graphslam.app.run.run import Run
-from graphslam.app.run.surface import COLOURS, RunSurface, draw_surface, surface_of_run, write_surface
-from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain_file, terrain_of_run, write_terrain
 from graphslam.core.config import build_config, merge_options
-from graphslam.core.errors import ConfigError, MissingDataError, UnknownNameError
+from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.io.submap_store import read_submaps
 from graphslam.maps.refined import map_of_frames
 from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
-from graphslam.maps.surface.piece import SurfaceConfig
 
 
 @dataclass(frozen=True)
@@ -98,82 +95,6 @@ def remake_map(
             add_report(new)  # the page of the run shows the pictures and the choices
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return RemadeMap(made, found, files, figures)
-
-
-def remake_terrain(
-    folder: str | Path,
-    *,
-    log: str | Path | SensorLog | None = None,
-    sensor_height: float | None = None,
-    progress: bool = True,
-) -> tuple[RunTerrain, list[Path], list[Path]]:
-    """Find where a vehicle can drive, and write it with its pictures and the page of the run.
-
-    Parameters
-    ----------
-    folder : path
-        Of a finished run in space.
-    log, sensor_height, progress
-        See :func:`graphslam.app.run.terrain.terrain_of_run`.
-
-    Returns
-    -------
-    RunTerrain, files, figures
-    """
-    home = Path(folder)
-    if not (current_outputs(home) / "run.json").is_file():
-        read_run_folder(home)  # says what is wrong
-    with lock_folder(home):
-        run = read_run_folder(home)
-        made = terrain_of_run(run, log=log, sensor_height=sensor_height, progress=progress)
-        with new_generation(home) as new:
-            files = write_terrain(new, made, generation=run.report.get("generation"))
-            figures = draw_terrain(made, new.figures, name=run.name)
-            new.adopt(drop=["terrain*", "figures/terrain*.png"])
-            add_report(new)
-    files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
-    return made, files, figures
-
-
-def remake_surface(
-    folder: str | Path,
-    *,
-    log: str | Path | SensorLog | None = None,
-    config: SurfaceConfig | None = None,
-    colour: str = "height",
-    progress: bool = True,
-) -> tuple[RunSurface, list[Path], list[Path]]:
-    """Make the surface of a run, and write it with its pictures and the page of the run.
-
-    Parameters
-    ----------
-    folder : path
-        Of a finished run in space.
-    log, config, progress
-        See :func:`graphslam.app.run.surface.surface_of_run`.
-    colour : str
-        One of :data:`graphslam.app.run.surface.COLOURS`.
-
-    Returns
-    -------
-    RunSurface, files, figures
-    """
-    home = Path(folder)
-    if colour not in COLOURS:
-        raise UnknownNameError("colour of a surface", colour, COLOURS)
-    if not (current_outputs(home) / "run.json").is_file():
-        read_run_folder(home)  # says what is wrong
-    with lock_folder(home):
-        run = read_run_folder(home)
-        terrain = read_terrain_file(current_outputs(home)) if colour == "terrain" else None
-        made = surface_of_run(run, log=log, config=config, progress=progress)
-        with new_generation(home) as new:
-            files = write_surface(new, made, colour=colour, terrain=terrain, generation=run.report.get("generation"))
-            figures = draw_surface(made, new.figures, name=run.name)
-            new.adopt(drop=["surface*", "figures/surface*.png"])
-            add_report(new)
-    files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
-    return made, files, figures
 
 
 def map_of_folder(path: str | Path, *, low: float | None = None, high: float | None = None) -> tuple[Run, RunMap]:

@@ -6,14 +6,16 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.app.folders.generations import current_outputs
 from graphslam.app.folders.output_files import OutputFiles
+from graphslam.app.run.layer import Layer
 from graphslam.app.run.run import Run
-from graphslam.app.run.terrain import scans_of_run
+from graphslam.app.run.terrain import read_terrain_file, scans_of_run
 from graphslam.core import se3
 from graphslam.core.errors import DataError, MissingDataError, UnknownNameError
 from graphslam.core.geometry import Array
@@ -139,17 +141,48 @@ class RunSurface:
         return vertex_colours(self.mesh.vertices[:, 2] if by == "height" else self.sigma)
 
 
-def surface_of_run(
-    run: Run, *, log: str | Path | SensorLog | None = None, config: SurfaceConfig | None = None, progress: bool = True
-) -> RunSurface:
-    """Read the log of a run once more, along its solved path; for the errors see
-    :func:`graphslam.app.run.terrain.terrain_of_run`."""
-    return read_surface([scanned_path(run, log=log)], config=config, progress=progress)
+@dataclass(frozen=True)
+class Surface(Layer):
+    """The level-set surface of a run in space, as PLY, GLB and OBJ.
+
+    Parameters
+    ----------
+    config : SurfaceConfig, optional
+    colour : str
+        One of :data:`COLOURS`.
+    """
+
+    name: ClassVar[str] = "surface"
+    config: SurfaceConfig | None = None
+    colour: str = "height"
+
+    def __post_init__(self) -> None:
+        if self.colour not in COLOURS:
+            raise UnknownNameError("colour of a surface", self.colour, COLOURS)
+
+    def make(self, run: Run, *, log: str | Path | SensorLog | None = None, progress: bool = True) -> RunSurface:
+        """See :meth:`Layer.make`."""
+        self.terrain_of(run)  # a run without one is refused before the work
+        return read_surface([scanned_path(run, log=log)], config=self.config, progress=progress)
+
+    def write(self, made: RunSurface, folder: OutputFiles, run: Run) -> list[Path]:
+        """See :func:`write_surface`."""
+        terrain, generation = self.terrain_of(run), run.report.get("generation")
+        return write_surface(folder, made, colour=self.colour, terrain=terrain, generation=generation)
+
+    def terrain_of(self, run: Run) -> ClassGrid | None:
+        """The terrain of the run, where it gives the colours."""
+        if self.colour != "terrain" or run.folder is None:
+            return None
+        return read_terrain_file(current_outputs(run.folder))
+
+    def draw(self, made: RunSurface, figures: Path, *, name: str) -> list[Path]:
+        """See :func:`draw_surface`."""
+        return draw_surface(made, figures, name=name)
 
 
 def scanned_path(run: Run, *, log: str | Path | SensorLog | None = None) -> ScannedPath:
-    """The scans of a run along its solved path; for the errors see
-    :func:`graphslam.app.run.terrain.terrain_of_run`."""
+    """The scans of a run in space along its solved path."""
     name, scans = scans_of_run(run, log, what="a surface")
     m = run.map
     return ScannedPath(

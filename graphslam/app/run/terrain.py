@@ -7,13 +7,14 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.files import read_options
+from graphslam.app.run.layer import Layer
 from graphslam.app.run.run import Run
 from graphslam.app.run.source import log_of_run
 from graphslam.core import se3
@@ -106,30 +107,45 @@ class RunTerrain:
         }
 
 
-def terrain_of_run(
-    run: Run, *, log: str | Path | SensorLog | None = None, sensor_height: float | None = None, progress: bool = True
-) -> RunTerrain:
-    """Read the log of a run once more, along its solved path: its point clouds, or else the lines of a laser.
+@dataclass(frozen=True)
+class Terrain(Layer):
+    """Where a vehicle can drive, from the point clouds of a run in space, or else from the lines of a laser.
 
     Parameters
     ----------
-    run : Run
-        With a folder, in space.
-    log : card name, folder, or SensorLog; optional
-        Where the run's log is by now; default where it was.
     sensor_height : float, optional
         Of the scanner above the ground [m]; default found from the ground in its scans. A line laser needs it: its base
         is taken to drive on the ground.
     """
-    name, scans = scans_of_run(run, log, what="terrain")
-    return read_terrain(
-        scans, run.map, moved=_moved(run) if isinstance(scans, PointClouds) else None,
-        stream=name, sensor_height=sensor_height, progress=progress,
-    )  # fmt: skip
+
+    name: ClassVar[str] = "terrain"
+    sensor_height: float | None = None
+
+    def make(self, run: Run, *, log: str | Path | SensorLog | None = None, progress: bool = True) -> RunTerrain:
+        """See :meth:`Layer.make`."""
+        name, scans = scans_of_run(run, log, what="terrain")
+        return read_terrain(
+            scans, run.map, moved=_moved(run) if isinstance(scans, PointClouds) else None,
+            stream=name, sensor_height=self.sensor_height, progress=progress,
+        )  # fmt: skip
+
+    def write(self, made: RunTerrain, folder: OutputFiles, run: Run) -> list[Path]:
+        """See :func:`write_terrain`."""
+        return write_terrain(folder, made, generation=run.report.get("generation"))
+
+    def draw(self, made: RunTerrain, figures: Path, *, name: str) -> list[Path]:
+        """Pictures of the classes, and in green, red and white."""
+        from graphslam.plots.save import save_figure
+        from graphslam.plots.terrain import plot_terrain
+
+        path = made.path[:, :2]
+        out = [save_figure(plot_terrain(made.map, path=path, title=f"{name}: terrain"), figures / "terrain.png")]
+        ax = plot_terrain(made.map, plain=True, title=f"{name}: free, hazard, unknown")
+        return [*out, save_figure(ax, figures / "terrain_plain.png")]
 
 
 def scans_of_run(run: Run, log: str | Path | SensorLog | None, *, what: str) -> tuple[str, PointClouds | RangeScans]:
-    """Name and records of the scans of a run in space, from its log; see :func:`terrain_of_run` for the errors."""
+    """Name and records of the scans of a run in space, from its log; errors say what is missing."""
     if run.folder is None:
         raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
     if run.map.dim != 3:
@@ -165,7 +181,7 @@ def read_terrain(
         By number of a node: points ``(m, 3)`` of things that moved while it was made, in the world. Clouds of that
         time are read without what stands where they are.
     stream, sensor_height, progress
-        See :func:`terrain_of_run`.
+        Of the scanner above the ground [m]; None: found from the ground in its scans.
     """
     path, node_times, node_poses = solved.trajectory, solved.node_times, solved.node_poses
     inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
@@ -364,14 +380,3 @@ def write_terrain(folder: OutputFiles, made: RunTerrain, *, generation: str | No
     folder.write_json("terrain.json", {**made.facts(), "generation": generation})
     costs = save_cost_map(cost_map(found, made.layer.vehicle), folder.path / "terrain_cost.yaml")
     return [target, folder.path / "terrain.json", *costs]
-
-
-def draw_terrain(made: RunTerrain, figures: Path, *, name: str) -> list[Path]:
-    """Pictures of the classes, and in green, red and white."""
-    from graphslam.plots.save import save_figure
-    from graphslam.plots.terrain import plot_terrain
-
-    path = made.path[:, :2]
-    out = [save_figure(plot_terrain(made.map, path=path, title=f"{name}: terrain"), figures / "terrain.png")]
-    ax = plot_terrain(made.map, plain=True, title=f"{name}: free, hazard, unknown")
-    return [*out, save_figure(ax, figures / "terrain_plain.png")]

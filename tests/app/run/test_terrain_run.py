@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from graphslam.app.cli import app
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.source import log_of_run
-from graphslam.app.run.terrain import RunTerrain, draw_terrain, read_terrain, read_terrain_file, write_terrain
+from graphslam.app.run.terrain import RunTerrain, Terrain, read_terrain, read_terrain_file, write_terrain
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError
 from graphslam.core.geometry import Array
@@ -127,7 +127,7 @@ def test_what_is_written(made: tuple[RunTerrain, PointClouds, Trajectory], tmp_p
     with np.load(tmp_path / "terrain.npz") as arrays:
         assert np.array_equal(arrays["classes"], made[0].map.classes)
     with full_pictures():
-        drawn = draw_terrain(made[0], folder.figures, name="street")
+        drawn = Terrain().draw(made[0], folder.figures, name="street")
     assert [p.name for p in drawn] == ["terrain.png", "terrain_plain.png"]
     assert all(p.stat().st_size > 5_000 for p in drawn)
 
