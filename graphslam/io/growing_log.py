@@ -16,7 +16,7 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.core.range_scans import RangeScans
 from graphslam.core.record_source import RecordSource
 from graphslam.core.records import LaserScans, Stream
-from graphslam.io.log_kinds import KINDS, StreamKind, kind_name
+from graphslam.io.log_kinds import StreamKind, kind_name, stream_kinds
 
 BEAMS = (LaserScans, RangeScans, PointClouds)
 """Streams whose records are let go of: all others are small, and figures are made of them at the end."""
@@ -118,7 +118,7 @@ class _Held:
     """One stream: its portions in memory and, of beams, all of it on disk."""
 
     def __init__(self, where: str, first: Stream, folder: Path) -> None:
-        found = KINDS[kind_name(first, where)]
+        found = stream_kinds()[kind_name(first, where)]
         self.where, self.kind = where, found
         self.until = -np.inf
         self.parts: list[Stream] = []

@@ -10,7 +10,7 @@ import numpy as np
 from graphslam.core.digest import Digest
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
-from graphslam.io.log_kinds import KINDS
+from graphslam.io.log_kinds import stream_kinds
 
 META = ("T_world_frame",)
 """Of a log's ``meta``, what figures are computed with."""
@@ -51,7 +51,7 @@ def _arrays(stream: Any) -> dict[str, Any]:
     if isinstance(stream, PointClouds):
         own = {"times": stream.times, "index": stream.index, "origin": stream.origin, "mount": stream.T_base_sensor}
         return {**own, "counts": stream.source.counts, "packed": stream.source.packed()}
-    kind = next((k for k in KINDS.values() if type(stream) is k.cls), None)
+    kind = next((k for k in stream_kinds().values() if type(stream) is k.cls), None)
     if kind is not None:
         return kind.arrays(stream)
     return _fields("", stream)  # a stream of somebody's own

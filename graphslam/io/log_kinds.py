@@ -175,7 +175,6 @@ KINDS: dict[str, StreamKind] = {
         _unpack_steering,
         {"wheelbase": floats(), "encoder_offset": floats(), "model": texts()},
     ),
-    **{kind: StreamKind(cls, {f.name: floats("n") for f in dataclasses.fields(cls)}) for kind, cls in PLAIN.items()},
     "odometry": StreamKind(Odometry, {**_TIMES, "increments": floats("n", "p"), "covariances": floats("n", "d", "d")}),
     "gps": StreamKind(
         Gps,
@@ -221,14 +220,24 @@ KINDS: dict[str, StreamKind] = {
         {"covariances": floats("n", "d", "d", optional=True)},
     ),
 }
-"""By the name that ``log.json`` gives."""
+"""By the name that ``log.json`` gives; with :data:`~graphslam.core.records.PLAIN` these are :func:`stream_kinds`."""
+
+
+def stream_kinds() -> dict[str, StreamKind]:
+    """All kinds of streams that are stored, those of plug-ins included."""
+    return KINDS | {
+        kind: StreamKind(cls, {f.name: floats("n") for f in dataclasses.fields(cls)}) for kind, cls in PLAIN.items()
+    }
 
 
 def kind_name(stream: Any, where: str | None = None) -> str:
     """Name of the kind of a stream."""
-    for name, kind in KINDS.items():
+    for name, kind in stream_kinds().items():
         if type(stream) is kind.cls:
             return name
     raise FormatError(
-        "stream of a kind that cannot be stored", where=where, got=type(stream).__name__, wanted=", ".join(KINDS)
+        "stream of a kind that cannot be stored",
+        where=where,
+        got=type(stream).__name__,
+        wanted=", ".join(stream_kinds()),
     )

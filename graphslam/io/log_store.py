@@ -20,7 +20,7 @@ from graphslam.core.npz import check_arrays, floats, ints
 from graphslam.core.reading import resolve_inside
 from graphslam.core.records import Stream
 from graphslam.core.trajectory import Trajectory
-from graphslam.io.log_kinds import KINDS, Arrays, kind_name
+from graphslam.io.log_kinds import Arrays, kind_name, stream_kinds
 
 LOG_FORMAT = "graphslam.log/1"
 STREAM_FORMAT = "graphslam.stream/1"
@@ -41,7 +41,7 @@ def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
             raise FormatError("stream name is no file name", where=where, wanted="letters, digits, _ . - (not truth)")
         kind = kind_name(stream, where)
         header = {"format": STREAM_FORMAT, "kind": kind}
-        write_npz(root / f"{name}.npz", {**header, **KINDS[kind].arrays(stream)})
+        write_npz(root / f"{name}.npz", {**header, **stream_kinds()[kind].arrays(stream)})
         entries.append({"name": name, "kind": kind, "file": f"{name}.npz", "records": len(stream.times)})
     if log.truth is not None:
         write_npz(root / "truth.npz", _truth_arrays(log.truth))
@@ -71,11 +71,12 @@ def load_log(folder: str | os.PathLike[str]) -> SensorLog:
         if name in streams:
             raise FormatError("stream listed twice", where=where, got=repr(name[:80]))
         arrays = read_npz(path, fmt=STREAM_FORMAT)
-        if kind not in KINDS or str(arrays.get("kind")) != kind:
+        if kind not in stream_kinds() or str(arrays.get("kind")) != kind:
             raise FormatError(
                 "unknown stream kind", where=str(path), got=f"{arrays.get('kind')} listed as {kind!r}", wanted=kind
             )
-        streams[name] = _build(str(path), lambda a=arrays, k=kind, p=path: KINDS[k].stream(a, str(p)))  # type: ignore[misc]
+        made = stream_kinds()[kind]
+        streams[name] = _build(str(path), lambda a=arrays, k=made, p=path: k.stream(a, str(p)))  # type: ignore[misc]
         if len(streams[name].times) != entry["records"]:
             raise FormatError(
                 "wrong number of records", where=str(path), got=len(streams[name].times), wanted=entry["records"]

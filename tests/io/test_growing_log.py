@@ -14,7 +14,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import PointClouds
 from graphslam.io.growing_log import BEAMS, GrowingLog
 from graphslam.io.log_digest import log_digest
-from graphslam.io.log_kinds import KINDS
+from graphslam.io.log_kinds import stream_kinds
 from tests.frontends.landmarks.test_preparing import in_portions
 from tests.io.test_log_store import every_kind
 
@@ -38,7 +38,7 @@ def test_every_kind_comes_back_bit_for_bit(log: SensorLog, tmp_path: Path) -> No
 
 
 def in_memory(log: SensorLog) -> SensorLog:
-    kinds = {k.cls: k for k in KINDS.values()}
+    kinds = {k.cls: k for k in stream_kinds().values()}
     streams = {n: kinds[type(s)].stream(kinds[type(s)].arrays(s), n) for n, s in log.streams.items()}
     return SensorLog(name=log.name, streams=streams)
 
@@ -53,7 +53,7 @@ def test_parts_are_those_of_the_whole(log: SensorLog, tmp_path: Path) -> None:
         for _ in range(5):
             a = int(rng.integers(0, n))
             b = int(rng.integers(a + 1, n + 1))
-            got, kind = growing.part(name, a, b), next(k for k in KINDS.values() if k.cls is type(stream))
+            got, kind = growing.part(name, a, b), next(k for k in stream_kinds().values() if k.cls is type(stream))
             for x, y in zip(kind.arrays(got).values(), kind.arrays(stream.take(slice(a, b))).values(), strict=True):
                 np.testing.assert_array_equal(x, y)
 

@@ -36,7 +36,12 @@ from graphslam.refine.scans import Scans
 TAKEN_FORMAT = "graphslam.taken/1"
 INPUTS = "inputs"
 SCANS = "scans.npz"
-KEPT = (Gps, Imu, LandmarkObservations, Odometry, SteeringControls, *PLAIN.values())
+KEPT = (Gps, Imu, LandmarkObservations, Odometry, SteeringControls)
+
+
+def _is_kept(stream: Any) -> bool:
+    """Is the stream kept with a run, and not its stamps alone?"""
+    return isinstance(stream, (*KEPT, *PLAIN.values()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +93,7 @@ def collect_inputs(
     scans: Scans | None = None,
 ) -> RunInputs:
     """What is kept of a log; ``dropped`` counts what its front end dropped."""
-    streams: dict[str, Any] = {n: s if isinstance(s, KEPT) else TimestampsOnly(s.times) for n, s in log.streams.items()}
+    streams: dict[str, Any] = {n: s if _is_kept(s) else TimestampsOnly(s.times) for n, s in log.streams.items()}
     read = dict(log.read) or {k: len(s.times) for k, s in log.streams.items()}
     return RunInputs(
         replace(log, streams=streams, read=read, dropped={**log.dropped, **dropped}), identities, tuple(noticed), scans
@@ -98,10 +103,10 @@ def collect_inputs(
 def write_inputs(folder: Path, taken: RunInputs, generation: str) -> None:
     """Write it into the folder of a run's files."""
     log = taken.log
-    save_log(replace(log, streams={n: s for n, s in log.streams.items() if isinstance(s, KEPT)}), folder / INPUTS)
+    save_log(replace(log, streams={n: s for n, s in log.streams.items() if _is_kept(s)}), folder / INPUTS)
     arrays: dict[str, Any] = {"format": TAKEN_FORMAT, "generation": generation, "names": np.array([*log.streams], "U")}
     for k, stream in enumerate(log.streams.values()):
-        if not isinstance(stream, KEPT):
+        if not _is_kept(stream):
             arrays[f"times_{k}"] = stream.times
     said = [(n.stream, n.finding.level, n.finding.code, n.finding.text) for n in taken.noticed]
     arrays["noticed"] = np.array(said, "U").reshape(-1, 4)
