@@ -31,9 +31,11 @@ Install = Callable[[str, str, str], None]
 
 def test_every_row_of_the_table_has_a_test() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text().partition("## Extend the program")[2]
-    rows = re.findall(r"^\| ([a-z ]+) \|", text, re.M)
+    rows = re.findall(r"^\| ([a-z -]+) \|", text, re.M)
     assert len(rows) > 8
-    assert {f"test_add_{row.replace(' ', '_')}" for row in rows} == {n for n in globals() if n.startswith("test_add_")}
+    assert {f"test_add_{re.sub('[ -]', '_', row)}" for row in rows} == {
+        n for n in globals() if n.startswith("test_add_")
+    }
 
 
 @pytest.fixture
@@ -160,7 +162,7 @@ def test_add_solver(monkeypatch: pytest.MonkeyPatch, log: gs.SensorLog, run: Run
     np.testing.assert_allclose(own.map.node_poses, run.map.node_poses, atol=1e-5)
 
 
-def test_add_joiner(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+def test_add_map_joining_method(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
     def own(submaps: list[Submap], **options: Any) -> Any:
         return join_sequential(submaps, **options)
 
