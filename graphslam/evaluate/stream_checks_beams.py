@@ -26,7 +26,7 @@ LEAST_BEAMS = 8
 NEAREST, FARTHEST = 0.1, 1000.0
 """Half of all things are neither nearer nor farther [m]: a body is larger than the one, and no scanner of a robot
 reaches the other."""
-MOST_CLOUDS = 200
+MOST_CLOUDS = 100
 """Clouds that are decoded for these checks, evenly over the stream: a recording may hold 10⁷ points."""
 SOME = 0.01
 """Share of the scans above which a fault that no sound scanner has is said."""
