@@ -7,7 +7,8 @@ from typing import Any
 
 from graphslam.app.compare import MapEstimate
 from graphslam.app.run.summary import headline, length_text
-from graphslam.app.run.verdict import ChiSquareTest, is_finite_number
+from graphslam.app.verdict.chi_square import ChiSquareTest
+from graphslam.app.verdict.figures import is_finite_number
 from graphslam.core.findings import Finding
 
 SAME = 1e-6

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.run.verdict import RunMetrics, nees_tests
+from graphslam.app.verdict.chi_square import nees_tests
+from graphslam.app.verdict.figures import RunMetrics
 from graphslam.core.poses import SE3, group_of
 from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.trajectory import Trajectory

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
+from graphslam.app.verdict.checks import findings_from_metrics
+from graphslam.app.verdict.figures import RunMetrics
 from graphslam.core.records import Gps
 from graphslam.evaluate.bias_test import sum_bias_windows
 from graphslam.evaluate.covariance_assessment import (

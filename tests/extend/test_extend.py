@@ -17,6 +17,9 @@ import graphslam as gs
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.run.layer import Layer, make_layer
 from graphslam.app.run.run import Run
+from graphslam.app.verdict import checks
+from graphslam.app.verdict.figures import RunMetrics
+from graphslam.core.findings import Finding
 from graphslam.core.submap import Submap
 from graphslam.io.readers import list_readers
 from graphslam.join import registry as joining
@@ -170,6 +173,18 @@ def test_add_map_joining_method(monkeypatch: pytest.MonkeyPatch, run: Run) -> No
     assert "own" in gs.joiners()
     poses = [gs.join_submaps(run.submaps, name).poses for name in ("own", "eif-sequential")]
     np.testing.assert_allclose(*poses)
+
+
+def test_add_check(monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    def few(figures: RunMetrics) -> list[Finding]:
+        n = figures.metrics["submaps"]
+        return [Finding("look", "few-submaps", f"submaps: {n:g} [≥ 100] — too few.")] if n < 100 else []
+
+    monkeypatch.setattr(checks, "CHECKS", [*checks.CHECKS, checks.Check(few, ("few-submaps",))])
+    figures = RunMetrics.of_table(run.report, run.metrics)
+    assert [f.text for f in checks.run_findings(figures) if f.code == "few-submaps"] == [
+        "submaps: 7 [≥ 100] — too few."
+    ]
 
 
 def test_add_map_layer(log: gs.SensorLog, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.run.residual_consistency import ResidualConsistency
-from graphslam.app.run.verdict import RunMetrics, whole_chi2
+from graphslam.app.verdict.figures import RunMetrics, whole_chi2
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of

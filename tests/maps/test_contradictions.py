@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
+from graphslam.app.verdict.checks import findings_from_metrics
+from graphslam.app.verdict.figures import RunMetrics
 from graphslam.core.poses import SE2, SE3
 from graphslam.evidence.beams import BeamModel
 from graphslam.maps.contradictions import FEW, Contradictions, find_contradictions

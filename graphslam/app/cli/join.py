@@ -106,8 +106,8 @@ def compare_command(
     """Compare methods on the same submaps: objective, NEES and CI before and after refinement, time, and memory."""
     from graphslam.app import compare as comparing
     from graphslam.app.join_verdict import compare_verdict
-    from graphslam.app.run.verdict import CONFIDENCE
     from graphslam.app.submap_sources import submap_source
+    from graphslam.app.verdict.figures import CONFIDENCE
     from graphslam.evaluate.residual_consistency import two_sided_bounds
 
     s = submap_source(source, submap_poses=submap_poses)

@@ -187,7 +187,7 @@ CAUSES = frozenset(
 
 def join_note(result: Any) -> list[str]:
     """What to do about submaps that fit each other worse or better than they say, beyond what chance does."""
-    from graphslam.app.run.verdict import CERTAIN
+    from graphslam.app.verdict.figures import CERTAIN
     from graphslam.evaluate.residual_consistency import two_sided_bounds
 
     m = result.metrics.set_index("key")["value"]

@@ -13,7 +13,7 @@ from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.packed import base64_floats, packed_points
 from graphslam.app.report.sections import metrics_of_folder
 from graphslam.app.run.files import read_gps_residuals
-from graphslam.app.run.verdict import CONFIDENCE, class_rows
+from graphslam.app.verdict.figures import CONFIDENCE, class_rows
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, arc_length
 from graphslam.core.trajectory import Trajectory

@@ -12,7 +12,8 @@ from graphslam.app.report.folder import ReportFolder
 from graphslam.app.report.markup import compact_json, folded_section, missing_note, page_section, remark
 from graphslam.app.run.files import RESUMED
 from graphslam.app.run.summary import headline, summarise_run
-from graphslam.app.run.verdict import CONFIDENCE, RunMetrics, class_rows, run_findings
+from graphslam.app.verdict.checks import run_findings
+from graphslam.app.verdict.figures import CONFIDENCE, RunMetrics, class_rows
 from graphslam.core.config import dump_toml
 from graphslam.core.findings import Finding
 from graphslam.core.markup import (

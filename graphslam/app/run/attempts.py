@@ -12,7 +12,8 @@ from graphslam.app.run.run_inputs import RunInputs
 from graphslam.app.run.stages import RunClock, run_of_solution
 from graphslam.app.run.submap_slam import SubmapSlam
 from graphslam.app.run.summary import summarise_run
-from graphslam.app.run.verdict import RunMetrics, run_findings
+from graphslam.app.verdict.checks import run_findings
+from graphslam.app.verdict.figures import RunMetrics
 from graphslam.core.findings import verdict_json
 from graphslam.loops.ledger import LoopDecision
 from graphslam.maps.contradictions import Contradictions

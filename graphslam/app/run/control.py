@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from graphslam.app.run.verdict import CERTAIN
+from graphslam.app.verdict.figures import CERTAIN
 from graphslam.core.control import ControlTable
 from graphslam.core.findings import Finding, Level
 from graphslam.evaluate.check_points import CheckPoints

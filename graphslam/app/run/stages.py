@@ -21,7 +21,9 @@ from graphslam.app.run.run_inputs import RunInputs
 from graphslam.app.run.stream_use import stream_use
 from graphslam.app.run.submap_slam import SubmapSlam, tell_stage
 from graphslam.app.run.summary import summarise_run
-from graphslam.app.run.verdict import RunMetrics, findings_from_run, run_findings
+from graphslam.app.verdict.checks import run_findings
+from graphslam.app.verdict.figures import RunMetrics
+from graphslam.app.verdict.observed import findings_from_run
 from graphslam.backend.config import GpsOptions
 from graphslam.backend.refining import RefinedRun, refine_run, refined_ledger
 from graphslam.backend.streams import split_fixes, used_fixes

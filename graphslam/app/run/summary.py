@@ -9,16 +9,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
-from graphslam.app.run.verdict import (
-    TWO_MAPS_DO,
-    ChiSquareTest,
-    RunMetrics,
-    chi_square_test,
-    covariance_assessment,
-    is_finite_number,
-    nees_tests,
-    of_the_start,
-)
+from graphslam.app.verdict.chi_square import ChiSquareTest, chi_square_test, nees_tests, of_the_start
+from graphslam.app.verdict.covariances import covariance_assessment
+from graphslam.app.verdict.figures import RunMetrics, is_finite_number
+from graphslam.app.verdict.maps import TWO_MAPS_DO
 from graphslam.core.errors import DataError
 from graphslam.core.findings import LEVELS, Finding, Level, worst_level
 from graphslam.evaluate.covariance_assessment import LEAST_POWER, CovarianceAssessment

@@ -32,7 +32,8 @@ from scipy import stats
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
 from graphslam.app.run.summary import verdict_word
-from graphslam.app.run.verdict import RunMetrics, covariance_assessment
+from graphslam.app.verdict.covariances import covariance_assessment
+from graphslam.app.verdict.figures import RunMetrics
 from graphslam.app.worlds import mesh_world, simulate
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, se2_adjoint, se2_between, se2_compose, se2_inverse, se2_log

@@ -15,7 +15,8 @@ from graphslam.app.cli import app
 from graphslam.app.run.control import control_findings
 from graphslam.app.run.reopened import resolve_from_folder
 from graphslam.app.run.summary import summarise_run
-from graphslam.app.run.verdict import RunMetrics, findings_from_metrics
+from graphslam.app.verdict.checks import findings_from_metrics
+from graphslam.app.verdict.figures import RunMetrics
 from graphslam.core.errors import DataError, RunFolderError
 from graphslam.evaluate.check_points import CheckPoints
 from graphslam.graph.factors.control import ControlRecord

@@ -28,7 +28,9 @@ from graphslam.app.run.summary import (
     length_text,
     summarise_run,
 )
-from graphslam.app.run.verdict import RunMetrics, findings_from_metrics, findings_from_run
+from graphslam.app.verdict.checks import findings_from_metrics
+from graphslam.app.verdict.figures import RunMetrics
+from graphslam.app.verdict.observed import findings_from_run
 from graphslam.core.findings import Finding, findings_of_json, headline_of_json, verdict_json, worst_level
 from graphslam.evaluate.covariance_assessment import chi_square_ratio_test, consistency_tests_as_json
 from tests.reference.page import Page

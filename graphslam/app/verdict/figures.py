@@ -1,0 +1,85 @@
+"""The figures of a finished run that its verdict is read from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from graphslam.evaluate.intervals import two_sided_width
+from graphslam.evaluate.residual_consistency import NOT_TESTED, two_sided_bounds
+
+CONFIDENCE = 0.95
+CERTAIN = 0.999
+"""A test that a consistent run fails less often than once in a thousand runs is no accident."""
+CERTAIN_OVER_CONFIDENT = two_sided_width(CERTAIN) / two_sided_width(CONFIDENCE)
+"""Ratio of the two-sided bounds of a normal variable at the two levels."""
+
+
+@dataclass(frozen=True)
+class RunMetrics:
+    """What the figures of a finished run are read from, in memory or from its folder.
+
+    Parameters
+    ----------
+    report : mapping
+        ``run.json`` or ``merge.json``.
+    metrics : mapping of str to float
+    sessions : sequence of mapping
+        Of a merge.
+    """
+
+    report: Mapping[str, Any]
+    metrics: Mapping[str, float]
+    events: Sequence[Mapping[str, Any]] = ()
+    sessions: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+
+    @classmethod
+    def of_table(cls, report: Mapping[str, Any], metrics: Any, events: Sequence[Mapping[str, Any]] = ()) -> RunMetrics:
+        """Those of a table of metrics (``key``, ``value``)."""
+        return cls(report, dict(zip(metrics["key"], metrics["value"])), events)
+
+    def part(self, name: str) -> Mapping[str, Any]:
+        """A mapping inside the report; empty where it is none."""
+        found = self.report.get(name)
+        return found if isinstance(found, Mapping) else {}
+
+
+def is_finite_number(value: Any) -> bool:
+    """Is it a finite number?"""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def class_rows(figures: RunMetrics) -> list[dict[str, Any]]:
+    """χ² of each class of factors with its bounds: from the report, or as far as metrics of older runs hold it."""
+    found = figures.part("graph").get("classes")
+    if isinstance(found, list):
+        return [r for r in found if isinstance(r, dict)]
+    m = figures.metrics
+    out = []
+    for key, ratio in m.items():
+        if not (key.startswith("honesty_") and key.endswith("_chi2_per_dof")):
+            continue
+        stem = key.removesuffix("_chi2_per_dof")
+        dof = m.get(f"{stem}_dof", math.nan)
+        row = {"class": stem.removeprefix("honesty_"), "dof": dof, "chi2": ratio * dof, "chi2_per_dof": ratio}
+        if dof > 0:
+            row["low"], row["high"], row["verdict"] = two_sided_bounds(ratio, dof, CONFIDENCE)
+        out.append(row | {"mean_weight": m.get(f"{stem}_mean_weight")})
+    return out
+
+
+def whole_chi2(figures: RunMetrics) -> tuple[float, float] | None:
+    """χ² and degrees of freedom of all classes that test anything; None where there are none, or not known."""
+    rows = [
+        r for r in class_rows(figures) if is_finite_number(r.get("dof")) and is_finite_number(r.get("chi2_per_dof"))
+    ]
+    chi2 = dof = 0.0
+    for r in rows:
+        dof += float(r["dof"])
+        if r["class"] in NOT_TESTED:  # without it the graph has fewer residuals, and fewer unknowns
+            dof -= max(float(r.get("rows", 0)) - NOT_TESTED[r["class"]], 0.0)
+        elif is_finite_number(r.get("chi2")):
+            chi2 += float(r["chi2"])
+    return (chi2, dof) if dof > 0.5 else None  # less than one degree of freedom is rounding
