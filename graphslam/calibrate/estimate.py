@@ -20,7 +20,7 @@ and the whole estimate gains so much on withheld data over what the log states."
 AGREE = 2.0
 """… and differs by less than so many σ between the two lengths of windows."""
 VAGUE = 0.05
-"""A scale that is told less exactly than this is left: wheels and rangefinders are better than that without it."""
+"""A scale with a larger σ is not corrected: wheels and rangefinders are better than that without it."""
 LASTS = 1.5
 """Noise that is so much larger in long windows than in short ones lasts."""
 ALIKE = 0.3
@@ -60,12 +60,12 @@ class Estimate:
 
     @property
     def applied(self) -> bool:
-        """Is it taken out of the log?"""
+        """Is the log corrected by it?"""
         return not self.why_not
 
     @property
     def contradiction(self) -> bool:
-        """Is it too large for an error of a sensor that works, and told exactly enough to say so?"""
+        """Is it too large for an error of a sensor that works, and known well enough to say so?"""
         if self.name.endswith("_scale") and self.sigma > VAGUE:
             return False
         return abs(self.value) - SURE * self.sigma > LARGEST.get(self.name, math.inf)
@@ -104,18 +104,18 @@ class Prediction:
     gains: dict[str, float]
 
     @property
-    def taken(self) -> str:
-        """``all``, ``noise``, or ``nothing`` of the estimate: it replaces what the log states only if it wins."""
+    def supported(self) -> str:
+        """What of the estimate the held-out data support, and so what is used: ``all``, ``noise`` or ``nothing``."""
         best = max(self.gains, key=lambda k: self.gains[k])
         return best if self.gains[best] > GAIN else "nothing"
 
-    def in_words(self) -> str:
-        """What they say."""
+    def text(self) -> str:
+        """The result of the cross-validation, for a line of the verdict."""
         test = f"cross-validation on {self.count} {self.what} [+{GAIN:g} nats needed]: log-likelihood"
         gain = self.gains["all"]
-        if self.taken == "all":
+        if self.supported == "all":
             return f"{test} +{gain:.0f} nats with the estimated noise and calibration"
-        if self.taken == "noise":
+        if self.supported == "noise":
             less = self.gains["noise"] - gain
             return f"{test} +{less:.0f} nats with the estimated noise alone, without the systematic errors"
         return f"{test} {gain:+.0f} nats with the estimated noise and calibration"
@@ -149,13 +149,13 @@ class Calibration:
     data: str = ""
     prediction: Prediction | None = None
 
-    def judged(self, prediction: Prediction) -> Calibration:
+    def validated(self, prediction: Prediction) -> Calibration:
         """The same without estimates that fail the cross-validation."""
         found = replace(self, prediction=prediction)
-        if prediction.taken == "all":
+        if prediction.supported == "all":
             return found
-        refused = [replace(e, why_not=prediction.in_words()) if e.applied else e for e in self.estimates]
-        kept = self.corrections.without_constants() if prediction.taken == "noise" else Corrections()
+        refused = [replace(e, why_not=prediction.text()) if e.applied else e for e in self.estimates]
+        kept = self.corrections.without_constants() if prediction.supported == "noise" else Corrections()
         return replace(found, estimates=tuple(refused), corrections=kept)
 
     def findings(self) -> list[Finding]:
@@ -168,21 +168,22 @@ class Calibration:
             text += "is wrong. Nothing was calibrated; default noise is used. To do: `graphslam data check`."
             return [Finding("bad", "calibration-contradiction", text)]
         out = []
-        taken = "all" if self.prediction is None else self.prediction.taken
+        supported = "all" if self.prediction is None else self.prediction.supported
         if self.prediction is not None:
-            text = f"{self.prediction.in_words()} ({self.data})"
-            alike = taken == "nothing" and self.prediction.gains["all"] > -GAIN
+            text = f"{self.prediction.text()} ({self.data})"
+            alike = supported == "nothing" and self.prediction.gains["all"] > -GAIN
             text += {
                 "all": " — used.",
                 "noise": " — systematic errors are not corrected.",
                 "nothing": " — the noise of the log is kept." if alike else " — the estimate is not used.",
-            }[taken]
-            right = taken == "all" or alike
+            }[supported]
+            right = supported == "all" or alike
             out.append(Finding("", "calibrated", text) if right else Finding("look", "calibration-refused", text))
         for e in self.estimates:
             said = estimate_text(e.name, e.value, e.sigma)
             if e.applied:
-                text = f"calibration from {self.data}: {said} — {MENDED[e.name]} (log-likelihood +{e.gain:.0f} nats)."
+                how = f"{CORRECTION_VERBS[e.name]} (log-likelihood +{e.gain:.0f} nats)"
+                text = f"calibration from {self.data}: {said} — {how}."
                 out.append(Finding("", "calibrated", text))
             elif e.why_not != "not significant":
                 text = f"calibration from {self.data}: {said} — not corrected: {e.why_not}."
@@ -191,7 +192,7 @@ class Calibration:
         if chance:
             out.append(Finding("", "calibrated", f"systematic errors of {' and '.join(chance)}: none found."))
         if self.noise:
-            text = f"noise from {self.data}: {noise_text(self.noise)}{', not used' * (taken == 'nothing')}."
+            text = f"noise from {self.data}: {noise_text(self.noise)}{', not used' * (supported == 'nothing')}."
             if self.corrections.widen_only:
                 text += " A larger σ in the log is kept."
             out.append(Finding("", "calibrated", text))
@@ -220,7 +221,7 @@ class Calibration:
             "noise": {k: float(v) for k, v in self.noise.items()},
             "prediction": None
             if self.prediction is None
-            else options_dict(self.prediction) | {"taken": self.prediction.taken},
+            else options_dict(self.prediction) | {"supported": self.prediction.supported},
             "lines": [f.as_row() for f in self.findings()],
         }
 
@@ -237,7 +238,7 @@ NAMES = {
     "mount_x": "the sensor position",
     "mount_y": "the sensor position",
 }
-MENDED = {
+CORRECTION_VERBS = {
     "yaw_bias": "subtracted",
     "distance_scale": "divided out",
     "turn_per_metre": "subtracted",

@@ -47,7 +47,7 @@ class CalibrationBudget:
     clock: bool = True
     """Is the offset of the clocks looked for?"""
     again: bool = False
-    """Is an estimate of ranges and bearings made once more, of all data, when withheld ones have judged it? That of
+    """Is an estimate of ranges and bearings made once more, of all data, when withheld ones have tested it? That of
     ranges alone always is."""
 
 
@@ -77,9 +77,9 @@ def calibrate_sightings(
         found = _range_and_bearing(held, effort)
         foretell = partial(predict_withheld_sightings, held, found, _tested(held, effort), noise)
     prediction = None if found.contradictions() else foretell()
-    if blind or effort.again:  # what was withheld is data like the rest once it has judged
+    if blind or effort.again:  # what was withheld is data like the rest once it has tested
         found = _ranges_alone(seen, effort, seed)[0] if blind else _range_and_bearing(seen, effort)
-    return found if prediction is None or found.contradictions() else found.judged(prediction)
+    return found if prediction is None or found.contradictions() else found.validated(prediction)
 
 
 def _tested(held: SightingLog, effort: CalibrationBudget) -> list[Ints]:

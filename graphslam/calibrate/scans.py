@@ -253,7 +253,7 @@ def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
         text += f"{math.hypot(noise['heading_metre'], noise['heading_second']):.2g} rad/√m — limited by scan matching."
         notes.append(Finding("", "calibrated", text))
     found = calibration_of(kind, estimates, noise, notes, data)
-    return found if found.contradictions() else found.judged(cross_validate(p, found, widen=kind == "scans"))
+    return found if found.contradictions() else found.validated(cross_validate(p, found, widen=kind == "scans"))
 
 
 def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Prediction:

@@ -128,7 +128,7 @@ class BiasTest:
     ----------
     error, sigma : (p,)
         Each error of :data:`KINDS` as if it were the only one, and its σ.
-    taken : (p,)
+    reduction : (p,)
         χ² that correcting it takes away.
     drift, drift_dof : (p,)
         Mean of ``g² / S`` over the windows, weighted by S: 1 where noise is white in a window, more where an error
@@ -140,7 +140,7 @@ class BiasTest:
     dof: int
     error: Array
     sigma: Array
-    taken: Array
+    reduction: Array
     drift: Array
     drift_dof: Array
 
@@ -216,12 +216,12 @@ def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
     names = list(KINDS)
     z = np.abs(found.error) / found.sigma
     certain = z > -special.ndtri((1.0 - CERTAIN) / len(names) / 2.0)
-    best = int(np.argmax(np.where(certain, found.taken, -1.0)))
+    best = int(np.argmax(np.where(certain, found.reduction, -1.0)))
     out = []
     misfit = found.ratio > found.bound
     if misfit:
         level: Level = "bad" if found.ratio > UNDERSTATED else "look"
-        left = (found.chi2 - found.taken[best]) / found.dof if certain.any() else found.ratio
+        left = (found.chi2 - found.reduction[best]) / found.dof if certain.any() else found.ratio
         text = (
             f"χ²/dof of odometry and observations: {found.ratio:.3g} over {found.windows} short windows "
             f"[≤ {found.bound:.3g} in 999 of 1000 consistent runs] — they do not fit one map. "
@@ -235,8 +235,12 @@ def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
             text += "The calibration error below explains it."
         out.append(Finding(level, "residuals", text))
     excess = found.chi2 - found.dof
-    if certain.any() and (not misfit or found.taken[best] > HALF * excess):
-        others = [k for k in np.argsort(-found.taken) if k != best and found.taken[k] > AS_MUCH * found.taken[best]]
+    if certain.any() and (not misfit or found.reduction[best] > HALF * excess):
+        others = [
+            k
+            for k in np.argsort(-found.reduction)
+            if k != best and found.reduction[k] > AS_MUCH * found.reduction[best]
+        ]
         said = [_said(names[k], found.error[k], found.sigma[k]) for k in (best, *others)]
         large = abs(found.error[best]) > KINDS[names[best]].careful
         text = f"systematic residuals: {said[0]}"

@@ -117,8 +117,8 @@ def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
     if found is None:
         return []
     out = chi_square_ratio_test("χ² of odometry and observations in short windows", "map", found.ratio, found.dof)
-    p = len(found.taken)
-    out.append(largest_score_test("calibration errors", "map", float(np.sqrt(found.taken.max())), tests=2 * p))
+    p = len(found.reduction)
+    out.append(largest_score_test("calibration errors", "map", float(np.sqrt(found.reduction.max())), tests=2 * p))
     drifts = [
         chi_square_ratio_test("time-correlated errors within windows", "map", v, d)
         for v, d in zip(found.drift, found.drift_dof)

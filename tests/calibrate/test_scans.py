@@ -37,7 +37,7 @@ def test_added_scale_noise_and_turning_are_found(log) -> None:
     assert np.sqrt(heading) == pytest.approx(NOISE * np.sqrt(step), rel=0.35)
     assert any("odometry distances" in f.text for f in found.findings())
     assert found.prediction is not None
-    assert found.prediction.taken == "all"
+    assert found.prediction.supported == "all"
 
 
 def test_run_of_a_front_end_on_grids_is_calibrated(log) -> None:
@@ -113,17 +113,17 @@ def drawn_pairs(bend, *, stated, seed=4) -> ScanPairs:
 def judged(p: ScanPairs) -> Calibration:
     bend = Estimate(name="turn_per_metre", value=0.1, sigma=0.01, gain=50.0, other=0.1, other_sigma=0.01)
     raw = Calibration(kind="scans", corrections=Corrections(turn_per_metre=0.1, along_metre=0.03), estimates=(bend,))
-    return raw.judged(cross_validate(p, raw, widen=True))
+    return raw.validated(cross_validate(p, raw, widen=True))
 
 
 def test_halves_that_contradict_each_other_refuse_what_the_whole_says() -> None:
     """A robot that bends to one side in half of the blocks and to the other in the rest has no lasting bend."""
     side = np.where(np.arange(240) // BLOCK % 2 == 0, 0.1, -0.1)
     lasting = judged(drawn_pairs(0.1, stated=0.25))
-    assert lasting.prediction.taken == "all"
+    assert lasting.prediction.supported == "all"
     assert lasting.corrections.turn_per_metre == 0.1
     refused = judged(drawn_pairs(side, stated=0.25))
-    assert refused.prediction.taken == "noise"
+    assert refused.prediction.supported == "noise"
     assert refused.corrections == Corrections(along_metre=0.03)
     assert not refused.estimates[0].applied
     assert any(f.code == "calibration-refused" for f in refused.findings())

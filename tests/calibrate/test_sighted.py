@@ -76,7 +76,7 @@ def test_clocks_that_agree_are_left_alone(number: int, rate: float, scans: float
 
 
 def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, found) -> None:
-    assert found.prediction.taken == "all"
+    assert found.prediction.supported == "all"
     assert found.prediction.gains["all"] > 100.0
     seen = SightingLog.of(log, "landmarks", log["landmarks"]).holding()
     share = float(seen.withheld.mean())
@@ -85,10 +85,10 @@ def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, fou
     bent = dataclasses.replace(found.corrections.without_constants(), yaw_bias=0.2)
     blunt = dataclasses.replace(bent, range_sigma=1e5, bearing_sigma=1e4)
     for c, taken in ((bent, "noise"), (blunt, "nothing")):
-        wrong = found.judged(
+        wrong = found.validated(
             predict_withheld_sightings(seen, dataclasses.replace(found, corrections=c), scans, MotionNoise())
         )
-        assert wrong.prediction.taken == taken
+        assert wrong.prediction.supported == taken
         assert not any(e.applied for e in wrong.estimates)
         assert "calibration-refused" in {f.code for f in wrong.findings()}
         assert wrong.corrections == (found.corrections.without_constants() if taken == "noise" else Corrections())

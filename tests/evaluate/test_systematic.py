@@ -46,8 +46,8 @@ def test_an_error_is_measured(log: SensorLog, frontend: str, fault: inject.Injec
     k = PARAMETERS.index(name)
     assert abs(found.error[k]) > 4 * found.sigma[k]
     assert found.error[k] == pytest.approx(truth, abs=4 * found.sigma[k])
-    best = float(found.taken.max())
-    assert found.taken[k] > 0.95 * best  # scales of ranges and of distances take away the same: one cannot be told
+    best = float(found.reduction.max())
+    assert found.reduction[k] > 0.95 * best  # scales of ranges and of distances take away the same: one cannot be told
     lines = {f.code: f for f in bias_test_findings(reports(fault(log), frontend))}
     said = KINDS[name].more if truth > 0 else KINDS[name].less
     assert said.partition("{}")[2] in lines["calibration"].text

@@ -169,10 +169,10 @@ def _write_gps(new: FolderTransaction, run: Run) -> None:
 
 
 def _write_inputs(new: FolderTransaction, run: Run) -> None:
-    if run.taken is None:
+    if run.inputs is None:
         return
     try:
-        write_inputs(new.path, run.taken, run.report["generation"])
+        write_inputs(new.path, run.inputs, run.report["generation"])
     except FormatError as error:
         logger.warning("no loop closure of this run can be undone: the inputs of its graph are not stored (%s)", error)
 

@@ -87,7 +87,7 @@ class Run:
         What of GPS became factors.
     folder : Path or None
     log : SensorLog or None
-    taken : RunInputs or None
+    inputs : RunInputs or None
         Subset of the log used for the graph and the metrics; None for a run read back from disk.
     truth : MapTruth or None
         Ends of the submaps and landmarks.
@@ -129,7 +129,7 @@ class Run:
     fixes: Gps | None = None
     folder: Path | None = None
     log: SensorLog | None = None
-    taken: RunInputs | None = None
+    inputs: RunInputs | None = None
     truth: MapTruth | None = None
     truth_path: Trajectory | None = None
     dead_reckoning: Trajectory | None = None

@@ -198,7 +198,7 @@ def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clo
         ledger=made.ledger.table(),
         gps=made.residuals,
         fixes=fixes,
-        taken=inputs,
+        inputs=inputs,
         truth=made.truth,
         truth_path=made.truth_path,
         dead_reckoning=made.dead_reckoning,

@@ -43,7 +43,7 @@ class StreamUse:
     asked: bool
     why: str = ""
 
-    def in_words(self) -> str:
+    def text(self) -> str:
         """``laser 7249 of 7249``."""
         return f"{self.name} {self.used} of {self.offered}"
 

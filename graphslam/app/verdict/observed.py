@@ -37,7 +37,7 @@ def findings_from_run(
     events : sequence of mapping
         Of the graph; ``outlier``, ``beacon-not-placed`` and ``readings-dropped`` become lines.
     """
-    counts = "; ".join(s.in_words() for s in streams)
+    counts = "; ".join(s.text() for s in streams)
     out = [Finding("", "streams", f"records used: {counts}.")] if streams else []
     for s in streams:
         if s.used == 0 and s.asked:

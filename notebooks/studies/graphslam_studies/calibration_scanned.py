@@ -162,7 +162,7 @@ def _told(name: str, before: Calibration, after: Calibration, added: Added, spee
     if added.along:
         new = max(after.noise["along_metre"] ** 2 - before.noise["along_metre"] ** 2, 0.0)
         yield Measurement(name, "along_ratio", float(np.sqrt(new)) / added.along)
-    yield Measurement(name, "refused", float(after.prediction is not None and after.prediction.taken != "all"))
+    yield Measurement(name, "refused", float(after.prediction is not None and after.prediction.supported != "all"))
 
 
 def _speed(log: SensorLog) -> float:

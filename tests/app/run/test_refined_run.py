@@ -337,8 +337,8 @@ def test_it_is_exported_as_it_is_seen_from_above(finished: Run, tmp_path: Path) 
 
 def test_scans_are_read_again_as_they_were(finished: Run) -> None:
     assert finished.folder is not None
-    assert finished.taken is not None
-    scans = finished.taken.scans
+    assert finished.inputs is not None
+    scans = finished.inputs.scans
     assert scans is not None
     read = type(scans).load(finished.folder / "scans.npz")
     for name in ("times", "offsets", "points", "origins", "returns", "tilt"):
