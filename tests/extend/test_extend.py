@@ -209,3 +209,17 @@ def test_add_map_layer(log: gs.SensorLog, tmp_path: Path) -> None:
 def test_add_study() -> None:
     """An object that is named by its module needs no installation; tests/studies/test_study.py runs it."""
     assert gs.find_study("tests.reference.small_study:STUDY") is STUDY
+
+
+def test_files_and_functions_that_contributors_read_of_exist() -> None:
+    found = 0
+    for page in ("CONTRIBUTING.md", "docs/architecture.md"):
+        text = (ROOT / page).read_text()
+        for file in set(re.findall(r"`((?:graphslam|frontends|tests|docs)/[\w/.]+)`", text)):
+            assert "NAME" in file or (ROOT / file).exists(), f"{page}: {file} does not exist"
+        for file, names in re.findall(r"^\| `([\w/.]+\.py)`((?:,? `[\w.]+`)*) \|", text, re.M):
+            source = (ROOT / file).read_text()
+            for part in re.findall(r"\w+", names):
+                found += 1
+                assert re.search(rf"(def|class) {part}\b", source), f"{page}: {file} has no {part}"
+    assert found > 12
