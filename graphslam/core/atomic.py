@@ -6,7 +6,7 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -87,22 +87,18 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
 
 
 def read_npz(
-    path: str | os.PathLike[str], *, fmt: str, old: Sequence[str] = (), fields: Mapping[str, Field] | None = None
+    path: str | os.PathLike[str], *, fmt: str, fields: Mapping[str, Field] | None = None
 ) -> dict[str, npt.NDArray[Any]]:
     """Read the arrays of an npz whose array ``format`` says ``fmt``; never unpickles.
 
     Parameters
     ----------
-    old : sequence of str
-        Earlier formats that the caller reads as well.
     fields : mapping of str to Field, optional
         What the arrays must be; only these are returned, and checked. Without: all, for a caller that checks them.
     """
     where = str(path)
     arrays = read_arrays(path)
-    found = str(arrays.get("format", "none"))
-    if found not in old:
-        check_format(found, fmt, where=where)
+    check_format(str(arrays.get("format", "none")), fmt, where=where)
     return arrays if fields is None else check_arrays(arrays, fields, where)
 
 

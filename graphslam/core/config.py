@@ -18,7 +18,6 @@ import tomli_w
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.reading import LARGEST, read_text
-from graphslam.core.removed_options import is_removed
 
 KEYS = "keys"
 
@@ -41,8 +40,6 @@ def build_config(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
     out: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{where}.{key}" if where else key
-        if key not in known and is_removed(kind, key, value, name):
-            continue
         if key not in known:
             raise ConfigError(f"unknown configuration key {name!r}; known: {', '.join(sorted(known))}")
         if key in parts:
@@ -55,19 +52,6 @@ def build_config(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
         return kind(**out)
     except TypeError as error:
         raise ConfigError(f"{where or kind.__name__}: {error}") from None
-
-
-def without_removed(kind: Any, values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Stored options of dataclass ``kind`` without removed ones that have the value which is fixed now."""
-    hints, out = typing.get_type_hints(kind), {}
-    for key, value in values.items():
-        name = f"{where}.{key}" if where else key
-        if key not in hints and is_removed(kind, key, value, name):
-            continue
-        hint = hints.get(key)
-        part = next((h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h)), None)
-        out[key] = without_removed(part, value, name) if part and isinstance(value, Mapping) else value
-    return out
 
 
 def convert_option(hint: Any, value: Any, name: str) -> Any:

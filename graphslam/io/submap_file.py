@@ -23,8 +23,6 @@ from graphslam.core.submap import LandmarkMap, Match, Submap
 from graphslam.core.trajectory import Trajectory
 
 SUBMAP_FORMAT = "graphslam.submap/2"
-OLD_FORMATS = ("graphslam.submap/1",)
-"""Without ``chart``: all landmark maps were Cartesian."""
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -133,7 +131,7 @@ _FIELDS = {
     "used": texts("u", optional=True),
     "aided": texts("a", optional=True),
     "report": texts(optional=True),
-    "chart": texts(optional=True),
+    "chart": texts(),
     "landmark_ids": ints("l", optional=True),
     "landmarks": floats("l", "c", optional=True),
     "covariance": floats("v", "v", optional=True),
@@ -224,7 +222,7 @@ def _lasting(a: Arrays, where: str) -> SensorBiases | None:
 
 def _chart(a: Arrays, where: str) -> str:
     try:
-        return check_chart(str(a.get("chart", "cartesian")))
+        return check_chart(str(a["chart"]))
     except ConfigError as error:
         raise FormatError(str(error), where=where) from None
 

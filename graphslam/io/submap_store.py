@@ -1,6 +1,6 @@
 """Submaps on disk: one npz each and an index, whole at every moment, the same bytes for the same submaps.
 
-``submaps/000000.npz`` … hold the submaps (``graphslam.submap/2``; 1 is read), ``submaps/index.json`` lists them
+``submaps/000000.npz`` … hold the submaps (``graphslam.submap/2``), ``submaps/index.json`` lists them
 (``graphslam.submaps/1``), ``truth.npz`` beside the folder holds the truth where it is known. A submap's file is written
 before the index names it, each under a temporary name that is then renamed: after a kill the store holds every submap
 the index names, and perhaps one file more, which is written again.
@@ -24,7 +24,7 @@ from graphslam.core.map_truth import MapTruth
 from graphslam.core.npz import check_arrays, floats, ints
 from graphslam.core.reading import resolve_inside, safe_name
 from graphslam.core.submap import Submap
-from graphslam.io.submap_file import OLD_FORMATS, SUBMAP_FORMAT, submap_arrays, submap_from_arrays
+from graphslam.io.submap_file import SUBMAP_FORMAT, submap_arrays, submap_from_arrays
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class SubmapStore:
         """Submap k of the index (not: of key k)."""
         entry = self.entries[k]
         file = resolve_inside(self.path, entry["file"], str(self.path / INDEX))
-        submap = submap_from_arrays(read_npz(file, fmt=SUBMAP_FORMAT, old=OLD_FORMATS), where=str(file))
+        submap = submap_from_arrays(read_npz(file, fmt=SUBMAP_FORMAT), where=str(file))
         found = {**_entry(submap), "file": entry["file"]}
         if found != entry:
             raise FormatError("index and file do not agree", where=str(file), got=found, wanted=entry)

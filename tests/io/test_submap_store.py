@@ -131,7 +131,8 @@ def test_a_store_as_the_format_is_written_down_can_be_read(tmp_path: Path, subma
     folder.mkdir()
     np.savez(
         folder / "000000.npz",
-        format="graphslam.submap/1",
+        format="graphslam.submap/2",
+        chart="cartesian",
         key=0,
         interval=[0, 1],
         dim=2,

@@ -12,7 +12,6 @@ import pandas as pd
 from graphslam.app.run.files import read_events, read_ledger, read_merge_report, read_metrics, read_options, read_report
 from graphslam.core.atomic import read_json
 from graphslam.core.errors import GraphSlamError, MissingDataError, RunFolderError
-from graphslam.evaluate.metrics import is_time
 from graphslam.io.submap_store import SubmapStore
 from graphslam.loops.ledger import LoopLedger, ledger_of_events
 
@@ -141,8 +140,7 @@ def read_folder(path: str | Path, root: Path) -> ReportFolder:
             out.problems[name] = "is missing; it is written when a run is finished"
         return out
     out.metrics = attempt("metrics.json", lambda: _metrics(root, "metrics.json"), [])
-    if not any(is_time(r.get("key")) for r in out.metrics):  # an older version kept them there
-        out.metrics += attempt("timings.json", lambda: _metrics(root, "timings.json"), [])
+    out.metrics += attempt("timings.json", lambda: _metrics(root, "timings.json"), [])
     out.events = attempt("events.jsonl", lambda: read_events(root), None)
     if out.events is not None:
         events = out.events

@@ -179,8 +179,6 @@ def times_section(folder: ReportFolder) -> Markup:
     timed = [r for r in folder.metrics if is_time(r.get("key"))]
     seconds = {str(r["key"])[8:]: r.get("value") for r in timed if str(r["key"]).startswith("seconds_")}
     seconds = seconds or folder.part("seconds")
-    if not seconds and is_numeric(folder.report.get("seconds")):  # of a merge by an older version
-        seconds = {"merge": folder.report["seconds"]}
     rows = [r for r in timed if not str(r["key"]).startswith("seconds_")]
     if not seconds and not rows:
         said = _UNFINISHED if folder.kind == "interrupted" else "not in the folder."

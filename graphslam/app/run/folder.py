@@ -20,7 +20,6 @@ from typing import Any
 from graphslam.app.folders.generations import check_links, current_outputs, is_empty, remove_stale_files
 from graphslam.app.folders.lock import lock_folder, make_folder
 from graphslam.app.run.files import removed_loops_of_run
-from graphslam.app.run.front_ends import current_options
 from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
@@ -110,16 +109,7 @@ class RunFolder:
             before = read_toml(old)
         except ConfigError as error:
             raise RunFolderError(f"{self.path}: damaged ({error})") from None
-        try:
-            before = current_options(before)
-        except ConfigError as error:
-            raise RunFolderError(f"{self.path}: cannot resume, {error}") from None
         now = tomllib.loads(dump_toml(config))
-        if isinstance(before.get("run"), dict) and "log" not in before["run"]:
-            logger.warning(
-                "%s: written by an older version without the name of its log; assuming it is this one", self.path
-            )
-            now["run"].pop("log", None)
         for key, a, b in _differences(before, now):
             what = "another log is given: " if key.startswith("run.log.") else ""
             raise RunFolderError(f"{self.path}: cannot resume, {what}{key} was {a!r} and is {b!r} now")

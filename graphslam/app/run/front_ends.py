@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, cast
 
 from graphslam.app.run import config as cfg
 from graphslam.app.run.choice import kind_preset
-from graphslam.core.config import build_config, merge_options, without_removed
+from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.plugins import load_plugin, plugins, unknown
@@ -105,16 +105,6 @@ def make_front_end(
     if not made.incremental() and type(made).submaps is FrontEnd.submaps:
         raise ConfigError(f"front end {name!r} is none: {kind.__name__} has neither submaps nor follow")
     return made
-
-
-def current_options(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of a run folder in the names of today, without options that were removed since."""
-    out = without_removed(cfg.RunConfig, stored)
-    run, options = out.get("run"), out.get("frontend")
-    name = run.get("frontend") if isinstance(run, Mapping) else None
-    if isinstance(options, Mapping) and isinstance(name, str) and name in front_end_names():
-        out["frontend"] = without_removed(_kind(name)[1], options, "frontend")
-    return out
 
 
 def options_of_scans(values: Mapping[str, Any]) -> Mapping[str, Any]:

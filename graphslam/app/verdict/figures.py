@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from graphslam.evaluate.intervals import two_sided_width
-from graphslam.evaluate.residual_consistency import NOT_TESTED, two_sided_bounds
+from graphslam.evaluate.residual_consistency import NOT_TESTED
 
 CONFIDENCE = 0.95
 CERTAIN = 0.999
@@ -52,22 +52,9 @@ def is_finite_number(value: Any) -> bool:
 
 
 def class_rows(figures: RunMetrics) -> list[dict[str, Any]]:
-    """χ² of each class of factors with its bounds: from the report, or as far as metrics of older runs hold it."""
+    """χ² of each class of factors with its bounds."""
     found = figures.part("graph").get("classes")
-    if isinstance(found, list):
-        return [r for r in found if isinstance(r, dict)]
-    m = figures.metrics
-    out = []
-    for key, ratio in m.items():
-        if not (key.startswith("honesty_") and key.endswith("_chi2_per_dof")):
-            continue
-        stem = key.removesuffix("_chi2_per_dof")
-        dof = m.get(f"{stem}_dof", math.nan)
-        row = {"class": stem.removeprefix("honesty_"), "dof": dof, "chi2": ratio * dof, "chi2_per_dof": ratio}
-        if dof > 0:
-            row["low"], row["high"], row["verdict"] = two_sided_bounds(ratio, dof, CONFIDENCE)
-        out.append(row | {"mean_weight": m.get(f"{stem}_mean_weight")})
-    return out
+    return [r for r in found if isinstance(r, dict)] if isinstance(found, list) else []
 
 
 def whole_chi2(figures: RunMetrics) -> tuple[float, float] | None:

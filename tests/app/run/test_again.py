@@ -157,17 +157,6 @@ def test_a_run_is_not_gone_on_with_on_another_log(copy: Path, log: SensorLog) ->
     go_on(log, copy)
 
 
-def test_a_folder_of_an_older_version_is_taken_at_its_word(
-    copy: Path, log: SensorLog, caplog: pytest.LogCaptureFixture
-) -> None:
-    config = copy / "config.toml"
-    text = config.read_text()
-    config.write_text(text[: text.index("[run.log]")] + text[text.index("[frontend]") :])
-    with caplog.at_level(logging.WARNING):
-        go_on(log, copy)
-    assert "without the name of its log" in caplog.text
-
-
 def test_a_run_that_failed_before_its_first_submap_does_not_block(
     log: SensorLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import re
 import tomllib
-import typing
 
 import pytest
 
 from graphslam.app.run import config as cfg
-from graphslam.app.run.front_ends import front_end_names, make_front_end, recommended_options
+from graphslam.app.run.front_ends import make_front_end, recommended_options
 from graphslam.app.worlds import simulate
 from graphslam.backend.config import GpsOptions, ImuOptions
 from graphslam.core.config import (
@@ -20,10 +19,8 @@ from graphslam.core.config import (
     options_dict,
     parse_setting,
     read_toml,
-    without_removed,
 )
 from graphslam.core.errors import ConfigError, UnknownNameError
-from graphslam.core.removed_options import REMOVED
 from graphslam.graph.factors.imu.config import ImuConfig
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
@@ -170,57 +167,3 @@ def test_broken_toml_is_refused(tmp_path):
         read_toml(file)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_toml(tmp_path / "nothing.toml")
-
-
-REMOVED_AT_THEIR_VALUES = {
-    "segslam": {"search": {"max_yaw": 0.8}, "choice": {"rivals": 0.15}, "localisation": {"particles": 100}},
-    "filter": {"clamp": [0.1192, 0.971], "miss": 0.4, "particles": 7},
-    "drift": {"passed": {"heading": 0.6}},
-}
-
-
-def test_a_removed_option_may_be_stated_at_its_fixed_value():
-    assert build_config(SegSlamFrontEndConfig, REMOVED_AT_THEIR_VALUES, "frontend").filter.particles == 7
-    assert without_removed(SegSlamFrontEndConfig, REMOVED_AT_THEIR_VALUES) == {
-        **{"segslam": {"search": {}, "choice": {}}, "filter": {"particles": 7}, "drift": {}}
-    }
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"filter": {"miss": 0.3}}, "frontend.filter.miss = 0.3: this option was removed, its value is always 0.4"),
-        ({"filter": {"clamp": [0.2, 0.9]}}, "frontend.filter.clamp = [0.2, 0.9]: this option was removed"),
-        ({"drift": {"passed": {"heading": 0.7}}}, "frontend.drift.passed.heading = 0.7: this option was removed"),
-        ({"segslam": {"localisation": {"partikles": 1}}}, "frontend.segslam.localisation.partikles = 1"),
-    ],
-)
-def test_another_value_of_a_removed_option_is_refused_in_one_line(values, message):
-    with pytest.raises(ConfigError, match=re.escape(message)) as caught:
-        build_config(SegSlamFrontEndConfig, values, "frontend")
-    assert "\n" not in str(caught.value)
-
-
-def option_classes():
-    """Classes of the options of a run and of every front end, their parts and their bases."""
-    found = set()
-
-    def add(kind):
-        for part in typing.get_args(kind):
-            add(part)
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind) and kind not in found:
-            found.update(k for k in kind.__mro__ if dataclasses.is_dataclass(k))
-            for hint in typing.get_type_hints(kind).values():
-                add(hint)
-
-    add(cfg.RunConfig)
-    for name in front_end_names():
-        add(type(make_front_end(name, {}).config))
-    return found
-
-
-def test_no_removed_option_is_one_still():
-    kinds = {k.__name__: k for k in option_classes()}
-    assert set(REMOVED) <= set(kinds)
-    for name, keys in REMOVED.items():
-        assert not set(keys) & {f.name for f in dataclasses.fields(kinds[name])}, name

@@ -103,13 +103,14 @@ def figures(
     converged: bool | None, chi2: float | None, nees: float | None, loops: float | None, own: float | None = None
 ) -> RunMetrics:
     m = {"submaps": 7.0, "path_length": 305.2, "gap": 0.0}
-    if chi2 is not None:
-        m |= {"honesty_submap_chi2_per_dof": chi2, "honesty_submap_dof": 300.0}
     if nees is not None:
         m |= {"nees_per_dof": nees, "nees_dof": 42.0, "path_rmse_aligned": 0.0412}
     if loops is not None:
         m |= {"loops_value": loops, "loops_dof": 400.0}
     report: dict[str, Any] = {} if converged is None else {"converged": converged}
+    if chi2 is not None:
+        row = {"class": "submap", "dof": 300.0, "rows": 300, "chi2": 300.0 * chi2, "chi2_per_dof": chi2}
+        report["graph"] = {"classes": [row]}
     if own is not None:
         report["evidence"] = consistency_tests_as_json(chi_square_ratio_test("χ²", "map", own, 300.0 if own else 2.0))
     return RunMetrics(report, m)
