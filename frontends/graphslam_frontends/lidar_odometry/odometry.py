@@ -503,6 +503,11 @@ class LidarOdometry:
             start = max(near, key=lambda x: x[0])[1] if near else predicted
         start = start if alike(start) else predicted
         pose, points, fit = self._finish(raw, chosen, start, time)
+        if self.held >= BEGUN and np.linalg.norm(se3.se3_between(predicted, start)[:3]) > 0.5 * self.config.levels[-1]:
+            # coarse cells led it out of sight of the prediction: the finest ones decide
+            ahead = self._finish(raw, chosen, predicted, time)
+            if ahead[2].overlap > fit.overlap:
+                start, (pose, points, fit) = predicted, ahead
         state = "matched"
         few_of_it = len(self.overlaps) >= 3 and fit.overlap < SUSPICIOUS * np.median(self.overlaps)
         if few_of_it or self._late(time):

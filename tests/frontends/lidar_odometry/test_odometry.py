@@ -9,6 +9,7 @@ from graphslam.app.worlds import mesh_world
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError
 from graphslam.sim.raycast import RayCaster
+from graphslam_frontends.lidar_odometry.cells import CellMap
 from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.odometry import LidarOdometry
 from graphslam_frontends.scan_window.relative_covariance import relative_covariance
@@ -239,3 +240,23 @@ def test_impossible_figures_are_refused():
     ):
         with pytest.raises(ConfigError):
             LidarOdometryConfig(**wrong)
+
+
+def test_coarse_cells_that_lead_a_match_astray_do_not_decide(drives, monkeypatch):
+    """As on a street, where cells of 2 m look alike a metre on: the finest cells compare it with the prediction."""
+    clouds, truth, _, _, _ = drives[1]
+    descend = CellMap.descend
+
+    def shifted(self, points, R, t, *rest):
+        fit = descend(self, points, R, t, *rest)
+        if self.config.size > 0.5:
+            t += [1.2, 0.0, 0.0]
+        return fit
+
+    odometry, poses = LidarOdometry(LidarOdometryConfig()), []
+    for k in range(40):
+        if k == 20:
+            monkeypatch.setattr(CellMap, "descend", shifted)
+        odometry.step(clouds.cloud(k), float(clouds.times[k]), clouds.ages(k))
+        poses.append(odometry.pose)
+    assert np.abs(errors(np.array(poses), truth[:40])[:, 3:]).max() < 0.1
