@@ -9,8 +9,8 @@ from graphslam.core import se3
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.garage import garage
-from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath, level_by_euler
 from graphslam_frontends.odometry.dead_reckoning import integrate_imu_and_wheels
+from graphslam_frontends.odometry.inertial_biases import DeadReckonedPath, level_by_euler
 
 Drive = tuple[DeadReckonedPath, np.ndarray, np.ndarray]
 

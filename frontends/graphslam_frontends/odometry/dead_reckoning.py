@@ -21,7 +21,9 @@ from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry, VelocityControls, check_times
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.dead_reckoned_path import (
+from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
+from graphslam_frontends.odometry.gaps import Gaps, find_gaps
+from graphslam_frontends.odometry.inertial_biases import (
     FADING,
     GYRO,
     LASTING,
@@ -34,8 +36,6 @@ from graphslam_frontends.odometry.dead_reckoned_path import (
     euler_quat,
     tangent_of_state,
 )
-from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
-from graphslam_frontends.odometry.gaps import Gaps, find_gaps
 
 __all__ = ["DeadReckoningNoise", "integrate_imu_and_wheels"]
 

@@ -27,9 +27,9 @@ from graphslam_frontends.odometry.deskew import (
     deskew_beams,
     stratified_indices,
 )
+from graphslam_frontends.odometry.motion_source import MotionSource, motion_source
 from graphslam_frontends.odometry.scan_matching import match_neighbours
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.step_motion import MotionSource, motion_source
 from graphslam_frontends.odometry.steps import Steps
 
 _log = logging.getLogger(__name__)

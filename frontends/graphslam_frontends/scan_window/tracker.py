@@ -33,7 +33,7 @@ from graphslam.registration.plane_kernels import PlanePairs, no_noise_correction
 from graphslam.registration.surfaces import SURFACE, fit_places, rotations, thin_places
 from graphslam_frontends.grid.motion import with_roll_pitch
 from graphslam_frontends.grid.weights import evenly_spaced_indices
-from graphslam_frontends.odometry.bias_sigmas import bias_sigmas
+from graphslam_frontends.odometry.motion_prior import bias_sigmas
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.config import ScanWindowConfig
 

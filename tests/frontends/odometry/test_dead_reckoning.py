@@ -11,18 +11,18 @@ from scipy.stats import chi2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
 from graphslam.core.log import DropCounter
-from graphslam_frontends.odometry.dead_reckoned_path import (
+from graphslam_frontends.odometry.dead_reckoning import (
+    DeadReckoningNoise,
+    integrate_imu_and_wheels,
+)
+from graphslam_frontends.odometry.gaps import find_gaps
+from graphslam_frontends.odometry.inertial_biases import (
     DeadReckonedPath,
     euler,
     euler_quat,
     level_by_euler,
     tangent_of_state,
 )
-from graphslam_frontends.odometry.dead_reckoning import (
-    DeadReckoningNoise,
-    integrate_imu_and_wheels,
-)
-from graphslam_frontends.odometry.gaps import find_gaps
 from tests.reference.imu_drive import NOISE, STILL, drive
 
 TIMES = np.linspace(0.0, 40.0, 101)

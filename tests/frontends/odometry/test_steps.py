@@ -11,8 +11,8 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.point_clouds import PointClouds
-from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath
 from graphslam_frontends.odometry.deskew import assign_steps, cut_beams, stratified_indices
+from graphslam_frontends.odometry.inertial_biases import DeadReckonedPath
 from graphslam_frontends.odometry.make_steps import level_on_the_whole, make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from tests.frontends.step_logs import HALF, odometry_of, planar_log, room_log, spoiled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath
+from graphslam_frontends.odometry.inertial_biases import DeadReckonedPath
 from graphslam_frontends.odometry.recorded import RecordedErrors
 from graphslam_frontends.odometry.steps import Steps
 
