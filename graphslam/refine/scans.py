@@ -16,7 +16,7 @@ from graphslam.core.npz import Field, flags, floats, ints
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.poses import Group, group_of
 from graphslam.core.records import Odometry, check_times
-from graphslam_frontends.odometry.motion_prior import BiasSigmas, bias_sigmas
+from graphslam_frontends.odometry.motion_prior import BiasSigmas
 from graphslam_frontends.odometry.steps import Steps
 
 SCANS_FORMAT = "graphslam.scans/1"
@@ -91,7 +91,7 @@ class Scans:
             points=steps.points.astype(np.float32, copy=False),
             origins=steps.origins.astype(np.float32, copy=False),
             ages=None if steps.ages is None else steps.ages.astype(np.float32),
-            lasting=bias_sigmas(steps),
+            lasting=steps.bias_sigmas,
             **{k: getattr(steps, k) for k in same},
         )
 

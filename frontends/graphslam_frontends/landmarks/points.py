@@ -26,8 +26,7 @@ from graphslam.core.submap import LandmarkMap, Submap, turned_covariance
 from graphslam.core.trajectory import Trajectory
 from graphslam.linear.space_maps import ORIGIN, PlacedMap, SpaceMap, minimise_space_maps
 from graphslam_frontends.base import FrontEnd, Watch
-from graphslam_frontends.odometry.motion import MotionNoise
-from graphslam_frontends.odometry.recorded import cut_odometry
+from graphslam_frontends.odometry.motion import MotionNoise, cut_odometry
 
 Ints = npt.NDArray[np.int64]
 NO_POSES, NO_POINTS = np.zeros((0, 7)), np.zeros((0, 3))

@@ -110,7 +110,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         uses=frozenset((*source.names, *names)),
         name=log.name + (f" (yaw rate off by {config.yaw_bias:g} rad/s)" if config.yaw_bias else ""),
         truth=log.truth.trajectory if log.truth is not None else None,
-        errors=motion.errors,
+        errors=motion,
         gaps=motion.gaps,
     )
     return match_neighbours(steps, drops=drops) if config.match_scans else steps

@@ -33,7 +33,6 @@ from graphslam.registration.plane_kernels import PlanePairs, no_noise_correction
 from graphslam.registration.surfaces import SURFACE, fit_places, rotations, thin_places
 from graphslam_frontends.grid.motion import with_roll_pitch
 from graphslam_frontends.grid.weights import evenly_spaced_indices
-from graphslam_frontends.odometry.motion_prior import bias_sigmas
 from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.config import ScanWindowConfig
 
@@ -89,7 +88,7 @@ class ScanToWindowOdometry:
         self.steps, self.config = steps, config
         self.group = g = group_of(steps.odometry.increments)
         self.gravity = steps.tilt is not None
-        self.sigmas = s = bias_sigmas(steps)
+        self.sigmas = s = steps.bias_sigmas
         w, self.w = g.dof, g.dof
         # lasting states: yaw bias, scale, side (, rise (, constant roll and pitch, fading roll and pitch))
         prior = [s.yaw_bias, s.scale, s.direction]
