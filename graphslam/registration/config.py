@@ -59,6 +59,10 @@ class RegistrationGates:
         _check(self, zero=tuple(f.name for f in fields(self)))
 
 
+LEAST_POINTS = 20
+"""Source and target of a registration need so many points, and so many pairs must be left."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationConfig:
     """How a registration is done; see :func:`graphslam.registration.register.register`.
@@ -71,8 +75,6 @@ class RegistrationConfig:
         At most, a stage.
     near : float
         A source point has a neighbour if one is nearer than this [m].
-    least_points : int
-        Source and target need so many, and so many pairs must be left.
     max_shift, max_turn : float
         A result farther from its start is refused [m, rad]: it is another place than the one asked about.
     covariance_scale : float
@@ -86,7 +88,6 @@ class RegistrationConfig:
     radii: tuple[float, ...] = (2.0, 0.5)
     iterations: int = 30
     near: float = 0.25
-    least_points: int = 20
     max_shift: float = 3.0
     max_turn: float = 0.5
     covariance_scale: float = 3.0
