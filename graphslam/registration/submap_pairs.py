@@ -181,9 +181,8 @@ def match_pair(
     T = check_pose(T_target_place, g.dim, what="prediction of a pair of submaps")
     P = check_covariance(covariance, what="covariance of a pair of submaps", dim=g.dof)
     points = source.around(T_base_place)
-    least = LEAST_POINTS
-    if len(points) < least or len(target.points) < least:
-        why = f"nothing: {len(points)} points around the place and {len(target.points)} in the map, wanted {least}"
+    if min(len(points), len(target.points)) < LEAST_POINTS:
+        why = f"nothing: points: {len(points)} around the place, {len(target.points)} in the map; wanted {LEAST_POINTS}"
         return _nothing(T, why, len(points))
     half = half_widths(T, P, c)
     fine, coarse = target.fields
