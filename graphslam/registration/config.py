@@ -8,6 +8,9 @@ from typing import Any
 
 from graphslam.core.errors import ConfigError
 
+LEAST_POINTS = 20
+"""Source and target of a registration need so many points, and so many pairs must be left."""
+
 
 def _check(config: Any, *, zero: tuple[str, ...] = ()) -> None:
     for f in fields(config):
@@ -57,10 +60,6 @@ class RegistrationGates:
 
     def __post_init__(self) -> None:
         _check(self, zero=tuple(f.name for f in fields(self)))
-
-
-LEAST_POINTS = 20
-"""Source and target of a registration need so many points, and so many pairs must be left."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -182,7 +182,7 @@ def match_pair(
     P = check_covariance(covariance, what="covariance of a pair of submaps", dim=g.dof)
     points = source.around(T_base_place)
     if min(len(points), len(target.points)) < LEAST_POINTS:
-        why = f"nothing: points: {len(points)} around the place, {len(target.points)} in the map; wanted {LEAST_POINTS}"
+        why = f"nothing: {len(points)} points around the place, {len(target.points)} in the map, wanted {LEAST_POINTS}"
         return _nothing(T, why, len(points))
     half = half_widths(T, P, c)
     fine, coarse = target.fields
