@@ -15,7 +15,7 @@ from graphslam.association.identity import find_association_outliers
 from graphslam.association.landmarks import AssociationConfig, associate_landmarks
 from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.backend.ambiguous_maps import AmbiguousMaps, ambiguous_maps
-from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.config import MATCH_KERNEL, BackEndConfig, GpsOptions
 from graphslam.backend.fix_errors import fit_fix_errors
 from graphslam.backend.streams import GpsSource, ImuSource, OtherSources, repreintegrate_until_converged
 from graphslam.core.control import ControlTable
@@ -24,7 +24,6 @@ from graphslam.core.records import Gps
 from graphslam.core.submap import Submap
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.graph.sensors.control import ControlFactors
 from graphslam.graph.sensors.gps import GpsFactors
 from graphslam.loops.appearance import AppearanceConfig
@@ -114,8 +113,6 @@ class BackEnd:
         self._later: list[Callable[[FactorGraph], object]] = []  # until the first submap says which dimension it is
         self._loops: LoopSearch | None = None
         self._noted = 0  # decisions on loops that are among the events
-        kind = self.config.match_robust
-        self._match_kernel = NO_KERNEL if kind == "none" else RobustKernel(kind, self.config.match_width)
         self._association = AssociationConfig(
             method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
         )
@@ -204,7 +201,7 @@ class BackEnd:
         """Re-entries that the front end found, as far as enough particles took them; the others stay in the events."""
         for m in submap.matches:
             if m.support >= self.config.match_support:
-                self.graph.add_match(submap.key, m, robust=self._match_kernel)
+                self.graph.add_match(submap.key, m, robust=MATCH_KERNEL)
             else:
                 self.graph.log_event(
                     "match-not-used", submap=submap.key, target=m.target, fitness=m.fitness, support=m.support

@@ -58,6 +58,10 @@ class BeaconOptions(BeaconConfig):
     """``"none"``, or the name of a stream of sightings with known identities that the front end does not use."""
 
 
+MATCH_KERNEL = RobustKernel("cauchy", 2.385)
+"""Robust kernel on every match of a front end and on every loop: 95 % efficient where all are right."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndConfig:
     """From submaps to a solved graph."""
@@ -84,10 +88,6 @@ class BackEndConfig:
     """In space: bases are levelled, each by itself, with this σ of roll and pitch [rad]; 0 = exits say it."""
     match_support: float = 0.5
     """A front end's match becomes a factor if at least this share of the particles took it; above 1 = none does."""
-    match_robust: Literal["none", "huber", "cauchy"] = "cauchy"
-    """Robust kernel on every match."""
-    match_width: float = 2.385
-    """Width of that kernel in standard deviations."""
     loops: Literal[True, False, "auto"] = "auto"
     """Look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
     The front end's matches are decided on with them; without, each that has the support is a factor. "auto": a run

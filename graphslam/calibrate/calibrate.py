@@ -15,7 +15,7 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import LaserScans
 from graphslam_frontends.landmarks.prepare import landmark_stream
 from graphslam_frontends.odometry.make_steps import make_steps
-from graphslam_frontends.odometry.recorded import RecordedErrors
+from graphslam_frontends.odometry.motion_prior import MotionPrior, OdometryBiases
 
 
 def _of_sightings(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int) -> Calibration:
@@ -28,7 +28,7 @@ def _of_scans(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int)
     if log.of_type(LaserScans) is None:
         wanted = replace(wanted, most_points=max(wanted.most_points, POINTS))
     steps = make_steps(log, wanted)
-    if not isinstance(steps.errors, RecordedErrors):
+    if not (isinstance(steps.errors, MotionPrior) and isinstance(steps.errors.biases, OdometryBiases)):
         raise DataError("an IMU with wheels is not calibrated: its front end estimates their errors", where=log.name)
     return calibrate_scans(steps, effort)
 

@@ -20,7 +20,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
-from graphslam.registration.config import RegistrationConfig
+from graphslam.registration.config import LEAST_POINTS, RegistrationConfig
 from graphslam.registration.register import register
 from graphslam.registration.target import Target
 from graphslam_frontends.odometry.steps import Steps
@@ -97,7 +97,7 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
     d = np.linalg.norm(g.log(o.increments)[:, g.position], axis=1)
     xi = g.log(o.increments)
     turns = xi[:, g.heading]
-    seen = np.diff(steps.offsets) >= MATCHING[steps.dim].least_points
+    seen = np.diff(steps.offsets) >= LEAST_POINTS
     keys, way, turned = [], np.inf, np.inf
     for k in range(len(steps)):
         way, turned = way + d[k], turned + abs(turns[k])
@@ -123,7 +123,7 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
                 if k not in targets:
                     points, _, returns = steps.scan(k)
                     targets[k] = Target(points[returns], voxel=VOXEL[steps.dim])
-            if min(len(targets[a]), len(targets[b])) < config.least_points:
+            if min(len(targets[a]), len(targets[b])) < LEAST_POINTS:
                 continue
             tried += apart == 1
             found = register(targets[b], targets[a], T, config)

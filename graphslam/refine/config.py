@@ -9,6 +9,11 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError
 
+DISTANCES = (1.0, 0.6, 0.4, 0.3)
+"""Greatest distance of a pair in each round over all passes [m]."""
+MOST_BEAMS = 3_000_000
+"""Of so many beams in the log at most surfaces are made; more are thinned evenly, which bounds the memory."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineConfig:
@@ -20,8 +25,6 @@ class RefineConfig:
     reach: float | None = None
     """Chunks whose centres are nearer than this may see the same surfaces [m]; None: the range that three quarters of
     the returns of the log stay below, 10 m at least and 30 m at most."""
-    distances: tuple[float, ...] = (1.0, 0.6, 0.4, 0.3)
-    """Greatest distance of a pair in each round over all passes [m]."""
     spacing: float = 0.2
     """In the plane: way from node to node [m]. Steps between, whole scans of the same place, follow the odometry."""
     turn: float = 0.1
@@ -30,8 +33,6 @@ class RefineConfig:
     """Every how many of the points is looked for on surfaces of other steps; all points make the surfaces."""
     most_points: int = 400_000
     """Of so many points in the log at most; more are thinned evenly."""
-    most_beams: int = 3_000_000
-    """Of so many beams in the log at most surfaces are made; more are thinned evenly, which bounds the memory."""
 
     def __post_init__(self) -> None:
         if self.use not in (True, False, "always"):
@@ -40,8 +41,6 @@ class RefineConfig:
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"refine: {name} = {value}; wanted > 0")
-        if not self.distances or not all(np.isfinite(d) and d > 0 for d in self.distances):
-            raise ConfigError(f"refine: distances = {self.distances}; wanted at least one, all > 0 m")
-        for name in ("every", "most_points", "most_beams"):
+        for name in ("every", "most_points"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"refine: {name} = {getattr(self, name)}; wanted ≥ 1")

@@ -22,7 +22,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.core.spill_cache import CacheEntry
 from graphslam.graph.sensors.gps import GpsConfig
-from graphslam.refine.config import RefineConfig
+from graphslam.refine.config import DISTANCES, MOST_BEAMS, RefineConfig
 from graphslam.refine.fixes import FixModel, FixReport
 from graphslam.refine.motion import MotionModel, States
 from graphslam.refine.nodes import StepsBetweenNodes, find_nodes, path_between, scans_at, thin_beams
@@ -302,7 +302,7 @@ def _begin(
     nodes = find_nodes(steps, config.spacing, config.turn)
     if len(nodes) < 3:
         nodes = np.arange(len(steps), dtype=np.int64)
-    some = thin_beams(scans_at(steps, nodes) if len(nodes) < len(steps) else steps, config.most_beams)
+    some = thin_beams(scans_at(steps, nodes) if len(nodes) < len(steps) else steps, MOST_BEAMS)
     work = _Refiner(some, start[nodes], config, gps, progress or (lambda _: None))
     if not len(work.cloud.points):
         raise DataError("no beam of the steps met anything", where=steps.name)
@@ -408,7 +408,7 @@ class _Refiner:
     def run(self) -> Refinement:
         """All rounds; from the odometry's path once more where the start turns out to be wrong."""
         guides, taken = self.neighbours_and_guides()
-        self.all_passes(self.config.distances)
+        self.all_passes(DISTANCES)
         other = None
         assert self.surfaces is not None
         odometry = self.odometry_path()
@@ -484,7 +484,7 @@ class _Refiner:
         self.cloud = self.problem.cloud = self.raw
         self.rounds = []
         self.neighbours()
-        self.all_passes(tuple(d for d in WIDE if d > self.config.distances[0]) + self.config.distances)
+        self.all_passes(tuple(d for d in WIDE if d > DISTANCES[0]) + DISTANCES)
         second = self.attempt()
         # the same noise for both, or the blunter path would agree better for that alone
         noise = np.minimum(first.noise, second.noise)
@@ -528,7 +528,7 @@ class _Refiner:
     def all_passes(self, distances: tuple[float, ...]) -> None:
         """Rounds over all passes at falling distances."""
         for k, distance in enumerate(distances):
-            again = k < len(distances) - len(self.config.distances) + KEPT
+            again = k < len(distances) - len(DISTANCES) + KEPT
             self.round(distance, None, passes=True, again=again, steps=2 if k == 0 else 1)
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool, steps: int = 2) -> None:
@@ -565,7 +565,7 @@ class _Refiner:
                 self.alike = correlation_factor(self.found, self.cloud, r, noise)
                 information /= self.alike
             solved = self.step(information)
-        if passes and distance <= self.config.distances[0] and solved is not None:
+        if passes and distance <= DISTANCES[0] and solved is not None:
             self.motion.widen(self.poses, self.states, solved.factor)
         self.noise = noise
         d = self.group.dim
@@ -633,7 +633,7 @@ class _Refiner:
             surfaces,
             poses,
             chunk_pairs(cloud, poses, self.reach, self.most, passes=True),
-            distance=self.config.distances[0],
+            distance=DISTANCES[0],
             every=4 * self.every,
             within=self.motion.within,
             least_share=0.0,
@@ -660,7 +660,7 @@ class _Refiner:
         before = self.agreement(self.raw, self.first.get(), self.start, self.noise)
         r = surface_residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
         self.alike = correlation_factor(self.found, self.cloud, r, self.noise)
-        information = point_information(self.found, r, self.noise, DOUBTED * self.config.distances[-1])
+        information = point_information(self.found, r, self.noise, DOUBTED * DISTANCES[-1])
         solved = self.step(information / self.alike)
         n, w, K = len(self.steps), self.group.dof, len(self.motion.knots)
         C = self.marginals(solved)

@@ -16,7 +16,7 @@ from graphslam.core.npz import Field, flags, floats, ints
 from graphslam.core.point_clouds import check_offsets
 from graphslam.core.poses import Group, group_of
 from graphslam.core.records import Odometry, check_times
-from graphslam_frontends.odometry.bias_sigmas import BiasSigmas, bias_sigmas
+from graphslam_frontends.odometry.motion_prior import BiasSigmas
 from graphslam_frontends.odometry.steps import Steps
 
 SCANS_FORMAT = "graphslam.scans/1"
@@ -81,7 +81,7 @@ class Scans:
     @classmethod
     def of(cls, steps: Steps) -> Scans:
         """Those of steps, with σ of the lasting errors that their motion states, never less
-        than :data:`~graphslam_frontends.odometry.bias_sigmas.LEAST`."""
+        than :data:`~graphslam_frontends.odometry.motion_prior.LEAST`."""
         odometry = steps.odometry
         if steps.recorded is not None:  # scans mended it: they may not be counted in its σ as well as by themselves
             odometry = replace(odometry, covariances=steps.recorded.covariances)
@@ -91,7 +91,7 @@ class Scans:
             points=steps.points.astype(np.float32, copy=False),
             origins=steps.origins.astype(np.float32, copy=False),
             ages=None if steps.ages is None else steps.ages.astype(np.float32),
-            lasting=bias_sigmas(steps),
+            lasting=steps.bias_sigmas,
             **{k: getattr(steps, k) for k in same},
         )
 

@@ -8,6 +8,9 @@ from typing import Any
 
 from graphslam.core.errors import ConfigError
 
+LEAST_POINTS = 20
+"""Source and target of a registration need so many points, and so many pairs must be left."""
+
 
 def _check(config: Any, *, zero: tuple[str, ...] = ()) -> None:
     for f in fields(config):
@@ -71,8 +74,6 @@ class RegistrationConfig:
         At most, a stage.
     near : float
         A source point has a neighbour if one is nearer than this [m].
-    least_points : int
-        Source and target need so many, and so many pairs must be left.
     max_shift, max_turn : float
         A result farther from its start is refused [m, rad]: it is another place than the one asked about.
     covariance_scale : float
@@ -86,7 +87,6 @@ class RegistrationConfig:
     radii: tuple[float, ...] = (2.0, 0.5)
     iterations: int = 30
     near: float = 0.25
-    least_points: int = 20
     max_shift: float = 3.0
     max_turn: float = 0.5
     covariance_scale: float = 3.0

@@ -21,7 +21,7 @@ from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array
 from graphslam.core.points import check_pose, transform_points
-from graphslam.registration.config import RegistrationConfig
+from graphslam.registration.config import LEAST_POINTS, RegistrationConfig
 from graphslam.registration.degeneracy import calibrated_covariance, noise_induced_information, translational_degeneracy
 from graphslam.registration.planar import PlanarAlignment, align_planar
 from graphslam.registration.target import Target
@@ -54,7 +54,7 @@ class Registration:
     fitness_upright : float
         The same of the source points on upright surfaces, whose normal is more than 45° off the target's z axis. Floors
         and ceilings match wherever they are level, and are most of many scans. NaN in two dimensions, and where there
-        are fewer than ``least_points`` of them.
+        are fewer than :data:`~graphslam.registration.config.LEAST_POINTS` of them.
     known_share : float
         Share of the source points that fall into known space; NaN likewise.
     rmse : float
@@ -153,16 +153,16 @@ def register(
     if known is not None and not callable(known) and np.shape(known) != (len(cloud),):
         raise DataError("the mask of known points does not go with the source", got=np.shape(known), wanted=len(cloud))
     for name, c in (("source", cloud), ("target", target)):
-        if len(c) < config.least_points:
-            return _no_result(start, f"{name} has {len(c)} points, fewer than {config.least_points}")
+        if len(c) < LEAST_POINTS:
+            return _no_result(start, f"{name} has {len(c)} points, fewer than {LEAST_POINTS}")
     found = _align(cloud, target, start, config)
     if found.pairs == 0:
         return _no_result(start, f"no target point within {config.radii[-1]:g} m of any source point")
     if not (np.all(np.isfinite(found.T)) and np.all(np.isfinite(found.hessian))):
         return _no_result(start, "the result is not finite")
     shift, turn = _moved(start, found.T)
-    if found.pairs < config.least_points:
-        why = f"{found.pairs} pairs left, fewer than {config.least_points}"
+    if found.pairs < LEAST_POINTS:
+        why = f"{found.pairs} pairs left, fewer than {LEAST_POINTS}"
         return dataclasses.replace(_no_result(start, why), inliers=found.pairs)
     if shift > config.max_shift or turn > config.max_turn:
         why = f"the result is {shift:.2f} m and {turn:.2f} rad from the start; at most {config.max_shift:g}, "
@@ -297,7 +297,7 @@ def _measure(
         normals, _ = source.normals(np.arange(len(source)))
         steep = np.abs(se3.quat_rotate(found.T[3:], normals)[:, 2]) < np.sqrt(0.5)
         steep &= np.any(normals != 0.0, axis=1)
-        if np.sum(steep) >= config.least_points:
+        if np.sum(steep) >= LEAST_POINTS:
             upright = float(np.mean(near[steep]))
     own, partner = source.normals(paired), target.normals(which[paired])
     rotation = se2.rotation2(found.T[2]) if planar else se3.quat_to_matrix(found.T[3:])

@@ -22,6 +22,7 @@ from graphslam.core.gaussian import check_covariance, chi2_quantile
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.core.points import check_pose, evenly_spaced
 from graphslam.core.poses import Group, group_of
+from graphslam.registration.config import LEAST_POINTS
 from graphslam.registration.gates import failed_match_gates, match_margins
 from graphslam.registration.pair_config import PairConfig
 from graphslam.registration.register import Registration, distinct_registrations, register_starts
@@ -180,9 +181,8 @@ def match_pair(
     T = check_pose(T_target_place, g.dim, what="prediction of a pair of submaps")
     P = check_covariance(covariance, what="covariance of a pair of submaps", dim=g.dof)
     points = source.around(T_base_place)
-    least = c.registration.least_points
-    if len(points) < least or len(target.points) < least:
-        why = f"nothing: {len(points)} points around the place and {len(target.points)} in the map, wanted {least}"
+    if min(len(points), len(target.points)) < LEAST_POINTS:
+        why = f"nothing: {len(points)} points around the place, {len(target.points)} in the map, wanted {LEAST_POINTS}"
         return _nothing(T, why, len(points))
     half = half_widths(T, P, c)
     fine, coarse = target.fields
@@ -315,7 +315,7 @@ def _upright_in_known(r: Registration, cloud: Target, target: PreparedMap, c: Pa
     steep = (np.abs(normals @ up) < math.sqrt(0.5)) & np.any(normals != 0.0, axis=1)
     moved = group_of(T).transform(np.broadcast_to(T, (len(cloud), 7)), cloud.points)
     steep &= target.view.known_at(moved)
-    if np.sum(steep) < rules.least_points:
+    if np.sum(steep) < LEAST_POINTS:
         return replace(r, fitness_upright=math.nan)
     near = target.target.tree.query(moved[steep], distance_upper_bound=rules.near)[0] < rules.near
     return replace(r, fitness_upright=float(np.mean(near)))

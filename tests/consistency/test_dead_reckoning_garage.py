@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
+from graphslam.core.poses import remove_roll_pitch
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import CrawlerConfig
 from graphslam.sim.garage import garage
-from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath, level_by_euler
 from graphslam_frontends.odometry.dead_reckoning import integrate_imu_and_wheels
+from graphslam_frontends.odometry.motion_prior import MotionPrior
 
-Drive = tuple[DeadReckonedPath, np.ndarray, np.ndarray]
+Drive = tuple[MotionPrior, np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def segments(drive: Drive, metres: float) -> list[tuple[np.ndarray, np.ndarray]]
     for start in np.arange(0.0, length[-1] - metres, metres):
         i, j = (int(k) for k in np.searchsorted(length, [start, start + metres]))
         T, C = r.between(i, j, level_start=True, level_end=True)
-        true = se3.se3_between(level_by_euler(truth[i]), level_by_euler(truth[j]))
+        true = se3.se3_between(remove_roll_pitch(truth[i]), remove_roll_pitch(truth[j]))
         out.append((se3.se3_log(se3.se3_between(T, true)), C))
     return out
 

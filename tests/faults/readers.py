@@ -65,7 +65,7 @@ from graphslam.io.submap_store import SubmapStore, read_submaps, read_truth, wri
 from graphslam.io.tum import read_tum, read_tum_log, write_tum
 from graphslam.maps.refined import base_frames
 from graphslam.refine.scans import Scans
-from graphslam_frontends.odometry.bias_sigmas import LEAST
+from graphslam_frontends.odometry.motion_prior import LEAST
 from graphslam_studies.io.kitti_gps import read_kitti_gps
 from graphslam_studies.io.lidar_pack import read_lidar_pack
 from graphslam_studies.io.mrclam import read_mrclam

@@ -77,23 +77,6 @@ class PlainSegMap:
             self.segments[i]["alive"] = False
         return len(dead)
 
-    def thin(self, most: int) -> int:
-        keep: set[int] = set()
-        for q in self.particles:
-            i = q["previous"]
-            while i >= 0 and self.segments[i]["alive"]:
-                keep.add(i)
-                i = self.segments[i]["previous"]
-        dropped = 0
-        for interval in {(s["start"], s["end"]) for s in self.segments if s["alive"]}:
-            rows = [i for i, s in enumerate(self.segments) if s["alive"] and (s["start"], s["end"]) == interval]
-            rows.sort(key=lambda i: (-self.segments[i]["weight"], i))
-            for i in rows[most:]:
-                if i not in keep:
-                    self.segments[i]["alive"] = False
-                    dropped += 1
-        return dropped
-
     def compatible(self, i: int, j: int) -> bool:
         return bool(self.segments[i]["end"] == self.segments[j]["start"])
 

@@ -23,7 +23,7 @@ from graphslam.refine.problem import (
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import ScanReturns, SurfacePairs, Surfaces
 from graphslam.registration.plane_kernels import PlanePairs
-from graphslam_frontends.odometry.bias_sigmas import LEAST
+from graphslam_frontends.odometry.motion_prior import LEAST
 
 EPS = 1e-6
 

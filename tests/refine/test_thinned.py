@@ -8,7 +8,7 @@ import pytest
 from graphslam.core.records import Odometry
 from graphslam.refine.nodes import thin_beams
 from graphslam.refine.scans import Scans
-from graphslam_frontends.odometry.bias_sigmas import BiasSigmas
+from graphslam_frontends.odometry.motion_prior import BiasSigmas
 
 
 @pytest.mark.parametrize("most", [1, 7, 40, 99])

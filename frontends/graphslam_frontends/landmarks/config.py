@@ -98,6 +98,9 @@ class DelayedInitialisation:
 DELAYED = DelayedInitialisation()
 """Of the particle filters."""
 
+GATE_NEW = 30.0
+"""An observation farther (χ², 2 dof) than this from every landmark founds a new one; between the gates it is unused."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SightingConfig:
@@ -105,8 +108,6 @@ class SightingConfig:
 
     gate: float = 11.8
     """χ² gate of an association (2 dof: 99.7 %; the same tail for an observation of one channel)."""
-    gate_new: float = 30.0
-    """An observation farther than this from every landmark founds a new one; between the gates it is ignored."""
     outlier_gate: float = 0.0
     """With known association: an observation with d² above this (χ², 2 dof; the same tail where it has one channel) is
     an outlier (to that particle) and not used; 0 = use all."""
@@ -133,8 +134,8 @@ class SightingConfig:
     def __post_init__(self) -> None:
         if not self.longest_gap >= 0:
             raise ConfigError(f"longest_gap = {self.longest_gap}; wanted ≥ 0 s")
-        if not 0 < self.gate <= self.gate_new:
-            raise ConfigError(f"gates must satisfy 0 < gate ≤ gate_new, got {self.gate} and {self.gate_new}")
+        if not 0 < self.gate <= GATE_NEW:
+            raise ConfigError(f"gate = {self.gate}; wanted 0 < gate ≤ {GATE_NEW}")
         if not self.outlier_gate >= 0:
             raise ConfigError(f"outlier_gate = {self.outlier_gate}; wanted ≥ 0")
 

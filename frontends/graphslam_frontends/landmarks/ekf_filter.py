@@ -16,6 +16,7 @@ from graphslam.core.errors import CovarianceError
 from graphslam.core.geometry import Array
 from graphslam_frontends.landmarks.compatibility import gates_by_dof, pair_observations
 from graphslam_frontends.landmarks.compatibility_kernels import LandmarkCounts, misses_kernel
+from graphslam_frontends.landmarks.config import GATE_NEW
 from graphslam_frontends.landmarks.ekf_config import EkfFilterConfig
 from graphslam_frontends.landmarks.ekf_kernels import (
     ActiveState,
@@ -191,13 +192,12 @@ class EkfMap:
             self.sensor,
             gate=c.gate,
             method="jcbb" if c.association == "jcbb" else "nearest",
-            max_nodes=c.max_nodes,
             alive=alive,
         )
         self.nodes += p.nodes
         self.capped += p.capped
         flat = np.isinf(observations[:, 3])
-        gates, new = gates_by_dof(c.gate, 2), gates_by_dof(c.gate_new, 2)
+        gates, new = gates_by_dof(c.gate, 2), gates_by_dof(GATE_NEW, 2)
         far = p.nearest > np.where(flat, new[1] / gates[1], new[2] / gates[2])
         self.unfounded += int(np.count_nonzero(far & flat))
         return p.landmark, [int(o) for o in np.flatnonzero(far & ~flat)], p.polar
@@ -207,7 +207,7 @@ class EkfMap:
 
         cross (4, N): covariance of the pose with the whole state, and how far that has moved since it was folded in.
         """
-        new = gates_by_dof(self.config.gate_new, 2)
+        new = gates_by_dof(GATE_NEW, 2)
         weights = np.broadcast_to([1.0 / new[1], 1.0 / new[2]], (len(observations), 2))
         out = np.empty(len(slots))
         now = PoseState(self._ax[:3], self._aP[:3, :3], cross[:3], cross[3])

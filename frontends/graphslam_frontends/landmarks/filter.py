@@ -8,7 +8,7 @@ import numpy.typing as npt
 from graphslam.core.gaussian import equal_tail_gate
 from graphslam.core.geometry import Array, se2_transform, wrap_angle
 from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
-from graphslam_frontends.landmarks.config import DELAYED, FilterConfig
+from graphslam_frontends.landmarks.config import DELAYED, GATE_NEW, FilterConfig
 from graphslam_frontends.landmarks.kernels import (
     CFG_LENGTH,
     IGNORED,
@@ -67,7 +67,7 @@ class ParticleSet:
         self._cfg[:] = (
             1.0 if config.proposal == "2.0" else 0.0,
             config.gate,
-            config.gate_new,
+            GATE_NEW,
             config.confirm_hits,
             config.drop_misses,
             config.drop_scans,
@@ -75,7 +75,7 @@ class ParticleSet:
             field_of_view[0] + margin,
             field_of_view[1] - margin,
             equal_tail_gate(config.gate, 2, 1),
-            equal_tail_gate(config.gate_new, 2, 1),
+            equal_tail_gate(GATE_NEW, 2, 1),
             outlier,
             equal_tail_gate(outlier, 2, 1),
         )

@@ -26,8 +26,7 @@ from graphslam.core.submap import LandmarkMap, Submap, turned_covariance
 from graphslam.core.trajectory import Trajectory
 from graphslam.linear.space_maps import ORIGIN, PlacedMap, SpaceMap, minimise_space_maps
 from graphslam_frontends.base import FrontEnd, Watch
-from graphslam_frontends.odometry.motion import MotionNoise
-from graphslam_frontends.odometry.recorded import cut_odometry
+from graphslam_frontends.odometry.motion import MotionNoise, cut_odometry
 
 Ints = npt.NDArray[np.int64]
 NO_POSES, NO_POINTS = np.zeros((0, 7)), np.zeros((0, 3))
@@ -35,6 +34,9 @@ NONE = np.zeros(0, dtype=np.int64)
 _ROUNDS = 10
 MAX_LANDMARKS = 60
 """A submap ends with this many landmarks."""
+
+MIN_SCANS = 5
+"""A submap does not end before this many scans."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,15 +47,13 @@ class PointsConfig:
     """A submap ends after this many metres."""
     max_scans: int = 100
     """… or after this many scans, or with :data:`MAX_LANDMARKS` landmarks."""
-    min_scans: int = 5
-    """It does not end before this many."""
     min_hits: int = 2
     """Landmarks that are handed over were seen at least this often in the submap."""
     gate: float = 0.9999
     """A sighting farther from what all others say than this share of honest ones is left out, and counted."""
 
     def __post_init__(self) -> None:
-        if self.max_distance <= 0 or min(self.max_scans, self.min_scans, self.min_hits) < 1:
+        if self.max_distance <= 0 or min(self.max_scans, self.min_hits) < 1:
             raise ConfigError("limits of a submap in space are not positive; wanted > 0 metres and ≥ 1 of the others")
         if not 0.5 < self.gate < 1.0:
             raise ConfigError(f"gate = {self.gate}; wanted between 0.5 and 1")
@@ -111,7 +111,7 @@ class Points(FrontEnd):
             for i in points.ids[points.scan(k)].tolist():
                 hits[i] = hits.get(i, 0) + 1
             n = k - first
-            if n < c.min_scans or end - k < c.min_scans:
+            if n < MIN_SCANS or end - k < MIN_SCANS:
                 continue
             if way >= c.max_distance:
                 return k, "distance"

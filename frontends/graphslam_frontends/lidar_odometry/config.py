@@ -8,6 +8,9 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError
 
+SPACING = 0.2
+"""Edge of the cubes of which one point each is matched [m]."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarOdometryConfig:
@@ -17,8 +20,6 @@ class LidarOdometryConfig:
     """Points farther away are left out [m]."""
     min_range: float = 0.5
     """… and nearer ones: the carrier itself [m]."""
-    spacing: float = 0.2
-    """Edge of the cubes of which one point each is matched [m]."""
     most_points: int = 3000
     """Points matched of a scan at most."""
     levels: tuple[float, ...] = (2.0, 1.0, 0.5)
@@ -29,7 +30,7 @@ class LidarOdometryConfig:
     """Move points of a scan to its stamp, where they have stamps of their own."""
 
     def __post_init__(self) -> None:
-        for name in ("max_range", "spacing", "window"):
+        for name in ("max_range", "window"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"lidar odometry: {name} = {value}; wanted > 0")

@@ -63,6 +63,9 @@ REHEARSED = 60
 MOST_SCANS = 100
 """A submap holds no more scans, however slowly the sensor moves."""
 
+CLOUD_CELL = 0.1
+"""Edge of the cubes of which the cloud of a submap keeps one point each [m]."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarSubmapConfig:
@@ -74,8 +77,6 @@ class LidarSubmapConfig:
     """… which holds no fewer scans than this."""
     voxel_size: float = 0.2
     """Edge of a voxel of the grid [m]."""
-    cloud_cell: float = 0.1
-    """Edge of the cubes of which the cloud keeps one point each [m]."""
     reach: float = 40.0
     """Beams are followed so far through the grid [m]."""
     points: int = 2000
@@ -84,7 +85,7 @@ class LidarSubmapConfig:
     """Probability that a voxel is occupied, given that a beam ended in it."""
 
     def __post_init__(self) -> None:
-        for name in ("length", "voxel_size", "cloud_cell", "reach"):
+        for name in ("length", "voxel_size", "reach"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"submap: {name} = {value}; wanted > 0")
@@ -525,7 +526,7 @@ def _submap(
     cloud = None
     if points:
         cloud = CloudMap(
-            points=np.concatenate(points), origins=np.array(origins), scan=np.concatenate(scan), cell=config.cloud_cell
+            points=np.concatenate(points), origins=np.array(origins), scan=np.concatenate(scan), cell=CLOUD_CELL
         )
     return Submap(
         key=key,

@@ -25,7 +25,7 @@ from graphslam_frontends.lidar_odometry.cells import (
     evenly_spaced_rows,
     first_rows_by_cube,
 )
-from graphslam_frontends.lidar_odometry.config import LidarOdometryConfig
+from graphslam_frontends.lidar_odometry.config import SPACING, LidarOdometryConfig
 from graphslam_frontends.lidar_odometry.inertial import InertialPredictor
 from graphslam_frontends.lidar_odometry.wheel_prior import WheelMotionPrior
 from graphslam_frontends.lidar_odometry.window_covariance import WindowCovariance
@@ -284,7 +284,7 @@ class LidarOdometry:
                 Q = np.diag(np.repeat(self.reckoned.variances(told[1]), 3))
                 led = ahead is None and (self.lost > 0 or self.reckoned.better)
         predicted = ahead if ahead is not None else bridge if led and bridge is not None else even
-        rows = first_rows_by_cube(np.ascontiguousarray(cloud), c.spacing, (c.min_range, c.max_range))
+        rows = first_rows_by_cube(np.ascontiguousarray(cloud), SPACING, (c.min_range, c.max_range))
         kept = rows[evenly_spaced_rows(len(rows), MOST_KEPT)]
         raw = self._raw(cloud[kept], None if ages is None or not c.deskew else ages[kept], time)
         dt = time - self.time if np.isfinite(self.time) else 0.0

@@ -21,7 +21,9 @@ from graphslam.core.imu import GRAVITY, Imu
 from graphslam.core.log import DropCounter
 from graphslam.core.records import Odometry, VelocityControls, check_times
 from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.dead_reckoned_path import (
+from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
+from graphslam_frontends.odometry.gaps import Gaps, find_gaps
+from graphslam_frontends.odometry.inertial_biases import (
     FADING,
     GYRO,
     LASTING,
@@ -29,13 +31,12 @@ from graphslam_frontends.odometry.dead_reckoned_path import (
     PSI,
     SCALE,
     STATES,
-    DeadReckonedPath,
     DeadReckoningErrorModel,
+    InertialBiases,
     euler_quat,
     tangent_of_state,
 )
-from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
-from graphslam_frontends.odometry.gaps import Gaps, find_gaps
+from graphslam_frontends.odometry.motion_prior import MotionPrior
 
 __all__ = ["DeadReckoningNoise", "integrate_imu_and_wheels"]
 
@@ -88,7 +89,7 @@ def integrate_imu_and_wheels(
     longest: float = 20.0,
     where: str = "log",
     drops: DropCounter | None = None,
-) -> DeadReckonedPath:
+) -> MotionPrior:
     """Dead-reckon a base at ``times``.
 
     Parameters
@@ -166,15 +167,14 @@ def integrate_imu_and_wheels(
     increments[1:] = se3.se3_between(poses[:-1], poses[1:])
     covariances = np.tile(np.diag(floor**2), (len(t), 1, 1))
     covariances[1:] += _white(poses, F, Q, lasting)
-    return DeadReckonedPath(
+    return MotionPrior(
         odometry=Odometry(times=t, increments=increments, covariances=covariances),
         poses=poses,
         path=path,
+        biases=InertialBiases(times=t, poses=poses, lasting=lasting, transitions=F, noises=Q, floor=floor),
         tilt=tilt[at],
-        lasting=lasting,
-        transitions=F,
-        noises=Q,
-        floor=floor,
+        tilt_sigma=float(np.hypot(lasting.attitude, lasting.attitude_bias)),
+        tilt_time=lasting.attitude_time,
         gaps=Gaps(np.concatenate([imu_gaps.begin, wheel_gaps.begin]), np.concatenate([imu_gaps.end, wheel_gaps.end])),
     )
 

@@ -27,9 +27,9 @@ from graphslam_frontends.odometry.deskew import (
     deskew_beams,
     stratified_indices,
 )
+from graphslam_frontends.odometry.motion_source import MotionSource, motion_source
 from graphslam_frontends.odometry.scan_matching import match_neighbours
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.step_motion import MotionSource, motion_source
 from graphslam_frontends.odometry.steps import Steps
 
 _log = logging.getLogger(__name__)
@@ -110,7 +110,7 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
         uses=frozenset((*source.names, *names)),
         name=log.name + (f" (yaw rate off by {config.yaw_bias:g} rad/s)" if config.yaw_bias else ""),
         truth=log.truth.trajectory if log.truth is not None else None,
-        errors=motion.errors,
+        errors=motion,
         gaps=motion.gaps,
     )
     return match_neighbours(steps, drops=drops) if config.match_scans else steps

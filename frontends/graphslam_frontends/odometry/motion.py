@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, MissingDataError
-from graphslam.core.geometry import Array, se2_exp, se2_log
+from graphslam.core.geometry import Array
 from graphslam.core.log import SensorLog
+from graphslam.core.poses import group_of
 from graphslam.core.record_source import RecordSource
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls, check_times
 from graphslam_frontends.odometry.motion_kernels import (
@@ -139,7 +140,9 @@ def dead_reckoned_increments(
             wanted=f"≥ {stream.times[0] - hold:.3f} s",
         )
     if isinstance(stream, Odometry):
-        return recorded_odometry(stream, t, noise, hold=hold), name
+        if stream.increments.shape[1] != 3:
+            raise DataError("odometry in space cannot be used", where=where, wanted="odometry in the plane")
+        return cut_odometry(stream, t, noise, hold=hold), name
     if early > 0:
         stream = replace(stream, times=np.concatenate([t[:1], stream.times[1:]]))
     if isinstance(stream, VelocityControls):
@@ -204,7 +207,7 @@ def velocity_odometry(controls: VelocityControls, times: Array, noise: MotionNoi
     return Odometry(times=t, increments=increments, covariances=covs)
 
 
-def recorded_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, hold: float = 0.0) -> Odometry:
+def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, hold: float = 0.0) -> Odometry:
     """Increments between consecutive ``times`` composed of recorded ones and their covariances.
 
     A record that a stamp falls into is cut at constant velocity, its covariance in proportion to time (as for noise
@@ -213,7 +216,7 @@ def recorded_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, h
     Parameters
     ----------
     odometry : Odometry
-        Two-dimensional.
+        In two or three dimensions.
     times : (n,)
     noise : MotionNoise
         Only its floors.
@@ -221,40 +224,48 @@ def recorded_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, h
         Reach beyond the first and the last record, continued at constant velocity [s]. Both the motion and its σ then
         grow with time: what goes on is a guess.
     """
-    t = check_times(times)
-    stamps = odometry.times
-    if odometry.increments.shape[1] != 3 or len(stamps) < 2:
-        raise DataError("odometry cannot be used", got=odometry.increments.shape, wanted="(n, 3) with n ≥ 2")
+    t, stamps, g = check_times(times), odometry.times, group_of(odometry.increments)
+    if len(stamps) < 2:
+        raise DataError("odometry cannot be used", got=f"{len(stamps)} records", wanted="two at least")
     if len(t) and not (t[0] >= stamps[0] - hold and t[-1] <= stamps[-1] + hold):
         raise DataError(
             "pose stamp outside the odometry",
             got=f"[{t[0]:.3f}, {t[-1]:.3f}] s",
             wanted=f"[{stamps[0] - hold:.3f}, {stamps[-1] + hold:.3f}] s",
         )
-    usual = float(np.sqrt(np.median(odometry.covariances[1:, 2, 2])))
-    if usual > HEADING_UNKNOWN:
+    usual = float(np.sqrt(np.median(odometry.covariances[1:, g.heading, g.heading])))
+    if g.dim == 2 and usual > HEADING_UNKNOWN:
         raise DataError(
             "the stated covariances of the odometry leave its heading unknown within one record",
             got=f"σ of {usual:.3g} rad in {float(np.median(np.diff(stamps))):.3g} s",
             wanted=f"below {HEADING_UNKNOWN:.2g} rad; look at their unit and their order: x, y [m], heading [rad]",
         )
-    increments, covs = _start(len(t), noise)
+    floor = np.full(g.dof, noise.floor_heading**2)
+    floor[g.position] = noise.floor_position**2
+    increments, covs = np.tile(g.identity, (len(t), 1)), np.tile(np.diag(floor), (len(t), 1, 1))
     if len(t) < 2:
         return Odometry(times=t, increments=increments, covariances=covs)
     knots = np.union1d(stamps[(stamps > t[0]) & (stamps < t[-1])], t)
     record = np.clip(np.searchsorted(stamps, 0.5 * (knots[:-1] + knots[1:]), side="right"), 1, len(stamps) - 1)
     u = np.diff(knots) / (stamps[record] - stamps[record - 1])
     whole = (knots[:-1] == stamps[record - 1]) & (knots[1:] == stamps[record])
-    steps = np.where(
-        whole[:, None], odometry.increments[record], se2_exp(u[:, None] * se2_log(odometry.increments[record]))
+    pieces = np.where(
+        whole[:, None], odometry.increments[record], g.exp(u[:, None] * g.log(odometry.increments[record]))
     )
     guessed = (knots[:-1] < stamps[0]) | (knots[:-1] >= stamps[-1])
-    share = np.where(guessed, np.maximum(u, u**2), u)
-    covs[1:] = covs[0]
+    added = np.where(guessed, np.maximum(u, u**2), u)[:, None, None] * odometry.covariances[record]
     first = np.searchsorted(knots, t).astype(np.int64)
-    compose_increments_kernel(
-        steps, share[:, None, None] * odometry.covariances[record], first, increments[1:], covs[1:]
-    )
+    if g.dim == 2:
+        compose_increments_kernel(pieces, added, first, increments[1:], covs[1:])
+        return Odometry(times=t, increments=increments, covariances=covs)
+    P, counts = np.zeros((len(t) - 1, g.dof, g.dof)), np.diff(first)
+    for m in range(int(counts.max())):  # all increments grow together, one piece each at a time
+        live = np.flatnonzero(counts > m)
+        piece = pieces[first[live] + m]
+        increments[live + 1] = g.compose(increments[live + 1], piece)
+        back = g.adjoint(g.inverse(piece))
+        P[live] = back @ P[live] @ np.swapaxes(back, -1, -2) + added[first[live] + m]
+    covs[1:] += 0.5 * (P + np.swapaxes(P, -1, -2))
     return Odometry(times=t, increments=increments, covariances=covs)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, se2_between, se2_compose, se2_exp, se2_log
 from graphslam.core.log import DropCounter
-from graphslam.registration.config import RegistrationConfig
+from graphslam.registration.config import LEAST_POINTS, RegistrationConfig
 from graphslam.registration.register import register
 from graphslam.registration.target import Target
 from graphslam_frontends.odometry.steps import Steps
@@ -53,7 +53,7 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
             before, T = T, se2_compose(T, o.increments[k])
         points, _, returns = steps.scan(k)
         cloud = points[returns]
-        if len(cloud) < MATCHING.least_points:
+        if len(cloud) < LEAST_POINTS:
             continue
         here = Target(cloud)
         moved = np.hypot(T[0], T[1]) > STILL[0] or abs(T[2]) > STILL[1]

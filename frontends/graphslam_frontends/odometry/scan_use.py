@@ -21,6 +21,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.submap import Submap
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_check import check_motion, half_turn_seconds, motion_findings
+from graphslam_frontends.odometry.motion_prior import OdometryBiases, interval_covariance
 from graphslam_frontends.odometry.scan_matching import match_neighbours
 from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
@@ -121,12 +122,7 @@ def dead_reckoning_covariance(steps: Steps, start: int, end: int, *, level_end: 
             return steps.errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]
         except DataError:  # recorded odometry does not know level frames
             return steps.errors.between(start, end)[1]
-    o, group = steps.odometry, group_of(steps.odometry.increments)
-    P = np.zeros((group.dof, group.dof))
-    for k in range(start + 1, end + 1):
-        back = group.adjoint(group.inverse(o.increments[k]))
-        P = back @ P @ back.T + o.covariances[k]
-    return P
+    return interval_covariance(OdometryBiases(odometry=steps.odometry), start, end)
 
 
 def scan_findings(steps: Steps) -> list[Finding]:

@@ -15,6 +15,7 @@ from graphslam.core.point_clouds import check_offsets
 from graphslam.core.records import Odometry, check_times
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry.gaps import Gaps
+from graphslam_frontends.odometry.motion_prior import BiasSigmas, MotionPrior
 
 
 class IntervalCovariance(Protocol):
@@ -135,6 +136,12 @@ class Steps:
         """Points ``(m, dim)``, origins ``(m, dim)`` and returns ``(m,)`` of step k."""
         rows = slice(int(self.offsets[k]), int(self.offsets[k + 1]))
         return self.points[rows], self.origins[rows], self.returns[rows]
+
+    @property
+    def bias_sigmas(self) -> BiasSigmas:
+        """Prior σ of the errors that outlive a step, as the motion states them; never less than usual."""
+        stated = self.errors.biases.sigmas if isinstance(self.errors, MotionPrior) else {}
+        return BiasSigmas.of({"tilt": self.tilt_sigma, **stated})
 
     @property
     def path_length(self) -> Array:

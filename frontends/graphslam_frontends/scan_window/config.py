@@ -8,6 +8,15 @@ import numpy as np
 
 from graphslam.core.errors import ConfigError
 
+MOST_STEPS = 60
+"""Steps of the window at most: of faster scans only every so many become surfaces."""
+DISTANCES = (1.0, 0.5, 0.3)
+"""Greatest distance of a point from its surface in each iteration [m]."""
+SPENT = 1.7
+"""σ of a residual in multiples of the spread of the residuals: steps share surfaces, whose errors last."""
+LEAST_POINTS = 20
+"""A scan with fewer points on surfaces is lost: it corrects nothing."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanWindowConfig:
@@ -15,8 +24,6 @@ class ScanWindowConfig:
 
     seconds: float = 24.0
     """Age of the oldest surfaces of the window [s]."""
-    most_steps: int = 60
-    """Steps of the window at most: of faster scans only every so many become surfaces."""
     lay: float | None = None
     """Scans become surfaces together, so many seconds of them at a time, when those of the next lot are there too [s].
     A surface needs neighbours on all sides, and one that was just seen says nothing of how far the path has drifted;
@@ -24,27 +31,16 @@ class ScanWindowConfig:
     the plane, where one scan sees all that it can."""
     points: int = 250
     """Points of a scan that are looked for on surfaces."""
-    distances: tuple[float, ...] = (1.0, 0.5, 0.3)
-    """Greatest distance of a point from its surface in each iteration [m]."""
-    spent: float = 1.7
-    """σ of a residual in multiples of the spread of the residuals: steps share surfaces, whose errors last."""
-    least_points: int = 20
-    """A scan with fewer points on surfaces is lost: it corrects nothing."""
 
     def __post_init__(self) -> None:
-        for name in ("seconds", "spent"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"window: {name} = {value}; wanted > 0")
-        if not self.distances or not all(np.isfinite(d) and d > 0 for d in self.distances):
-            raise ConfigError(f"window: distances = {self.distances}; wanted at least one, all > 0 m")
-        for name, least in (("most_steps", 2), ("points", 6), ("least_points", 6)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"window: {name} = {getattr(self, name)}; wanted ≥ {least}")
+        if not (np.isfinite(self.seconds) and self.seconds > 0):
+            raise ConfigError(f"window: seconds = {self.seconds}; wanted > 0")
+        if self.points < 6:
+            raise ConfigError(f"window: points = {self.points}; wanted ≥ 6")
         if self.lay is not None and not self.spacing <= self.lay <= self.seconds:
             raise ConfigError(f"window: lay = {self.lay} s; wanted between two steps ({self.spacing} s) and seconds")
 
     @property
     def spacing(self) -> float:
         """Least time between steps that become surfaces [s]."""
-        return self.seconds / self.most_steps
+        return self.seconds / MOST_STEPS

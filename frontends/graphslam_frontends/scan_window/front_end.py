@@ -34,6 +34,10 @@ LAST = "end-of-log"
 MANY = 0.2
 """Share of lost scans from which a line of the verdict says so."""
 
+LIFT = 0.25
+"""Height of the base over the lattice of its map, in voxels, where gravity is told: a floor between two layers of
+voxels would be in one of them here and in the other there."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowSubmapConfig:
@@ -45,9 +49,6 @@ class WindowSubmapConfig:
     """… which lasts no less than this [s]."""
     voxel_size: float = 0.2
     """Edge of a voxel [m]."""
-    lift: float = 0.25
-    """Height of the base over the lattice of its map, in voxels, where gravity is told: a floor between two layers of
-    voxels would be in one of them here and in the other there."""
     hit: float = 0.7
     """Probability that a voxel is occupied, given that a beam ended in it."""
 
@@ -58,8 +59,6 @@ class WindowSubmapConfig:
                 raise ConfigError(f"submap: {name} = {value}; wanted > 0")
         if not (np.isfinite(self.seconds) and self.seconds >= 0):
             raise ConfigError(f"submap: seconds = {self.seconds}; wanted ≥ 0")
-        if not (np.isfinite(self.lift) and 0.0 <= self.lift <= 1.0):
-            raise ConfigError(f"submap: lift = {self.lift}; wanted 0 … 1 voxels")
         self.beam_model()
 
     def beam_model(self) -> BeamModel:
@@ -157,7 +156,7 @@ def _submap(
     start, end = interval
     gravity = steps.tilt is not None
     poses = np.array([s[0] for s in states])
-    lift = config.lift * config.voxel_size if gravity else 0.0
+    lift = LIFT * config.voxel_size if gravity else 0.0
     g = group_of(poses)
     begin, exit = (_base(p, lift, gravity) for p in (poses[0], poses[-1]))
     path = g.between(np.broadcast_to(begin, poses.shape), poses)

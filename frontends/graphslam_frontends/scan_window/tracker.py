@@ -33,9 +33,8 @@ from graphslam.registration.plane_kernels import PlanePairs, no_noise_correction
 from graphslam.registration.surfaces import SURFACE, fit_places, rotations, thin_places
 from graphslam_frontends.grid.motion import with_roll_pitch
 from graphslam_frontends.grid.weights import evenly_spaced_indices
-from graphslam_frontends.odometry.bias_sigmas import bias_sigmas
 from graphslam_frontends.odometry.steps import Steps
-from graphslam_frontends.scan_window.config import ScanWindowConfig
+from graphslam_frontends.scan_window.config import DISTANCES, LEAST_POINTS, MOST_STEPS, SPENT, ScanWindowConfig
 
 Index = npt.NDArray[np.int64]
 
@@ -89,7 +88,7 @@ class ScanToWindowOdometry:
         self.steps, self.config = steps, config
         self.group = g = group_of(steps.odometry.increments)
         self.gravity = steps.tilt is not None
-        self.sigmas = s = bias_sigmas(steps)
+        self.sigmas = s = steps.bias_sigmas
         w, self.w = g.dof, g.dof
         # lasting states: yaw bias, scale, side (, rise (, constant roll and pitch, fading roll and pitch))
         prior = [s.yaw_bias, s.scale, s.direction]
@@ -100,7 +99,7 @@ class ScanToWindowOdometry:
             prior += [s.tilt, s.tilt, steps.tilt_sigma, steps.tilt_sigma]
         self.x = w + len(prior)  # of pose and lasting states together
         self.lasting = np.zeros(len(prior))
-        self.slots = config.most_steps + 1
+        self.slots = MOST_STEPS + 1
         self.ANCHOR, self.NOW = self.slots, self.slots + 1
         n = self.x + (self.slots + 1) * w
         self.P = np.zeros((n, n))
@@ -244,8 +243,8 @@ class ScanToWindowOdometry:
         p = hit[evenly_spaced_indices(len(hit), self.config.points)]
         if self.tree is None:
             return ScanMatch(0, np.nan, np.nan, 0.0, "start")
-        c, g, w = self.config, self.group, self.w
-        if len(p) < c.least_points:
+        g, w = self.group, self.w
+        if len(p) < LEAST_POINTS:
             return ScanMatch(len(p), 0.0, np.nan, 0.0, "points")
         first = self.NOW * self.rows
         source = first + np.arange(len(p))
@@ -253,7 +252,7 @@ class ScanToWindowOdometry:
         towards = origins[p] - points[p]
         d = np.zeros(self.x)
         lately = self._seen(self.pose)  # the corrections to come turn it by next to nothing
-        for distance in c.distances:
+        for distance in DISTANCES:
             pose = g.compose(self.pose, g.exp(d[:w]))
             R = self._place(self.NOW, pose)
             W = points[p] @ R.T + pose[: g.dim]
@@ -264,14 +263,14 @@ class ScanToWindowOdometry:
             facing = np.einsum("kij,kj,ki->k", self.R[slot], self.normals[q], towards[near] @ R.T) > 0
             near, q, slot = near[facing], q[facing], slot[facing]
             overlap = len(near) / len(p)
-            if len(near) < c.least_points or overlap < LEAST_OVERLAP:
+            if len(near) < LEAST_POINTS or overlap < LEAST_OVERLAP:
                 return ScanMatch(len(near), overlap, np.nan, 0.0, "overlap")
             n = len(near)
             pairs = PlanePairs(source[near], q, np.full(n, self.NOW), slot)
             r = np.empty(n)
             plane_residuals(pairs, self.R, self.t, self.points, self.normals, r)
             scatter = 1.4826 * float(np.median(np.abs(r)))
-            sigma = max(c.spent * scatter, 0.1 * distance)
+            sigma = max(SPENT * scatter, 0.1 * distance)
             information = 1.0 / (1.0 + (r / (2.0 * sigma)) ** 2) ** 2 / sigma**2
             slots = np.unique(slot)
             L, G, b = self._blocks(pairs, information, slots)

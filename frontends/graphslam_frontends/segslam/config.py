@@ -103,8 +103,6 @@ class SegmentCandidateConfig:
     """Voxels in it that the candidate must know."""
     keep: int = 4
     """Candidates of one particle at one time, nearest (in σ) first."""
-    local_length: float = 0.0
-    """A local map sample reaches this far along the path [m]; 0 = over the whole map."""
 
     def __post_init__(self) -> None:
         _check(self, "winnowing", positive=("sigma", "sigmas", "keep"))
@@ -116,6 +114,12 @@ class SegmentCandidateConfig:
     def drift(self, length: Any) -> Any:
         """σ after a path of a length [m]; arrays too."""
         return self.sigma + self.sigma_per_metre * length
+
+
+YAW = (0.1, 2.5e-3)
+"""Half width of a search in heading: this [rad], and this for each metre driven since, no more than :data:`MAX_YAW`."""
+STARTS = 6
+"""Distinct modes of a search that are handed to the registration."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,12 +136,6 @@ class CandidateSearch:
     """Half width of the search: this [m], or 2.5 σ of the path-length model if that is less."""
     height: float = 0.8
     """Half width in z [m]."""
-    yaw: float = 0.1
-    """Half width in heading [rad] …"""
-    yaw_per_metre: float = 2.5e-3
-    """… plus this for each metre driven since, and no more than :data:`MAX_YAW`."""
-    starts: int = 6
-    """Distinct modes handed to the registration."""
     source_radius: float = 15.0
     """Points of the look-ahead window beyond this are left out [m]."""
     source_points: int = 300
@@ -153,7 +151,6 @@ class CandidateSearch:
                 "grid",
                 "yaw_step",
                 "max_radius",
-                "starts",
                 "source_radius",
                 "source_points",
                 "most_searches",
@@ -162,7 +159,7 @@ class CandidateSearch:
 
     def yaw_width(self, length: float) -> float:
         """Half width in heading after a path of a length [m]."""
-        return min(self.yaw + self.yaw_per_metre * length, MAX_YAW)
+        return min(YAW[0] + YAW[1] * length, MAX_YAW)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -237,10 +234,6 @@ class SegSlamConfig:
     """What carries the particles through a segment: the motion with its noise, which the filter samples, as in the
     paper; or scan-to-window odometry (``frontend.window``), which is the same for all and leaves nothing to sample that
     a map could tell apart. Particles then differ where it pays: in which older map they enter."""
-    segments_per_interval: int = 0
-    """Segments of one interval that are kept, heaviest first; 0 = all."""
-    lock_after: int = 0
-    """A submap that was entered this often is locked: localised in, no more updated; 0 = never."""
 
     def __post_init__(self) -> None:
         _check(self, "segslam")

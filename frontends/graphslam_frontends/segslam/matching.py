@@ -19,12 +19,13 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.core.poses import heading_of
 from graphslam.core.random import SeedTree
+from graphslam.registration.config import LEAST_POINTS
 from graphslam.registration.register import Registration, distinct_registrations, register_starts
 from graphslam.registration.search import correlative_search
 from graphslam.registration.search_field import SearchField
 from graphslam.registration.target import Target
 from graphslam_frontends.segslam.candidate_selection import CandidateSelection, SegmentCandidates, select_candidates
-from graphslam_frontends.segslam.config import SegSlamConfig
+from graphslam_frontends.segslam.config import STARTS, SegSlamConfig
 from graphslam_frontends.segslam.localisation import localise_in_map
 from graphslam_frontends.segslam.match_posterior import NULL, Proposal, match_posterior
 from graphslam_frontends.segslam.sampling import draw_weights, grow_sample, root_of_particle
@@ -175,7 +176,7 @@ class Matcher:
         if not ahead.full or not np.any(segmap.times[step] - ended >= config.winnowing.gap):
             return nothing
         source = ahead.source(config.search.source_points, config.search.source_radius)
-        if len(source) < config.registration.least_points:
+        if len(source) < LEAST_POINTS:
             return nothing
         asked = self._candidates(step, poses, seed)
         if not any(map(len, asked)):
@@ -216,7 +217,6 @@ class Matcher:
             rng = seed.child("sample", number).generator()
             sample = grow_sample(
                 segmap, root_of_particle(segmap, members[0], step), rng, weights=weights,
-                local_length=config.winnowing.local_length,
             )  # fmt: skip
             entry = segmap.entries[members[0]]
             held = self._held(-1 if entry is None or entry.kind == NEW else entry.source)
@@ -294,7 +294,7 @@ class Matcher:
 
         def made() -> Target | None:
             points = self.segmap.map_of(segment)[0].binned_cloud(CLOUD_LEVEL).points
-            return Target(points) if len(points) >= self.config.registration.least_points else None
+            return Target(points) if len(points) >= LEAST_POINTS else None
 
         return self._targets.of(m, made)
 
@@ -312,7 +312,7 @@ class Matcher:
 
         fine, coarse = self._fields.of(known, made)
         steps = [*[s.grid] * self.segmap.group.dim, s.yaw_step]
-        found = correlative_search(source, fine, T, half, steps, s.starts, coarse=coarse)
+        found = correlative_search(source, fine, T, half, steps, STARTS, coarse=coarse)
         best = max((p.score for p in found), default=0.0)
         return [p.T for p in found if p.score >= max(LEAST_SCORE, best - SCORE_MARGIN)]
 

@@ -258,22 +258,6 @@ class SegMap:
         dead = np.flatnonzero(t.alive[: t.count] & ~np.isin(ends, list(here)))
         return self._release(dead)
 
-    def thin(self, most: int) -> int:
-        """Keep no more than ``most`` segments of each interval, the heaviest; returns how many were dropped.
-
-        Those that the particles of now came through are kept beside them.
-        """
-        if most < 1:
-            raise DataError("an interval cannot do without any segment", got=most, wanted="≥ 1")
-        t = self.table
-        through = {int(i) for p in np.unique(self.previous) if p >= 0 and t.alive[p] for i in self.chain(int(p))}
-        dead = []
-        for interval in self.intervals():
-            i = self.in_interval((int(interval[0]), int(interval[1])))
-            order = i[np.lexsort((i, -t.weight[i]))]
-            dead += [k for k in order[most:].tolist() if k not in through]
-        return self._release(np.sort(np.array(dead, np.int64)))
-
     def lock(self, index: int) -> None:
         """A segment's map is localised in from now on, not updated: also its copies that are entered later (A12)."""
         self.maps.lock(int(self.table.map[self._alive(index)]))

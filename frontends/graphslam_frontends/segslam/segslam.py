@@ -168,8 +168,6 @@ class _Run:
             entries.append(entry if entry is not None else self._goes_on(p, i, bool(ends[p])))
         self._enter(k, chosen, entries)
         self.segmap.prune()
-        if self.config.segments_per_interval:
-            self.segmap.thin(self.config.segments_per_interval)
         self.matcher.forget()
         self.seconds["segments"] += time.perf_counter() - begin
 
@@ -301,7 +299,6 @@ class _Run:
                 p.ages[i] = 0
             elif e.kind == MATCH:
                 p.ages[i] = max(int(p.ages[i]), self.filter.config.young)
-                self._lock(e.source)
             if e.kind != SAME:
                 self.segmenters[i] = self._segmenter(k)
             key = (e.kind, e.source)
@@ -309,10 +306,6 @@ class _Run:
                 known[key] = self.begun
                 self.begun += 1
             self.ids[i] = known[key]
-
-    def _lock(self, source: int) -> None:
-        if self.config.lock_after and self.segmap.entered(source) >= self.config.lock_after:
-            self.segmap.lock(source)
 
     def _segmenter(self, k: int) -> Segmenter:
         return Segmenter(

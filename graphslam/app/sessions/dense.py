@@ -12,7 +12,7 @@ from graphslam.app.folders.generations import read_consistently
 from graphslam.app.run.files import read_options, read_report
 from graphslam.app.run.outputs import refined_submaps_of
 from graphslam.app.run.run import Run
-from graphslam.backend.config import BackEndConfig, GpsOptions
+from graphslam.backend.config import MATCH_KERNEL, BackEndConfig, GpsOptions
 from graphslam.backend.sessions import DenseSession, IntraSessionLoop, loops_of_graph, loops_of_network
 from graphslam.core.config import build_config
 from graphslam.core.errors import DataError
@@ -21,7 +21,6 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.evidence.views import has_dense_view
-from graphslam.graph.noise import NO_KERNEL, RobustKernel
 from graphslam.io.g2o import read_g2o
 from graphslam.io.submap_store import read_submaps
 from graphslam.loops.inter_session_loops import SessionMap
@@ -108,8 +107,7 @@ def _inner(run: Run, config: BackEndConfig) -> list[IntraSessionLoop]:
     net = None if run.folder is None else read_consistently(run.folder, lambda root: _graph_of(run, root))
     if net is None:
         raise DataError("a run does not say how its submaps hang together", where=run.name, wanted="its graph.g2o")
-    kernel = NO_KERNEL if config.match_robust == "none" else RobustKernel(config.match_robust, config.match_width)
-    return loops_of_network(net, kernel)
+    return loops_of_network(net, MATCH_KERNEL)
 
 
 def _graph_of(run: Run, root: Path) -> PoseNetwork | None:

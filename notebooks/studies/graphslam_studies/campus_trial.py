@@ -31,7 +31,7 @@ from graphslam.graph.factors.gps import GpsRecord, level_datum_pose
 from graphslam.solve.solution import Solution
 from graphslam_frontends.odometry.dead_reckoning import DeadReckoningNoise
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.scan_window.front_end import ScanWindow, ScanWindowFrontEndConfig, WindowSubmapConfig
+from graphslam_frontends.scan_window.front_end import LIFT, ScanWindow, ScanWindowFrontEndConfig, WindowSubmapConfig
 from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.sim.campus import simulate_campus
 from graphslam_studies.sim.campus_config import CampusConfig
@@ -125,7 +125,7 @@ def without_fixes(end: BackEnd) -> None:
 
 def submap_lift(config: WindowSubmapConfig) -> float:
     """Height of a body over the frame of the submap that begins with it [m]."""
-    return config.lift * config.voxel_size
+    return LIFT * config.voxel_size
 
 
 class Judge:

@@ -224,7 +224,6 @@ def test_bad_motion_is_named_at_once():
         {"association": "likelihood"},
         {"gate": 31.0},
         {"gate": 0.0},
-        {"max_nodes": 0},
         {"min_hits": 0},
         {"max_range": np.inf},
         {"outlier_gate": -1.0},

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from graphslam.core.geometry import se2_compose, wrap_angle
-from graphslam_frontends.landmarks.config import DelayedInitialisation, RbpfEkfConfig
+from graphslam_frontends.landmarks.config import GATE_NEW, DelayedInitialisation, RbpfEkfConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.measurement_kernels import observe_landmark
 from tests.reference.fastslam import SlowParticle, measure, numeric_jacobians
@@ -68,7 +68,7 @@ def test_step_equals_slow_twin(proposal, association, ranges_only, seed, monkeyp
     fast = ParticleSet(config, SENSOR, FOV, 9.0, recorded)
     slow = [SlowParticle() for _ in range(5)]
     margin = np.deg2rad(1.0)
-    values = {"gate": config.gate, "gate_new": config.gate_new, "outlier": outlier or np.inf}
+    values = {"gate": config.gate, "gate_new": GATE_NEW, "outlier": outlier or np.inf}
     gates = {name: {2: v, 1: chi2.isf(chi2.sf(v, 2), 1)} for name, v in values.items()}
     cfg = {"proposal": proposal, **gates, "confirm": config.confirm_hits,
                "misses": config.drop_misses, "scans": config.drop_scans, "miss_range": 9.0,

@@ -11,18 +11,18 @@ from scipy.stats import chi2
 from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError, GeometryError, MissingDataError
 from graphslam.core.log import DropCounter
-from graphslam_frontends.odometry.dead_reckoned_path import (
-    DeadReckonedPath,
-    euler,
-    euler_quat,
-    level_by_euler,
-    tangent_of_state,
-)
+from graphslam.core.poses import remove_roll_pitch
 from graphslam_frontends.odometry.dead_reckoning import (
     DeadReckoningNoise,
     integrate_imu_and_wheels,
 )
 from graphslam_frontends.odometry.gaps import find_gaps
+from graphslam_frontends.odometry.inertial_biases import (
+    euler,
+    euler_quat,
+    tangent_of_state,
+)
+from graphslam_frontends.odometry.motion_prior import MotionPrior
 from tests.reference.imu_drive import NOISE, STILL, drive
 
 TIMES = np.linspace(0.0, 40.0, 101)
@@ -31,7 +31,7 @@ RUNS = 200
 
 def motion(poses: np.ndarray, i: int, j: int, is_level: bool) -> np.ndarray:
     a, b = poses[i], poses[j]
-    return se3.se3_between(level_by_euler(a), level_by_euler(b)) if is_level else se3.se3_between(a, b)
+    return se3.se3_between(remove_roll_pitch(a), remove_roll_pitch(b)) if is_level else se3.se3_between(a, b)
 
 
 @pytest.mark.parametrize("gives_attitude", [True, False])
@@ -110,7 +110,7 @@ def test_independent_increments_promise_too_much() -> None:
     for step, C in zip(r.odometry.increments[1:], r.odometry.covariances[1:]):
         back = se3.se3_adjoint(se3.se3_inverse(step))
         P = back @ P @ back.T + C
-    honest = r.covariance(0, 100)
+    honest = r.between(0, 100)[1]
     assert honest[2, 2] > 5.0 * P[2, 2]
 
 
@@ -118,10 +118,10 @@ def test_transition_equals_differences_of_the_whole_integration() -> None:
     """Errors put into the measurements move the end as the transition says: gyro's bias, wheels' scale, tilt."""
     d = drive(None, stated=STILL)
     r = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE)
-    F = np.linalg.multi_dot(r.transitions[1:][::-1])
+    F = np.linalg.multi_dot(r.biases.transitions[1:][::-1])
     eps = 1e-4
 
-    def state(q: DeadReckonedPath) -> np.ndarray:
+    def state(q: MotionPrior) -> np.ndarray:
         return np.concatenate([[euler(q.poses[-1])[2]], q.poses[-1][:3]])
 
     to_imu = se3.quat_to_matrix(d.imu.T_base_imu[3:])
@@ -145,7 +145,7 @@ def test_tangent_of_state_equals_finite_differences(rng: np.random.Generator) ->
     a, b = (np.concatenate([rng.normal(size=3), euler_quat(*rng.normal(scale=0.4, size=3))]) for _ in range(2))
     eps = 1e-6
     for is_level in (False, True):
-        frames = [level_by_euler(p) if is_level else p for p in (a, b)]
+        frames = [remove_roll_pitch(p) if is_level else p for p in (a, b)]
         G = tangent_of_state(frames[0][None], frames[1][None], level_start=is_level, level_end=is_level)[0]
         for k in range(14):
             e = eps * np.eye(14)[k]
@@ -169,7 +169,7 @@ def test_gaps_are_bridged_with_doubt_and_counted() -> None:
         r = integrate_imu_and_wheels(streams["imu"], streams["wheels"], TIMES, NOISE, drops=drops)
         assert drops.counts == {f"log/{what}: gap bridged": 1}
         # the whole gap's σ over 1.5 s: of the heading 0.3 rad/s, of the distance 0.5 m/s
-        added = (r.covariance(49, 55) - sharp.covariance(49, 55))[inside, inside]
+        added = (r.between(49, 55)[1] - sharp.between(49, 55)[1])[inside, inside]
         expected = (
             (0.3 if what == "imu" else 0.5) * (hole.times[hole.times > 20.5][0] - hole.times[hole.times < 20.5][-1])
         ) ** 2
@@ -193,7 +193,7 @@ def test_a_standing_base_stays_and_only_its_heading_drifts() -> None:
     d = drive(np.random.default_rng(3))
     r = integrate_imu_and_wheels(d.imu, replace(d.wheels, speed=0.0 * d.wheels.speed), TIMES, NOISE)
     np.testing.assert_allclose(r.poses[:, :3], 0.0)
-    C = r.covariance(0, 100)
+    C = r.between(0, 100)[1]
     assert np.abs(np.diag(C)[3:] - NOISE.floor_position**2).max() < 1e-15
     assert np.sqrt(C[2, 2]) > 0.05
 
@@ -229,4 +229,4 @@ def test_one_time_is_a_path_without_motion() -> None:
     np.testing.assert_array_equal(r.odometry.increments, [[0, 0, 0, 0, 0, 0, 1]])
     T, C = r.between(0, 0)
     np.testing.assert_allclose(T, [0, 0, 0, 0, 0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(C, np.diag(r.floor**2), atol=1e-15)
+    np.testing.assert_allclose(C, np.diag(r.biases.floor**2), atol=1e-15)

@@ -11,8 +11,8 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import AckermannGeometry, Gps, Odometry, SteeringControls, VelocityControls
 from graphslam_frontends.odometry.motion import (
     MotionNoise,
+    cut_odometry,
     dead_reckoned_increments,
-    recorded_odometry,
     steering_odometry,
     velocity_odometry,
 )
@@ -127,7 +127,7 @@ def test_recorded_odometry_composes_motion_and_covariance(rng):
     o = recorded(rng)
     at = np.array([0, 3, 4, 11])
     floors = MotionNoise(floor_position=1e-9, floor_heading=1e-9)
-    got = recorded_odometry(o, o.times[at], floors)
+    got = cut_odometry(o, o.times[at], floors)
     for k in range(1, len(at)):
         T_ab, P = np.zeros(3), np.zeros((3, 3))
         for j in range(at[k - 1] + 1, at[k] + 1):
@@ -140,7 +140,7 @@ def test_recorded_odometry_composes_motion_and_covariance(rng):
 def test_a_cut_record_is_driven_at_constant_velocity(rng):
     o = recorded(rng)
     a, b = o.times[4], o.times[5]
-    got = recorded_odometry(o, np.array([a, a + 0.25 * (b - a), b]), MotionNoise())
+    got = cut_odometry(o, np.array([a, a + 0.25 * (b - a), b]), MotionNoise())
     np.testing.assert_allclose(got.increments[1], se2_exp(0.25 * se2_log(o.increments[5])), atol=1e-12)
     np.testing.assert_allclose(se2_compose(got.increments[1], got.increments[2]), o.increments[5], atol=1e-12)
     np.testing.assert_allclose(got.covariances[1], 0.25 * o.covariances[5], atol=2e-8)
@@ -190,4 +190,4 @@ def test_impossible_requests_are_refused(rng):
         times=[0.0, 1.0], increments=np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1)), covariances=np.tile(np.eye(6), (2, 1, 1))
     )
     with pytest.raises(DataError, match="cannot be used"):
-        recorded_odometry(spatial, np.array([0.0, 1.0]), MotionNoise())
+        dead_reckoned_increments(SensorLog(name="l", streams={"odo": spatial}), np.array([0.0, 1.0]), MotionNoise())

@@ -11,8 +11,8 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.log import DropCounter, SensorLog, Truth
 from graphslam.core.point_clouds import PointClouds
-from graphslam_frontends.odometry.dead_reckoned_path import DeadReckonedPath
 from graphslam_frontends.odometry.deskew import assign_steps, cut_beams, stratified_indices
+from graphslam_frontends.odometry.inertial_biases import InertialBiases
 from graphslam_frontends.odometry.make_steps import level_on_the_whole, make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
 from tests.frontends.step_logs import HALF, odometry_of, planar_log, room_log, spoiled
@@ -176,7 +176,7 @@ def test_motion_of_an_imu_and_wheels() -> None:
     assert steps.tilt.shape == (len(steps), 2)
     assert steps.tilt_sigma == pytest.approx(d.imu.noise.attitude)
     assert steps.tilt_time == d.imu.noise.attitude_time
-    assert isinstance(steps.errors, DeadReckonedPath)
+    assert isinstance(steps.errors.biases, InertialBiases)
     assert steps.uses == {"imu", "wheels", "scanner"}
     # moved by the estimated motion inside a step only: within centimetres of the truth
     exact = make_steps(SensorLog(name="exact", streams={"scanner": scans, "odometry": odometry_of(d.truth)}))

@@ -176,7 +176,7 @@ def test_what_makes_no_submap_is_refused() -> None:
     short = ring(0, 2, length=0.3, beams=20)
     with pytest.raises(DataError, match="too few steps"):
         list(scan_window_submaps(short, WINDOW, WindowSubmapConfig()))
-    for bad in ({"length": 0.0}, {"voxel_size": np.nan}, {"lift": 2.0}, {"seconds": -1.0}):
+    for bad in ({"length": 0.0}, {"voxel_size": np.nan}, {"seconds": -1.0}):
         with pytest.raises(ConfigError, match="submap"):
             WindowSubmapConfig(**bad)  # type: ignore[arg-type]
 

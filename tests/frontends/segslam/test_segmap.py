@@ -116,18 +116,6 @@ def test_a_dead_end_of_two_segments_goes_at_once() -> None:
     assert m.alive.tolist() == [0]
 
 
-def test_only_the_heaviest_of_an_interval_are_kept_and_those_lived_through() -> None:
-    m = small_segmap(5, 4)
-    m.open(0, [_new()] * 4)
-    m.close(2, [flat_grid() for _ in range(4)], [straight(ZERO, 1.0 + p, 2) for p in range(4)], [1, 4, 3, 2])
-    m.open(2, [_new()] * 4)
-    m.resample([0, 0, 0, 0])
-    assert m.thin(2) == 1
-    assert m.alive.tolist() == [0, 1, 2]  # 1 and 2 are heaviest, all came through 0
-    with pytest.raises(DataError, match="cannot do without"):
-        m.thin(0)
-
-
 def test_a_locked_map_is_entered_as_a_locked_copy() -> None:
     m = small_segmap(5, 1)
     m.open(0, [_new()])
@@ -287,7 +275,6 @@ OPS = st.one_of(
     st.tuples(st.just("resample"), st.lists(st.integers(0, 2), min_size=3, max_size=3)),
     st.tuples(st.just("cut"), st.lists(st.integers(0, 3), min_size=3, max_size=3), st.integers(0, 99)),
     st.tuples(st.just("prune")),
-    st.tuples(st.just("thin"), st.integers(1, 3)),
 )
 
 
@@ -339,10 +326,8 @@ def test_any_history_gives_what_the_plain_twin_has(ops: list[tuple], seed: int) 
                 grids[p] = flat_grid(pool) if made is None else made
                 paths[p] = [T]
                 twin.open(p, now, kind, source, T)
-        elif op[0] == "prune":
-            assert m.prune() == twin.prune()
         else:
-            assert m.thin(op[1]) == twin.thin(op[1])
+            assert m.prune() == twin.prune()
     assert len(m) == len(twin.segments)
     assert m.alive.tolist() == [i for i, s in enumerate(twin.segments) if s["alive"]]
     for i in m.alive.tolist():

@@ -233,9 +233,9 @@ def test_decisions_come_at_their_rate_and_copies_go_their_own_way() -> None:
 
 def test_configurations_are_checked_and_built_from_tables() -> None:
     c = build_config(
-        SegSlamConfig, {"segmentation": {"period": 20}, "winnowing": {"gap": 30.0}, "search": {"starts": 3}}
+        SegSlamConfig, {"segmentation": {"period": 20}, "winnowing": {"gap": 30.0}, "search": {"grid": 0.4}}
     )
-    assert (c.segmentation.period, c.winnowing.gap, c.search.starts) == (20.0, 30.0, 3)
+    assert (c.segmentation.period, c.winnowing.gap, c.search.grid) == (20.0, 30.0, 0.4)
     assert c.winnowing.drift(100.0) == pytest.approx(4.5)
     assert c.search.yaw_width(1000.0) == 0.8
     for bad in (
@@ -250,7 +250,6 @@ def test_configurations_are_checked_and_built_from_tables() -> None:
         {"localisation": {"particles": 99}},
         {"handover": {"drift_scale": 0.0}},
         {"search": {"grids": 1.0}},
-        {"lock_after": -1},
     ):
         with pytest.raises(ConfigError):
             build_config(SegSlamConfig, bad)

@@ -1,8 +1,4 @@
-"""What dead reckoning from an IMU and wheels gives: poses, and the errors they share.
-
-Errors of an IMU last: one bias of the gyro bends the whole path, and increments that pretend to be independent promise
-a path many times better than it is. The errors that last are therefore carried in the error state, and the covariance
-of a motion over any interval is had by running that state through the interval.
+"""Errors of dead reckoning from an IMU and wheels that outlive a step.
 
 Error state (12), true minus estimated, position in the frame of the path: heading; x, y, z; bias of the gyro (3, base
 frame); scale of the wheels; roll and pitch that fade (Ornstein-Uhlenbeck, 2); roll and pitch that last (2).
@@ -10,16 +6,14 @@ frame); scale of the wheels; roll and pitch that fade (Ornstein-Uhlenbeck, 2); r
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from graphslam.core import se3
-from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
-from graphslam.core.records import Odometry
-from graphslam.core.trajectory import Trajectory
-from graphslam_frontends.odometry.gaps import Gaps
+from graphslam.core.poses import remove_roll_pitch
 
 PSI, POS, GYRO, SCALE, FADING, LASTING = 0, slice(1, 4), slice(4, 7), 7, slice(8, 10), slice(10, 12)
 STATES = 12
@@ -65,78 +59,52 @@ class DeadReckoningErrorModel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DeadReckonedPath:
-    """A dead-reckoned path at given times.
+class InertialBiases:
+    """Errors of a dead-reckoned path as states of a linear system.
+
+    Behind the error state stand two more: errors of roll and pitch at the start of the interval, kept as they were.
 
     Parameters
     ----------
-    odometry : Odometry
-        Increments ``(n, 7)`` with the covariance of what is new in each step: for filters that sample steps as
-        independent. Errors that last are not in it.
+    times : (n,)
+        [s]
     poses : (n, 7)
-        Frame of the path: position and heading of its start, level.
-    path : Trajectory
-        Poses at every record of the sensors, same frame.
-    tilt : (n, 2)
-        Roll and pitch [rad].
+        Of the path.
     transitions, noises : (n, 12, 12)
         Of the error state from pose k - 1 to k; record 0 is identity and zero.
     floor : (6,)
         σ that every covariance has at least: radians, metres.
-    gaps : Gaps
-        Of either stream, bridged.
     """
 
-    odometry: Odometry
+    times: Array
     poses: Array
-    path: Trajectory
-    tilt: Array
     lasting: DeadReckoningErrorModel
     transitions: Array
     noises: Array
     floor: Array
-    gaps: Gaps = field(default_factory=Gaps)
 
-    def between(
-        self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
-    ) -> tuple[Array, Array]:
-        """Motion from pose ``start`` to pose ``end`` and its covariance, errors that last included.
+    @property
+    def sigmas(self) -> Mapping[str, float]:
+        """See :class:`~graphslam_frontends.odometry.motion_prior.BiasStates`."""
+        e = self.lasting
+        return {"yaw_bias": e.gyro_bias, "yaw_walk": e.gyro_walk, "scale": e.wheel_scale, "tilt": e.attitude_bias}
 
-        Parameters
-        ----------
-        start, end : int
-            0 ≤ start ≤ end < n.
-        level_start, level_end : bool
-            True: the frame there has position and heading of the body, but stands level, as frames of submaps do. Such
-            a frame is level by definition; what the sensors get wrong about it is only where it is and heads.
-
-        Returns
-        -------
-        pose : (7,)
-        covariance : (6, 6)
-            Right tangent.
-        """
-        n = len(self.poses)
-        if not 0 <= start <= end < n:
-            raise DataError("no such interval of the path", got=(start, end), wanted=f"0 ≤ start ≤ end < {n}")
-        times = self.odometry.times
-        # two more states: errors of roll and pitch at the start, kept as they were
+    def initial(self, start: int) -> Array:
+        """See :class:`~graphslam_frontends.odometry.motion_prior.BiasStates`."""
         pick = np.vstack([np.eye(STATES), np.eye(STATES)[FADING] + np.eye(STATES)[LASTING]])
-        P = pick @ self.lasting.covariance(float(times[start])) @ pick.T
-        F = np.eye(STATES + 2)
-        for k in range(start + 1, end + 1):
-            F[:STATES, :STATES] = self.transitions[k]
-            P = F @ P @ F.T
-            P[:STATES, :STATES] += self.noises[k]
-        a = level_by_euler(self.poses[start]) if level_start else self.poses[start]
-        b = level_by_euler(self.poses[end]) if level_end else self.poses[end]
-        G = tangent_of_state(a[None], b[None], level_start=level_start, level_end=level_end)[0]
-        C = G @ P @ G.T + np.diag(self.floor**2)
-        return se3.se3_between(a, b), 0.5 * (C + C.T)
+        return np.asarray(pick @ self.lasting.covariance(float(self.times[start])) @ pick.T)
 
-    def covariance(self, start: int, end: int, *, level_start: bool = False, level_end: bool = False) -> Array:
-        """Of :meth:`between` ``(6, 6)``."""
-        return self.between(start, end, level_start=level_start, level_end=level_end)[1]
+    def step(self, k: int) -> tuple[Array, Array]:
+        """See :class:`~graphslam_frontends.odometry.motion_prior.BiasStates`."""
+        F, Q = np.eye(STATES + 2), np.zeros((STATES + 2, STATES + 2))
+        F[:STATES, :STATES], Q[:STATES, :STATES] = self.transitions[k], self.noises[k]
+        return F, Q
+
+    def tangent(self, start: int, end: int, *, level_start: bool, level_end: bool) -> Array:
+        """See :class:`~graphslam_frontends.odometry.motion_prior.BiasStates`."""
+        a = remove_roll_pitch(self.poses[start]) if level_start else self.poses[start]
+        b = remove_roll_pitch(self.poses[end]) if level_end else self.poses[end]
+        return tangent_of_state(a[None], b[None], level_start=level_start, level_end=level_end)[0]
 
 
 def euler(poses: Array) -> Array:
@@ -152,14 +120,6 @@ def euler_quat(roll: Array, pitch: Array, heading: Array) -> Array:
     turns = [(0, roll), (1, pitch), (2, heading)]
     x, y, z = (se3.so3_exp(np.stack([a if i == j else zero for j in range(3)], -1)) for i, a in turns)
     return se3.quat_normalize(se3.quat_multiply(se3.quat_multiply(z, y), x))
-
-
-def level_by_euler(poses: Array) -> Array:
-    """Poses ``(..., 7)`` with position and heading kept, roll and pitch removed."""
-    p = np.asarray(poses, dtype=np.float64)
-    heading = euler(p)[..., 2]
-    zero = np.zeros_like(heading)
-    return np.concatenate([p[..., :3], euler_quat(zero, zero, heading)], -1)
 
 
 def tangent_of_state(start: Array, end: Array, *, level_start: bool, level_end: bool) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,48 +13,21 @@ from graphslam.core.geometry import Array
 from graphslam.core.imu import Imu
 from graphslam.core.log import DropCounter, SensorLog
 from graphslam.core.records import Odometry, SteeringControls, VelocityControls
-from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.grid.motion import roll_pitch_of
 from graphslam_frontends.odometry.dead_reckoning import integrate_imu_and_wheels
 from graphslam_frontends.odometry.gaps import Gaps, find_gaps
-from graphslam_frontends.odometry.motion import steering_odometry, velocity_odometry
+from graphslam_frontends.odometry.motion import cut_odometry, steering_odometry, velocity_odometry
+from graphslam_frontends.odometry.motion_prior import MotionPrior, OdometryBiases
 from graphslam_frontends.odometry.recorded import (
-    RecordedErrors,
     add_yaw_bias,
     bridge_gap,
     chain_odometry,
-    cut_odometry,
     without_yaw_per_metre,
 )
 from graphslam_frontends.odometry.step_config import StepConfig
-from graphslam_frontends.odometry.steps import IntervalCovariance
 
 TILT_TIME = 10.0
 """Time over which errors of the roll and pitch of recorded odometry stay alike [s]."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StepMotion:
-    """Motion at the stamps of steps, and the path between them.
-
-    Parameters
-    ----------
-    poses : (n, 7) or (n, 3)
-    path : Trajectory
-        In the frame of ``poses``; covers ``span``.
-    tilt : (n, 2) or None
-    gaps : Gaps
-        In which the motion is a guess.
-    """
-
-    odometry: Odometry
-    poses: Array
-    path: Trajectory
-    errors: IntervalCovariance
-    tilt: Array | None = None
-    tilt_sigma: float = 0.0
-    tilt_time: float = 1.0
-    gaps: Gaps = field(default_factory=Gaps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +41,14 @@ class MotionSource:
     begin, end : float
         What they cover [s].
     solve : callable
-        (stamps of the steps, further stamps, drops) → :class:`StepMotion` whose path covers all of them.
+        (stamps of the steps, further stamps, drops) → prior whose path covers all of them.
     """
 
     names: tuple[str, ...]
     dim: int
     begin: float
     end: float
-    solve: Callable[[Array, Array, DropCounter | None], StepMotion]
+    solve: Callable[[Array, Array, DropCounter | None], MotionPrior]
 
 
 def motion_source(log: SensorLog, config: StepConfig, dim: int) -> MotionSource:
@@ -132,21 +105,10 @@ def _inertial(
         noise = replace(imu.noise, gyro_bias=float(np.hypot(imu.noise.gyro_bias, config.yaw_bias)))
         imu = replace(imu, angular_rate=imu.angular_rate + to_imu, noise=noise)
 
-    def solve(times: Array, further: Array, drops: DropCounter | None) -> StepMotion:
+    def solve(times: Array, further: Array, drops: DropCounter | None) -> MotionPrior:
         since = min(float(times[0]), float(further.min(initial=times[0])))
-        r = integrate_imu_and_wheels(
+        return integrate_imu_and_wheels(
             imu, wheels, times, config.noise, since=since, longest=config.longest_record, where=log.name, drops=drops
-        )
-        lasting = r.lasting
-        return StepMotion(
-            odometry=r.odometry,
-            poses=r.poses,
-            path=r.path,
-            errors=r,
-            tilt=r.tilt,
-            tilt_sigma=float(np.hypot(lasting.attitude, lasting.attitude_bias)),
-            tilt_time=lasting.attitude_time,
-            gaps=r.gaps,
         )
 
     begin = float(max(imu.times[0], wheels.times[0]))
@@ -159,9 +121,9 @@ def _spacing(stamps: Array) -> float:
     return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
 
 
-def _errors(odometry: Odometry, config: StepConfig) -> RecordedErrors:
+def _biases(odometry: Odometry, config: StepConfig) -> OdometryBiases:
     bias = float(np.hypot(config.lasting_yaw_bias, config.yaw_bias))
-    return RecordedErrors(odometry=odometry, yaw_bias=bias, scale=config.lasting_scale)
+    return OdometryBiases(odometry=odometry, yaw_bias=bias, scale=config.lasting_scale)
 
 
 def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig) -> MotionSource:
@@ -176,11 +138,11 @@ def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig)
         odometry = add_yaw_bias(odometry, config.yaw_bias)
     whole = chain_odometry(odometry) if config.yaw_bias else upright
 
-    def solve(times: Array, _: Array, drops: DropCounter | None) -> StepMotion:
+    def solve(times: Array, _: Array, drops: DropCounter | None) -> MotionPrior:
         sure, gaps = bridge_gap(odometry, config.longest_record, where=f"{log.name}/{name}", drops=drops)
         cut = cut_odometry(sure, times, config.controls)
         poses = whole.interpolate(times)
-        motion = StepMotion(odometry=cut, poses=poses, path=whole, errors=_errors(cut, config), gaps=gaps)
+        motion = MotionPrior(odometry=cut, poses=poses, path=whole, biases=_biases(cut, config), gaps=gaps)
         if not config.odometry_tilt_sigma:
             return motion
         return replace(
@@ -206,7 +168,7 @@ def _controlled(
             return steering_odometry(controls, times, config.controls)
         return velocity_odometry(controls, times, config.controls)
 
-    def solve(times: Array, further: Array, drops: DropCounter | None) -> StepMotion:
+    def solve(times: Array, further: Array, drops: DropCounter | None) -> MotionPrior:
         span = (float(times[0]), float(times[-1]))
         where = f"{log.name}/{name}"
         gaps = find_gaps(controls.times, *span, config.longest_record, where=where, drops=drops)
@@ -215,7 +177,7 @@ def _controlled(
         poses = path.poses[np.searchsorted(path.times, times)]
         if len(times) > 1 and not np.all(np.isfinite(poses)):
             raise DataError("dead reckoning is not finite", where=where)
-        return StepMotion(odometry=odometry, poses=poses, path=path, errors=_errors(odometry, config), gaps=gaps)
+        return MotionPrior(odometry=odometry, poses=poses, path=path, biases=_biases(odometry, config), gaps=gaps)
 
     end = float(controls.times[-1]) + _spacing(controls.times)
     return MotionSource((name,), 2, float(controls.times[0]), end, solve)
