@@ -39,7 +39,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.join import registry as joining
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import Refinement, refine_by_scans
+from graphslam.refine.refine import refine_by_scans
+from graphslam.refine.result import Refinement
 from graphslam.refine.scans import Scans
 from graphslam.solve import registry
 from graphslam_frontends.odometry.make_steps import make_steps

@@ -24,7 +24,8 @@ from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import refined_map, refined_submaps
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import Refinement, ScanCheck, refine_by_scans, refine_if_contradicted
+from graphslam.refine.refine import refine_by_scans, refine_if_contradicted
+from graphslam.refine.result import Refinement, ScanCheck
 from graphslam.refine.revisit_constraints import FAR, tangent_lengths
 from graphslam.refine.scans import Scans
 

@@ -31,7 +31,7 @@ from graphslam.graph.factors.control import survey_terms
 from graphslam.graph.factors.range import antennas
 from graphslam.graph.sensors.control import ControlFactors
 from graphslam.graph.sensors.gps import arm_jacobian
-from graphslam.refine.refine import Refinement
+from graphslam.refine.result import Refinement
 
 Word = Literal["consistent", "conservative", "overconfident", "wrong", "not tested"]
 CONFIDENCE = 0.95

@@ -16,7 +16,7 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.metrics import Metrics, end_metrics, match_ids
 from graphslam.maps.global_map import GlobalMap
 from graphslam.maps.refined import steps_at
-from graphslam.refine.refine import Refinement
+from graphslam.refine.result import Refinement
 
 
 def level_truth(

@@ -59,6 +59,105 @@ class SubmapBlocks(NamedTuple):
     """(S,)"""
 
 
+class SubmapTerms(NamedTuple):
+    """What residual and Jacobian of a submap with n entries are made of."""
+
+    q: Array
+    """(n + 1, 2): the end and all points in the frame of the start."""
+    h: Array
+    """(n + 1, 2): what their residuals change by with the end's heading, in the chart."""
+    r: Array
+    """(3 + 2n,): ``H(X) - z`` (eq. 15) in its chart."""
+
+
+@njit
+def submap_terms(
+    ends: tuple[Array, Array], points: Array, rows: Index, z: Array, places: int, group: bool, out: SubmapTerms
+) -> tuple[float, float, float, float, float, float]:
+    """Residual of a submap; returns ``a, b`` of V⁻¹ and cosine and sine of the start's heading and of the turn.
+
+    Parameters
+    ----------
+    ends : (start, end)
+        Poses (x, y, θ).
+    rows : (n,)
+        Row of each entry among the points.
+    places : int
+        Entries from this one on are pairs of constants: they have no frame, and no chart.
+    """
+    start, end = ends
+    q, h, r = out
+    ca, sa = np.cos(start[2]), np.sin(start[2])
+    t = end[2] - start[2] - z[2]
+    t = np.pi - ((np.pi - t) % (2.0 * np.pi))
+    va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
+    if group:
+        va, vb, slope = inverse_left_jacobian_kernel(t)
+        half = 0.5
+    for i in range(places, len(rows)):
+        k = 3 + 2 * i
+        r[k], r[k + 1] = points[rows[i], 0] - z[k], points[rows[i], 1] - z[k + 1]
+    for i in range(places + 1):
+        if i == 0:
+            dx, dy = end[0] - start[0], end[1] - start[1]
+        else:
+            dx, dy = points[rows[i - 1], 0] - start[0], points[rows[i - 1], 1] - start[1]
+        q[i, 0] = ca * dx + sa * dy
+        q[i, 1] = -sa * dx + ca * dy
+        k = 0 if i == 0 else 1 + 2 * i
+        ex, ey = q[i, 0] - z[k], q[i, 1] - z[k + 1]
+        r[k], r[k + 1] = va * ex + vb * ey, va * ey - vb * ex
+        h[i, 0], h[i, 1] = slope * ex + half * ey, slope * ey - half * ex
+    r[2] = t
+    return va, vb, ca, sa, np.cos(end[2] - start[2]), np.sin(end[2] - start[2])
+
+
+@njit
+def times_submap_jacobian(
+    L: Array, terms: SubmapTerms, turns: tuple[float, float, float, float, float, float], places: int, M: Array
+) -> None:
+    """``M = L J`` ``(k, 6 + 2n)`` for any L ``(k, 3 + 2n)``, right tangents of ``[start (3), end (3), entries…]``.
+
+    ``turns`` are those of :func:`submap_terms`.
+    """
+    q, h, _ = terms
+    va, vb, ca, sa, ce, se = turns
+    for row in range(L.shape[0]):
+        sx, sy, st = 0.0, 0.0, 0.0
+        turn = L[row, 2]
+        for i in range(places + 1):
+            k = 0 if i == 0 else 1 + 2 * i
+            lx, ly = L[row, k], L[row, k + 1]
+            turn += lx * h[i, 0] + ly * h[i, 1]
+            lx, ly = va * lx - vb * ly, vb * lx + va * ly
+            sx += lx
+            sy += ly
+            st += lx * q[i, 1] - ly * q[i, 0]
+            if i == 0:  # d/dx_end: R_sᵀ R_e
+                M[row, 3] = lx * ce + ly * se
+                M[row, 4] = -lx * se + ly * ce
+            else:  # d/dl: R_sᵀ
+                M[row, 4 + 2 * i] = lx * ca - ly * sa
+                M[row, 5 + 2 * i] = lx * sa + ly * ca
+        for k in range(3 + 2 * places, L.shape[1]):
+            M[row, k + 3] = L[row, k]
+        M[row, 0], M[row, 1], M[row, 2] = -sx, -sy, st - turn
+        M[row, 5] = turn
+
+
+@njit
+def whiten_submap(
+    ends: tuple[Array, Array], points: Array, rows: Index, z: Array, places: int, group: bool, W: Array
+) -> tuple[Array, Array]:
+    """``W r`` and ``W J`` of one submap; see :func:`submap_terms` and :func:`times_submap_jacobian`."""
+    n = len(rows)
+    terms = SubmapTerms(np.empty((n + 1, 2)), np.empty((n + 1, 2)), np.empty(3 + 2 * n))
+    turns = submap_terms(ends, points, rows, z, places, group, terms)
+    M = np.empty((W.shape[0], 6 + 2 * n))
+    times_submap_jacobian(W, terms, turns, places, M)
+    return W @ terms.r, M
+
+
 @njit
 def submap_blocks(poses: Array, points: Array, submaps: SubmapFactorArrays, hessian: bool, out: SubmapBlocks) -> None:
     """Objective, gradient block and Gauss-Newton block of every submap (eq. 15–16, right tangents).
@@ -75,99 +174,29 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapFactorArrays, hess
     start, entry_offset, entry_row, z, z_offset, info, info_offset, group, constant = submaps
     H, H_offset, g, g_offset, chi2 = out
     for s in range(start.shape[0]):
-        a, b = start[s], start[s] + 1
-        e0, e1 = entry_offset[s], entry_offset[s + 1]
-        n = e1 - e0
-        m = 3 + 2 * n
-        d = 6 + 2 * n
-        z0 = z_offset[s]
+        rows = entry_row[entry_offset[s] : entry_offset[s + 1]]
+        n = len(rows)
+        m, d = 3 + 2 * n, 6 + 2 * n
         L = info[info_offset[s] : info_offset[s] + m * m].reshape(m, m)
-        ca, sa = np.cos(poses[a, 2]), np.sin(poses[a, 2])
-        t = poses[b, 2] - poses[a, 2] - z[z0 + 2]
-        t = np.pi - ((np.pi - t) % (2.0 * np.pi))
-        va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
-        if group[s]:
-            va, vb, slope = inverse_left_jacobian_kernel(t)
-            half = 0.5
-        # q: everything in the start frame; r = H(X) - z (eq. 15) in its chart; h: what it changes by with the heading
-        q = np.empty((n + 1, 2))
-        h = np.empty((n + 1, 2))
-        r = np.empty(m)
         places = n  # constants stand last
-        while places > 0 and entry_row[e0 + places - 1] >= constant:
+        while places > 0 and rows[places - 1] >= constant:
             places -= 1
-            row, k = entry_row[e0 + places], 3 + 2 * places
-            r[k], r[k + 1] = points[row, 0] - z[z0 + k], points[row, 1] - z[z0 + k + 1]
-        for i in range(places + 1):
-            if i == 0:
-                dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
-            else:
-                row = entry_row[e0 + i - 1]
-                dx, dy = points[row, 0] - poses[a, 0], points[row, 1] - poses[a, 1]
-            q[i, 0] = ca * dx + sa * dy
-            q[i, 1] = -sa * dx + ca * dy
-            k = 0 if i == 0 else 1 + 2 * i
-            ex, ey = q[i, 0] - z[z0 + k], q[i, 1] - z[z0 + k + 1]
-            r[k], r[k + 1] = va * ex + vb * ey, va * ey - vb * ex
-            h[i, 0], h[i, 1] = slope * ex + half * ey, slope * ey - half * ex
-        r[2] = t
-        Lr = L @ r
-        chi2[s] = np.dot(r, Lr)
+        terms = SubmapTerms(np.empty((n + 1, 2)), np.empty((n + 1, 2)), np.empty(m))
+        r = terms.r
+        ends = poses[start[s]], poses[start[s] + 1]
+        turns = submap_terms(ends, points, rows, z[z_offset[s] : z_offset[s] + m], places, group[s], terms)
+        chi2[s] = np.dot(r, L @ r)
         if not hessian:
             continue
-        ce, se = np.cos(poses[b, 2] - poses[a, 2]), np.sin(poses[b, 2] - poses[a, 2])
-        M = np.zeros((m, d))  # Λ J, column block by column block
-        for row in range(m):
-            sx, sy, st = 0.0, 0.0, 0.0
-            turn = L[row, 2]
-            for i in range(places + 1):
-                k = 0 if i == 0 else 1 + 2 * i
-                lx, ly = L[row, k], L[row, k + 1]
-                turn += lx * h[i, 0] + ly * h[i, 1]
-                lx, ly = va * lx - vb * ly, vb * lx + va * ly
-                sx += lx
-                sy += ly
-                st += lx * q[i, 1] - ly * q[i, 0]
-                c = 3 if i == 0 else 4 + 2 * i
-                if i == 0:  # d/dx_end: R_sᵀ R_e
-                    M[row, 3] = lx * ce + ly * se
-                    M[row, 4] = -lx * se + ly * ce
-                else:  # d/dl: R_sᵀ
-                    M[row, c] = lx * ca - ly * sa
-                    M[row, c + 1] = lx * sa + ly * ca
-            for k in range(3 + 2 * places, m):
-                M[row, k + 3] = L[row, k]
-            M[row, 0], M[row, 1], M[row, 2] = -sx, -sy, st - turn
-            M[row, 5] = turn
-        h0 = H_offset[s]
-        g0 = g_offset[s]
-        B = H[h0 : h0 + d * d].reshape(d, d)
-        for c in range(d):  # Jᵀ M, the same sparsity of J applied to rows
-            sx, sy, st = 0.0, 0.0, 0.0
-            turn = M[2, c]
-            for i in range(places + 1):
-                k = 0 if i == 0 else 1 + 2 * i
-                lx, ly = M[k, c], M[k + 1, c]
-                turn += lx * h[i, 0] + ly * h[i, 1]
-                lx, ly = va * lx - vb * ly, vb * lx + va * ly
-                sx += lx
-                sy += ly
-                st += lx * q[i, 1] - ly * q[i, 0]
-                if i == 0:
-                    B[3, c] = lx * ce + ly * se
-                    B[4, c] = -lx * se + ly * ce
-                else:
-                    B[4 + 2 * i, c] = lx * ca - ly * sa
-                    B[5 + 2 * i, c] = lx * sa + ly * ca
-            for k in range(3 + 2 * places, m):
-                B[k + 3, c] = M[k, c]
-            B[0, c], B[1, c], B[2, c] = -sx, -sy, st - turn
-            B[5, c] = turn
+        M = np.zeros((m, d))  # Λ J
+        times_submap_jacobian(L, terms, turns, places, M)
+        B = H[H_offset[s] : H_offset[s] + d * d].reshape(d, d)
+        times_submap_jacobian(M.T, terms, turns, places, B.T)  # Jᵀ M
         for c in range(d):
             v = 0.0
             for row in range(m):
                 v += M[row, c] * r[row]
-            g[g0 + c] = v
+            g[g_offset[s] + c] = v
 
 
 @njit

@@ -19,7 +19,7 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.pool import GridPool
 from graphslam.evidence.spilled_grid import spill_grid
 from graphslam.maps.global_map import GlobalMap
-from graphslam.refine.refine import Refinement
+from graphslam.refine.result import Refinement
 from graphslam.refine.scans import Scans
 
 Index = npt.NDArray[np.int64]

@@ -141,6 +141,13 @@ LEAST_SPREAD = 1e-3
 """No surface is known better [m]."""
 
 
+def agreeing_share(found: SurfacePairs, r: Array, noise: Array) -> float:
+    """Share of the source points with a surface within reach that lie on it, to three times their σ."""
+    near = np.maximum(1.0 - r**2 / (9.0 * found.once @ noise), 0.0)
+    weight = 1.0 / found.spent[:, 1]
+    return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
+
+
 def point_information(pairs: SurfacePairs, residuals: Array, noise: Array, least: float = 0.0) -> Array:
     """Information of each pair: Geman–McClure weight over the variance of what it newly spends.
 

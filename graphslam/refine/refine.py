@@ -23,18 +23,20 @@ from graphslam.core.records import Gps
 from graphslam.core.spill_cache import CacheEntry
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.refine.config import DISTANCES, MOST_BEAMS, RefineConfig
-from graphslam.refine.fixes import FixModel, FixReport
+from graphslam.refine.fixes import FixModel
 from graphslam.refine.motion import MotionModel, States
-from graphslam.refine.nodes import StepsBetweenNodes, find_nodes, path_between, scans_at, thin_beams
+from graphslam.refine.nodes import StepsBetweenNodes, find_nodes, scans_at, thin_beams
 from graphslam.refine.problem import (
     LinearisedProblem,
     RefinementProblem,
+    agreeing_share,
     chunk_information,
     correlation_factor,
     pair_noise,
     point_information,
     surface_residuals,
 )
+from graphslam.refine.result import AttemptComparison, Refinement, RefinementRound, ScanCheck
 from graphslam.refine.revisit_constraints import ACCEPTED, RevisitConstraints, find_revisit_constraints
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import (
@@ -63,8 +65,6 @@ WIDE = 3.0, 2.0
 """Greatest distances of pairs before those of the configuration, where no guide brought passes together [m]."""
 DOUBTED = 0.2
 """Residuals below this share of the greatest distance of a pair are not doubted."""
-REACH = 10.0, 30.0
-"""Least and greatest distance of chunks that may see the same surfaces, where the log says which [m]."""
 FEWEST = 3
 """Chunks of one pass that a chunk is paired with at least; over a reach there lie so many as fit."""
 KEPT = 2
@@ -75,174 +75,6 @@ CHUNK_TIME = 10.0
 """… the longest time of such a chunk, for robots that stand still [s] …"""
 CHUNK_TURN = 0.5
 """… and in the plane the greatest turn within it [rad]; a scanner that looks one way soon sees other walls."""
-AGREEMENT_NOISE = 0.01
-"""Shares of agreeing points of two paths that differ by less than this do not rank the paths."""
-
-
-@dataclass(frozen=True, slots=True)
-class RefinementRound:
-    """One association and what followed.
-
-    Parameters
-    ----------
-    distance : float
-        Greatest distance of a pair [m].
-    range_sigma, surface_sigma : float
-        σ of a range and of the surfaces themselves [m].
-    pairs, passes : int
-        Pairs of points, and how many of them between different passes.
-    spread : float
-        1.48 × the median absolute residual [m].
-    moved : float
-        RMS by which positions changed [m].
-    """
-
-    distance: float
-    range_sigma: float
-    surface_sigma: float
-    pairs: int
-    passes: int
-    spread: float
-    moved: float
-
-
-@dataclass(frozen=True, slots=True)
-class AttemptComparison:
-    """Two attempts, from the start and from the odometry alone.
-
-    Parameters
-    ----------
-    apart : float
-        RMS distance between their paths [m].
-    kept, left : float
-        Agreement of the scans at the path that was kept, and at the other, to the same noise.
-    taken : bool
-        That from the odometry was kept.
-    """
-
-    apart: float
-    kept: float
-    left: float
-    taken: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ScanCheck:
-    """Do the scans contradict a path? Measured before anything is refined.
-
-    Parameters
-    ----------
-    odometry, start : float
-        Share of the points of passes and neighbours that lie on the surfaces of the others, along the path of the
-        odometry and along the path that was checked, to the same noise.
-    refused : (m, 2)
-        Steps that the path draws together although the scans between contradict it.
-    """
-
-    odometry: float
-    start: float
-    refused: Index
-
-    @property
-    def contradicted(self) -> bool:
-        """Do the scans agree better along the odometry, or does the path draw steps together wrongly?"""
-        return len(self.refused) > 0 or self.odometry > self.start + AGREEMENT_NOISE
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """A refined path with its uncertainty, and what was found on the way.
-
-    Parameters
-    ----------
-    times : (n,)
-    poses : (n, 7) or (n, 3)
-        In the frame of the start, whose first position and heading are held.
-    covariances : (n, d, d)
-        Right tangent, first position and heading held.
-    start : (n, 7) or (n, 3)
-    yaw_bias : (k, 2)
-        Time [s] and bias of the yaw rate [rad/s] at the knots.
-    constants : dict of str to (value, σ)
-        ``scale``, ``side``, ``rise``, ``clock``, ``roll``, ``pitch``; ``bend``, ``turn``.
-    parts : dict of str to float
-        Objective by kind of factor at the end.
-    refused : (m, 2)
-        Steps that the start drew together although the scans between contradict it.
-    agreement : (start, refined)
-        Share of the points of passes and neighbours that lie on the surfaces of the others, at both paths.
-    reckoned : float
-        The same share at the path of the odometry alone.
-    other : AttemptComparison or None
-        The second attempt, from the odometry, where the start contradicts the scans or the odometry agrees better.
-    scales : (c,)
-        By which the σ of the odometry's components were widened, since the scans show more.
-    walk : float
-        The same of the walk of the yaw bias.
-    motion : float
-        χ² of the walk of the yaw bias by its degrees of freedom: far above 1 where the scans of passes and the motion
-        contradict each other.
-    solved : LinearisedProblem
-        The last linearisation, for joint covariances.
-    nodes : (m,)
-        Steps that are nodes of the problem; between them the path follows the odometry.
-    between : StepsBetweenNodes
-        How the steps lie between nodes, and what they do not share with any.
-    fixes : FixReport or None
-        What fixes did; None: there were none, or their way is too short to say where north is.
-    alike : float
-        By how much sums of residuals of one scan vary more than independent errors would, for which covariances are
-        larger; 1: no more.
-    left : float or None
-        Agreement at the refined path where that of the odometry was taken instead, since scans agree better there.
-    """
-
-    times: Array
-    poses: Array
-    covariances: Array
-    start: Array
-    yaw_bias: Array
-    constants: dict[str, tuple[float, float]]
-    rounds: tuple[RefinementRound, ...]
-    parts: dict[str, float]
-    refused: Index
-    agreement: tuple[float, float]
-    reckoned: float
-    other: AttemptComparison | None
-    scales: Array
-    walk: float
-    motion: float
-    solved: LinearisedProblem
-    nodes: Index
-    between: StepsBetweenNodes
-    fixes: FixReport | None = None
-    alike: float = 1.0
-    left: float | None = None
-
-    @property
-    def better(self) -> bool:
-        """Do the scans agree with each other at the refined path at least as well as at the start?"""
-        return self.agreement[1] >= self.agreement[0]
-
-    @property
-    def input_better(self) -> bool:
-        """Do they agree better at the path of the odometry than at the start and at the refined path?"""
-        return self.reckoned > max(self.agreement)
-
-    def joint(self, steps: npt.ArrayLike) -> Array:
-        """Joint covariance of some steps ``(k·d, k·d)``."""
-        d, m = self.covariances.shape[1], self.between
-        k = np.asarray(steps, np.int64)
-        rows, at = np.unique(np.concatenate([m.a[k], m.b[k]]), return_inverse=True)
-        P = self.solved.factor.inverse_block((rows[:, None] * d + np.arange(d)).ravel())
-        J = np.zeros((len(k), d, len(rows), d))
-        every = np.arange(len(k))
-        J[every, :, at[: len(k)]] += m.by_a[k]
-        J[every, :, at[len(k) :]] += m.by_b[k]
-        rows_of = J.reshape(len(k) * d, -1)
-        C = (rows_of @ P @ rows_of.T).reshape(len(k), d, len(k), d)
-        C[every, :, every] += m.own[k]
-        return np.asarray(C.reshape(len(k) * d, -1))
 
 
 def refine_by_scans(
@@ -265,7 +97,7 @@ def refine_by_scans(
         Told each round in words.
     """
     work, nodes = _begin(steps, start, config or RefineConfig(), gps, progress)
-    return _at_all_steps(work.run(), steps, start, nodes)
+    return work.run().at_all_steps(steps, start, nodes)
 
 
 def refine_if_contradicted(
@@ -281,7 +113,7 @@ def refine_if_contradicted(
     """
     work, nodes = _begin(steps, start, config or RefineConfig(), None, progress)
     check = work.check()
-    return _at_all_steps(work.run(), steps, start, nodes) if check.contradicted else check
+    return work.run().at_all_steps(steps, start, nodes) if check.contradicted else check
 
 
 def _begin(
@@ -316,30 +148,6 @@ def _begin(
     return work, nodes
 
 
-def _at_all_steps(found: Refinement, steps: Scans, start: Array, nodes: Index) -> Refinement:
-    """A refinement of some steps, with the steps between them along the odometry."""
-    if len(nodes) == len(steps):
-        return found
-    poses, covariances, between = path_between(steps, nodes, found.poses, found.covariances, found.scales)
-    return replace(
-        found,
-        times=steps.times,
-        poses=poses,
-        covariances=covariances,
-        start=start,
-        refused=nodes[found.refused],
-        nodes=nodes,
-        between=between,
-    )
-
-
-def agreeing_share(found: SurfacePairs, r: Array, noise: Array) -> float:
-    """Share of the source points with a surface within reach that lie on it, to three times their σ."""
-    near = np.maximum(1.0 - r**2 / (9.0 * found.once @ noise), 0.0)
-    weight = 1.0 / found.spent[:, 1]
-    return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
-
-
 @dataclass(frozen=True, slots=True)
 class _Attempt:
     poses: Array
@@ -352,14 +160,6 @@ class _Attempt:
     rounds: list[RefinementRound]
     scales: Array
     walk: float
-
-
-def _reach(steps: Scans) -> float:
-    """The range that three quarters of the returns stay below: two places that far apart see the same things [m]."""
-    points = (steps.points - steps.origins)[steps.returns]
-    if not len(points):
-        return REACH[0]
-    return float(np.clip(np.quantile(np.linalg.norm(points[:: 1 + len(points) // 100_000], axis=1), 0.75), *REACH))
 
 
 NOTHING = SurfacePairs(
@@ -396,7 +196,7 @@ class _Refiner:
         self.surfaces: Surfaces | None = None
         self.first: CacheEntry[Surfaces] | None = None
         self.length = float(steps.path_length[-1])
-        self.reach = config.reach if config.reach is not None else _reach(steps)
+        self.reach = config.reach if config.reach is not None else steps.reach
         self.most = max(FEWEST, round(self.reach / CHUNK_LENGTH))
         self.guided: tuple[RevisitConstraints, npt.NDArray[np.bool_]] | None = None
 

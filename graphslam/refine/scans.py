@@ -34,6 +34,8 @@ FIELDS: dict[str, Field] = {
 }
 LASTING = ("yaw_bias", "yaw_walk", "scale", "direction", "clock", "tilt", "bend", "turn")
 """``scalars``: max_range, tilt_sigma, tilt_time, these lasting errors, ``matched`` (0 where missing)."""
+REACH = 10.0, 30.0
+"""Least and greatest distance of chunks that may see the same surfaces, where the log says which [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,6 +109,14 @@ class Scans:
     def path_length(self) -> Array:
         """Metres driven until each step ``(n,)``, by the odometry."""
         return np.cumsum(np.linalg.norm(self.odometry.increments[:, : self.group.dim], axis=1))
+
+    @property
+    def reach(self) -> float:
+        """The range that three quarters of the returns stay below: places that far apart see the same things [m]."""
+        points = (self.points - self.origins)[self.returns]
+        if not len(points):
+            return REACH[0]
+        return float(np.clip(np.quantile(np.linalg.norm(points[:: 1 + len(points) // 100_000], axis=1), 0.75), *REACH))
 
     def scan(self, k: int) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         """Points ``(m, dim)``, origins ``(m, dim)`` and returns ``(m,)`` of step k."""

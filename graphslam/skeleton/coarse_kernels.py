@@ -13,22 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.jit import njit
+from graphslam.skeleton.block_table_kernels import _find, _grown
 from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 Array = npt.NDArray[np.float64]
-
-
-class BlockTable(NamedTuple):
-    """Blocks (row, column), row ≤ column, by open addressing; made by :func:`make_block_table`."""
-
-    key: npt.NDArray[np.int64]
-    """(2^b,): row · keyframes + column, -1 where free."""
-    place: npt.NDArray[np.int32]
-    """(2^b,)"""
-    block: Array
-    """(capacity, 6, 6)"""
-    filled: npt.NDArray[np.int64]
-    """(1,): blocks so far."""
 
 
 class PendingLandmarks(NamedTuple):
@@ -61,60 +49,6 @@ def make_pending(landmarks):
         np.empty((16, 6)),
         ends,
     )
-
-
-@njit(nogil=True)
-def make_block_table(capacity):
-    """An empty table for ``capacity`` blocks."""
-    size = 16
-    while size < 2 * capacity:
-        size *= 2
-    return BlockTable(
-        np.full(size, -1, np.int64),
-        np.zeros(size, np.int32),
-        np.zeros((capacity, 6, 6)),
-        np.zeros(1, np.int64),
-    )
-
-
-@njit(nogil=True)
-def _find(table, key):
-    """Place of a block; it is made where there is none."""
-    mask = len(table.key) - 1
-    at = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
-    while table.key[at] != key:
-        if table.key[at] < 0:
-            table.key[at] = key
-            table.place[at] = table.filled[0]
-            table.filled[0] += 1
-            break
-        at = (at + 1) & mask
-    return table.place[at]
-
-
-@njit(nogil=True)
-def _grown(table):
-    """The same table with twice the room."""
-    n = table.filled[0]
-    big = make_block_table(2 * len(table.block))
-    big.block[:n] = table.block[:n]
-    keys = np.empty(n, np.int64)
-    for at in range(len(table.key)):
-        if table.key[at] >= 0:
-            keys[table.place[at]] = table.key[at]
-    for i in range(n):
-        _find(big, keys[i])
-    return big
-
-
-@njit(nogil=True)
-def sorted_block_keys(table):
-    """Keys in the order of the blocks."""
-    keys = np.empty(table.filled[0], np.int64)
-    for at in range(len(table.key)):
-        if table.key[at] >= 0:
-            keys[table.place[at]] = table.key[at]
-    return keys
 
 
 @njit(nogil=True, error_model="numpy")

@@ -14,6 +14,7 @@ from graphslam.linear.block_cholesky import BlockFactor, BlockSymbolic
 from graphslam.linear.symmetric_factor import elimination_order
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import coarse_kernels as kernels
+from graphslam.skeleton.block_table_kernels import make_block_table, sorted_block_keys
 from graphslam.skeleton.schur import Network, inverse_of
 
 Index = npt.NDArray[np.int64]
@@ -81,12 +82,12 @@ class KeyframeNetwork:
         problem, poses = network.layout.problem, network.poses
         self.k, self.frames, self.position = k, keyframes_of(problem.poses, k), poses.position
         count = network.layout.counts.copy()
-        table = kernels.make_block_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
+        table = make_block_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
         landmarks, waiting = (network.landmarks, network.inverse), kernels.make_pending(problem.landmarks)
         for a, b in _interval_chunks(network, k, 0, self.frames - 1):
             sight = problem.sightings_of(*_poses_of(problem.poses, k, a, b))
             waiting, table = kernels.keyframe_network(sight, poses, landmarks, k, (a, b), count, waiting, table)
-        keys = kernels.sorted_block_keys(table)
+        keys = sorted_block_keys(table)
         self.blocks = table.block[: len(keys)]
         diagonal, upper = keyframe_chain_blocks(network, k)
         c = np.arange(self.frames, dtype=np.int64)

@@ -7,7 +7,7 @@ import scipy.sparse as sp
 
 from graphslam.core.errors import SolverError
 from graphslam.core.geometry import Array
-from graphslam.skeleton import coarse_kernels
+from graphslam.skeleton import block_table_kernels
 from graphslam.skeleton import reduction_kernels as kernels
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.schur import Network
@@ -51,11 +51,11 @@ class ReducedNetwork:
                 f"the thinned network of {N} poses has {per_pose:.0f} blocks a pose: about {bytes_ / 1e9:.1f} GB; "
                 f"wanted at most {limit / 1e9:.1f} GB. The method 'gn' applies the same matrix without forming it"
             )
-        table = coarse_kernels.make_block_table(int(1.3 * N * (per_pose + 2)) + 64)
+        table = block_table_kernels.make_block_table(int(1.3 * N * (per_pose + 2)) + 64)
         kernels.eliminate_landmarks(
             problem.sightings, network.poses, (network.landmarks, network.inverse), order, table
         )
-        keys = coarse_kernels.sorted_block_keys(table)
+        keys = block_table_kernels.sorted_block_keys(table)
         blocks = table.block[: len(keys)]
         diagonal, upper = network.chain_blocks()
         i = np.arange(N, dtype=np.int64)

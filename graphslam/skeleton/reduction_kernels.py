@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from graphslam.core.jit import njit
-from graphslam.skeleton.coarse_kernels import _add_lever, _find, _weighted
+from graphslam.skeleton.block_table_kernels import _find
+from graphslam.skeleton.coarse_kernels import _add_lever, _weighted
 from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 

@@ -12,6 +12,7 @@ from graphslam.skeleton import chain_kernels as kernels
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.problem import SkeletonProblem
 from graphslam.skeleton.schur import add_fixes, add_start, step_poses
+from graphslam.skeleton.start_kernels import forward_pass_kernel
 
 
 def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
@@ -98,6 +99,6 @@ def forward_pass(
     rules = (int(ago), TURN_SIGMA**-2, WAY_SIGMA**-2, GATE)
     tied = refused = 0
     for span in problem.chunks(0, N):
-        t, r = kernels.forward_pass_kernel(problem.sightings_of(*span), chain, span, rules, seen, D, b, out)
+        t, r = forward_pass_kernel(problem.sightings_of(*span), chain, span, rules, seen, D, b, out)
         tied, refused = tied + int(t), refused + int(r)
     return ForwardPass(out, tied, refused)

@@ -13,7 +13,7 @@ from graphslam.core.config import build_config
 from graphslam.core.log import SensorLog
 from graphslam.core.poses import SE2
 from graphslam.core.trajectory import Trajectory
-from graphslam.refine.refine import Refinement
+from graphslam.refine.result import Refinement
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig

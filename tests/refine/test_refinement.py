@@ -14,7 +14,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.maps.global_map import GlobalMap
 from graphslam.refine.nodes import scans_at
-from graphslam.refine.refine import Refinement, ScanCheck, _Refiner, refine_by_scans, refine_if_contradicted
+from graphslam.refine.refine import _Refiner, refine_by_scans, refine_if_contradicted
+from graphslam.refine.result import Refinement, ScanCheck
 from graphslam.refine.scans import Scans
 from graphslam.refine.surfaces import find_surfaces
 from graphslam.registration.surfaces import SURFACE

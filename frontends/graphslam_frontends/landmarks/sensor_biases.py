@@ -18,7 +18,7 @@ from graphslam_frontends.detectors.trees import TreeDetectorConfig
 from graphslam_frontends.landmarks.config import SensorBiasConfig
 from graphslam_frontends.landmarks.fix_points import FixPlacement
 from graphslam_frontends.landmarks.prepare import landmark_stream
-from graphslam_frontends.landmarks.smoothing_kernels import bias_sensitivities
+from graphslam_frontends.landmarks.sensitivity_kernels import bias_sensitivities
 from graphslam_frontends.landmarks.summarise import SmoothingResult
 from graphslam_frontends.odometry.motion import motion_stream
 

@@ -16,9 +16,9 @@ from graphslam.core.errors import CovarianceError
 from graphslam.core.gaussian import Gaussian, equal_tail_gate
 from graphslam.core.geometry import Array, circular_mean, rotation2, wrap_angle
 from graphslam_frontends.landmarks.filter import ParticleSet
+from graphslam_frontends.landmarks.sensitivity_kernels import bias_sensitivities
 from graphslam_frontends.landmarks.smoothing_kernels import (
     SmoothingMeasurements,
-    bias_sensitivities,
     second_order_bias,
     smooth_kernel,
     smoothed_covariances,

@@ -29,7 +29,7 @@ from graphslam_frontends.lidar_odometry.config import SPACING, LidarOdometryConf
 from graphslam_frontends.lidar_odometry.inertial import InertialPredictor
 from graphslam_frontends.lidar_odometry.wheel_prior import WheelMotionPrior
 from graphslam_frontends.lidar_odometry.window_covariance import WindowCovariance
-from graphslam_frontends.scan_window.tracker import direction_strengths
+from graphslam_frontends.scan_window.observability import direction_strengths
 
 Index = npt.NDArray[np.int64]
 

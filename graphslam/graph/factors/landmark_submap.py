@@ -1,15 +1,12 @@
 """A landmark submap: one n-ary factor with its full joint covariance (Combined SLAM eq. 15).
 
-All submaps together are one compiled loop. One of them is a GTSAM factor written in Python, with an analytic Jacobian:
-it never raises, fills every Jacobian it is asked for, and whitens by itself, in three matrix products for all landmarks
-together, telling GTSAM that its noise is of unit size: handing over some twenty small blocks to be whitened one by one
-costs more than the whole linearisation here. Whitening commutes with linearisation (it is a constant matrix), so
-nothing is approximated by it.
+All submaps together are one compiled loop. One of them is a GTSAM factor in Python by the same kernel: it never raises,
+fills every Jacobian it is asked for, and whitens by itself, telling GTSAM that its noise is of unit size: handing over
+some twenty small blocks to be whitened one by one costs more than the whole linearisation here.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -18,12 +15,10 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.charts import inverse_left_jacobian_terms
 from graphslam.core.geometry import Array
 from graphslam.graph.factors.batch import FactorBatch, Index, block_offsets, safe_factor
 from graphslam.graph.variables import Values, VariableLayout, gtsam_key
 
-_TWO_PI = 2.0 * math.pi
 CONSTANT = ("wheels", "sensor", "mount")
 """Kinds of variables that hold the constant errors of a robot, a pair each."""
 
@@ -220,7 +215,7 @@ class SubmapBatch(FactorBatch):
 
     @classmethod
     def gtsam(cls, record: SubmapRecord | PathRecord, origin: Array) -> gtsam.NonlinearFactor:
-        """A custom factor in scalars and three products of matrices."""
+        """A custom factor by the same kernel."""
         return submap_factor(record, origin)
 
 
@@ -249,104 +244,30 @@ def submap_factor(record: SubmapRecord | PathRecord, origin: Array) -> gtsam.Cus
 def _terms(
     keys: list[int], fixed: bool, entry_of: npt.NDArray[np.intp], record: SubmapRecord | PathRecord, origin: Array
 ) -> Callable[..., Array]:
+    from graphslam.graph.normal_kernels import whiten_submap  # numba takes a third of a second to load
+
     constants = len(CONSTANT) if record.robot >= 0 else 0  # keys that stand last
-    whole = record.whitener
-    m = whole.shape[1] - 2 * constants
-    z, W, group = record.z[:m], whole[:, :m], record.chart == "group"
-    rows, last = len(W), len(keys) - constants
-    W_constants = np.asfortranarray(whole[:, m:])
-    entry_of = entry_of[: len(entry_of) - constants]
-    first_landmark = last - (len(np.unique(entry_of)) if len(entry_of) else 0)
-    landmark_keys, constant_keys = keys[first_landmark:last], keys[last:]
-    u = len(landmark_keys)
-    repeated = u != len(entry_of)
-    W = np.ascontiguousarray(W)
-    W_end, W_heading = W[:, :2].copy(), W[:, 2].copy()
-    W_points = W[:, 3:]
-    if repeated:  # columns of entries of one landmark are added up once and for all
-        W_unique = np.zeros((rows, u, 2))
-        for entry, k in enumerate(entry_of.tolist()):
-            W_unique[:, k] += W_points[:, 2 * entry : 2 * entry + 2]
-    else:
-        W_unique = W_points.reshape(rows, -1, 2)[:, np.argsort(entry_of)]
-    W_unique = np.ascontiguousarray(W_unique.reshape(rows * u, 2))
-    W_sum = np.stack([W[:, 0] + W_points[:, 0::2].sum(1), W[:, 1] + W_points[:, 1::2].sum(1)], -1)  # Σ over all points
-    end_key, start_key = keys[0 if fixed else 1], None if fixed else keys[0]
+    first, last = 1 if fixed else 2, len(keys) - constants
+    rows, places = entry_of.astype(np.int64), len(entry_of) - constants
+    W, z, group = np.ascontiguousarray(record.whitener), record.z, record.chart == "group"
+    columns = [6 + 2 * np.flatnonzero(rows == i) for i in range(len(keys) - first)]
+
+    def pose(values: gtsam.Values, key: int) -> Array:
+        at = values.atPose2(key)
+        return np.array([at.x(), at.y(), at.theta()])
 
     def terms(values: gtsam.Values, H: list[Array] | None) -> Array:
-        if start_key is None:
-            sx, sy, st = origin
-        else:
-            start = values.atPose2(start_key)
-            sx, sy, st = start.x(), start.y(), start.theta()
-        end = values.atPose2(end_key)
-        c, s = math.cos(st), math.sin(st)
-        R = np.array([[c, -s], [s, c]])
-        points = np.empty((u + 1, 2))
-        points[0] = end.x(), end.y()
-        for i, k in enumerate(landmark_keys):
-            points[i + 1] = values.atPoint2(k)
-        q = (points - (sx, sy)) @ R  # everything in the start frame
-        qe = q[1:][entry_of] if u else q[1:]
-        r = np.empty(m)
-        r[:2] = q[0]
-        dt = end.theta() - st
-        r[2] = dt
-        r[3:] = qe.ravel()
-        r -= z
-        r[2] = math.pi - (math.pi - r[2]) % _TWO_PI
-        Vi, bent = None, None
-        if group:
-            a, b, slope = (float(v) for v in inverse_left_jacobian_terms(r[2]))
-            e = np.concatenate([r[:2], r[3:]]).reshape(-1, 2)
-            Vi = np.array([[a, b], [-b, a]])
-            bent = _rows(e @ np.array([[slope, -0.5], [0.5, slope]]))
-            bent[2] = 0.0
-            heading = r[2]
-            r = _rows(e @ Vi.T)
-            r[2] = heading
+        points = np.empty((len(keys) - first, 2))
+        for i, key in enumerate(keys[first:]):
+            points[i] = values.atPoint2(key) if first + i < last else values.atVector(key)
+        ends = origin if fixed else pose(values, keys[0]), pose(values, keys[first - 1])
+        r, J = whiten_submap(ends, points, rows, z, places, group, W)
         if H is not None:
-            _fill(H, q[0], qe, dt, R, Vi, bent)
-        out = np.asarray(W @ r)
-        for i, k in enumerate(constant_keys):
-            out += W_constants[:, 2 * i : 2 * i + 2] @ values.atVector(k)
-        return out
-
-    def _rows(points: Array) -> Array:
-        """Points of the end and of all entries in the layout of the residual; the heading is left open."""
-        out = np.empty(m)
-        out[:2], out[3:] = points[0], points[1:].ravel()
-        return out
-
-    def _fill(
-        H: list[Array], q_end: Array, qe: Array, dt: float, R: Array, Vi: Array | None, bent: Array | None
-    ) -> None:
-        # along an arc V⁻¹ stands before every rotation, and the end heading moves all points
-        by_heading = W_heading if bent is None else W_heading + W @ bent
-        if not fixed:
-            J = np.empty((rows, 3), order="F")
-            J[:, :2] = -W_sum if Vi is None else -W_sum @ Vi  # a step of the start moves every point by -1
-            turn = np.empty(m)
-            turn[0], turn[1], turn[2] = q_end[1], -q_end[0], -1.0
-            turn[3::2], turn[4::2] = qe[:, 1], -qe[:, 0]
-            if Vi is not None and bent is not None:
-                turn = _rows(np.concatenate([turn[:2], turn[3:]]).reshape(-1, 2) @ Vi.T) - bent
-                turn[2] = -1.0
-            J[:, 2] = W @ turn
-            H[0] = J
-        J = np.empty((rows, 3), order="F")
-        ce, se = math.cos(dt), math.sin(dt)
-        ends = W_end if Vi is None else W_end @ Vi
-        J[:, 0] = ends[:, 0] * ce + ends[:, 1] * se  # R_sᵀ R_e
-        J[:, 1] = ends[:, 1] * ce - ends[:, 0] * se
-        J[:, 2] = by_heading
-        H[first_landmark - 1] = J
-        if u:
-            turned = R.T if Vi is None else Vi @ R.T
-            J_points = (W_unique @ turned).reshape(rows, u, 2)  # R_sᵀ in each landmark's own rows
-            for i in range(u):
-                H[first_landmark + i] = J_points[:, i]
-        for i in range(constants):
-            H[last + i] = W_constants[:, 2 * i : 2 * i + 2]
+            if not fixed:
+                H[0] = J[:, :3]
+            H[first - 1] = J[:, 3:6]
+            for i, some in enumerate(columns):
+                H[first + i] = sum((J[:, c : c + 2] for c in some[1:]), J[:, some[0] : some[0] + 2])
+        return np.asarray(r)
 
     return terms

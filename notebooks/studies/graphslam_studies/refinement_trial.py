@@ -23,7 +23,8 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.refined import heading_error
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.refine.config import RefineConfig
-from graphslam.refine.refine import Refinement, refine_by_scans
+from graphslam.refine.refine import refine_by_scans
+from graphslam.refine.result import Refinement
 from graphslam.refine.scans import Scans
 from graphslam.sim.crawler import simulate_crawler
 from graphslam.sim.crawler_config import crawler_preset
