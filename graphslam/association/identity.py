@@ -19,9 +19,8 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.graph.factor_graph_state import FactorGraphState
-from graphslam.graph.factors.landmark_submap import SubmapRecord
+from graphslam.graph.factors.landmark_submap import SubmapRecord, submap_jacobian
 from graphslam.graph.factors.sensor_biases import sensor_biases_at
-from graphslam.graph.submap_model import submap_jacobians, submap_residual
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,34 +51,29 @@ def identity_statistics(graph: FactorGraphState, record: SubmapRecord) -> Array:
     lonely = np.array([len(graph.sightings(int(i))) < 2 for i in ids])
     if n == 0 or bool(lonely.all()):
         return np.full(n, np.nan)
-    start, end = graph.values.poses[record.start], graph.values.poses[record.start + 1]
+    ends = graph.values.poses[record.start], graph.values.poses[record.start + 1]
     points = np.array([graph.landmark(int(i)) for i in ids])
-    z, _ = record.own
-    r = submap_residual(start, end, points, z, record.chart)
-    J_start, J_end, J_point = submap_jacobians(start, end, points, z, record.chart, tangent=True)
-    robot = record.robot
-    if robot >= 0:
-        r = np.concatenate([r, sensor_biases_at(graph.values, robot)])
+    if record.robot >= 0:
+        points = np.concatenate([points, sensor_biases_at(graph.values, record.robot).reshape(-1, 2)])
+    r, J_entries = submap_jacobian(ends, points, record.z, record.chart, n)
     variables = record.variables()
     column = {name: k for k, name in enumerate(variables[2:])}
     J = np.zeros((len(r), 6 + 2 * len(column)))
-    J[: len(z), :3], J[: len(z), 3:6] = J_start, J_end
-    for k in range(len(z), len(r)):  # constant errors, which stand last
-        J[k, J.shape[1] + k - len(r)] = 1.0
-    for k, i in enumerate(ids.tolist()):
-        c = 6 + 2 * column[f"l{i}"]
-        J[3 + 2 * k : 5 + 2 * k, c : c + 2] = J_point
+    J[:, :6] = J_entries[:, :6]
+    for k, name in enumerate(record.entries()):
+        c = 6 + 2 * column[name]
+        J[:, c : c + 2] += J_entries[:, 6 + 2 * k : 8 + 2 * k]
     if record.start == 0:
         J = J[:, 3:]  # the first base is fixed and has no columns
     P = graph.covariance().joint(variables)
     omega = record.whitener.T @ record.whitener
-    g = (omega @ r)[3 : len(z)].reshape(n, 2)
+    g = (omega @ r)[3 : 3 + 2 * n].reshape(n, 2)
     JtO = J.T @ omega
     C = omega - JtO.T @ P @ JtO  # Ω S Ω
     rows = 3 + 2 * np.arange(n)[:, None] + np.arange(2)
     blocks = C[rows[:, :, None], rows[:, None, :]]
     # a landmark that only this submap holds in place has no redundancy: its block vanishes
-    share = np.linalg.eigvalsh(blocks)[:, 0] / np.maximum(np.trace(omega[3 : len(z), 3 : len(z)]) / n, 1e-300)
+    share = np.linalg.eigvalsh(blocks)[:, 0] / np.maximum(np.trace(omega[3 : 3 + 2 * n, 3 : 3 + 2 * n]) / n, 1e-300)
     testable = ~lonely & (share > 1e-9)
     out = np.full(n, np.nan)
     if np.any(testable):

@@ -16,16 +16,16 @@ import pandas as pd
 
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
-from graphslam.core.geometry import Array, rotation2
+from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 from graphslam.core.records import Gps
 from graphslam.evaluate.gps_repeatability import fix_segments
 from graphslam.evaluate.residual_consistency import correlated_dof, two_sided_bounds
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.gps import GpsRecord, antenna_terms
+from graphslam.graph.factors.landmark_submap import submap_jacobian
 from graphslam.graph.factors.sensor_biases import sensor_biases_at
 from graphslam.graph.sensors.gps import FixErrors, GpsFactors, arm_jacobian, datum_columns, lever_arm
-from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from graphslam.graph.submap_node import SubmapNode
 
 Ints = npt.NDArray[np.int64]
@@ -273,18 +273,10 @@ def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> Inne
         path = replace(path, positions=path.positions + (inner.lasting.points @ g).reshape(-1, 2))
     marks = np.array([lay.row_of[i] for i in ids.tolist()], dtype=np.int64)
     places = np.concatenate([values.landmarks[marks].reshape(-1, 2), values["point"][rows].reshape(-1, 2)])
-    start, end = values.poses[s.node], values.poses[s.exit_node]
     record = graph.records[s.factor_id]
     chart = str(getattr(record, "chart", "cartesian"))
-    u = submap_residual(start, end, places, z, chart)
-    J_start, J_end, J_mark = submap_jacobians(start, end, places, z, chart, tangent=True)
-    m = len(places)
-    J = np.zeros((len(z), 6 + 2 * m))
-    J[:, :3], J[:, 3:6] = J_start, J_end
-    for k in range(m):
-        J[3 + 2 * k : 5 + 2 * k, 6 + 2 * k : 8 + 2 * k] = J_mark
-    Vi = J_mark @ rotation2(start[2])  # V⁻¹: the chart's residual of a difference in the base frame
-    V = np.linalg.inv(Vi)
+    u, J = submap_jacobian((values.poses[s.node], values.poses[s.exit_node]), places, z, chart)
+    V = np.linalg.inv(-J[:2, :2])  # V⁻¹: the chart's residual of a difference in the base frame
     off = (gain @ u).reshape(-1, 2) @ V.T
     columns = np.concatenate(
         [

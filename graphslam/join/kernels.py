@@ -271,31 +271,14 @@ def predict_nodes(known: BlockMap, new: BlockMap, image: Index, start: int, valu
 
 
 @njit
-def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
-    """A map that is Gaussian in the group chart about its mean, as a Gauss–Newton system at other values.
-
-    With u the chart's difference of ``x`` from the mean (:mod:`graphslam.core.charts`) and J its derivative, the map
-    says ``uᵀ I u``: its matrix at x is ``Jᵀ I J`` and its gradient ``Jᵀ I u``. A node moves along the arc of its
-    anchor's heading, so the anchor's column couples with all that the node is coupled with.
-
-    Parameters
-    ----------
-    anchor : (N,)
-        Pose that each node hangs on; of a pose itself.
-    x : (n,)
-
-    Returns
-    -------
-    BlockMap
-        At ``x``.
-    gradient : (n,)
-    """
+def _arcs(m: BlockMap, anchor: Index, x: Array) -> tuple[Array, Array]:
+    """``a, b`` of V⁻¹ and the column of the anchor's heading ``(N, 4)`` of each node at x; the gradient ``Jᵀ I u``."""
     mean, width, ptr, idx, block, value = m
     N = len(width)
     at = np.zeros(N + 1, np.int64)
     for i in range(N):
         at[i + 1] = at[i] + width[i]
-    arc = np.empty((N, 4))  # a, b of V⁻¹; the column of the anchor's heading
+    arc = np.empty((N, 4))
     u = np.empty(at[N])
     for i in range(N):
         k, p = at[i], at[anchor[i]] + 2
@@ -324,8 +307,14 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
         gradient[k] += a * y0 - b * y1
         gradient[k + 1] += b * y0 + a * y1
         gradient[at[anchor[i]] + 2] += hx * y0 + hy * y1 + y2
+    return arc, gradient
 
-    begin = np.zeros(N + 1, np.int64)  # of the nodes that hang on each pose
+
+@njit
+def _nodes_on_poses(anchor: Index) -> tuple[Index, Index]:
+    """Nodes that hang on pose i: ``hanging[begin[i] : begin[i + 1]]``."""
+    N = len(anchor)
+    begin = np.zeros(N + 1, np.int64)
     for i in range(N):
         if anchor[i] != i:
             begin[anchor[i] + 1] += 1
@@ -337,7 +326,33 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
         if anchor[i] != i:
             hanging[fill[anchor[i]]] = i
             fill[anchor[i]] += 1
+    return begin, hanging
 
+
+@njit
+def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
+    """A map that is Gaussian in the group chart about its mean, as a Gauss–Newton system at other values.
+
+    With u the chart's difference of ``x`` from the mean (:mod:`graphslam.core.charts`) and J its derivative, the map
+    says ``uᵀ I u``: its matrix at x is ``Jᵀ I J`` and its gradient ``Jᵀ I u``. A node moves along the arc of its
+    anchor's heading, so the anchor's column couples with all that the node is coupled with.
+
+    Parameters
+    ----------
+    anchor : (N,)
+        Pose that each node hangs on; of a pose itself.
+    x : (n,)
+
+    Returns
+    -------
+    BlockMap
+        At ``x``.
+    gradient : (n,)
+    """
+    _, width, ptr, idx, block, value = m
+    N = len(width)
+    arc, gradient = _arcs(m, anchor, x)
+    begin, hanging = _nodes_on_poses(anchor)
     new_ptr = np.zeros(N + 1, np.int64)
     seen = np.full(N, -1, np.int64)
     room = 0

@@ -211,6 +211,126 @@ class SystemSlots(NamedTuple):
     """From :func:`entry_slots`."""
 
 
+U, D, H, WU, WD, WH = range(6)
+"""Rows of a submap's room: residual in its chart (0, 1 end position, 2 end heading, then landmarks), the Jacobian's
+columns of the start's and the end's heading, and the products of the three with Ω."""
+
+
+@njit
+def _fill_columns(r: Array, z: Array, group: bool, rows: Array) -> tuple[float, float]:
+    """Residual and columns of a submap with Cartesian residual r; ``a, b`` of V⁻¹."""
+    va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
+    if group:
+        va, vb, slope = inverse_left_jacobian_kernel(r[2])
+        half = 0.5
+    rows[U, 2], rows[D, 2], rows[H, 2] = r[2], -1.0, 1.0
+    for e in range((len(r) - 1) // 2):
+        i = 0 if e == 0 else 1 + 2 * e
+        x, y = r[i], r[i + 1]
+        qx, qy = x + z[i], y + z[i + 1]
+        rows[U, i], rows[U, i + 1] = va * x + vb * y, va * y - vb * x
+        rows[H, i], rows[H, i + 1] = slope * x + half * y, slope * y - half * x
+        rows[D, i], rows[D, i + 1] = va * qy - vb * qx - rows[H, i], -va * qx - vb * qy - rows[H, i + 1]
+    return va, vb
+
+
+@njit
+def _weigh_columns(W: Array, c: float, s: float, rows: Array, turned: Array) -> tuple[float, float, float]:
+    """Products with Ω, turned by ``T = [c, -s; s, c]``: ``T Ω Tᵀ`` and ``T Ω`` times the columns; rᵀΩr, dᵀΩr, dᵀΩd."""
+    n = len(W)
+    rr, dd, dr, hh, hd, hr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        v0, v1, v2 = 0.0, 0.0, 0.0
+        for j in range(n):
+            v0 += W[i, j] * rows[U, j]
+            v1 += W[i, j] * rows[D, j]
+            v2 += W[i, j] * rows[H, j]
+        rows[WU, i], rows[WD, i], rows[WH, i] = v0, v1, v2
+        rr += v0 * rows[U, i]
+        dr += v0 * rows[D, i]
+        hr += v0 * rows[H, i]
+        dd += v1 * rows[D, i]
+        hd += v1 * rows[H, i]
+        hh += v2 * rows[H, i]
+    entries = (n - 1) // 2
+    for e in range(entries):  # rows first, then columns
+        i = 0 if e == 0 else 1 + 2 * e
+        for j in range(n):
+            turned[i, j] = c * W[i, j] - s * W[i + 1, j]
+            turned[i + 1, j] = s * W[i, j] + c * W[i + 1, j]
+    for i in range(n):
+        for e in range(entries):
+            j = 0 if e == 0 else 1 + 2 * e
+            x, y = turned[i, j], turned[i, j + 1]
+            turned[i, j], turned[i, j + 1] = c * x - s * y, s * x + c * y
+    for e in range(entries):
+        i = 0 if e == 0 else 1 + 2 * e
+        for w in range(WU, WH + 1):
+            x, y = rows[w, i], rows[w, i + 1]
+            rows[w, i], rows[w, i + 1] = c * x - s * y, s * x + c * y
+    rows[WU, 2], rows[WD, 2], rows[WH, 2] = hr, hd, hh
+    for j in range(n):
+        turned[2, j] = turned[j, 2] = rows[WH, j]
+    return rr, dr, dd
+
+
+@njit
+def _add_entries(slots: Index, at: Index, rows: Array, turned: Array, g: Array, value: Array) -> tuple[float, float]:
+    """Add gradient and blocks of a submap's entries, whose scalars begin at ``at``; the sum of their gradients."""
+    gx, gy = 0.0, 0.0
+    for e in range(len(at)):
+        i = 0 if e == 0 else 1 + 2 * e
+        wi = 3 if e == 0 else 2
+        for p in range(wi):
+            g[at[e] + p] += rows[WU, i + p]
+        gx += rows[WU, i]
+        gy += rows[WU, i + 1]
+        for o in range(len(at)):
+            v = slots[e + 1, o + 1]
+            if v >= 0:
+                j = 0 if o == 0 else 1 + 2 * o
+                wj = 3 if o == 0 else 2
+                for p in range(wi):
+                    for q in range(wj):
+                        value[v + p * wj + q] += turned[i + p, j + q]
+    return gx, gy
+
+
+@njit
+def _add_start(slots: Index, rows: Array, turned: Array, dd: float, value: Array) -> None:
+    """Add the block of a submap's start, and those that couple it with every entry: translation, then heading."""
+    entries = len(slots) - 1
+    sxx, sxy, syy, sxt, syt = 0.0, 0.0, 0.0, 0.0, 0.0
+    for e in range(entries):
+        i = 0 if e == 0 else 1 + 2 * e
+        wi = 3 if e == 0 else 2
+        one, other = slots[0, e + 1], slots[e + 1, 0]
+        for p in range(wi):
+            tx, ty = 0.0, 0.0
+            for o in range(entries):
+                j = 0 if o == 0 else 1 + 2 * o
+                tx -= turned[j, i + p]
+                ty -= turned[j + 1, i + p]
+            if p == 0:
+                sxx -= tx
+            elif p == 1:
+                sxy -= tx
+                syy -= ty
+            if one >= 0:
+                value[one + p] += tx
+                value[one + wi + p] += ty
+                value[one + 2 * wi + p] += rows[WD, i + p]
+            else:
+                value[other + 3 * p] += tx
+                value[other + 3 * p + 1] += ty
+                value[other + 3 * p + 2] += rows[WD, i + p]
+        sxt -= rows[WD, i]
+        syt -= rows[WD, i + 1]
+    own = slots[0, 0]
+    for p, v in enumerate((sxx, sxy, sxt, sxy, syy, syt, sxt, syt, dd)):
+        value[own + p] += v
+
+
 @njit
 def linearise_submaps(
     poses: Array, submaps: SubmapChainArrays, where: SystemSlots, r: Array, g: Array, value: Array
@@ -236,128 +356,24 @@ def linearise_submaps(
     most = 0
     for k in range(m):
         most = max(most, row_ptr[k + 1] - row_ptr[k])
-    d, wr, wd = np.empty(most), np.empty(most), np.empty(most)
-    h, wh, u = np.empty(most), np.empty(most), np.empty(most)
-    turned = np.empty((most, most))
+    room, turned = np.empty((6, most)), np.empty((most, most))
     for k in range(m):
-        n, a0 = row_ptr[k + 1] - row_ptr[k], row_ptr[k]
-        entries = entry_ptr[k + 1] - entry_ptr[k]
+        rows = slice(row_ptr[k], row_ptr[k + 1])
+        n, entries = row_ptr[k + 1] - row_ptr[k], entry_ptr[k + 1] - entry_ptr[k]
         W = omega[omega_ptr[k] : omega_ptr[k + 1]].reshape(n, n)
+        va, vb = _fill_columns(r[rows], z[rows], group[k], room)
         st = poses[k - 1, 2] if k else 0.0
-        va, vb, slope, half = 1.0, 0.0, 0.0, 0.0
-        if group[k]:
-            va, vb, slope = inverse_left_jacobian_kernel(r[a0 + 2])
-            half = 0.5
-        # Rows: 0, 1 end position, 2 end heading, then landmarks. u is the residual, d the column of the start heading,
-        # h that of the end heading.
-        u[2], d[2], h[2] = r[a0 + 2], -1.0, 1.0
-        for e in range(entries):
-            i = 0 if e == 0 else 1 + 2 * e
-            x, y = r[a0 + i], r[a0 + i + 1]
-            qx, qy = x + z[a0 + i], y + z[a0 + i + 1]
-            u[i], u[i + 1] = va * x + vb * y, va * y - vb * x
-            h[i], h[i + 1] = slope * x + half * y, slope * y - half * x
-            d[i], d[i + 1] = va * qy - vb * qx - h[i], -va * qx - vb * qy - h[i + 1]
-        rr, dd, dr, hh, hd, hr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for i in range(n):
-            v0, v1, v2 = 0.0, 0.0, 0.0
-            for j in range(n):
-                v0 += W[i, j] * u[j]
-                v1 += W[i, j] * d[j]
-                v2 += W[i, j] * h[j]
-            wr[i], wd[i], wh[i] = v0, v1, v2
-            rr += v0 * u[i]
-            dr += v0 * d[i]
-            hr += v0 * h[i]
-            dd += v1 * d[i]
-            hd += v1 * h[i]
-            hh += v2 * h[i]
-        f += rr
-        # T W Tᵀ: rows first, then columns
         c, s = np.cos(st), np.sin(st)
-        c, s = c * va - s * vb, s * va + c * vb
-        for e in range(entries):
-            i = 0 if e == 0 else 1 + 2 * e
-            for j in range(n):
-                turned[i, j] = c * W[i, j] - s * W[i + 1, j]
-                turned[i + 1, j] = s * W[i, j] + c * W[i + 1, j]
-        for i in range(n):
-            for e in range(entries):
-                j = 0 if e == 0 else 1 + 2 * e
-                x, y = turned[i, j], turned[i, j + 1]
-                turned[i, j], turned[i, j + 1] = c * x - s * y, s * x + c * y
-        for e in range(entries):
-            i = 0 if e == 0 else 1 + 2 * e
-            x, y = wr[i], wr[i + 1]
-            wr[i], wr[i + 1] = c * x - s * y, s * x + c * y
-            x, y = wd[i], wd[i + 1]
-            wd[i], wd[i + 1] = c * x - s * y, s * x + c * y
-            x, y = wh[i], wh[i + 1]
-            wh[i], wh[i + 1] = c * x - s * y, s * x + c * y
-        wr[2], wd[2], wh[2] = hr, hd, hh
-        for j in range(n):
-            turned[2, j] = turned[j, 2] = wh[j]
+        rr, dr, dd = _weigh_columns(W, c * va - s * vb, s * va + c * vb, room, turned)
+        f += rr
         slots = slot[pair_ptr[k] : pair_ptr[k + 1]].reshape(entries + 1, entries + 1)
-        gx, gy = 0.0, 0.0
-        for e in range(entries):
-            i = 0 if e == 0 else 1 + 2 * e
-            wi = 3 if e == 0 else 2
-            at = node_at[entry_node[entry_ptr[k] + e]]
-            for p in range(wi):
-                g[at + p] += wr[i + p]
-            gx += wr[i]
-            gy += wr[i + 1]
-            for o in range(entries):
-                v = slots[e + 1, o + 1]
-                if v >= 0:
-                    j = 0 if o == 0 else 1 + 2 * o
-                    wj = 3 if o == 0 else 2
-                    for p in range(wi):
-                        for q in range(wj):
-                            value[v + p * wj + q] += turned[i + p, j + q]
-        if k == 0:
-            continue
-        at = node_at[k - 1]
-        g[at] -= gx
-        g[at + 1] -= gy
-        g[at + 2] += dr
-        # Coupling of the start with every entry: translation, then heading
-        sxx, sxy, syy, sxt, syt = 0.0, 0.0, 0.0, 0.0, 0.0
-        for e in range(entries):
-            i = 0 if e == 0 else 1 + 2 * e
-            wi = 3 if e == 0 else 2
-            one, other = slots[0, e + 1], slots[e + 1, 0]
-            for p in range(wi):
-                tx, ty = 0.0, 0.0
-                for o in range(entries):
-                    j = 0 if o == 0 else 1 + 2 * o
-                    tx -= turned[j, i + p]
-                    ty -= turned[j + 1, i + p]
-                if p == 0:
-                    sxx -= tx
-                elif p == 1:
-                    sxy -= tx
-                    syy -= ty
-                if one >= 0:
-                    value[one + p] += tx
-                    value[one + wi + p] += ty
-                    value[one + 2 * wi + p] += wd[i + p]
-                else:
-                    value[other + 3 * p] += tx
-                    value[other + 3 * p + 1] += ty
-                    value[other + 3 * p + 2] += wd[i + p]
-            sxt -= wd[i]
-            syt -= wd[i + 1]
-        own = slots[0, 0]
-        value[own] += sxx
-        value[own + 1] += sxy
-        value[own + 2] += sxt
-        value[own + 3] += sxy
-        value[own + 4] += syy
-        value[own + 5] += syt
-        value[own + 6] += sxt
-        value[own + 7] += syt
-        value[own + 8] += dd
+        gx, gy = _add_entries(slots, node_at[entry_node[entry_ptr[k] : entry_ptr[k + 1]]], room, turned, g, value)
+        if k:
+            at = node_at[k - 1]
+            g[at] -= gx
+            g[at + 1] -= gy
+            g[at + 2] += dr
+            _add_start(slots, room, turned, dd, value)
     return f
 
 

@@ -98,6 +98,74 @@ def _postorder(parent: Index) -> Index:
 
 
 @njit
+def _columns(
+    start: Index, earlier: Index, turned: tuple[Index, Index], up: Index, offset: Index
+) -> tuple[Index, Index, Index, Index, int]:
+    """Positions below each column of L, ``below[below_ptr[k] : below_ptr[k + 1]]``, their number and scalars; entries.
+
+    ``turned`` leads from the postorder to the order of ``start`` and ``earlier``, and back.
+    """
+    post, rank = turned
+    N = len(up)
+    # Structure of every column of L: k belongs to all on the way from its earlier neighbours up to k.
+    count = np.zeros(N, np.int64)
+    seen = np.full(N, -1, np.int64)
+    for k in range(N):
+        old = post[k]
+        seen[k] = k
+        for e in range(start[old], start[old + 1]):
+            i = rank[earlier[e]]
+            while seen[i] != k:
+                seen[i] = k
+                count[i] += 1
+                i = up[i]
+    below_ptr = np.zeros(N + 1, np.int64)
+    for k in range(N):
+        below_ptr[k + 1] = below_ptr[k] + count[k]
+    below = np.empty(below_ptr[N], np.int64)
+    fill = below_ptr[:-1].copy()
+    scalars = np.zeros(N, np.int64)  # rows below each node
+    seen[:] = -1
+    entries = np.int64(0)
+    for k in range(N):
+        old = post[k]
+        seen[k] = k
+        w = offset[k + 1] - offset[k]
+        for e in range(start[old], start[old + 1]):
+            i = rank[earlier[e]]
+            while seen[i] != k:
+                seen[i] = k
+                below[fill[i]] = k
+                fill[i] += 1
+                scalars[i] += w
+                entries += w * (offset[i + 1] - offset[i])
+                i = up[i]
+        entries += w * (w + 1) // 2
+    return count, scalars, below_ptr, below, entries
+
+
+@njit
+def _supernodes(up: Index, offset: Index, scalars: Index, slack: int) -> tuple[Index, Index]:
+    """Supernode of each position, and the first position of each."""
+    N = len(up)
+    # Supernodes: a node joins its child when the child's rows are its own, give or take the slack.
+    super_of = np.empty(N, np.int64)
+    first = np.empty(N + 1, np.int64)
+    S = 0
+    for k in range(N):
+        joins = False
+        if k > 0 and up[k - 1] == k:
+            extra = scalars[k] + (offset[k + 1] - offset[k]) - scalars[k - 1]
+            joins = extra * (offset[k] - offset[first[S - 1]]) <= slack
+        if not joins:
+            first[S] = k
+            S += 1
+        super_of[k] = S - 1
+    first[S] = N
+    return super_of, first[: S + 1].copy()
+
+
+@njit
 def analyse_blocks(
     order: Index, width: Index, ptr: Index, idx: Index, slack: int
 ) -> tuple[Index, Index, Index, Index, Index, Index, Index, Index]:
@@ -149,56 +217,9 @@ def analyse_blocks(
         if parent[post[k]] >= 0:
             up[k] = rank[parent[post[k]]]
         offset[k + 1] = offset[k] + width[new_order[k]]
-    # Structure of every column of L: k belongs to all on the way from its earlier neighbours up to k.
-    count = np.zeros(N, np.int64)
-    seen = np.full(N, -1, np.int64)
-    for k in range(N):
-        old = post[k]
-        seen[k] = k
-        for e in range(start[old], start[old + 1]):
-            i = rank[earlier[e]]
-            while seen[i] != k:
-                seen[i] = k
-                count[i] += 1
-                i = up[i]
-    below_ptr = np.zeros(N + 1, np.int64)
-    for k in range(N):
-        below_ptr[k + 1] = below_ptr[k] + count[k]
-    below = np.empty(below_ptr[N], np.int64)
-    fill = below_ptr[:-1].copy()
-    scalars = np.zeros(N, np.int64)  # rows below each node
-    seen[:] = -1
-    entries = np.int64(0)
-    for k in range(N):
-        old = post[k]
-        seen[k] = k
-        w = offset[k + 1] - offset[k]
-        for e in range(start[old], start[old + 1]):
-            i = rank[earlier[e]]
-            while seen[i] != k:
-                seen[i] = k
-                below[fill[i]] = k
-                fill[i] += 1
-                scalars[i] += w
-                entries += w * (offset[i + 1] - offset[i])
-                i = up[i]
-        entries += w * (w + 1) // 2
-
-    # Supernodes: a node joins its child when the child's rows are its own, give or take the slack.
-    super_of = np.empty(N, np.int64)
-    first = np.empty(N + 1, np.int64)
-    S = 0
-    for k in range(N):
-        joins = False
-        if k > 0 and up[k - 1] == k:
-            extra = scalars[k] + (offset[k + 1] - offset[k]) - scalars[k - 1]
-            joins = extra * (offset[k] - offset[first[S - 1]]) <= slack
-        if not joins:
-            first[S] = k
-            S += 1
-        super_of[k] = S - 1
-    first[S] = N
-    first = first[: S + 1].copy()
+    count, scalars, below_ptr, below, entries = _columns(start, earlier, (post, rank), up, offset)
+    super_of, first = _supernodes(up, offset, scalars, slack)
+    S = len(first) - 1
     above = np.full(S, -1, np.int64)
     row_ptr = np.zeros(S + 1, np.int64)
     panel_ptr = np.zeros(S + 1, np.int64)

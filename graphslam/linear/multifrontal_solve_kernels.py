@@ -146,17 +146,14 @@ def inverse_diagonal(panels: FactorPanels, begin: Index, width: int, most: int) 
             left[parent[s]] += 1
     base = np.zeros(S, np.int64)  # where the front of s begins on the stack
     stack = np.empty(4 * most * most)
-    height = 0
+    height, q = 0, len(begin) - 1
     local = np.empty(own[S], np.int64)
-    q = len(begin) - 1
     for s in range(S - 1, -1, -1):
         w, r, at = own[s + 1] - own[s], start[s + 1] - start[s], start[s]
         n = r - w
         P = L[panel_ptr[s] : panel_ptr[s + 1]].reshape(w, r)
         if height + r * r > len(stack):
-            bigger = np.empty(2 * len(stack) + r * r)
-            bigger[:height] = stack[:height]
-            stack = bigger
+            stack = np.concatenate((stack[:height], np.empty(2 * len(stack) + r * r - height)))
         base[s] = height
         Z = stack[height : height + r * r].reshape(r, r)
         height += r * r

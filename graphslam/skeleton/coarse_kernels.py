@@ -245,6 +245,27 @@ def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
 
 
 @njit(nogil=True)
+def _subtract_pairs(chain, landmark, waiting, position, size, room, table):
+    """Subtract ``S D⁻¹ S`` of a landmark for all pairs of its keyframes, those of the entries ``chain``."""
+    l, Di = landmark
+    frame, kept = waiting
+    k, K = size
+    X, Y = room
+    for i in range(len(chain)):
+        q = position[min(frame[chain[i]] * k, len(position) - 1)]
+        _weighted(kept[chain[i]], l[0] - q[0], l[1] - q[1], l[2] - q[2], X[i])
+        for d in range(6):
+            x, y, z = X[i, 0, d], X[i, 1, d], X[i, 2, d]
+            Y[i, 0, d] = Di[0] * x + Di[1] * y + Di[2] * z
+            Y[i, 1, d] = Di[1] * x + Di[3] * y + Di[4] * z
+            Y[i, 2, d] = Di[2] * x + Di[4] * y + Di[5] * z
+    for i in range(len(chain)):  # later keyframes come first
+        for i2 in range(i, len(chain)):
+            key = np.int64(frame[chain[i2]]) * K + frame[chain[i]]
+            _subtract(X[i2], Y[i], table.block[_find(table, key)])
+
+
+@njit(nogil=True)
 def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table):
     """Add the blocks of ``Pᵀ S P`` that come from measurements to ``table``, interval after interval.
 
@@ -269,7 +290,7 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
     ids, sums = np.empty(most, np.int32), np.empty((most, 31))
     room, used, free = len(frame), ends[0], ends[1]
     longest = 64
-    X, Y, G = np.empty((longest, 3, 6)), np.empty((longest, 3, 6)), np.empty((longest, 3))
+    X, Y = np.empty((longest, 3, 6)), np.empty((longest, 3, 6))
     chain = np.empty(longest, np.int32)
     B00, B01, B11 = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     T = np.empty((3, 6))
@@ -321,30 +342,13 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
             while at >= 0:
                 if f == longest:
                     longest *= 2
-                    X, Y, G, chain = (
-                        np.empty((longest, 3, 6)),
-                        np.empty((longest, 3, 6)),
-                        np.empty((longest, 3)),
-                        _doubled(chain),
-                    )
+                    X, Y, chain = np.empty((longest, 3, 6)), np.empty((longest, 3, 6)), _doubled(chain)
                 chain[f] = at
                 f += 1
                 at = after[at]
             while table.filled[0] + f * (f + 1) // 2 > len(table.block):
                 table = _grown(table)
-            for i in range(f):
-                q = poses.position[min(frame[chain[i]] * k, N - 1)]
-                G[i, 0], G[i, 1], G[i, 2] = l[j, 0] - q[0], l[j, 1] - q[1], l[j, 2] - q[2]
-                _weighted(kept[chain[i]], G[i, 0], G[i, 1], G[i, 2], X[i])
-                for d in range(6):
-                    x, y, z = X[i, 0, d], X[i, 1, d], X[i, 2, d]
-                    Y[i, 0, d] = Di[j, 0] * x + Di[j, 1] * y + Di[j, 2] * z
-                    Y[i, 1, d] = Di[j, 1] * x + Di[j, 3] * y + Di[j, 4] * z
-                    Y[i, 2, d] = Di[j, 2] * x + Di[j, 4] * y + Di[j, 5] * z
-            for i in range(f):  # later keyframes come first
-                for i2 in range(i, f):
-                    key = np.int64(frame[chain[i2]]) * K + frame[chain[i]]
-                    _subtract(X[i2], Y[i], table.block[_find(table, key)])
+            _subtract_pairs(chain[:f], (l[j], Di[j]), (frame, kept), poses.position, (k, K), (X, Y), table)
             for i in range(f):
                 after[chain[i]] = free
                 free = chain[i]

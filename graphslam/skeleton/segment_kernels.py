@@ -81,6 +81,18 @@ def _turned(Rb, r, B):
 
 
 @njit(nogil=True, error_model="numpy")
+def _add_square(information, k, r, f, total):
+    """``total + rᵀ Ω r`` of link k; f: room."""
+    for m in range(6):
+        f[m] = 0.0
+        for n in range(6):
+            f[m] += information[k, m, n] * r[n]
+    for m in range(6):
+        total += r[m] * f[m]
+    return total
+
+
+@njit(nogil=True, error_model="numpy")
 def join_links(links, poses, covariance, misfit):
     """Join the links of each segment to one.
 
@@ -118,12 +130,7 @@ def join_links(links, poses, covariance, misfit):
             way = Q[j, 0] - Q[i, 0], Q[j, 1] - Q[i, 1], Q[j, 2] - Q[i, 2]
             _residual(links, e, (Ra, Rb), way, (A, X), r)
             k = 0 if single else e
-            for m in range(6):
-                f[m] = 0.0
-                for n in range(6):
-                    f[m] += links.information[k, m, n] * r[n]
-            for m in range(6):
-                total += r[m] * f[m]
+            total = _add_square(links.information, k, r, f, total)
             _turned(Rb, r, B)
             S = links.covariance[k]
             # N = B Σ_ww Bᵀ, M = Ra Σ_uu Raᵀ

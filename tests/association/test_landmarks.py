@@ -11,9 +11,9 @@ from graphslam.association.merging import euclidean_merges, mahalanobis_merges
 from graphslam.core.errors import ConfigError
 from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.graph.factor_graph import FactorGraph
-from graphslam.graph.submap_model import predict_submap
 from graphslam.solve.batch import BatchSolver
 from tests.reference.graph_chain import anonymous, dense_submap, make_chain
+from tests.reference.submap_model import predict_submap
 
 JC, NN = AssociationConfig(), AssociationConfig(method="nearest-neighbour")
 

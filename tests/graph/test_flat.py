@@ -16,9 +16,9 @@ from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
-from graphslam.graph.submap_model import submap_jacobians, submap_residual
 from tests.reference.graph_chain import dense_submap, make_chain, make_gps
 from tests.reference.plain_gps import gps_residual
+from tests.reference.submap_model import submap_jacobians, submap_residual
 
 
 def rich_graph(rng) -> FactorGraph:

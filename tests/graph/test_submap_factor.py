@@ -11,10 +11,10 @@ from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import gtsam_factor
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.noise import whitener
-from graphslam.graph.submap_model import submap_residual
 from graphslam.graph.variables import gtsam_key, key_name, vector_form
 from tests.reference.graph_chain import correlated_covariance, dense_submap, end_only_submap, make_chain
 from tests.reference.gtsam_twin import to_gtsam
+from tests.reference.submap_model import submap_residual
 
 
 def build(rng, start: int, ids: np.ndarray, chart: str = "cartesian"):

@@ -10,12 +10,12 @@ import scipy.sparse as sp
 
 from graphslam.core.errors import CovarianceError, DataError, GeometryError, IndeterminateError
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.submap_model import submap_residual
 from graphslam.join.submap_blocks import SubmapProblem, fuse_repeated, relabel, scale_covariances
 from graphslam.join.submap_solver import minimise_submaps, solve_submaps
 from graphslam.linear.symmetric_factor import SymmetricFactor
 from tests.reference.dense_join import dense_normal_equations, first_sighting
 from tests.reference.submap_chain import submap_chain
+from tests.reference.submap_model import submap_residual
 
 
 def with_repeated_landmark(submaps: list[Submap], k: int) -> list[Submap]:

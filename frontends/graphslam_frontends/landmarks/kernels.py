@@ -118,6 +118,23 @@ class _Pairing(NamedTuple):
 
 
 @njit(error_model="numpy")
+def _choose(n_pairs, pair_o, pair_s, pair_c, match):
+    """Greedy by likelihood, each observation and each landmark at most once; uses ``pair_o`` up."""
+    while True:
+        best, k = np.inf, -1
+        for i in range(n_pairs):
+            if pair_o[i] >= 0 and pair_c[i] < best:
+                best, k = pair_c[i], i
+        if k < 0:
+            return
+        o, j = pair_o[k], pair_s[k]
+        match[o] = j
+        for i in range(n_pairs):
+            if pair_o[i] == o or pair_s[i] == j:
+                pair_o[i] = -1
+
+
+@njit(error_model="numpy")
 def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
     """Maximum-likelihood association of one particle, exclusive (B4, step 2): fills match[o] with a slot or -1.
 
@@ -192,19 +209,7 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
                         pair_d[n_pairs], pair_c[n_pairs] = d2, d2 + math.log(det)
                         n_pairs += 1
                 j = link[j]
-    # greedy by likelihood, each observation and each landmark at most once
-    while True:
-        best, k = np.inf, -1
-        for i in range(n_pairs):
-            if pair_o[i] >= 0 and pair_c[i] < best:
-                best, k = pair_c[i], i
-        if k < 0:
-            break
-        o, j = pair_o[k], pair_s[k]
-        match[o] = j
-        for i in range(n_pairs):
-            if pair_o[i] == o or pair_s[i] == j:
-                pair_o[i] = -1
+    _choose(n_pairs, pair_o, pair_s, pair_c, match)
 
 
 @njit(error_model="numpy")

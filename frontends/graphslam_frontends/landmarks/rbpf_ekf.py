@@ -24,10 +24,15 @@ from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.fix_points import expects_fixes, fix_points, place_fixes
 from graphslam_frontends.landmarks.mirror_ambiguity import resolve_mirror_ambiguity
 from graphslam_frontends.landmarks.moment_consistency import consistency_flag, gaussian_discrepancy, particle_gaussians
-from graphslam_frontends.landmarks.prepare import LogPreparation, known_slots, landmark_stream
+from graphslam_frontends.landmarks.prepare import LogPreparation, PreparedLog, known_slots, landmark_stream
 from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases, possible_biases
 from graphslam_frontends.landmarks.stopping import StoppingRule
-from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult, winning_association
+from graphslam_frontends.landmarks.summarise import (
+    LandmarkAssociation,
+    SmoothingProblem,
+    SmoothingResult,
+    winning_association,
+)
 
 Ints = npt.NDArray[np.int64]
 
@@ -137,22 +142,9 @@ class RbpfEkf(FrontEnd):
         c, data, particles = self.config, growing.prepared, filters[0]
         obs = data.observations
         association = winning_association(particles, c.min_hits)
-        offset = int(obs.offsets[first])
-        rows = offset + association.observation
-        scan_of = np.searchsorted(obs.offsets, rows, side="right") - 1 - first
-        best = particles.best
-        z = np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]])
-        span = slice(first, last)
-        problem = SmoothingProblem(
-            increments=data.odometry.increments[span],
-            covariances=data.odometry.covariances[span],
-            ob_pose=scan_of,
-            ob_landmark=association.landmark,
-            observations=z,
-            sensor=obs.T_base_sensor,
-            trim=c.trim,
-            min_hits=c.min_hits,
-        )
+        rows = int(obs.offsets[first]) + association.observation
+        best, span = particles.best, slice(first, last)
+        problem = self._problem(data, association, rows, span)
         smoothed = problem.smooth(particles.path[best, : last - first], particles.mean[best, association.slots])
         if not data.has_bearing.all():
             settled = resolve_mirror_ambiguity(problem, smoothed, DELAYED)
@@ -172,31 +164,7 @@ class RbpfEkf(FrontEnd):
                 "dropped_filters": made.dropped_filters,
                 "pooled_filters": c.pooled - made.dropped_filters,
             }
-        report |= {
-            "gaps": data.gaps_in(first, last),
-            "handover": c.handover,
-            "scans": last - first,
-            "observations": int(particles.observations),
-            "after_gap": int(obs.offsets[last] - obs.offsets[first]) - int(particles.observations),
-            "used": int(smoothed.kept.sum()),
-            "not_associated": int(particles.observations - len(association.observation)),
-            "trimmed": int(len(smoothed.kept) - smoothed.kept.sum()),
-            "particles": c.particles,
-            "association": c.association,
-            "resamplings": particles.resamplings,
-            "min_ess": round(particles.min_ess, 3),
-            "ancestors": particles.ancestors,
-            "effective_ancestors": round(particles.effective_ancestors, 3),
-            "dropped_particles": made.dropped_particles,
-            "chi2": smoothed.chi2,
-            "dof": smoothed.dof,
-            "chi2_odometry": float(smoothed.parts[0]),
-            "chi2_range": float(smoothed.parts[1]),
-            "chi2_bearing": float(smoothed.parts[2]),
-            "converged": smoothed.converged,
-            "nonlinearity": smoothed.nonlinearity() / len(smoothed.gaussian.mean),
-            "unknowns": len(smoothed.gaussian.mean),
-        }
+        report |= self._counts(data, particles, association, smoothed, made, span)
         report["flag"] = consistency_flag(report, c.particles)
         handed = {"smoothed": smoothed.gaussian, "moments": made.moments, "pooled": made.pooled}[c.handover]
         if handed is None:
@@ -238,6 +206,59 @@ class RbpfEkf(FrontEnd):
             uses=data.uses,
             report=report,
         )
+
+    def _problem(
+        self, data: PreparedLog, association: LandmarkAssociation, rows: Ints, span: slice
+    ) -> SmoothingProblem:
+        """Smoothing of the scans of a span with their observations ``rows``."""
+        obs = data.observations
+        return SmoothingProblem(
+            increments=data.odometry.increments[span],
+            covariances=data.odometry.covariances[span],
+            ob_pose=np.searchsorted(obs.offsets, rows, side="right") - 1 - span.start,
+            ob_landmark=association.landmark,
+            observations=np.column_stack([data.rows[rows, :2], data.smoothing_variances[rows]]),
+            sensor=obs.T_base_sensor,
+            trim=self.config.trim,
+            min_hits=self.config.min_hits,
+        )
+
+    def _counts(
+        self,
+        data: PreparedLog,
+        particles: ParticleSet,
+        association: LandmarkAssociation,
+        smoothed: SmoothingResult,
+        made: ParticleGaussians,
+        span: slice,
+    ) -> dict[str, Any]:
+        """Of scans, observations and particles, and how well the smoothing fits, for the report of a submap."""
+        obs, first, last = data.observations, span.start, span.stop
+        return {
+            "gaps": data.gaps_in(first, last),
+            "handover": self.config.handover,
+            "scans": last - first,
+            "observations": int(particles.observations),
+            "after_gap": int(obs.offsets[last] - obs.offsets[first]) - int(particles.observations),
+            "used": int(smoothed.kept.sum()),
+            "not_associated": int(particles.observations - len(association.observation)),
+            "trimmed": int(len(smoothed.kept) - smoothed.kept.sum()),
+            "particles": self.config.particles,
+            "association": self.config.association,
+            "resamplings": particles.resamplings,
+            "min_ess": round(particles.min_ess, 3),
+            "ancestors": particles.ancestors,
+            "effective_ancestors": round(particles.effective_ancestors, 3),
+            "dropped_particles": made.dropped_particles,
+            "chi2": smoothed.chi2,
+            "dof": smoothed.dof,
+            "chi2_odometry": float(smoothed.parts[0]),
+            "chi2_range": float(smoothed.parts[1]),
+            "chi2_bearing": float(smoothed.parts[2]),
+            "converged": smoothed.converged,
+            "nonlinearity": smoothed.nonlinearity() / len(smoothed.gaussian.mean),
+            "unknowns": len(smoothed.gaussian.mean),
+        }
 
 
 def _trajectory(t_start: float, times: Array, smoothed: SmoothingResult) -> Trajectory:

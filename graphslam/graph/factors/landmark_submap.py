@@ -225,6 +225,25 @@ class PathBatch(SubmapBatch):
     record = PathRecord
 
 
+def submap_jacobian(
+    ends: tuple[Array, Array], points: Array, z: Array, chart: str, places: int | None = None
+) -> tuple[Array, Array]:
+    """Residual ``H(X) - z`` ``(3 + 2n,)`` (Combined SLAM eq. 15) and its Jacobian ``(3 + 2n, 6 + 2n)``.
+
+    Parameters
+    ----------
+    ends : (start, end)
+        World poses; the Jacobian is by their right tangents, then by the points.
+    points : (n, 2)
+        World positions; from ``places`` on, pairs of constant errors.
+    """
+    from graphslam.graph.normal_kernels import whiten_submap  # numba takes a third of a second to load
+
+    n = len(points)
+    every = np.arange(n, dtype=np.int64)
+    return whiten_submap(ends, points, every, z, n if places is None else places, chart == "group", np.eye(3 + 2 * n))
+
+
 def submap_factor(record: SubmapRecord | PathRecord, origin: Array) -> gtsam.CustomFactor:
     """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start where that is the fixed first base, at ``origin``.
 
