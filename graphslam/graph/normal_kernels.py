@@ -76,14 +76,8 @@ def submap_terms(
 ) -> tuple[float, float, float, float, float, float]:
     """Residual of a submap; returns ``a, b`` of V⁻¹ and cosine and sine of the start's heading and of the turn.
 
-    Parameters
-    ----------
-    ends : (start, end)
-        Poses (x, y, θ).
-    rows : (n,)
-        Row of each entry among the points.
-    places : int
-        Entries from this one on are pairs of constants: they have no frame, and no chart.
+    ``rows`` are those of the entries among the points; from ``places`` on they are pairs of constants, which have no
+    frame, and no chart.
     """
     start, end = ends
     q, h, r = out

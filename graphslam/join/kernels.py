@@ -34,6 +34,14 @@ class BlockMap(NamedTuple):
 
 
 @njit
+def _begin_of(width: Index) -> Index:
+    """Where each node begins among the scalars, and their number ``(N + 1,)``."""
+    at = np.zeros(len(width) + 1, np.int64)
+    at[1:] = np.cumsum(width)
+    return at
+
+
+@njit
 def join_blocks(
     known: BlockMap, new: BlockMap, image: Index, start: int, rounding: float, pull: Array
 ) -> tuple[Array, Index, Index, Index, Index, Array, Array, bool]:
@@ -75,12 +83,7 @@ def join_blocks(
     for b in range(NB):
         new_width[image[b]] = b_width[b]
         source[image[b]] = b
-    at = np.zeros(total + 1, np.int64)
-    b_at = np.zeros(NB + 1, np.int64)
-    for i in range(total):
-        at[i + 1] = at[i] + new_width[i]
-    for b in range(NB):
-        b_at[b + 1] = b_at[b] + b_width[b]
+    at, b_at = _begin_of(new_width), _begin_of(b_width)
     out = np.empty(at[total])
     out[: len(x)] = x
     sx, sy, st = x[at[start]], x[at[start] + 1], x[at[start] + 2]
@@ -275,9 +278,7 @@ def _arcs(m: BlockMap, anchor: Index, x: Array) -> tuple[Array, Array]:
     """``a, b`` of V⁻¹ and the column of the anchor's heading ``(N, 4)`` of each node at x; the gradient ``Jᵀ I u``."""
     mean, width, ptr, idx, block, value = m
     N = len(width)
-    at = np.zeros(N + 1, np.int64)
-    for i in range(N):
-        at[i + 1] = at[i] + width[i]
+    at = _begin_of(width)
     arc = np.empty((N, 4))
     u = np.empty(at[N])
     for i in range(N):

@@ -126,7 +126,7 @@ def _columns(
     fill = below_ptr[:-1].copy()
     scalars = np.zeros(N, np.int64)  # rows below each node
     seen[:] = -1
-    entries = np.int64(0)
+    entries = 0
     for k in range(N):
         old = post[k]
         seen[k] = k
@@ -141,7 +141,7 @@ def _columns(
                 entries += w * (offset[i + 1] - offset[i])
                 i = up[i]
         entries += w * (w + 1) // 2
-    return count, scalars, below_ptr, below, entries
+    return count, scalars, below_ptr, below, int(entries)
 
 
 @njit

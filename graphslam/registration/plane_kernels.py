@@ -227,6 +227,15 @@ def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array)
 
 
 @njit(fastmath={"contract"})
+def _share_of(share: Array, m: int, J: Array, out: Array) -> None:
+    """``out = share[m] J``."""
+    for u in range(len(J)):
+        out[u] = 0.0
+        for v in range(len(J)):
+            out[u] += share[m, u, v] * J[v]
+
+
+@njit(fastmath={"contract"})
 def plane_blocks(
     pairs: PlanePairs,
     poses: tuple[Array, Array],
@@ -270,8 +279,7 @@ def plane_blocks(
         i, j, p, q = pairs.i[k], pairs.j[k], pairs.source[k], pairs.target[k]
         nj, pi = normals[q], points[p]
         for u in range(d):
-            ni[u] = 0.0
-            y[u] = 0.0
+            ni[u], y[u] = 0.0, 0.0
         for u in range(d):
             x[u] = t[i, u] - t[j, u]
             nw[u] = 0.0
@@ -284,9 +292,6 @@ def plane_blocks(
         r = 0.0
         for v in range(d):
             r += nj[v] * (y[v] - points[q, v])
-        for u in range(w):
-            gi[u] = 0.0
-            gj[u] = 0.0
         if len(held.group):
             m = held.group[k]
             for u in range(d):
@@ -304,16 +309,10 @@ def plane_blocks(
                 normal_jacobian(x, nw, K)
                 for u in range(w):
                     pull[u] -= K[u] * e
-            for u in range(w):
-                K[u] = 0.0
-                for v in range(w):
-                    K[u] += held.share[m, u, v] * J[v]
+            _share_of(held.share, m, J, K)
             _moved(K, R[i], t[i], held.centre[m], 1.0, Ji)
             _moved(K, R[j], t[j], held.centre[m], -1.0, Jj)
-            for u in range(w):
-                K[u] = 0.0
-                for v in range(w):
-                    K[u] += held.share[m, u, v] * pull[v]
+            _share_of(held.share, m, pull, K)
             _moved(K, R[i], t[i], held.centre[m], 1.0, gi)
             _moved(K, R[j], t[j], held.centre[m], -1.0, gj)
         else:
@@ -323,9 +322,8 @@ def plane_blocks(
                 Jj[v] = -Jj[v]
                 gi[v] = Ji[v] * r
                 gj[v] = Jj[v] * r
-        L = information[k]
+        L, a, b, c = information[k], first[i], first[j], offset[k]
         total += L * r * r
-        a, b, c = first[i], first[j], offset[k]
         low_is_j = rank[j] < rank[i]
         for u in range(w):
             Lu, Lv = L * Ji[u], L * Jj[u]
@@ -334,8 +332,5 @@ def plane_blocks(
             for v in range(w):
                 H[a + u * w + v] += Lu * Ji[v]
                 H[b + u * w + v] += Lv * Jj[v]
-                if low_is_j:
-                    H[c + u * w + v] += Lv * Ji[v]
-                else:
-                    H[c + u * w + v] += Lu * Jj[v]
+                H[c + u * w + v] += Lv * Ji[v] if low_is_j else Lu * Jj[v]
     return total

@@ -450,7 +450,7 @@ def _both(T, B):
 @njit(nogil=True)
 def restrict_residual(position, k, r, out):
     """Write ``Pᵀ r`` to ``out (K, 6)``."""
-    N, K = len(position), len(out)
+    p, N, K = position, len(position), len(out)
     out[:] = 0.0
     for c in range(K - 1):
         a, b, end = _interval(c, k, N)
@@ -459,11 +459,7 @@ def restrict_residual(position, k, r, out):
             for side in range(2):
                 q = a if side == 0 else b
                 g = 1.0 - h if side == 0 else h
-                x, y, z = (
-                    position[i, 0] - position[q, 0],
-                    position[i, 1] - position[q, 1],
-                    position[i, 2] - position[q, 2],
-                )
+                x, y, z = p[i, 0] - p[q, 0], p[i, 1] - p[q, 1], p[i, 2] - p[q, 2]
                 o = out[c + side]
                 o[0] += g * (r[i, 0] + y * r[i, 5] - z * r[i, 4])
                 o[1] += g * (r[i, 1] + z * r[i, 3] - x * r[i, 5])
@@ -476,7 +472,7 @@ def restrict_residual(position, k, r, out):
 @njit(nogil=True)
 def prolong_step(position, k, x, out):
     """Add ``P x`` of ``x (K, 6)`` to ``out (N, 6)``."""
-    N, K = len(position), len(x)
+    p, N, K = position, len(position), len(x)
     for c in range(K - 1):
         a, b, end = _interval(c, k, N)
         for i in range(a, end):
@@ -484,11 +480,7 @@ def prolong_step(position, k, x, out):
             for side in range(2):
                 q = a if side == 0 else b
                 g = 1.0 - h if side == 0 else h
-                dx, dy, dz = (
-                    position[i, 0] - position[q, 0],
-                    position[i, 1] - position[q, 1],
-                    position[i, 2] - position[q, 2],
-                )
+                dx, dy, dz = p[i, 0] - p[q, 0], p[i, 1] - p[q, 1], p[i, 2] - p[q, 2]
                 v = x[c + side]
                 out[i, 0] += g * v[0]
                 out[i, 1] += g * v[1]

@@ -81,18 +81,6 @@ def _turned(Rb, r, B):
 
 
 @njit(nogil=True, error_model="numpy")
-def _add_square(information, k, r, f, total):
-    """``total + rᵀ Ω r`` of link k; f: room."""
-    for m in range(6):
-        f[m] = 0.0
-        for n in range(6):
-            f[m] += information[k, m, n] * r[n]
-    for m in range(6):
-        total += r[m] * f[m]
-    return total
-
-
-@njit(nogil=True, error_model="numpy")
 def join_links(links, poses, covariance, misfit):
     """Join the links of each segment to one.
 
@@ -117,8 +105,7 @@ def join_links(links, poses, covariance, misfit):
         for i in range(3):
             for j in range(3):
                 mixed |= links.covariance[k, i, 3 + j] != 0.0
-    single = len(links.information) == 1
-    total = 0.0
+    single, total = len(links.information) == 1, 0.0
     for s in range(len(links.first) - 1):
         V, c = covariance[s], misfit[s]
         V[:] = 0.0
@@ -130,7 +117,11 @@ def join_links(links, poses, covariance, misfit):
             way = Q[j, 0] - Q[i, 0], Q[j, 1] - Q[i, 1], Q[j, 2] - Q[i, 2]
             _residual(links, e, (Ra, Rb), way, (A, X), r)
             k = 0 if single else e
-            total = _add_square(links.information, k, r, f, total)
+            for m in range(6):
+                f[m] = 0.0
+                for n in range(6):
+                    f[m] += links.information[k, m, n] * r[n]
+                total += r[m] * f[m]
             _turned(Rb, r, B)
             S = links.covariance[k]
             # N = B Σ_ww Bᵀ, M = Ra Σ_uu Raᵀ
@@ -177,9 +168,7 @@ def join_links(links, poses, covariance, misfit):
             x = Rb[0] * r[0] + Rb[1] * r[1] + Rb[2] * r[2]
             y = Rb[3] * r[0] + Rb[4] * r[1] + Rb[5] * r[2]
             z = Rb[6] * r[0] + Rb[7] * r[1] + Rb[8] * r[2]
-            c[0] += x
-            c[1] += y
-            c[2] += z
+            c[0], c[1], c[2] = c[0] + x, c[1] + y, c[2] + z
             c[3] += Ra[0] * r[3] + Ra[1] * r[4] + Ra[2] * r[5] + ly * z - lz * y
             c[4] += Ra[3] * r[3] + Ra[4] * r[4] + Ra[5] * r[5] + lz * x - lx * z
             c[5] += Ra[6] * r[3] + Ra[7] * r[4] + Ra[8] * r[5] + lx * y - ly * x

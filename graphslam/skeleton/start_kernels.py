@@ -9,6 +9,180 @@ from graphslam.skeleton.chain_kernels import _cholesky, _log, _solve, write_se3_
 
 
 @njit(nogil=True)
+def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, out):
+    """One walk along the poses: each is tied to the landmarks that were seen long before, then adds its sightings.
+
+    Parameters
+    ----------
+    chain_poses : Poses
+        Their increments are followed.
+    span : (begin, end)
+        Poses; those before are done.
+    rules : (ago, turn, way, gate)
+        A landmark is old when it was first seen more than ``ago`` poses earlier; prior information of a pose against
+        its prediction [1/rad², 1/m²]; chi-square (3) up to which a sighting is believed.
+    start_seen : (L,) int32
+        The pose that saw each landmark first, at the beginning -1; changed.
+    D, b : (L, 6), (L, 3)
+        Sums of weights and of weighted places, at the beginning zero; changed.
+    out : Poses
+        The first pose is that of the chain.
+
+    Returns
+    -------
+    tied, refused : int
+        Poses that were tied to old landmarks; sightings of old landmarks that were not believed.
+    """
+    ago, turn, way, gate = rules
+    rotation, position, points = chain_poses.rotation, chain_poses.position, sightings.points
+    A = np.empty((6, 6))
+    x = np.empty(6)
+    w = np.empty(3)
+    E = np.empty((3, 3))
+    T = np.empty((3, 3))
+    Rp = np.empty((3, 3))
+    pp = np.empty(3)
+    most = 0
+    for i in range(span[0], span[1]):
+        most = max(most, sightings.first[i + 1] - sightings.first[i])
+    seen = np.empty((most, 8))
+    misfit = np.empty(most)
+    which = np.empty(most, np.int64)
+    believed = np.ones(most, np.bool_)
+    tied = refused = 0
+    for i in range(span[0], span[1]):
+        R, p = out.rotation[i], out.position[i]
+        if i == 0:
+            R[:] = rotation[0]
+            p[:] = position[0]
+        else:
+            a, c = rotation[i - 1], rotation[i]
+            Q, q0 = out.rotation[i - 1], out.position[i - 1]
+            for r in range(3):
+                for k in range(3):
+                    T[r, k] = Q[r, 0] * a[k, 0] + Q[r, 1] * a[k, 1] + Q[r, 2] * a[k, 2]
+            for r in range(3):
+                p[r] = q0[r]
+                for k in range(3):
+                    R[r, k] = T[r, 0] * c[0, k] + T[r, 1] * c[1, k] + T[r, 2] * c[2, k]
+                    p[r] += T[r, k] * (position[i, k] - position[i - 1, k])
+        lo, hi = sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base
+        believed[: hi - lo] = True
+        n = 0
+        for m in range(lo, hi):
+            j = sightings.landmark[m]
+            if start_seen[j] < 0 or i - start_seen[j] <= ago:
+                continue
+            # the running mean D⁻¹ b
+            d0, d1, d2, d3, d4, d5 = D[j, 0], D[j, 1], D[j, 2], D[j, 3], D[j, 4], D[j, 5]
+            xx, xy, xz = d3 * d5 - d4 * d4, d2 * d4 - d1 * d5, d1 * d4 - d2 * d3
+            yy, yz, zz = d0 * d5 - d2 * d2, d2 * d1 - d0 * d4, d0 * d3 - d1 * d1
+            over = 1.0 / (d0 * xx + d1 * xy + d2 * xz)
+            seen[n, 0] = (xx * b[j, 0] + xy * b[j, 1] + xz * b[j, 2]) * over
+            seen[n, 1] = (xy * b[j, 0] + yy * b[j, 1] + yz * b[j, 2]) * over
+            seen[n, 2] = (xz * b[j, 0] + yz * b[j, 1] + zz * b[j, 2]) * over
+            z0, z1, z2 = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
+            seen[n, 3], seen[n, 4], seen[n, 5] = z0, z1, z2
+            r2 = z0 * z0 + z1 * z1 + z2 * z2
+            seen[n, 6] = sightings.across / r2
+            seen[n, 7] = (sightings.along - seen[n, 6]) / r2
+            which[n] = m - lo
+            n += 1
+        if n >= 3:
+            tied += 1
+            Rp[:] = R
+            pp[:] = p
+            limit = np.inf
+            for step in range(3):
+                A[:] = 0.0
+                x[:] = 0.0
+                for k in range(3):  # prior: the turn and the way since the prediction
+                    A[k, k] = turn
+                    A[3 + k, 3 + k] = way
+                    x[3 + k] = -way * (p[k] - pp[k])
+                for r in range(3):
+                    for k in range(3):
+                        E[r, k] = R[r, 0] * Rp[k, 0] + R[r, 1] * Rp[k, 1] + R[r, 2] * Rp[k, 2]
+                _log(E, w)
+                for k in range(3):
+                    x[k] = -turn * w[k]
+                for e in range(n):
+                    z0, z1, z2, al, be = seen[e, 3], seen[e, 4], seen[e, 5], seen[e, 6], seen[e, 7]
+                    sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+                    sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+                    sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+                    qx, qy, qz = seen[e, 0] - p[0], seen[e, 1] - p[1], seen[e, 2] - p[2]
+                    ex, ey, ez = qx - sx, qy - sy, qz - sz
+                    d = sx * ex + sy * ey + sz * ez
+                    misfit[e] = al * (ex * ex + ey * ey + ez * ez) + be * d * d
+                if step > 0:
+                    limit = max(gate, 9.0 * np.median(misfit[:n]))
+                for e in range(n):
+                    if misfit[e] > limit:
+                        continue
+                    z0, z1, z2, al, be = seen[e, 3], seen[e, 4], seen[e, 5], seen[e, 6], seen[e, 7]
+                    sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+                    sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+                    sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+                    qx, qy, qz = seen[e, 0] - p[0], seen[e, 1] - p[1], seen[e, 2] - p[2]
+                    ex, ey, ez = qx - sx, qy - sy, qz - sz
+                    d = be * (sx * ex + sy * ey + sz * ez)
+                    fx, fy, fz = al * ex + d * sx, al * ey + d * sy, al * ez + d * sz
+                    x[0] -= fy * qz - fz * qy
+                    x[1] -= fz * qx - fx * qz
+                    x[2] -= fx * qy - fy * qx
+                    x[3] += fx
+                    x[4] += fy
+                    x[5] += fz
+                    _add_weight(A, qx, qy, qz, sx, sy, sz, (al, be))
+                _cholesky(A)
+                _solve(A, x)
+                for k in range(3):
+                    w[k] = x[k]
+                    p[k] += x[3 + k]
+                write_se3_exp(w, E)
+                for r in range(3):
+                    for k in range(3):
+                        T[r, k] = E[r, 0] * R[0, k] + E[r, 1] * R[1, k] + E[r, 2] * R[2, k]
+                R[:] = T
+            for e in range(n):
+                z0, z1, z2, al, be = seen[e, 3], seen[e, 4], seen[e, 5], seen[e, 6], seen[e, 7]
+                sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+                sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+                sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+                ex, ey, ez = seen[e, 0] - p[0] - sx, seen[e, 1] - p[1] - sy, seen[e, 2] - p[2] - sz
+                d = sx * ex + sy * ey + sz * ez
+                if al * (ex * ex + ey * ey + ez * ez) + be * d * d > gate:
+                    believed[which[e]] = False
+                    refused += 1
+        for m in range(lo, hi):
+            if not believed[m - lo]:
+                continue
+            j = sightings.landmark[m]
+            z0, z1, z2 = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
+            r2 = z0 * z0 + z1 * z1 + z2 * z2
+            al = sightings.across / r2
+            be = (sightings.along - al) / r2
+            sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
+            sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
+            sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
+            D[j, 0] += al + be * sx * sx
+            D[j, 1] += be * sx * sy
+            D[j, 2] += be * sx * sz
+            D[j, 3] += al + be * sy * sy
+            D[j, 4] += be * sy * sz
+            D[j, 5] += al + be * sz * sz
+            ax, ay, az = p[0] + sx, p[1] + sy, p[2] + sz
+            d = be * (sx * ax + sy * ay + sz * az)
+            b[j, 0] += al * ax + d * sx
+            b[j, 1] += al * ay + d * sy
+            b[j, 2] += al * az + d * sz
+            if start_seen[j] < 0:
+                start_seen[j] = i
+    return tied, refused
+
+
+@njit(nogil=True)
 def _add_weight(A, qx, qy, qz, sx, sy, sz, weight):
     """Add ``Jᵀ W J``, J = [[q]× , -I], to a block (6, 6)."""
     al, be = weight
@@ -37,213 +211,3 @@ def _add_weight(A, qx, qy, qz, sx, sy, sz, weight):
     A[4, 3] += be * sy * sx
     A[5, 3] += be * sz * sx
     A[5, 4] += be * sz * sy
-
-
-@njit(nogil=True)
-def _follow(i, chain_poses, R, p, out):
-    """Pose i, ``R`` and ``p``, from the one before it by the chain's increment."""
-    rotation, position = chain_poses.rotation, chain_poses.position
-    a, c = rotation[i - 1], rotation[i]
-    Q, q0 = out.rotation[i - 1], out.position[i - 1]
-    for r in range(3):
-        p[r] = q0[r]
-        t = (
-            Q[r, 0] * a[0, 0] + Q[r, 1] * a[0, 1] + Q[r, 2] * a[0, 2],
-            Q[r, 0] * a[1, 0] + Q[r, 1] * a[1, 1] + Q[r, 2] * a[1, 2],
-            Q[r, 0] * a[2, 0] + Q[r, 1] * a[2, 1] + Q[r, 2] * a[2, 2],
-        )
-        for k in range(3):
-            R[r, k] = t[0] * c[0, k] + t[1] * c[1, k] + t[2] * c[2, k]
-            p[r] += t[k] * (position[i, k] - position[i - 1, k])
-
-
-@njit(nogil=True)
-def _old_landmarks(i, sightings, landmarks, ago, seen, which):
-    """Number of landmarks that pose i sees again; mean, sighting and its weights of each in a row of ``seen``."""
-    start_seen, D, b = landmarks
-    lo = sightings.first[i] - sightings.base
-    n = 0
-    for m in range(lo, sightings.first[i + 1] - sightings.base):
-        j = sightings.landmark[m]
-        if start_seen[j] < 0 or i - start_seen[j] <= ago:
-            continue
-        # the running mean D⁻¹ b
-        d0, d1, d2, d3, d4, d5 = D[j, 0], D[j, 1], D[j, 2], D[j, 3], D[j, 4], D[j, 5]
-        xx, xy, xz = d3 * d5 - d4 * d4, d2 * d4 - d1 * d5, d1 * d4 - d2 * d3
-        yy, yz, zz = d0 * d5 - d2 * d2, d2 * d1 - d0 * d4, d0 * d3 - d1 * d1
-        over = 1.0 / (d0 * xx + d1 * xy + d2 * xz)
-        seen[n, 0] = (xx * b[j, 0] + xy * b[j, 1] + xz * b[j, 2]) * over
-        seen[n, 1] = (xy * b[j, 0] + yy * b[j, 1] + yz * b[j, 2]) * over
-        seen[n, 2] = (xz * b[j, 0] + yz * b[j, 1] + zz * b[j, 2]) * over
-        for r in range(3):
-            seen[n, 3 + r] = sightings.points[m, r]
-        r2 = seen[n, 3] * seen[n, 3] + seen[n, 4] * seen[n, 4] + seen[n, 5] * seen[n, 5]
-        seen[n, 6] = sightings.across / r2
-        seen[n, 7] = (sightings.along - seen[n, 6]) / r2
-        which[n] = m - lo
-        n += 1
-    return n
-
-
-@njit(nogil=True)
-def _seen_from(R, p, seen, e):
-    """Sighting e and its landmark from a pose, in axes of the world."""
-    z0, z1, z2 = seen[e, 3], seen[e, 4], seen[e, 5]
-    sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
-    sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
-    sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
-    return sx, sy, sz, seen[e, 0] - p[0], seen[e, 1] - p[1], seen[e, 2] - p[2]
-
-
-@njit(nogil=True)
-def _chi2(R, p, seen, e):
-    """Of sighting e from a pose."""
-    sx, sy, sz, qx, qy, qz = _seen_from(R, p, seen, e)
-    ex, ey, ez = qx - sx, qy - sy, qz - sz
-    d = sx * ex + sy * ey + sz * ez
-    return seen[e, 6] * (ex * ex + ey * ey + ez * ez) + seen[e, 7] * d * d
-
-
-@njit(nogil=True)
-def _tie(R, p, seen, n, misfit, rules, work):
-    """Fit a pose to its prediction and to the n landmarks that it sees again, in three steps."""
-    _, turn, way, gate = rules
-    A, x, w, E, T, Rp, pp = work
-    Rp[:] = R
-    pp[:] = p
-    limit = np.inf
-    for step in range(3):
-        A[:] = 0.0
-        x[:] = 0.0
-        for k in range(3):  # prior: the turn and the way since the prediction
-            A[k, k] = turn
-            A[3 + k, 3 + k] = way
-            x[3 + k] = -way * (p[k] - pp[k])
-        for r in range(3):
-            for k in range(3):
-                E[r, k] = R[r, 0] * Rp[k, 0] + R[r, 1] * Rp[k, 1] + R[r, 2] * Rp[k, 2]
-        _log(E, w)
-        for k in range(3):
-            x[k] = -turn * w[k]
-        for e in range(n):
-            misfit[e] = _chi2(R, p, seen, e)
-        if step > 0:
-            limit = max(gate, 9.0 * np.median(misfit[:n]))
-        for e in range(n):
-            if misfit[e] > limit:
-                continue
-            al, be = seen[e, 6], seen[e, 7]
-            sx, sy, sz, qx, qy, qz = _seen_from(R, p, seen, e)
-            ex, ey, ez = qx - sx, qy - sy, qz - sz
-            d = be * (sx * ex + sy * ey + sz * ez)
-            fx, fy, fz = al * ex + d * sx, al * ey + d * sy, al * ez + d * sz
-            x[0] -= fy * qz - fz * qy
-            x[1] -= fz * qx - fx * qz
-            x[2] -= fx * qy - fy * qx
-            x[3] += fx
-            x[4] += fy
-            x[5] += fz
-            _add_weight(A, qx, qy, qz, sx, sy, sz, (al, be))
-        _cholesky(A)
-        _solve(A, x)
-        for k in range(3):
-            w[k] = x[k]
-            p[k] += x[3 + k]
-        write_se3_exp(w, E)
-        for r in range(3):
-            for k in range(3):
-                T[r, k] = E[r, 0] * R[0, k] + E[r, 1] * R[1, k] + E[r, 2] * R[2, k]
-        R[:] = T
-
-
-@njit(nogil=True)
-def _add_sightings(i, sightings, landmarks, believed, R, p):
-    """Add what pose i believes of its sightings to the sums of the landmarks."""
-    start_seen, D, b = landmarks
-    lo = sightings.first[i] - sightings.base
-    for m in range(lo, sightings.first[i + 1] - sightings.base):
-        if not believed[m - lo]:
-            continue
-        j = sightings.landmark[m]
-        z0, z1, z2 = (
-            np.float64(sightings.points[m, 0]),
-            np.float64(sightings.points[m, 1]),
-            np.float64(sightings.points[m, 2]),
-        )
-        r2 = z0 * z0 + z1 * z1 + z2 * z2
-        al = sightings.across / r2
-        be = (sightings.along - al) / r2
-        sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
-        sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
-        sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2
-        D[j, 0] += al + be * sx * sx
-        D[j, 1] += be * sx * sy
-        D[j, 2] += be * sx * sz
-        D[j, 3] += al + be * sy * sy
-        D[j, 4] += be * sy * sz
-        D[j, 5] += al + be * sz * sz
-        ax, ay, az = p[0] + sx, p[1] + sy, p[2] + sz
-        d = be * (sx * ax + sy * ay + sz * az)
-        b[j, 0] += al * ax + d * sx
-        b[j, 1] += al * ay + d * sy
-        b[j, 2] += al * az + d * sz
-        if start_seen[j] < 0:
-            start_seen[j] = i
-
-
-@njit(nogil=True)
-def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, out):
-    """One walk along the poses: each is tied to the landmarks that were seen long before, then adds its sightings.
-
-    Parameters
-    ----------
-    chain_poses : Poses
-        Their increments are followed.
-    span : (begin, end)
-        Poses; those before are done.
-    rules : (ago, turn, way, gate)
-        A landmark is old when it was first seen more than ``ago`` poses earlier; prior information of a pose against
-        its prediction [1/rad², 1/m²]; chi-square (3) up to which a sighting is believed.
-    start_seen : (L,) int32
-        The pose that saw each landmark first, at the beginning -1; changed.
-    D, b : (L, 6), (L, 3)
-        Sums of weights and of weighted places, at the beginning zero; changed.
-    out : Poses
-        The first pose is that of the chain.
-
-    Returns
-    -------
-    tied, refused : int
-        Poses that were tied to old landmarks; sightings of old landmarks that were not believed.
-    """
-    landmarks = start_seen, D, b
-    work = (
-        *(np.empty((6, 6)), np.empty(6), np.empty(3), np.empty((3, 3)), np.empty((3, 3))),
-        *(np.empty((3, 3)), np.empty(3)),
-    )
-    most = 0
-    for i in range(span[0], span[1]):
-        most = max(most, sightings.first[i + 1] - sightings.first[i])
-    seen = np.empty((most, 8))
-    misfit = np.empty(most)
-    which = np.empty(most, np.int64)
-    believed = np.ones(most, np.bool_)
-    tied = refused = 0
-    for i in range(span[0], span[1]):
-        R, p = out.rotation[i], out.position[i]
-        if i == 0:
-            R[:] = chain_poses.rotation[0]
-            p[:] = chain_poses.position[0]
-        else:
-            _follow(i, chain_poses, R, p, out)
-        believed[: sightings.first[i + 1] - sightings.first[i]] = True
-        n = _old_landmarks(i, sightings, landmarks, rules[0], seen, which)
-        if n >= 3:
-            tied += 1
-            _tie(R, p, seen, n, misfit, rules, work)
-            for e in range(n):
-                if _chi2(R, p, seen, e) > rules[3]:
-                    believed[which[e]] = False
-                    refused += 1
-        _add_sightings(i, sightings, landmarks, believed, R, p)
-    return tied, refused

@@ -23,7 +23,12 @@ from graphslam_frontends.landmarks.config import DELAYED, RbpfEkfConfig
 from graphslam_frontends.landmarks.filter import ParticleSet
 from graphslam_frontends.landmarks.fix_points import expects_fixes, fix_points, place_fixes
 from graphslam_frontends.landmarks.mirror_ambiguity import resolve_mirror_ambiguity
-from graphslam_frontends.landmarks.moment_consistency import consistency_flag, gaussian_discrepancy, particle_gaussians
+from graphslam_frontends.landmarks.moment_consistency import (
+    ParticleGaussians,
+    consistency_flag,
+    gaussian_discrepancy,
+    particle_gaussians,
+)
 from graphslam_frontends.landmarks.prepare import LogPreparation, PreparedLog, known_slots, landmark_stream
 from graphslam_frontends.landmarks.sensor_biases import estimate_sensor_biases, possible_biases
 from graphslam_frontends.landmarks.stopping import StoppingRule

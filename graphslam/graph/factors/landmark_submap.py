@@ -230,12 +230,8 @@ def submap_jacobian(
 ) -> tuple[Array, Array]:
     """Residual ``H(X) - z`` ``(3 + 2n,)`` (Combined SLAM eq. 15) and its Jacobian ``(3 + 2n, 6 + 2n)``.
 
-    Parameters
-    ----------
-    ends : (start, end)
-        World poses; the Jacobian is by their right tangents, then by the points.
-    points : (n, 2)
-        World positions; from ``places`` on, pairs of constant errors.
+    By the right tangents of the start and the end, then by the points ``(n, 2)``, which are pairs of constant errors
+    from ``places`` on.
     """
     from graphslam.graph.normal_kernels import whiten_submap  # numba takes a third of a second to load
 
