@@ -81,13 +81,7 @@ class ControlRow:
         return f"line {self.line}" + (f" ({self.name})" if self.name else "")
 
     def coordinates(self, dim: int) -> tuple[Array, Array]:
-        """Coordinates ``(dim,)`` and their covariance ``(dim, dim)``; in the plane the height is left out.
-
-        Raises
-        ------
-        DataError
-            The row has no height, and the map is in space.
-        """
+        """Coordinates ``(dim,)`` and their covariance ``(dim, dim)``; in the plane the height is left out."""
         assert self.position is not None
         if len(self.position) < dim:
             raise DataError("a map in space needs a height", got="no z", wanted="x, y and z")
@@ -112,15 +106,7 @@ class ControlTable:
 
     @classmethod
     def parse(cls, source: str, lines: list[str]) -> ControlTable:
-        """Read a table, header first; empty lines and those that begin with ``#`` are skipped.
-
-        Raises
-        ------
-        FormatError
-            The header is not usable.
-        DataError
-            No row is.
-        """
+        """Read a table, header first; empty lines and those that begin with ``#`` are skipped."""
         numbered = [(k, t) for k, t in enumerate(lines, 1) if t.strip() and not t.lstrip().startswith("#")]
         cells = [[c.strip() for c in next(csv.reader([t]))] for _, t in numbered]
         header = [c.lower() for c in cells[0]] if cells else []

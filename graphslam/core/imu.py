@@ -62,10 +62,6 @@ class Imu:
         The unit's own roll and pitch [rad]: gravity is seen, heading is not.
     T_base_imu : (7,)
 
-    Raises
-    ------
-    DataError, GeometryError
-
     Examples
     --------
     >>> from graphslam.core.imu import ImuNoise

@@ -40,10 +40,6 @@ class RangeScans:
     spin, spin_rate : (n,)
         Angle at the stamp [rad] and its rate [rad/s]; zeros for a head that stands still.
 
-    Raises
-    ------
-    DataError, GeometryError
-
     Examples
     --------
     >>> ahead = np.array([[1.0, 0, 0], [0, 1.0, 0]])

@@ -115,13 +115,7 @@ class Trajectory:
         return np.asarray(i), np.asarray(j), np.asarray(u, dtype=np.float64)
 
     def interpolate(self, t: ArrayLike, *, max_gap: float | None = None) -> Array:
-        """Poses at times ``t`` ``(q,)`` along the geodesic between neighbours, position *and* heading.
-
-        Raises
-        ------
-        DataError
-            Outside the trajectory, or (with ``max_gap``) inside a gap longer than it.
-        """
+        """Poses at times ``t`` ``(q,)`` along the geodesic between neighbours, position *and* heading."""
         i, j, u = self._bracket(t, max_gap)
         a, b = self.poses[i], self.poses[j]
         if self.dim == 2:

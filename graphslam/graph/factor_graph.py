@@ -94,13 +94,6 @@ class FactorGraph(FactorGraphState):
             Each begins where the one before it ends. Landmarks are identified by the submaps' own ids, -1 = new.
         covariance_scale : float
             As for :meth:`add_submap`.
-
-        Raises
-        ------
-        GeometryError
-            Submaps of two dimensions.
-        DataError
-            No submaps; two of one key; a match into a submap that is not among them.
         """
         chain = list(submaps)
         if not chain:
@@ -260,11 +253,6 @@ class FactorGraph(FactorGraphState):
         """Constant errors of a robot's wheels and sensor ``(4,)`` at the graph's values, and their covariance.
 
         In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; their prior is in it.
-
-        Raises
-        ------
-        DataError
-            The graph has none.
         """
         if not 0 <= robot < self.values.count("wheels"):
             raise DataError(

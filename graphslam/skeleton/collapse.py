@@ -50,11 +50,6 @@ class Collapse:
         ----------
         a, b : (n,)
             Indices of measurements.
-
-        Raises
-        ------
-        DataError
-            They are no integers, of different length, or beyond the measurements. Nothing of the block is taken then.
         """
         parent = self._open()
         left, right = np.asarray(a), np.asarray(b)
