@@ -201,11 +201,12 @@ def test_ties_between_sessions_and_the_base_they_give(tmp_path: Path) -> None:
     tie = {"submap_map": 0, "submap_here": 1, "i": 1, "j": 1, "source": "appearance", "score": 0.7, "gates": {"a": 0.5}}
     candidates = [{**tie, "accepted": True, "why": "agrees"}, {**tie, "accepted": False, "why": "<b>no</b>"}]
     sessions = [{"name": "a", "submaps": 1}, {"name": "b", "submaps": 1, "ties": 1, "candidates": candidates}]
-    report = {"format": "graphslam.merge/1", "by": "auto", "solver": "batch", "sessions": sessions, "seconds": 1.5}
+    report = {"format": "graphslam.merge/1", "by": "auto", "solver": "batch", "sessions": sessions}
     (tmp_path / "merge.json").write_text(json.dumps(report))
     metrics = {"converged": 1.0, "objective": 2.0, "b_base_nees": 60.0, "b_base_nees_dof": 3.0}
     rows = [{"key": k, "value": v, "unit": "", "direction": "none"} for k, v in metrics.items()]
     (tmp_path / "metrics.json").write_text(json.dumps(rows))
+    (tmp_path / "timings.json").write_text(json.dumps([{"key": "seconds_merge", "value": 1.5, "unit": "s"}]))
     add_events(tmp_path, [{"event": "between", "factor_id": 3, "i": 1, "j": 4, "group": "session"}])
     page = Page(make_report(tmp_path).html)
     page.check_alone()
