@@ -170,7 +170,7 @@ def test_too_few_digits_are_an_error_and_not_a_step() -> None:
     omega[::2] *= 1e19
     net = PoseNetwork(2, np.arange(n), np.zeros((n, 3)), np.ones(n, bool), edges, z, omega)
     solution = solve_network(net)
-    # 10^20 at the start; whether the last 10^-11 count as converged is rounding, which differs from processor to processor
+    # 10^20 at the start; whether the last 10^-11 count as converged depends on the processor
     assert solution.objective < 1e-6
 
 
