@@ -341,7 +341,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
     Parameters
     ----------
     anchor : (N,)
-        Pose that each node hangs on; of a pose itself.
+        Pose in whose frame each node is; of a pose itself.
     x : (n,)
 
     Returns

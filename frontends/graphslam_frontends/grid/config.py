@@ -30,9 +30,9 @@ class GridFilterConfig:
     voxel_size: float = 0.2
     """Edge of a voxel [m]: smaller ones cost time with the cube, larger ones blur what end points are weighed by."""
     lift: float = 0.25
-    """Height of the body over the lattice of a new map, in voxels, where gravity is told. A floor between two layers of
-    voxels sinks into the lower one, and the body with it: half a voxel in every new map. In simulated garages heights
-    drifted half as much with 0.25 (and with 0.5) as with 0."""
+    """Height of the body over the lattice of a new map, in voxels, where gravity is measured. A floor between two
+    layers of voxels sinks into the lower one, and the body with it: half a voxel in every new map. In simulated garages
+    heights drifted half as much with 0.25 (and with 0.5) as with 0."""
     hit: float = 0.7
     """Probability that a voxel is occupied, given that a beam ended in it (OctoMap's). With a larger one floors outlast
     the beams that graze them, so that heights drift less; walls get thicker, and the way across them is told less

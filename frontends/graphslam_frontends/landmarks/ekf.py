@@ -176,19 +176,7 @@ class EkfRun:
             self.identities(slots)[s.landmark_kept],
             np.column_stack([data.original[rows[s.kept]], index]),
             self.trajectory(s.poses, s.pose_covariances),
-            report
-            | {"handover": "smoothed", "trimmed": len(s.kept) - used}
-            | counts
-            | {
-                "chi2": s.chi2,
-                "dof": s.dof,
-                "chi2_odometry": float(s.parts[0]),
-                "chi2_range": float(s.parts[1]),
-                "chi2_bearing": float(s.parts[2]),
-                "converged": s.converged,
-                "nonlinearity": s.nonlinearity() / len(s.gaussian.mean),
-                "unknowns": len(s.gaussian.mean),
-            },
+            report | {"handover": "smoothed", "trimmed": len(s.kept) - used} | counts | s.report(),
             None if way is None else fix_points(s, way),
         )
 

@@ -17,12 +17,14 @@ class EkfFilterConfig(SightingConfig):
 
     association: Literal["known", "nearest", "jcbb"] = "nearest"
     """Identities in the log, gated nearest neighbour, or joint compatibility by branch and bound."""
+    max_nodes: int = 20_000
+    """Joint compatibility: hypotheses tested per scan; the best one so far is used then, and the scan counted."""
 
     def __post_init__(self) -> None:
         SightingConfig.__post_init__(self)
         if self.association not in ("known", "nearest", "jcbb"):
             raise ConfigError(f"association = {self.association!r}; known: known, nearest, jcbb")
-        for name in ("confirm_hits", "drop_misses", "drop_scans", "min_hits"):
+        for name in ("max_nodes", "confirm_hits", "drop_misses", "drop_scans", "min_hits"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} = {getattr(self, name)}; wanted ≥ 1")
         if not (np.isfinite(self.max_range) and self.max_range > 0):

@@ -192,6 +192,7 @@ class EkfMap:
             self.sensor,
             gate=c.gate,
             method="jcbb" if c.association == "jcbb" else "nearest",
+            max_nodes=c.max_nodes,
             alive=alive,
         )
         self.nodes += p.nodes

@@ -255,14 +255,7 @@ class RbpfEkf(FrontEnd):
             "ancestors": particles.ancestors,
             "effective_ancestors": round(particles.effective_ancestors, 3),
             "dropped_particles": made.dropped_particles,
-            "chi2": smoothed.chi2,
-            "dof": smoothed.dof,
-            "chi2_odometry": float(smoothed.parts[0]),
-            "chi2_range": float(smoothed.parts[1]),
-            "chi2_bearing": float(smoothed.parts[2]),
-            "converged": smoothed.converged,
-            "nonlinearity": smoothed.nonlinearity() / len(smoothed.gaussian.mean),
-            "unknowns": len(smoothed.gaussian.mean),
+            **smoothed.report(),
         }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphslam.core.jit import njit
 from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, wrap_angle_kernel
-from graphslam_frontends.landmarks.smoothing_kernels import _at_optimum, _odometry_residual
+from graphslam_frontends.landmarks.smoothing_kernels import _at_optimum, _odometry_residual, bound_bearing_slopes
 
 
 @njit(error_model="numpy")
@@ -61,11 +61,7 @@ def bias_sensitivities(poses, landmarks, evidence, along, seen):
         k, j = ob_pose[o], ob_lm[o]
         observe_landmark(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
         n0, n1 = ob[o, 0] - h[0], wrap_angle_kernel(ob[o, 1] - h[1])
-        near = math.sqrt(ob[o, 2])
-        if h[0] < near:
-            share = h[0] / near
-            h[5], h[6], h[7] = share * h[5], share * h[6], share * (h[7] + 1.0) - 1.0
-            h[10], h[11] = share * h[10], share * h[11]
+        bound_bearing_slopes(h, ob[o, 2])
         w0, w1 = weight[o] / ob[o, 2], weight[o] / ob[o, 3]
         for a in range(c):
             # measured less predicted falls by h' δ and changes by seen g

@@ -53,6 +53,16 @@ class NormalBlocks(NamedTuple):
 
 
 @njit(error_model="numpy")
+def bound_bearing_slopes(h, variance):
+    """Bound the derivatives of a bearing, 1/r, where the landmark is nearer than the σ of the range."""
+    near = math.sqrt(variance)
+    if h[0] < near:
+        share = h[0] / near
+        h[5], h[6], h[7] = share * h[5], share * h[6], share * (h[7] + 1.0) - 1.0
+        h[10], h[11] = share * h[10], share * h[11]
+
+
+@njit(error_model="numpy")
 def _inverse3(A):
     """Inverse of a symmetric 3×3 matrix by cofactors."""
     out = np.empty((3, 3))
@@ -152,12 +162,7 @@ def _linearise(poses, landmarks, evidence, normal):
         k, j = ob_pose[o], ob_lm[o]
         observe_landmark(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
         n0, n1 = ob[o, 0] - h[0], wrap_angle_kernel(ob[o, 1] - h[1])
-        near = math.sqrt(ob[o, 2])
-        if h[0] < near:
-            # nearer than its σ a range tells no place: there the bearing's derivative by it, 1/r, has no bound
-            share = h[0] / near
-            h[5], h[6], h[7] = share * h[5], share * h[6], share * (h[7] + 1.0) - 1.0
-            h[10], h[11] = share * h[10], share * h[11]
+        bound_bearing_slopes(h, ob[o, 2])
         w0, w1 = weight[o] / ob[o, 2], weight[o] / ob[o, 3]
         for r_ in range(3):
             a0, a1 = h[2 + r_] * w0, h[5 + r_] * w1

@@ -8,6 +8,7 @@ moment-matched Gaussian stays as the paper's mode and as a figure of honesty bes
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -221,6 +222,19 @@ class SmoothingResult:
     converged: bool
     landmarks: Array
     evidence: SmoothingMeasurements
+
+    def report(self) -> dict[str, Any]:
+        """How well the submap fits its measurements, for the report of the submap."""
+        return {
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "chi2_odometry": float(self.parts[0]),
+            "chi2_range": float(self.parts[1]),
+            "chi2_bearing": float(self.parts[2]),
+            "converged": self.converged,
+            "nonlinearity": self.nonlinearity() / len(self.gaussian.mean),
+            "unknowns": len(self.gaussian.mean),
+        }
 
     def nonlinearity(self) -> float:
         """Distance², under the own covariance, by which curvature moves the optimum from the mean; 0 if all is linear.

@@ -35,7 +35,7 @@ MANY = 0.2
 """Share of lost scans from which a line of the verdict says so."""
 
 LIFT = 0.25
-"""Height of the base over the lattice of its map, in voxels, where gravity is told: a floor between two layers of
+"""Height of the base over the lattice of its map, in voxels, where gravity is measured: a floor between two layers of
 voxels would be in one of them here and in the other there."""
 
 

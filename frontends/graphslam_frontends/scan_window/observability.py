@@ -33,7 +33,7 @@ def direction_strengths(information: Array, every: Array, sigma: float) -> tuple
     """By how many times surfaces hold a body better than noise of their normals would pretend to, and where to.
 
     Normals are found among points that are themselves noisy. Those of a straight wall are therefore turned a little to
-    and fro, each by some σ, and seem to hold a body along the wall too; what is not well above that is not taken for
+    and fro, each by some σ, and seem to hold a body along the wall too; what is not well above that is no
     information.
 
     Parameters

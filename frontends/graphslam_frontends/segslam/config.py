@@ -52,11 +52,9 @@ class SegmentationConfig:
     period: float = 0.0
     """With a number: segments of this many seconds, whatever score and motion say [s]; 0 = off."""
     motion_translation: float = 0.0
-    """α1 of the motion error: error a metre driven [1/m] (A7)."""
+    """α1 of the motion error: error a metre driven [1/m] (A7). A segment ends where its error reaches 1."""
     motion_rotation: float = 0.0
-    """α2: error a radian turned [1/rad]."""
-    motion_limit: float = 1.0
-    """A segment ends where its motion error reaches this; α1 = α2 = 0: never."""
+    """α2: error a radian turned [1/rad]; α1 = α2 = 0: the motion ends no segment."""
     decide: Literal["filter", "particle"] = "filter"
     """One decision for the filter, or one for each particle, which leaves fewer segments that fit together."""
 

@@ -314,7 +314,7 @@ class Segmenter:
             return "max-seconds"
         if c.period:
             return "period" if seconds >= c.period - 1e-6 else ""
-        if (c.motion_translation or c.motion_rotation) and error >= c.motion_limit:
+        if (c.motion_translation or c.motion_rotation) and error >= 1.0:
             return "motion-error"
         if not math.isnan(score):
             if score < c.score:

@@ -106,7 +106,7 @@ def check_classes(figures: RunMetrics) -> list[Finding]:
     """Failed tests without ground truth; those that a run passes are in the metrics."""
     out: list[Finding] = []
 
-    def judge(what: str, value: Any, dof: Any, cause: str) -> None:
+    def check(what: str, value: Any, dof: Any, cause: str) -> None:
         if not (is_finite_number(value) and is_finite_number(dof) and dof > 0):
             return
         high = TOLERANCE * two_sided_bounds(float(value), float(dof), CERTAIN)[1]
@@ -122,13 +122,13 @@ def check_classes(figures: RunMetrics) -> list[Finding]:
             if is_finite_number(row.get("dof"))
             else None
         )
-        judge(f"χ²/dof of factors “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
+        check(f"χ²/dof of factors “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
         # a refined path holds fixes; the other factors of the graph were its start
         if row.get("verdict") == LASTING and (row.get("class") == "gps" or not figures.part("refine")):
             out.append(_lasting(row))
     m = figures.metrics
     cause = "GPS errors are larger or more correlated than assumed, or the map is wrong."
-    judge("NIS/dof of withheld GPS fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
+    check("NIS/dof of withheld GPS fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
     median, expected, chance = (m.get(f"gps_distance_{k}") for k in ("median", "expected", "chance"))
     if median is not None and expected is not None and chance is not None and chance < LEVEL:
         text = (
@@ -141,7 +141,7 @@ def check_classes(figures: RunMetrics) -> list[Finding]:
         text = f"autocorrelation of withheld GPS errors: {alike:.2f} [± {white:.2f}] — {_LASTS}"
         out.append(Finding("look", "gps-correlated", text))
     cause = "submaps with common landmarks disagree; noise, mounting or data association is wrong."
-    judge("disagreement of loop closures, relative to its expectation", m.get("loops_value"), m.get("loops_dof"), cause)
+    check("disagreement of loop closures, relative to its expectation", m.get("loops_value"), m.get("loops_dof"), cause)
     return out
 
 

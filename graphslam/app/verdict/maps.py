@@ -78,7 +78,7 @@ def check_two_maps(figures: RunMetrics) -> list[Finding]:
     text = (
         f"ambiguous loop closures: two maps, one with {first}, one with {second} — both fit the log, only one can be "
         f"right. Nodes differ by up to {found['apart_max']:.2f} m (at {found['apart_max_time']:.0f} s; median "
-        f"{found['apart_median']:.2f} m). Disputed is the relative pose of these stretches: {more}.{each} The map of "
+        f"{found['apart_median']:.2f} m). The relative pose of these stretches is unclear: {more}.{each} The map of "
         f"this run uses neither group and drifts there; both maps are in two_maps/ and in the report. "
         f"To do: {TWO_MAPS_DO}."
     )

@@ -202,7 +202,7 @@ def test_leaving_known_ground_is_no_drop() -> None:
 
 def test_periods_and_motion_error() -> None:
     assert _run(SegmentationConfig(period=20.0), {30.0: 0.0}, 50.0) == [(20.0, "period"), (40.0, "period")]
-    config = SegmentationConfig(score=0.0, relative_score=0.0, motion_translation=0.05, motion_limit=0.999)
+    config = SegmentationConfig(score=0.0, relative_score=0.0, motion_translation=0.05 / 0.999)
     assert _run(config, {}, 50.0) == [(20.0, "motion-error"), (40.0, "motion-error")]
     s = Segmenter(SegmentationConfig(motion_translation=0.02, motion_rotation=0.2), 10.0, 5.0, 1.0)
     assert s.decide(30.0, 25.0, turned=3.9).error == pytest.approx(0.02 * 20 + 0.2 * 2.9)
