@@ -51,6 +51,8 @@ SEARCH_STEP, SEARCH_SIDE = np.deg2rad(4.0), 3
 """Rotations are tried ±3 steps of 4° about every axis …"""
 WIDE_STEP, WIDE_SIDE = np.deg2rad(8.0), 8
 """… and, where a scan is looked for far and wide, ±8 steps of 8° about one with ±1 about the others."""
+LED_AWAY = 0.5
+"""Cells of the finest level by which coarse levels may move a match before it is compared with the prediction."""
 LIKELY = 0.85
 """Overlap of the prediction's match beside the running median above which rotations are not searched …"""
 NEAR = (np.deg2rad(4.0), 0.6)
@@ -503,8 +505,9 @@ class LidarOdometry:
             start = max(near, key=lambda x: x[0])[1] if near else predicted
         start = start if alike(start) else predicted
         pose, points, fit = self._finish(raw, chosen, start, time)
-        if self.held >= BEGUN and np.linalg.norm(se3.se3_between(predicted, start)[:3]) > 0.5 * self.config.levels[-1]:
-            # coarse cells led it out of sight of the prediction: the finest ones decide
+        led = float(np.linalg.norm(se3.se3_between(predicted, start)[:3]))
+        if self.held >= BEGUN and led > LED_AWAY * self.config.levels[-1]:
+            # coarse cells moved it out of reach of the prediction: the finest ones decide
             ahead = self._finish(raw, chosen, predicted, time)
             if ahead[2].overlap > fit.overlap:
                 start, (pose, points, fit) = predicted, ahead

@@ -369,6 +369,7 @@ def test_a_place_that_looks_alike_when_turned_is_refused_by_the_gyro(monkeypatch
     """Rooms look alike when turned by a right angle: the search once turned this path by 90° against its own gyro."""
     monkeypatch.setattr(odometry_module, "GYRO_OFF", limit)
     monkeypatch.setattr(inertial_module, "FARTHEST", 1e6)  # or its place would be refused
+    monkeypatch.setattr(odometry_module, "LED_AWAY", np.inf)  # or the finest cells would refuse it
     log = ScanWorld(kind="lidar", number=91, seconds=70.0).log(7)
     path, _ = follow(log, log["imu"])
     assert (float(np.abs(errors(path, log)[:, :3]).max()) > 1.0) == fooled
