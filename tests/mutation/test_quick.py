@@ -69,3 +69,9 @@ def test_some_mutants_of_the_quick_modules_die() -> None:
     assert [r[0] for r in rows] == ["ledger", "gaussian", "gauge"]
     # which ones are drawn changes with every edit of a module: one new gap is for the whole check to find
     assert sum(int(r[2]) + int(r[3]) for r in rows) >= 8, done.stdout
+
+
+def test_listed_files_and_tests_are_there() -> None:
+    listed = tomllib.loads((HERE / "modules.toml").read_text())
+    named = [f for m in listed.values() for f in (*m["files"], *m["tests"])]
+    assert [f for f in named if not (ROOT / f).is_file()] == []

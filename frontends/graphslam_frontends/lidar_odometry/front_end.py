@@ -138,8 +138,8 @@ class FollowedScan:
     spread: Array
     points: Array
     seen: ScanResult
-    timed: bool
-    """Points have times of their own."""
+    sweep: float | None
+    """Time from its first to its last point [s]; None: points have no times of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +301,7 @@ class LidarFrontEnd(FrontEnd):
         return name if len(some) and (level or asked != "auto") else None
 
     def _follow(self, odometry: LidarOdometry, clouds: PointClouds, k: int) -> FollowedScan:
-        seen = _step(odometry, clouds, k)
+        seen, ages = _step(odometry, clouds, k), clouds.ages(k)
         return FollowedScan(
             float(clouds.times[k]),
             odometry.pose,
@@ -309,7 +309,7 @@ class LidarFrontEnd(FrontEnd):
             odometry.spread,
             odometry.points[evenly_spaced_rows(len(odometry.points), self.config.submap.points)],
             seen,
-            clouds.ages(k) is not None,
+            None if ages is None else float(np.ptp(ages)) if len(ages) else 0.0,
         )
 
 
@@ -430,7 +430,7 @@ def _bent(key: int, kept: list[FollowedScan]) -> list[Finding]:
     """Do points without times lie on a scan that its motion has bent?"""
     worst = 0.0
     for a, b in pairwise(kept):
-        if not b.timed and len(b.points):
+        if b.sweep is None and len(b.points):
             far = float(np.median(np.linalg.norm(b.points, axis=1)))
             move = np.asarray(se3.se3_log(se3.se3_between(a.pose, b.pose)))
             worst = max(worst, float(np.linalg.norm(move[3:]) + far * np.linalg.norm(move[:3])))
@@ -448,14 +448,16 @@ def _uneven(key: int, kept: list[FollowedScan]) -> list[Finding]:
     """Does the motion change so much from scan to scan that scans straightened by an even one stay bent?
 
     If the velocity changes evenly over a scan, by Δ in all, points in its middle are off by Δ / 8 times its duration.
+    Δ is the change from one scan to the next; the duration is from the first point of a scan to its last.
     """
     off = []
     for a, b, c in zip(kept, kept[1:], kept[2:]):
-        if c.timed and not c.seen.aided and len(c.points):
+        if c.sweep is not None and not c.seen.aided and len(c.points) and c.time > b.time:
             before, now = se3.se3_between(np.stack([a.pose, b.pose]), np.stack([b.pose, c.pose]))
             change = np.asarray(se3.se3_log(se3.se3_between(before, now)))
             far = float(np.median(np.linalg.norm(c.points, axis=1)))
-            off.append(float(np.linalg.norm(change[3:]) + far * np.linalg.norm(change[:3])) / 8.0)
+            share = min(c.sweep / (c.time - b.time), 1.0)  # a hand shakes faster than scans come: of time, not of Δ
+            off.append(share * float(np.linalg.norm(change[3:]) + far * np.linalg.norm(change[:3])) / 8.0)
     if not off or np.median(off) <= UNEVEN:
         return []
     text = (

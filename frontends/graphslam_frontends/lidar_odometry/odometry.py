@@ -524,11 +524,9 @@ class LidarOdometry:
                 state = "found again"
             if few_of_it and fit.overlap < SUSPICIOUS * np.median(self.overlaps):
                 # after scans that were lost, what overlaps little is not new but elsewhere
-                fits = (
-                    not self.lost and fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW
-                )
+                fits = fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW
                 spread = self.spread if told is None else told
-                state = "new space" if fits and not _far(stands, pose, spread) else "lost"
+                state = "new space" if fits and not self.lost and not _far(stands, pose, spread) else "lost"
         free, (pose, unheld) = pose, self._hold(pose, stands, fit)
         if inertial is not None and state != "lost":
             inertial.shifts.append(float(np.linalg.norm(se3.se3_between(predicted, pose)[:3])))
