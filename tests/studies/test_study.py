@@ -30,7 +30,7 @@ from tests.pictures import full_pictures
 from tests.reference import small_study
 from tests.reference.trials import steady
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 SMALL = "tests.reference.small_study:STUDY"
 FRAGILE = "tests.reference.small_study:FRAGILE"
 KILLED = 16
