@@ -23,10 +23,13 @@ __version__ = "0.1.0"
 
 # name → module that holds it. None may bear the name of a subpackage: importing that would take its place.
 _VERBS = {
-    **dict.fromkeys(("load", "simulate", "run", "open_run", "local_maps", "first_particles"), "graphslam.app.verbs"),
-    **dict.fromkeys(("compare", "join_submaps", "solve_file"), "graphslam.app.verbs"),
-    **dict.fromkeys(("study", "open_study", "find_study"), "graphslam.app.verbs"),
-    **dict.fromkeys(("refine_path", "calibrate_log"), "graphslam.app.verbs"),
+    "load": "graphslam.app.run.source",
+    "simulate": "graphslam.app.worlds",
+    "run": "graphslam.app.run.pipeline",
+    "calibrate_log": "graphslam.app.run.calibration",
+    **dict.fromkeys(("local_maps", "first_particles"), "graphslam.app.run.local_maps"),
+    **dict.fromkeys(("study", "open_study", "find_study"), "graphslam.app.studies"),
+    **dict.fromkeys(("open_run", "compare", "join_submaps", "solve_file", "refine_path"), "graphslam.app.verbs"),
     "merge": "graphslam.app.sessions.merge",
     "localise": "graphslam.app.sessions.localise",
     **dict.fromkeys(("export", "to_open3d"), "graphslam.app.export"),

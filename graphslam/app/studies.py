@@ -22,7 +22,7 @@ def study(
     quick: bool = False,
     progress: bool = True,
 ) -> Any:
-    """Run a study, or go on with one: trials that are in the folder are not run again, failed ones are.
+    """Run a study, or resume one: trials that are in the folder are not run again, failed ones are.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The verbs of a notebook: ``graphslam.load``, ``run``, ``compare``, ``join_submaps`` and so on."""
+"""Verbs of a notebook that have no module of their own (``compare``, ``join_submaps`` …), and lists of names."""
 
 from __future__ import annotations
 
@@ -13,22 +13,14 @@ import pandas as pd
 from graphslam.app import compare as comparing
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.option_table import option_rows
-from graphslam.app.run.calibration import calibrate_log as calibrate_log
 from graphslam.app.run.front_ends import front_end_names, recommended_options
-from graphslam.app.run.local_maps import first_particles as first_particles
-from graphslam.app.run.local_maps import local_maps as local_maps
 from graphslam.app.run.outputs import read_run_folder as read_run
-from graphslam.app.run.pipeline import run as run
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.reopened import resolve_from_folder
 from graphslam.app.run.run import DeferredPart, Run
-from graphslam.app.run.source import load_log_source
-from graphslam.app.studies import find_study as find_study
-from graphslam.app.studies import open_study as open_study
-from graphslam.app.studies import study as study
+from graphslam.app.run.source import load
 from graphslam.app.submap_sources import submap_source
 from graphslam.app.worlds import GROUP, MESH_WORLDS, WORLDS
-from graphslam.app.worlds import simulate as simulate
 from graphslam.core.config import build_config
 from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.log import SensorLog
@@ -47,12 +39,8 @@ from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
-__all__ = [
-    *("calibrate_log", "compare", "find_study", "first_particles", "front_ends"),
-    *("join_submaps", "joiners", "load", "local_maps"),
-    *("open_run", "open_study", "options", "refine_path", "run", "simulate"),
-    *("solve_file", "solvers", "study", "worlds"),
-]
+__all__ = ["compare", "front_ends", "join_submaps", "joiners", "open_run", "options", "refine_path", "solve_file"]
+__all__ += ["solvers", "worlds"]
 
 
 def front_ends() -> list[str]:
@@ -166,33 +154,6 @@ def open_run(path: str | Path) -> Run:
     parts: dict[str, Any] = {"graph": DeferredPart(lambda: solved()[0]), "solution": DeferredPart(lambda: solved()[1])}
     parts["fused"] = DeferredPart(fused)
     return replace(run, **parts)
-
-
-def load(source: str | Path, **options: Any) -> SensorLog:
-    """Load a sensor log by data set name, or from a folder.
-
-    Parameters
-    ----------
-    source : str or path
-        Name of a data set (``graphslam data list``), or a folder in a layout that is known.
-    **options
-        For its reader.
-
-    Returns
-    -------
-    SensorLog
-
-    Raises
-    ------
-    UnknownNameError, MissingDataError, FormatError
-
-    Examples
-    --------
-    >>> again = gs.load("logs/field")
-    >>> again.slice(0.0, 10.0).duration <= 10.0
-    True
-    """
-    return load_log_source(source, **options)
 
 
 def refine_path(

@@ -36,7 +36,7 @@ from graphslam_studies.sim.campus_world import campus
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 STAGES: list[tuple[Any, str, str]] = [
-    (pipeline, "load_log_source", "log opened"),
+    (pipeline, "load", "log opened"),
     (submap_slam.SubmapSlam, "step", "front end, back end"),
     (submap_slam.SubmapSlam, "release_memory", "scans for the refinement"),
     (BackEnd, "finish", "loops, solved"),

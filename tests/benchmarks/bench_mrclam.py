@@ -25,7 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from graphslam.app.run.pipeline import load_log_source, run
+from graphslam.app.run.pipeline import load, run
 from graphslam.app.run.run import Run
 from graphslam.app.sessions.merge import merge
 from graphslam.core.errors import DataError, MissingDataError
@@ -152,7 +152,7 @@ def noise(which: Sequence[int]) -> None:
     ]
     for k in which:
         for label, reader, options in settings:
-            log = load_log_source(f"mrclam-dataset7/robot{k}", **reader)
+            log = load(f"mrclam-dataset7/robot{k}", **reader)
             merged = {part: {**plain.get(part, {}), **options.get(part, {})} for part in ("frontend", "backend")}
             r = run(log, config=merged, progress=False)
             print(
@@ -178,7 +178,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     try:
-        load_log_source("mrclam-dataset7/robot2")
+        load("mrclam-dataset7/robot2")
     except MissingDataError as error:
         sys.exit(f"cannot run: {error}" if os.environ.get("CI") else print(f"not run: {error}"))
     if args.out is not None:

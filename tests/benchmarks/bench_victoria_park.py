@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from graphslam.app.machine import one_blas_thread
-from graphslam.app.run.pipeline import load_log_source, run
+from graphslam.app.run.pipeline import load, run
 from graphslam.app.run.run import Run
 from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     args = parser.parse_args()
     try:
-        log = load_log_source("victoria-park")
+        log = load("victoria-park")
     except MissingDataError as error:
         sys.exit(f"cannot run: {error}" if os.environ.get("CI") else print(f"not run: {error}"))
     if args.quick:

@@ -100,7 +100,7 @@ def run_command(
     """Make a map from a recorded log: submaps, factor graph, solution, map, and a verdict on its consistency."""
     from graphslam.app.run.pipeline import run as run_pipeline
     from graphslam.app.run.run_bar import RunBar
-    from graphslam.app.run.source import load_log_source
+    from graphslam.app.run.source import load
 
     options = run_options(config, setting)
     if preset is not None:
@@ -108,7 +108,7 @@ def run_command(
     options |= {name: str(file) for name, file in (("control", control), ("check", check)) if file is not None}
     log: Any = source
     if reader is not None or reader_option:
-        log = load_log_source(source, reader=reader, **reader_options(reader_option))
+        log = load(source, reader=reader, **reader_options(reader_option))
     observers: list[Any] = []
     if live or live_file is not None:
         from graphslam.app.live import LiveView

@@ -11,7 +11,7 @@ import numpy as np
 
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.front_ends import make_front_end, recommended_options
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import load
 from graphslam.calibrate.calibrate import CALIBRATIONS
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections, moved_end
 from graphslam.calibrate.estimate import NAMES, SURE, Calibration, estimate_text
@@ -98,7 +98,7 @@ def calibrate_log(
 
     Parameters
     ----------
-    source : card name, folder, or SensorLog
+    source : data set name, folder, or SensorLog
     frontend : str, optional
         Front end that reads the log. Default: by the streams of the log.
     quick : bool
@@ -124,7 +124,7 @@ def calibrate_log(
     >>> found = gs.calibrate_log(log, quick=True)
     >>> again = gs.run(log, config={"calibrate": found.config()}, progress=False)
     """
-    log = load_log_source(source, reader=reader, **(reader_options or {}))
+    log = load(source, reader=reader, **(reader_options or {}))
     name = frontend or (LANDMARKS if log.of_type(LandmarkObservations) else SCANS)
     options = merge_options(recommended_options(log, name, preset), config or {})
     front = make_front_end(name, options.get("frontend", {}))

@@ -9,7 +9,7 @@ from typing import Any
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run import config as cfg
 from graphslam.app.run.front_ends import make_front_end, recommended_options
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import load
 from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError
 from graphslam.core.log import SensorLog
@@ -40,7 +40,7 @@ def local_maps(
 
     Parameters
     ----------
-    source : card name, folder, or SensorLog
+    source : data set name, folder, or SensorLog
     frontend : str
         Registered name. The single-map front ends (``ekf-slam``, ``rbpf-slam``) give one submap over the whole log.
     seed : int
@@ -66,7 +66,7 @@ def local_maps(
     >>> submaps[0].key
     0
     """
-    log = load_log_source(source)
+    log = load(source)
     made = _front_end(log, frontend, options)
     submaps = []
     with one_blas_thread(), Bar(name=log.name, unit="submap", shown=progress) as bar:
@@ -110,7 +110,7 @@ def first_particles(
     >>> submap.key
     0
     """
-    log = load_log_source(source)
+    log = load(source)
     made = _front_end(log, frontend, options)
     if not isinstance(made, RbpfEkf):
         raise ConfigError(f"front end {frontend!r} makes no local maps of particles; wanted rbpf-ekf")

@@ -14,7 +14,7 @@ from graphslam.app.run.options import FrontEnds, RunOptions, check_names
 from graphslam.app.run.outputs import write_outputs
 from graphslam.app.run.run import Run
 from graphslam.app.run.run_bar import bar_among
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import load
 from graphslam.app.run.stages import RunClock
 from graphslam.app.run.submap_slam import SubmapSlam, tell_stage
 from graphslam.backend.back_end import Observer
@@ -39,7 +39,7 @@ def run(
 
     Parameters
     ----------
-    source : card name, file, folder, or SensorLog
+    source : data set name, file, folder, or SensorLog
         What another reader than the default one shall read is loaded first (:func:`graphslam.load`).
     frontend : str, class or object, or a list of these, optional
         Registered name; by default the one that fits what the log holds (:mod:`graphslam.app.run.choice`). Or a class
@@ -84,7 +84,7 @@ def run(
     with one_blas_thread(), bar:
         clock = RunClock()
         tell_stage(watch, "reading")
-        log = load_log_source(source)
+        log = load(source)
         clock.lap("load")
         bar.log_read(log)
         seen = check_streams(log)

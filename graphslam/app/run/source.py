@@ -12,8 +12,32 @@ from graphslam.io.catalog import load_recording
 from graphslam.io.log_digest import log_digest
 
 
-def load_log_source(source: str | Path | SensorLog, *, reader: str | None = None, **options: Any) -> SensorLog:
-    """A log from a card name, a file or folder on disk, or itself; ``options`` are for the reader."""
+def load(source: str | Path | SensorLog, *, reader: str | None = None, **options: Any) -> SensorLog:
+    """Load a sensor log by data set name, or from a file or folder.
+
+    Parameters
+    ----------
+    source : str, path or SensorLog
+        Name of a data set (``graphslam data list``), or a file or folder in a known format. A log is returned as it is.
+    reader : str, optional
+        Name of the reader (``graphslam data readers``). Default: the one that recognises the source.
+    **options
+        For the reader.
+
+    Returns
+    -------
+    SensorLog
+
+    Raises
+    ------
+    UnknownNameError, MissingDataError, FormatError
+
+    Examples
+    --------
+    >>> again = gs.load("logs/field")
+    >>> again.slice(0.0, 10.0).duration <= 10.0
+    True
+    """
     if isinstance(source, SensorLog):
         return source
     log = load_recording(source, reader=reader, **options)
@@ -36,7 +60,7 @@ def log_of_run(said: Mapping[str, Any], log: str | Path | SensorLog | None = Non
         Where the log is now. Default: where it was; a relative path begins where the command is started.
     """
     try:
-        source = load_log_source(said["source"] if log is None else log)
+        source = load(said["source"] if log is None else log)
     except GraphSlamError as error:
         if log is not None or Path(said["source"]).exists():
             raise

@@ -16,7 +16,7 @@ from graphslam.app.run.files import read_options
 from graphslam.app.run.front_ends import make_front_end
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.run import Run
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import load
 from graphslam.app.sessions.dense import back_end_config, run_is_dense, session_of, submaps_with_maps
 from graphslam.backend.sessions import DenseSession, add_session, connect_session
 from graphslam.core.errors import DataError, MissingDataError, SolverError
@@ -158,7 +158,7 @@ def source_of(
             )
         submaps = submaps_with_maps(run)
         return submaps if not rows else [submaps[k] for k in rows]
-    log = load_log_source(source, reader=reader, **(reader_options or {}))
+    log = load(source, reader=reader, **(reader_options or {}))
     a, b = log.interval
     part = log.slice(a if begin is None else begin, b if end is None else end)
     if not any(len(s.times) for s in part.streams.values()):

@@ -13,7 +13,7 @@ import numpy as np
 from graphslam.app.run.calibration import calibrate_log, without_noise
 from graphslam.app.run.config import preset
 from graphslam.app.run.pipeline import run
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import load
 from graphslam.calibrate.estimate import Calibration
 from graphslam.core.findings import findings_of_json
 from graphslam.core.log import SensorLog
@@ -111,7 +111,7 @@ def scanned(
         Maps that are made: of the log as recorded by its ``preset``, and as if it were unknown (``recorded``); with the
         errors as if it were unknown (``calibrated``), and by the preset (``stated``).
     """
-    recorded = load_log_source(source)
+    recorded = load(source)
     begin = float(recorded["reference"].times[0])
     if first is not None:
         recorded = recorded.slice(begin, begin + first)

@@ -13,7 +13,7 @@ from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.calibration import calibrate_log, without_noise
 from graphslam.app.run.config import preset
 from graphslam.app.run.pipeline import run
-from graphslam.app.run.source import load_log_source
+from graphslam.app.run.source import load
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import Calibration
 from graphslam.core.config import options_dict
@@ -178,7 +178,7 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], seed: int) ->
 
 def _recorded(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
     """A log of landmarks as if unknown, and as its preset has it (without the errors that were added)."""
-    recorded, added = load_log_source(config.source), config.added or Added.drawn(seed)
+    recorded, added = load(config.source), config.added or Added.drawn(seed)
     log, own = faulty(recorded, added), preset(config.presets)
     begin = process_time()
     found = calibrate_log(log, frontend="rbpf-ekf", quick=True, seed=seed)

@@ -308,7 +308,7 @@ def test_a_run_goes_on_in_a_saved_map(drives: list[HallDrive], runs: list[Any], 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_options, "make_front_end", lambda *_: Ready(tuple(drives[1].submaps)))
         patch.setattr(run_options, "recommended_options", lambda *_: {})
-        patch.setattr(pipeline, "load_log_source", lambda *_, **__: log_of(drives[1], "again", 1))
+        patch.setattr(pipeline, "load", lambda *_, **__: log_of(drives[1], "again", 1))
         patch.setattr(pipeline, "check_names", lambda *_: None)
         arguments = ["run", "again", "--frontend", "ready", "--continue", str(runs[0].folder), "--json"]
         out = tmp_path / "again"

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.app.run.front_ends import make_front_end, recommended_options
-from graphslam.app.run.pipeline import load_log_source
-from graphslam.app.verbs import run
+from graphslam.app.run.pipeline import load, run
 from graphslam.core.random import SeedTree
 
 
@@ -27,7 +26,7 @@ def test_whole_log_against_gps(data_dir, tmp_path):
 
 @pytest.mark.data
 def test_joint_compatibility_and_nearest_neighbour_agree_on_separate_trees(data_dir):
-    log = load_log_source("victoria-park")
+    log = load("victoria-park")
     log = log.slice(log.interval[0], log.interval[0] + 120.0)
     maps = []
     for association in ("nearest", "jcbb"):
