@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 from graphslam.core.errors import FormatError, GraphSlamError, MissingDataError
 from graphslam.core.extras import import_extra
 from graphslam.core.log import DropCounter
 from graphslam.core.reading import most_bytes
+from graphslam.io import cut_bags as cut
 from graphslam.io.recognise import bag_kind
-from graphslam.io.source_probe import SourceProbe
+from graphslam.io.source_probe import SourceProbe, plain_name
 
 
 @dataclass
@@ -27,22 +28,8 @@ class BagTopic:
     count: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class McapChannel:
-    """A topic of an MCAP file."""
-
-    topic: str
-    msgtype: str
-    msgcount: int
-    encoding: str
-
-
-class McapFile:
-    """A single MCAP file, whatever else is in it; with the methods of the readers of rosbags that are used here."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.connections: list[McapChannel] = []
+class McapFile(cut.RecordFile):
+    """A single MCAP file, whatever else is in it."""
 
     def open(self) -> None:
         """Find the topics: in the summary at the end, or else by all records."""
@@ -58,33 +45,25 @@ class McapFile:
             schemas = summary.schemas
             self.connections = [self._channel(c, schemas, counts.get(k, 0)) for k, c in summary.channels.items()]
             return
-        seen: Counter[str] = Counter()
-        known: dict[str, McapChannel] = {}
-        try:
-            for channel, _, _ in self._records():
-                known.setdefault(channel.topic, channel)
-                seen[channel.topic] += 1
-        except Exception:
-            if not known:
-                raise
-        self.connections = [replace(c, msgcount=seen[t]) for t, c in known.items()]
+        super().open()
 
     @staticmethod
-    def _channel(channel: Any, schemas: Any, count: int) -> McapChannel:
+    def _channel(channel: Any, schemas: Any, count: int) -> cut.BagChannel:
         schema = schemas.get(channel.schema_id)
         name = str(schema.name) if schema is not None else "no schema"
         if channel.message_encoding not in ("cdr", "ros1"):
             name += f", {channel.message_encoding}"
         elif name.count("/") == 1:  # as ROS 1 says it
             name = name.replace("/", "/msg/")
-        return McapChannel(str(channel.topic), name, int(count), str(channel.message_encoding))
+        return cut.BagChannel(str(channel.topic), name, int(count), str(channel.message_encoding))
 
-    def _records(self) -> Iterator[tuple[McapChannel, int, bytes]]:
+    def records(self) -> Iterator[cut.Record]:
+        """See :class:`~graphslam.io.cut_bags.RecordFile`."""
         from mcap.records import Channel, Message, Schema
         from mcap.stream_reader import StreamReader
 
         schemas: dict[int, Any] = {}
-        channels: dict[int, McapChannel] = {}
+        channels: dict[int, cut.BagChannel] = {}
         with open(self._path, "rb") as stream:
             for record in StreamReader(stream, record_size_limit=most_bytes()).records:
                 if isinstance(record, Schema):
@@ -94,14 +73,6 @@ class McapFile:
                 elif isinstance(record, Message) and record.channel_id in channels:
                     yield channels[record.channel_id], record.log_time, record.data
 
-    def messages(self, chosen: list[McapChannel]) -> Iterator[tuple[McapChannel, int, bytes]]:
-        """Messages of topics."""
-        topics = {c.topic for c in chosen}
-        return (r for r in self._records() if r[0].topic in topics)
-
-    def close(self) -> None:
-        """Nothing is open between two calls."""
-
 
 class BagFiles:
     """The files of a bag, opened: topics, and messages as ``(topic, bytes, bag's stamp, decode)``."""
@@ -109,29 +80,15 @@ class BagFiles:
     def __init__(self, path: Path, stack: ExitStack) -> None:
         for package in ("mcap", "rosbags"):
             import_extra(package, "a bag", where=str(path))
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
         from rosbags.typesys import Stores, get_typestore
 
         self.path = path
-        files = _files(path)
-        kinds = {f: "" if f.is_dir() else bag_kind(SourceProbe(f), f) for f in files}
-        self.ros2 = "ROS 1 bag" not in kinds.values()
+        self._stack, self.faults = stack, dict[int, str]()
         self.readers: list[Any] = []
-        for f in files:
-            try:
-                reader = McapFile(f) if kinds[f] == "MCAP" else Reader2(f) if self.ros2 else Reader1(f)
-                reader.open()
-            except Exception as error:  # MemoryError, too: a damaged length asks for more than any file holds
-                raise FormatError(
-                    f"bag cannot be opened: {error_text(error)}",
-                    where=str(f),
-                    got=f"{_size(f):,} bytes" if f.is_file() else None,
-                    wanted="a bag that is whole: `rosbag reindex`, `ros2 bag reindex` or `mcap recover` may repair it",
-                ) from None
-            stack.callback(_quietly, reader.close)
-            self.readers.append(reader)
-        if kinds[files[0]] == "MCAP" and {c.encoding for r in self.readers for c in r.connections} == {"ros1"}:
+        self.ros2 = True
+        for f in _files(path):
+            self._open(f)
+        if {getattr(c, "encoding", "") for r in self.readers for c in r.connections} == {"ros1"}:
             self.ros2 = False
         self.store = get_typestore(Stores.ROS2_HUMBLE if self.ros2 else Stores.ROS1_NOETIC)
         if not self.ros2:
@@ -144,19 +101,61 @@ class BagFiles:
                 topic = self.topics.setdefault(c.topic, BagTopic(c.topic, c.msgtype))
                 topic.count += int(c.msgcount)
 
+    def _open(self, path: Path) -> None:
+        """The reader of a file: that of rosbags, or else record by record."""
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+
+        kind, file = bag_kind(SourceProbe(path), path), cut.local_copy(path, self._stack)
+        self.ros2 = kind != "ROS 1 bag"
+        try:
+            if kind == "MCAP":
+                return self._add(McapFile(file))
+            if self.ros2 and (missing := cut.missing_pages(file)):
+                raise FormatError(missing)
+            return self._add(Reader2(file) if self.ros2 else Reader1(file))
+        except Exception as error:  # MemoryError, too: a damaged length asks for more than any file holds
+            why = error_text(error)
+        try:
+            if kind == "MCAP":
+                raise FormatError(why)
+            return self._add(cut.CutDatabase(file) if self.ros2 else cut.CutBag1(file), why)
+        except Exception:
+            raise FormatError(
+                f"no message is found in this bag, which is damaged or cut off ({why})",
+                where=str(path),
+                got=f"{path.stat().st_size:,} bytes",
+                wanted="a bag with messages: copy it once more from where it was recorded, or try"
+                " `rosbag reindex`, `ros2 bag reindex` or `mcap recover`",
+            ) from None
+
+    def _add(self, reader: Any, fault: str = "") -> None:
+        self._stack.callback(_quietly, reader.close)
+        reader.open()
+        if fault and not reader.connections:
+            raise FormatError(fault)
+        self.readers.append(reader)
+        self.faults[id(reader)] = fault
+
     def messages(self, names: set[str], drops: DropCounter) -> Iterator[tuple[str, bytes, float]]:
         """Messages of topics, in the order of the bag; a bag that ends too early ends there, which is counted."""
         for r in self.readers:
             chosen = [c for c in r.connections if c.topic in names and c.msgtype == self.topics[c.topic].type]
-            if not chosen:
-                continue
+            why, count, first, last = self.faults[id(r)], 0, 0, 0
             try:
-                for c, t, raw in r.messages(chosen):
-                    yield c.topic, bytes(raw), 1e-9 * t
+                for c, t, raw in r.messages(chosen) if chosen else ():
+                    first, last, count = first if count else t, t, count + 1
+                    yield c.topic, cut.unpack_message(bytes(raw)), 1e-9 * t
             except GraphSlamError:
                 raise
             except Exception as error:
-                drops.drop("bag", f"is damaged or truncated; read up to there ({error_text(error)})")
+                why = error_text(error)
+            if why:
+                drops.drop(
+                    "bag",
+                    f"is damaged or cut off ({why}); read up to there: {count} messages in"
+                    f" {1e-9 * (last - first):.1f} s, the last at {1e-9 * last:.3f}",
+                )
 
     def decode(self, raw: bytes, kind: str) -> Any:
         """A message; :class:`ValueError` where it cannot be decoded."""
@@ -169,12 +168,8 @@ class BagFiles:
 
 
 def error_text(error: Exception) -> str:
-    text = " ".join(str(error).split())[:200]
-    return text or f"damaged or cut off ({type(error).__name__})"
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size
+    text = re.sub(re.escape(gettempdir()) + r"/\w+/", "", " ".join(str(error).split())[:200])
+    return text or type(error).__name__
 
 
 def _quietly(close: Callable[[], None]) -> None:
@@ -195,16 +190,19 @@ def _files(path: Path) -> list[Path]:
         p for p in look.files if p.name == "metadata.yaml" and look.lines(p, 1)[:1] == ["rosbag2_bagfile_information:"]
     ]
     if len(metadata) == 1:
-        return [metadata[0].parent]
+        look = SourceProbe(metadata[0].parent)
+        names = re.findall(r"^ +- (?:.*/)?([^/:]+\.(?:db3|mcap)(?:\.zstd)?)$", "\n".join(look.lines(metadata[0])), re.M)
+        if lost := [n for n in names if not (look.path / n).is_file()]:
+            raise MissingDataError("a part of the bag is not there", where=str(path), got=str(look), wanted=lost[0])
     found = [p for p in look.files if bag_kind(look, p)]
     if len(metadata) > 1 or not found:
         raise MissingDataError(
             f"{len(metadata) or 'no'} bags here",
             where=str(path),
             got=", ".join(look.relative(p.parent) for p in metadata[:4]) or str(look),
-            wanted="one bag",
+            wanted="one bag: a .bag, .db3 or .mcap file, or a folder with metadata.yaml",
         )
-    parts = {re.sub(r"_\d+$", "", p.stem) for p in found}
+    parts = {re.sub(r"_\d+$", "", Path(plain_name(p)).stem) for p in found}
     if len(parts) > 1 or len({p.suffix for p in found}) > 1:
         raise MissingDataError(
             f"{len(found)} bags here", where=str(path), got=", ".join(look.relative(p) for p in found[:6]), wanted="one"

@@ -19,7 +19,7 @@ CARMEN_SCANS = re.compile(r"^(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d)\b")
 CARMEN_OTHER = re.compile(r"^(PARAM|ODOM|TRUEPOS|SYNC|# message formats|# robot-id)\b")
 NETWORK = re.compile(r"^(VERTEX|EDGE|ODOMETRY \d|LANDMARK \d|EQUIV|FIX )")
 CLOUD_ENDINGS = (".bin", ".ply", ".pcd", ".las", ".laz")
-SQLITE, MCAP, BAG1 = b"SQLite format 3\0", b"\x89MCAP0\r\n", b"#ROSBAG V"
+SQLITE, MCAP, BAG1, ZSTD = b"SQLite format 3\0", b"\x89MCAP0\r\n", b"#ROSBAG V", b"\x28\xb5\x2f\xfd"
 
 
 def parse_numbers(line: str) -> list[float] | None:
@@ -69,9 +69,9 @@ def bag_kind(look: SourceProbe, path: Path) -> str:
     head = look.head(path)
     if head.startswith(BAG1):
         return "ROS 1 bag"
-    if head.startswith(MCAP):
+    if head.startswith(MCAP) or (head.startswith(ZSTD) and file_ending(path) == ".mcap"):
         return "MCAP"
-    return "ROS 2 bag (sqlite3)" if head.startswith(SQLITE) and file_ending(path) == ".db3" else ""
+    return "ROS 2 bag (sqlite3)" if head.startswith((SQLITE, ZSTD)) and file_ending(path) == ".db3" else ""
 
 
 # --- one function a reader ----------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def _euroc(look: SourceProbe) -> ReaderMatch | None:
 
 
 def _bag(look: SourceProbe) -> ReaderMatch | None:
-    candidates = [p for e in (".bag", ".db3", ".mcap", "") for p in look.by_ending.get(e, [])]
+    candidates = [p for e in (".bag", ".db3", ".mcap", ".active", "") for p in look.by_ending.get(e, [])]
     if look.path.is_file():
         candidates = [look.path]
     kinds = [(p, k) for p in candidates[:200] if (k := bag_kind(look, p))]

@@ -16,7 +16,7 @@ from pathlib import Path
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.reading import read_bytes
 
-COMPRESSIONS = (".gz", ".bz2", ".xz")
+COMPRESSIONS = (".gz", ".bz2", ".xz", ".zstd")
 MOST_FILES, DEEPEST, HEAD, SAMPLE = 200_000, 5, 1 << 16, 6
 
 

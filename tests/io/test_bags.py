@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.core import se3
-from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError
+from graphslam.core.errors import ConfigError, DataError, MissingDataError
 from graphslam.core.geometry import se2_between
 from graphslam.core.records import LaserScans
 from graphslam.io.catalog import load_recording
@@ -244,18 +244,9 @@ def test_fixes_without_covariance_or_place(tmp_path: Path) -> None:
         load_recording(written(tmp_path / "none", "ros2", none))
 
 
-@pytest.mark.parametrize("form", ["ros1", "db3", "mcap"])
-def test_a_bag_that_is_cut_off_or_empty(tmp_path: Path, form: str) -> None:
-    path = written(tmp_path, form, world(Messages(form == "ros1")))
-    raw = path.read_bytes()
-    path.write_bytes(raw[: len(raw) // 2])
-    if form == "mcap":
-        log = load_recording(path)
-        assert 0 < len(log["clouds"].times) < N
-        assert any("cut off" in k for k in log.dropped)
-    else:
-        with pytest.raises(GraphSlamError, match=r"bag cannot be opened.*wanted a bag that is whole"):
-            load_recording(path)
+@pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap"])
+def test_a_file_that_is_empty_or_something_else(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
     path.write_bytes(b"")
     with pytest.raises(MissingDataError, match="which is empty; wanted a bag that is whole"):
         load_recording(path)
