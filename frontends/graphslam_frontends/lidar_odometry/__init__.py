@@ -1,1 +1,1 @@
-"""LiDAR odometry: where each scan of a moving 3-D lidar lies in the map of the scans before it."""
+"""LiDAR odometry: each scan of a moving 3-D lidar is matched to the map of the scans before it."""

@@ -1,8 +1,8 @@
 """Gaussian cells of a point map with a cached nearest neighbour (urban GraphSLAM, equations C2).
 
-A level divides space into cubes. A cube holds the Gaussian of the points in it, and a grid of 4 × 4 × 4 smaller cubes,
-in each of which the nearest cell is noted when it is first asked for. Asking again is one probe of a hash table. A cell
-that begins to count, or whose centre moves, is compared with what is noted around it.
+A level divides space into cubes. A cube has the Gaussian of its points and a grid of 4 × 4 × 4 smaller cubes. Each of
+these stores its nearest cell at the first query; later queries are one look-up in a hash table. A cell that becomes
+valid, or whose centre moves, updates the stored neighbours around it.
 """
 
 from __future__ import annotations
@@ -19,52 +19,52 @@ I8 = npt.NDArray[np.int64]
 I4 = npt.NDArray[np.int32]
 
 FINE = 4
-"""Cached cubes along an edge of a cell."""
+"""Cached cubes along the edge of a cell."""
 LEAST = 5
-"""Points from which on a cell counts."""
+"""Least number of points of a valid cell."""
 FULL = 400
-"""Points after which a cell learns no more."""
+"""Most points of a cell; more are ignored."""
 UNKNOWN, NONE = -1, -2
-"""Of a cached cube: not asked for yet; no cell near it."""
+"""State of a cached cube: not queried yet; no cell near it."""
 _HALF = 1 << 20
 _MASK = (1 << 21) - 1
 _MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 
 
 class Cells(NamedTuple):
-    """One level, as arrays. Blocks are cubes that hold points, or were asked for."""
+    """One level, as arrays. Blocks are cubes that have points or were queried."""
 
     keys: I8
     """Hash table ``(h,)``: packed cube, -1 where free."""
     slots: I4
-    """… and its block."""
+    """Block of each key."""
     cube: I8
     """Packed cube of each block ``(b,)``."""
     number: I4
-    """Points in it."""
+    """Number of points of each block."""
     mean: F8
-    """Of the points so far ``(b, 3)``."""
+    """Mean of the points ``(b, 3)``."""
     scatter: F8
-    """Sums of squares about it ``(b, 6)``: xx, xy, xz, yy, yz, zz."""
+    """Sums of squares about the mean ``(b, 6)``: xx, xy, xz, yy, yz, zz."""
     told: I4
-    """Number of points in what is matched to; 0: the cell does not count yet."""
+    """Number of points when the cell was last updated for matching; 0: not valid yet."""
     centre: F8
-    """What is matched to ``(b, 3)``."""
+    """Mean used for matching ``(b, 3)``."""
     root: F8
-    """Square root ``(b, r, 3)`` of the information of a point's distance to it, which is ``rootᵀ root``; one row where
-    only surfaces tell, else three."""
+    """Square root ``(b, r, 3)`` of the information of a point's distance, which is ``rootᵀ root``; r = 1 if only
+    surfaces constrain points, else 3."""
     seen: I8
-    """Scan that last put points into it."""
+    """Scan that last added points."""
     made: F8
-    """Mean number of the scans whose points it holds."""
+    """Mean number of the scans that added its points."""
     around: I4
-    """Cells that count among the 27 ``(b, 27)``."""
+    """Valid cells among the 27 neighbours ``(b, 27)``."""
     n_around: I4
-    """… and how many; -1: not looked up."""
+    """Number of these; -1: not looked up."""
     near: I4
-    """The nearest cell of each cached cube ``(b, 64)``."""
+    """Nearest cell of each cached cube ``(b, 64)``."""
     used: I8
-    """``(1,)``: blocks in use."""
+    """Number of blocks in use ``(1,)``."""
 
 
 @njit(inline="always")
@@ -90,7 +90,7 @@ def _find(c: Cells, key: Any) -> Any:
 
 @njit
 def _put(c: Cells, key: Any) -> Any:
-    """The block of a cube, made if it is new; -1 where there is no room."""
+    """Block of a cube, created if it is new; -1 if there is no space."""
     mask = len(c.keys) - 1
     h = np.int64((np.uint64(key) * _MULTIPLIER) >> np.uint64(20)) & mask
     while True:
@@ -114,7 +114,7 @@ def _put(c: Cells, key: Any) -> Any:
 
 @njit
 def _enter(c: Cells, b: Any, size: float, new: bool) -> None:
-    """A cell begins to count, or moved: cached cubes around it whose nearest it is now, or was, learn of it."""
+    """A cell became valid or moved: update the cached cubes around it whose nearest cell it is now, or was."""
     key = c.cube[b]
     fine = size / FINE
     x, y, z = c.centre[b, 0], c.centre[b, 1], c.centre[b, 2]
@@ -181,16 +181,16 @@ def _eigen(S: F8, V: F8) -> None:
 
 @njit
 def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, float]:
-    """Main axes of the points of a cell: variances onto the diagonal of S, directions into columns of V.
+    """Principal axes of the points of a cell: variances on the diagonal of S, directions in the columns of V.
 
     Returns
     -------
     k : int
-        Which of them is the smallest.
+        Index of the smallest.
     surface : float
-        0 to 1: how far that is the thickness of a surface, variance well below ``flat`` [m²].
+        0 to 1: how flat the points are; 1 if the smallest variance is well below ``flat`` [m²].
     wide : float
-        0 to 1: how far points spread over two directions. Those in a row, as one line of a scanner leaves them, do not.
+        0 to 1: how far points spread in two directions; 0 for collinear points, such as one line of a scanner.
     """
     n, s = c.number[b], c.scatter[b]
     S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = s[0], s[1], s[2], s[3], s[4], s[5]
@@ -207,11 +207,11 @@ def _spread(c: Cells, b: Any, flat: float, S: F8, V: F8) -> tuple[int, float, fl
 
 @njit
 def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells, float]) -> None:
-    """Take the points so far for the cell that is matched to.
+    """Update the cell used for matching from its points so far.
 
-    Only across a surface do points hold: along it a cell's centre is where the scans happened to fall. Points in a row
-    tell of no surface; where the wider cell around them is one, as several lines of a scanner make it, and they lie in
-    it, they are part of it. What is thicker than a surface holds by all of its spread, if not ``planes``.
+    A surface constrains points along its normal only: along the surface the mean depends on where the scans sampled it.
+    Collinear points define no surface; if the wider cell around them is one and they lie in it, its normal is used. A
+    cell thicker than a surface constrains by its full covariance, unless ``planes``.
     """
     size, least, planes = how
     wide, wide_size = around
@@ -257,14 +257,14 @@ def _tell(c: Cells, b: Any, how: tuple[float, float, bool], around: tuple[Cells,
 
 @njit(nogil=True)
 def add_points(c: Cells, points: F8, scan: int, how: tuple[float, float, bool], around: tuple[Cells, float]) -> int:
-    """Put points of the world into their cells; how many found no room.
+    """Add points, world frame, to their cells; returns how many found no space.
 
     Parameters
     ----------
     how : (float, float, bool)
-        Edge of a cell [m]; σ added to its own [m]; only surfaces tell.
+        Edge of a cell [m]; σ added to that of the cell [m]; only surfaces constrain points.
     around : (Cells, float)
-        A level of wider cells, which has the points already, and their edge [m]; 0: none.
+        A level of wider cells that already contains the points, and its edge [m]; 0: none.
     """
     lost = 0
     inverse = 1.0 / how[0]
@@ -306,7 +306,7 @@ def add_points(c: Cells, points: F8, scan: int, how: tuple[float, float, bool], 
 
 @njit(nogil=True)
 def keep_since(c: Cells, out: Cells, scan: int) -> None:
-    """Copy the cells that were seen since a scan into an empty level."""
+    """Copy the cells with points since a scan into an empty level."""
     for b in range(c.used[0]):
         if c.seen[b] < scan or c.number[b] == 0:
             continue
@@ -322,7 +322,7 @@ def keep_since(c: Cells, out: Cells, scan: int) -> None:
 
 @njit
 def _fill(c: Cells, b: Any, key: Any, sub: Any, size: float) -> Any:
-    """Note the cell nearest to the middle of a cached cube."""
+    """Find and store the cell nearest to the centre of a cached cube."""
     if c.n_around[b] < 0:
         n = 0
         for di in range(-1, 2):
@@ -349,7 +349,7 @@ def _fill(c: Cells, b: Any, key: Any, sub: Any, size: float) -> Any:
 
 @njit(inline="always")
 def _nearest(c: Cells, x: float, y: float, z: float, size: float) -> Any:
-    """The cell nearest to a point, but for less than an edge of a cached cube times √3; negative: none."""
+    """Cell nearest to the centre of the cached cube of a point; negative: none."""
     inverse = 1.0 / size
     key = _pack(x, y, z, inverse)
     b = _find(c, key)
@@ -377,7 +377,7 @@ def nearest_cells(c: Cells, points: F8, size: float, out: I8) -> None:
 
 @njit(nogil=True)
 def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: float, out: F8) -> None:
-    """Mean of ``exp(-d² / 2σ²)`` over points, at each rotation ``(m, 3, 3)`` about a place ``t``."""
+    """Mean of ``exp(-d² / 2σ²)`` over points, for each rotation ``(m, 3, 3)`` about a position ``t``."""
     k = -0.5 / (sigma * sigma)
     for r in range(len(R)):
         total = 0.0
@@ -397,22 +397,22 @@ def score_rotations(c: Cells, points: F8, R: F8, t: F8, size: float, sigma: floa
 def cell_normal_equations(
     c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, H: F8, g: F8, told: F8
 ) -> None:
-    """Gauss–Newton's normal equations of points on cells, weights by Geman and McClure.
+    """Gauss–Newton normal equations of points on cells, with Geman–McClure weights.
 
     Parameters
     ----------
     points : (n, 3)
-        Frame of the body.
+        Body frame.
     pose : (3, 3), (3,)
         Rotation and position of the body.
     scale : float
-        Mahalanobis distance at which a point's pull is greatest but for a factor.
+        Mahalanobis distance at which the weight is 1/4.
     H, g : (6, 6), (6,)
         Out: right tangent, rotation first; ``H δ = -g``.
     told : (13,)
-        Out: sum of weights; points with a cell that says something; weighted sum of squared Mahalanobis distances;
-        then the sum of weights times traces of information, of these times the points (3), and times their squares
-        (6: xx, xy, xz, yy, yz, zz).
+        Out: sum of weights; number of points with an informative cell; weighted sum of squared Mahalanobis distances;
+        then the sum of weights times traces of information, of these times the points (3), and times their squares (6:
+        xx, xy, xz, yy, yz, zz).
     """
     notes = np.full(len(points), -1, np.int64), np.empty(len(points), np.int64)
     _normal_equations(c, points, pose, size, scale, (H, g, told), notes)
@@ -428,7 +428,7 @@ def _normal_equations(
     out: tuple[F8, F8, F8],
     notes: tuple[I8, I8],
 ) -> None:
-    """``notes``: the cached cube in which each point lay the last time, and the cell it was told then."""
+    """``notes``: the last cached cube of each point, and its nearest cell."""
     (R, t), (H, g, told), (asked, found) = pose, out, notes
     fine = FINE / size
     H[:, :] = 0.0
@@ -477,7 +477,7 @@ def _normal_equations(
         told[11] += trace * b * e
         told[12] += trace * e * e
         for k in range(rows):
-            # the row in the body's axes; its residual's derivative is [p × u, u]
+            # the row in the body frame; the derivative of its residual is [p × u, u]
             ux = R[0, 0] * W[k, 0] + R[1, 0] * W[k, 1] + R[2, 0] * W[k, 2]
             uy = R[0, 1] * W[k, 0] + R[1, 1] * W[k, 1] + R[2, 1] * W[k, 2]
             uz = R[0, 2] * W[k, 0] + R[1, 2] * W[k, 1] + R[2, 2] * W[k, 2]
@@ -495,7 +495,7 @@ def _normal_equations(
 
 @njit
 def _rotation(w: F8, R: F8, V: F8) -> None:
-    """Rotation by a vector, and the left Jacobian."""
+    """Rotation matrix of a rotation vector, and its left Jacobian."""
     x = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     if x < 1e-4:
         a, b, d = 1.0 - x * x / 6.0, 0.5 - x * x / 24.0, 1.0 / 6.0 - x * x / 120.0
@@ -514,7 +514,7 @@ def _rotation(w: F8, R: F8, V: F8) -> None:
 
 @njit
 def _log(R: F8, t: F8, out: F8) -> None:
-    """Logarithm (6,) of a motion that turns by less than a right angle."""
+    """Logarithm (6,) of a motion that rotates by less than π."""
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
     sine = np.sqrt(x * x + y * y + z * z)
     angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
@@ -540,23 +540,23 @@ def descend_pose(
     stop: tuple[float, float, int],
     out: tuple[F8, F8, F8],
 ) -> int:
-    """Gauss–Newton steps of a pose, in place, until it stands still; how many.
+    """Gauss–Newton steps of a pose until convergence; returns their number.
 
     Parameters
     ----------
     pose : (3, 3), (3,)
-        Improved in place.
+        Updated in place.
     start : (3, 3), (3,), (6, 6)
-        A pose that is known beforehand, and its information, right tangent.
+        Prior pose and its information, right tangent.
     stop : (float, float, int)
-        A step below this [rad], [m] is the last; most steps.
+        Convergence threshold of a step [rad], [m]; most steps.
     out : (6, 6), (6,), (13,)
-        As of `normal_equations`, before the last step.
+        As of `cell_normal_equations`, before the last step.
 
     Returns
     -------
     steps : int
-        Negative, less one: there was no room for another step.
+        Negative, ``-steps - 1``: no space for another step.
     """
     (R, t), (H, g, _) = pose, out
     start_R, start_t, prior = start
@@ -575,7 +575,7 @@ def descend_pose(
                 dR[i, j] = start_R[0, i] * R[0, j] + start_R[1, i] * R[1, j] + start_R[2, i] * R[2, j]
         _log(dR, dt, off)
         d[:] = -np.linalg.solve(H + prior, g + prior @ off)
-        # a step as long as a cell is a guess
+        # longer steps are unreliable and are cut
         for part, least in ((3, 0.5 * size), (0, 0.2)):
             length = np.sqrt(d[part] ** 2 + d[part + 1] ** 2 + d[part + 2] ** 2)
             if length > least:
@@ -598,15 +598,15 @@ def descend_pose(
 def information_by_slot(
     c: Cells, points: F8, pose: tuple[F8, F8], size: float, scale: float, ends: F8, out: tuple[F8, F8, F8]
 ) -> None:
-    """Gauss–Newton's Hessian by the scans that made the cells, and the spread of its gradient.
+    """Gauss–Newton Hessian by the scans that made the cells, and the covariance of the gradient.
 
     Parameters
     ----------
     ends : (s,)
-        Rising; a cell belongs to the first slot whose end is not before the mean of the scans that made it.
+        Increasing; a cell belongs to the first slot whose end is not before the mean number of its scans.
     out : (s, 6, 6), (6, 6), (c, 6)
-        H by slot, right tangent; covariance M of the gradient where points of one cell err together and each by what
-        the cell says; gradients G of c parts of space, cubes of eight cells along an edge (some share a part).
+        H by slot, right tangent; covariance M of the gradient for errors common to all points of a cell, with the
+        cell's covariance; gradients G of c parts of space, cubes of 8 cells along an edge (by hash, some share a part).
     """
     (R, t), (H, M, G) = pose, out
     H[:, :, :] = 0.0
@@ -673,7 +673,7 @@ def information_by_slot(
 
 @njit(nogil=True)
 def thin_kernel(points: F8, size: float, near: float, far: float, out: I8) -> int:
-    """Rows of the first point of each cube, of those with squared ranges between; how many. They keep their order."""
+    """Rows, in order, of the first point in each cube, for squared ranges in (near, far); returns their number."""
     bits = 4
     while (1 << bits) < 2 * len(points):
         bits += 1

@@ -1,4 +1,4 @@
-"""A point map in levels of Gaussian cells, coarse to fine."""
+"""A point map in several levels of Gaussian cells, coarse to fine."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from graphslam.core.geometry import Array
 from graphslam_frontends.lidar_odometry import cell_kernels as kernels
 
 PARTS = 512
-"""Parts of space whose gradients are told apart."""
+"""Number of hash bins for gradients by parts of space."""
 _FIRST_ROOM = 1 << 12
 
 
 @dataclass(frozen=True, slots=True)
 class LevelConfig:
-    """One level.
+    """One level of the map.
 
     Parameters
     ----------
     size : float
         Edge of a cell [m].
     least : float
-        σ that is added to a cell's own [m]: on coarse levels a quarter of the cell, or the weights are 0 before the
-        match begins.
+        σ added to that of a cell [m]: a quarter of the cell on coarse levels; with less, the weights are 0 at the
+        initial guess.
     planes : bool
-        Only surfaces hold a point. Without it, what is thicker than a surface holds it, too, by all of its spread. On
-        every level a surface holds a point across itself alone, and a row of points only as a part of a wider surface.
+        Only the component normal to a surface constrains a point. Otherwise the full covariance of thick cells does,
+        too. A surface constrains along its normal only, and collinear points only as a part of a wider surface.
     """
 
     size: float
@@ -39,20 +39,20 @@ class LevelConfig:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Normal equations at a pose.
+    """Normal equations of a match at a pose.
 
     Parameters
     ----------
     H, g : (6, 6), (6,)
         Right tangent, rotation first.
     every : (6, 6)
-        What the same points would say with surfaces turned anyhow.
+        Information of the same points if each constrained every direction.
     overlap : float
         Sum of the weights over the number of points.
     known : float
-        Share of the points with a cell near them that says something.
+        Share of the points with an informative cell near them.
     quality : float
-        Mean weight of these: whether the scan fits where there is something to fit to.
+        Mean weight of these points: the quality of the fit where the map has cells.
     misfit : float
         Weighted mean of the squared Mahalanobis distance.
     """
@@ -78,29 +78,29 @@ class CellMap:
 
     @property
     def centres(self) -> Array:
-        """Of the cells that count ``(n, 3)``, world [m]."""
+        """Centres of the cells that are in use ``(n, 3)``, world [m]."""
         used = int(self.cells.used[0])
         return np.asarray(self.cells.centre[:used][self.cells.told[:used] > 0])
 
     def add(self, points: Array, scan: int, wide: CellMap | None = None) -> None:
-        """Put points ``(n, 3)`` of the world into the cells they fall into; ``scan`` is a number that rises.
+        """Add points ``(n, 3)``, world frame, to their cells; ``scan`` is an increasing number.
 
-        ``wide`` is a level of wider cells that has them already: points in a row belong to its surfaces.
+        ``wide`` is a level of wider cells that already contains them; collinear points get the normals of its surfaces.
         """
-        # every point may make a block, and a match asks for as many again
+        # every point may create a block, and a match as many again
         self.room(2 * len(points))
         c = self.config
         around = (self.cells, 0.0) if wide is None else (wide.cells, wide.config.size)
         kernels.add_points(self.cells, points, scan, (c.size, c.least, c.planes), around)
 
     def room(self, more: int) -> None:
-        """Make room for blocks."""
+        """Allocate space for more blocks."""
         c = self.cells
         if int(c.used[0]) + more > len(c.cube):
             self._copy(-1, more)
 
     def keep_since(self, scan: int) -> None:
-        """Forget the cells that no scan saw since."""
+        """Delete the cells without points since a scan."""
         self._copy(scan, 0)
 
     def _copy(self, scan: int, more: int) -> None:
@@ -118,7 +118,7 @@ class CellMap:
         return out
 
     def scores(self, points: Array, R: Array, t: Array) -> Array:
-        """How well points ``(n, 3)`` lie on cells at rotations ``(m, 3, 3)`` about ``t``: 0 to 1."""
+        """Scores, 0 to 1, of points ``(n, 3)`` at rotations ``(m, 3, 3)`` about a position ``t``."""
         self.room(len(points) * 8)
         out, step = np.empty(len(R)), max(1, 8)
         sigma = 0.4 * self.config.size
@@ -128,7 +128,7 @@ class CellMap:
         return out
 
     def fit(self, points: Array, R: Array, t: Array, scale: float) -> NormalEquations:
-        """Normal equations of points ``(n, 3)`` in the body, at a pose."""
+        """Normal equations of points ``(n, 3)``, body frame, at a pose."""
         self.room(len(points))
         out = np.empty((6, 6)), np.empty(6), np.empty(13)
         kernels.cell_normal_equations(self.cells, points, (R, t), self.config.size, scale, *out)
@@ -137,7 +137,7 @@ class CellMap:
     def descend(
         self, points: Array, R: Array, t: Array, scale: float, prior: Array, still: tuple[float, float], most: int
     ) -> NormalEquations:
-        """Gauss–Newton steps, at most so many, of a pose that is improved in place (see `cell_kernels.descend`)."""
+        """At most ``most`` Gauss–Newton steps; the pose is updated in place (see `cell_kernels.descend_pose`)."""
         out = np.empty((6, 6)), np.empty(6), np.empty(13)
         start, size, done = (R.copy(), t.copy(), prior), self.config.size, -1
         while done < 0:
@@ -147,7 +147,7 @@ class CellMap:
         return _fit(len(points), *out)
 
     def known(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Which points ``(n, 3)`` of the world have a cell near them that says something."""
+        """Which points ``(n, 3)``, world frame, have an informative cell near them."""
         at = self.nearest(points)
         return np.asarray((at >= 0) & (np.abs(self.cells.root[at]).max(axis=(1, 2)) > 0.0))
 
@@ -204,11 +204,11 @@ def _empty(blocks: int, rows: int) -> kernels.Cells:
 def first_rows_by_cube(
     points: Array, size: float, ranges: tuple[float, float] = (0.0, np.inf)
 ) -> npt.NDArray[np.int64]:
-    """Rows of the first point of each cube of edge ``size``, of the points within ranges."""
+    """Rows of the first point in each cube of edge ``size``, of the points within ranges."""
     rows = np.empty(len(points), np.int64)
     return rows[: kernels.thin_kernel(points, size, ranges[0] ** 2, ranges[1] ** 2, rows)]
 
 
 def evenly_spaced_rows(n: int, most: int) -> npt.NDArray[np.int64]:
-    """At most so many of n rows, spread over all."""
+    """At most ``most`` of n rows, evenly spaced."""
     return np.arange(n, dtype=np.int64) if n <= most else np.arange(most, dtype=np.int64) * n // most

@@ -9,25 +9,25 @@ import numpy as np
 from graphslam.core.errors import ConfigError
 
 SPACING = 0.2
-"""Edge of the cubes of which one point each is matched [m]."""
+"""One point per cube of this edge is kept [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarOdometryConfig:
-    """How scans are matched to the scans before them. One set for hand-held, wheeled and car-borne lidars."""
+    """Matching of scans to the map of earlier scans. One set for hand-held, wheeled and car-mounted lidars."""
 
     max_range: float = 80.0
-    """Points farther away are left out [m]."""
+    """Points farther away are ignored [m]."""
     min_range: float = 0.5
-    """… and nearer ones: the carrier itself [m]."""
+    """Nearer points, such as the robot itself, are ignored [m]."""
     most_points: int = 3000
-    """Points matched of a scan at most."""
+    """Most points matched per scan."""
     levels: tuple[float, ...] = (2.0, 1.0, 0.5)
     """Edges of the cells, coarse to fine [m]."""
     window: float = 50.0
-    """Way behind from which cells are kept [m]; those of the last hundred scans are kept in any case."""
+    """Cells of the last this many metres of path are kept [m], and those of the last 100 scans in any case."""
     deskew: bool = True
-    """Move points of a scan to its stamp, where they have stamps of their own."""
+    """Deskew points to the stamp of the scan, if they have times of their own."""
 
     def __post_init__(self) -> None:
         for name in ("max_range", "window"):

@@ -1,4 +1,4 @@
-"""The front end ``lidar-odometry``: LiDAR odometry, cut into short submaps that carry a cloud and an evidence grid."""
+"""The front end ``lidar-odometry``: LiDAR odometry, cut into short submaps with a point cloud and an evidence grid."""
 
 from __future__ import annotations
 
@@ -43,44 +43,44 @@ from graphslam_frontends.odometry.steps import Steps
 from graphslam_frontends.scan_window.relative_covariance import relative_covariance
 
 BENT = 0.1
-"""Way of points in the time from scan to scan from which it matters that they have no times [m]."""
+"""Motion of points between scans above which missing point times are reported [m]."""
 UNEVEN = 0.03
-"""Points that an uneven motion displaces by more than the noise of a range, as data sheets have it [m], are bent."""
+"""Point displacement by non-uniform motion above which it is reported [m]: a typical range noise of data sheets."""
 MANY = 0.05
-"""Share of lost scans of a submap from which a line of the verdict says so."""
+"""Share of lost scans in a submap above which they are reported."""
 BEGUN = 3
-"""Scans at the start of a log of which the map of a sparse lidar tells nothing yet."""
+"""Unmatched scans accepted at the start of a log, when the map of a sparse lidar is still empty."""
 FIRST = 5
-"""Scans that must have come before any is followed: an IMU whose readings begin later is left alone."""
+"""Scans that must exist before the first is processed: an IMU that begins later is ignored."""
 UNNAMED = ("auto", "none")
-"""Choices of an IMU that are no name of a stream."""
+"""Values of the option ``imu`` that are not names of streams."""
 OF_USE = 15.0
-"""Readings are of use for so long after a scan [s]."""
+"""Readings are kept this long after a scan [s]."""
 LEVEL = 1e-6
-"""Odometry is that of wheels if heights and tilts change by no more while the first scans are made [m, quaternion]."""
+"""Odometry is planar if heights and tilts change by no more than this during the first scans [m, quaternion]."""
 REHEARSED = 60
-"""Scans at the start that are followed thrice at most, until it is known what an IMU does not know."""
+"""Scans at the start that are processed repeatedly to initialise the IMU."""
 MOST_SCANS = 100
-"""A submap holds no more scans, however slowly the sensor moves."""
+"""Most scans in a submap, however slowly the sensor moves."""
 
 CLOUD_CELL = 0.1
-"""Edge of the cubes of which the cloud of a submap keeps one point each [m]."""
+"""One point per cube of this edge is kept in the cloud of a submap [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarSubmapConfig:
-    """How the path is cut into submaps, and what they carry."""
+    """How the path is cut into submaps, and the contents of a submap."""
 
     length: float = 3.0
-    """Way of a submap [m] …"""
+    """Path length of a submap [m] …"""
     scans: int = 5
-    """… which holds no fewer scans than this."""
+    """… with at least this many scans."""
     voxel_size: float = 0.2
     """Edge of a voxel of the grid [m]."""
     reach: float = 40.0
-    """Beams are followed so far through the grid [m]."""
+    """Range up to which beams enter the grid [m]."""
     points: int = 2000
-    """Points of a scan in grid and cloud at most."""
+    """Most points of a scan in grid and cloud."""
     hit: float = 0.7
     """Probability that a voxel is occupied, given that a beam ended in it."""
 
@@ -94,7 +94,7 @@ class LidarSubmapConfig:
         self.beam_model()
 
     def beam_model(self) -> BeamModel:
-        """What a beam says of a voxel."""
+        """Sensor model of a beam for the evidence grid."""
         return BeamModel(hit=self.hit)
 
 
@@ -105,31 +105,31 @@ class LidarFrontEndConfig:
     stream: str | None = None
     """Stream of point clouds; None: the first of the log."""
     imu: str = "auto"
-    """Stream of an IMU that tells where a match begins, unbends scans, and knows up; ``none``; or the first of the
-    log."""
+    """Stream of an IMU for initial guesses, deskewing and the direction of gravity; ``none``; or ``auto``: the first of
+    the log."""
     wheels: str = "auto"
-    """Stream of odometry that stands where scans find no place, and tells where a match begins if it tells that better
-    than an even motion; ``none``; or the first of the log, if it is that of wheels: without heights and tilts."""
+    """Stream of odometry for unmatched scans, and for the initial guess if it predicts better than constant velocity;
+    ``none``; or ``auto``: the first of the log, if it is planar (no heights and tilts)."""
     odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
-    """How scans are matched."""
+    """Matching of scans."""
     submap: LidarSubmapConfig = field(default_factory=LidarSubmapConfig)
-    """How the path is cut, and what submaps carry."""
+    """Cutting of the path, and contents of the submaps."""
 
 
 @dataclass(frozen=True, slots=True)
 class FollowedScan:
-    """A scan that was followed.
+    """A processed scan.
 
     Parameters
     ----------
     pose : (7,)
         ``T_first_base``.
     joint : (12, 12)
-        Joint covariance of the pose where the submap began and of this one.
+        Joint covariance of the first pose of the submap and this pose.
     spread : (6, 6)
-        Covariance of what the motion from the last scan was expected to be, right tangent.
+        Covariance of the predicted motion from the last scan, right tangent.
     points : (m, 3)
-        In the base at ``time``.
+        In the base frame at ``time``.
     """
 
     time: float
@@ -146,9 +146,9 @@ class FollowedScan:
 class LidarFrontEnd(FrontEnd):
     """The front end ``lidar-odometry``.
 
-    Needs a stream of point clouds, and takes an IMU where there is one. It draws nothing, and says of every scan what
-    the scans up to it let it say. A run that is resumed follows the scans again from the start, since window and
-    running medians go on from submap to submap, and makes the maps that are missing.
+    Needs a stream of point clouds and uses an IMU if there is one. It is deterministic and causal. A resumed run
+    processes the scans again from the start, because window and running medians continue from submap to submap, and
+    outputs only the missing submaps.
     """
 
     config: LidarFrontEndConfig = field(default_factory=LidarFrontEndConfig)
@@ -164,8 +164,8 @@ class LidarFrontEnd(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
-        """See :class:`~graphslam_frontends.base.FrontEnd`. A scan is followed when the next one has come, and the IMU's
-        readings up to it; the first ones when there are enough of them to know that unit."""
+        """See :class:`~graphslam_frontends.base.FrontEnd`. A scan is processed when the next scan and the IMU readings
+        up to it have arrived; the first ones when there are enough readings to initialise the IMU."""
         first = 0 if after is None else after.key + 1
         while not feed.ended and self._stream(feed) is None:
             yield None
@@ -189,7 +189,7 @@ class LidarFrontEnd(FrontEnd):
                 or not wheels.reaches(feed.part(name, k + 1, k + 2))
             ):
                 yield None
-            k, scans = k + 1, feed.count(name)  # only the end tells that a scan is the last
+            k, scans = k + 1, feed.count(name)  # only the end of the feed shows that a scan is the last
             if k >= scans:
                 break
             clouds = self._checked(name, feed.part(name, k, k + 1))
@@ -214,7 +214,7 @@ class LidarFrontEnd(FrontEnd):
                         base = align_with_gravity(base, odometry.inertial.up)
                     yield _submap((name, unit.name, wheels.name), base, kept, origin, config, key, ended, bent)
                 odometry.errors.begin()
-                for i in range(k - n, k):  # what is in a submap is asked for once more, by a refinement
+                for i in range(k - n, k):  # the points of a submap are needed again only by a refinement
                     seen[i] = replace(seen[i], points=seen[i].points.astype(np.float32))
                 kept, key, way = [replace(seen[-1], joint=odometry.errors.joint)], key + 1, odometry.way
         if scans and not mapped:
@@ -229,9 +229,9 @@ class LidarFrontEnd(FrontEnd):
             raise DataError("too few scans for a submap", where=f"{feed.name}/{name}", got=scans, wanted="at least 2")
 
     def steps(self, log: SensorLog) -> Steps:
-        """Scans and motion, for a refinement; the motion is only as sure as an even motion would be.
+        """Scans and motion for a refinement; the motion covariance is that of constant velocity.
 
-        The path of the odometry is made of the same scans. It is the start of a refinement and must not weigh in it.
+        The odometry path was estimated from the same scans, so it is only the initial guess of a refinement.
         """
         name, clouds = self._clouds(log)
         made = bool(self._made) and self._made[0].ended and self._made[0].log is log
@@ -251,11 +251,11 @@ class LidarFrontEnd(FrontEnd):
         return _steps(log, frozenset(uses), clouds, seen, self.config, unit.tilt(log, *_stamped(seen)))
 
     def forget(self) -> None:
-        """Let go of the path and the scans of the last log."""
+        """Free the path and the scans of the last log."""
         self._made.clear()
 
     def _odometry(self, unit: Unit) -> LidarOdometry:
-        """The odometry at its start."""
+        """The odometry in its initial state."""
         return unit.odometry()
 
     def _stream(self, streams: SensorLog | RecordSource) -> str | None:
@@ -276,7 +276,7 @@ class LidarFrontEnd(FrontEnd):
         return name, self._checked(name, log[name])
 
     def _imu(self, feed: RecordSource, clouds: str) -> str | None:
-        """Name of the IMU that is taken: one that reads as soon as the first scans are made."""
+        """Name of the IMU that is used: it must have readings by the time of the first scans."""
         name = feed.of_type(Imu) if self.config.imu == "auto" else self.config.imu
         if name is None or name == "none":
             return None
@@ -287,7 +287,7 @@ class LidarFrontEnd(FrontEnd):
         return name if len(stream.times) and len(scans) and stream.times[0] <= scans[-1] else None
 
     def _wheels(self, feed: RecordSource, clouds: str) -> str | None:
-        """Name of the odometry that is taken: one that tells motions as soon as the first scans are made."""
+        """Name of the odometry that is used: it must have records by the time of the first scans."""
         asked = self.config.wheels
         name = feed.of_type(Odometry) if asked == "auto" else asked
         scans = feed.part(clouds, 0, min(FIRST, feed.count(clouds))).times
@@ -314,7 +314,7 @@ class LidarFrontEnd(FrontEnd):
 
 
 class _Heard(ABC):
-    """A stream beside the scans, taken as it comes.
+    """A stream used with the scans, read as it arrives.
 
     Parameters
     ----------
@@ -329,14 +329,14 @@ class _Heard(ABC):
     @property
     @abstractmethod
     def listener(self) -> ImuReadings | WheelMotionPrior | None:
-        """What takes its records."""
+        """The object that receives its records."""
 
     def reaches(self, scan: Stream) -> bool:
-        """Have its records come up to the stamp of a scan?"""
+        """Have its records arrived up to the stamp of a scan?"""
         return self.name is None or self.feed.until(self.name) >= float(scan.times[0])
 
     def hear(self, now: float = -np.inf) -> None:
-        """Take the records that have come, and forget those that are of no use any more after the scan before."""
+        """Process the new records, and discard those that are too old for the previous scan."""
         if self.name is None or self.listener is None:
             return
         n, since, self._last = self.feed.count(self.name), min(self._last, now) - OF_USE, now
@@ -350,7 +350,7 @@ class _Heard(ABC):
 
 
 class Unit(_Heard):
-    """The IMU of a feed, if there is one, and what of it is known."""
+    """The IMU of a feed, if there is one, and its estimated parameters."""
 
     def __init__(self, feed: RecordSource, name: str | None, config: LidarOdometryConfig) -> None:
         super().__init__(feed, name)
@@ -363,11 +363,11 @@ class Unit(_Heard):
         return None if self.inertial is None else self.inertial.readings
 
     def rehearse(self, clouds: str) -> Iterator[None]:
-        """Follow the first scans to learn what the unit does not know; None: more records are wanted.
+        """Process the first scans to initialise the IMU; yields None while more records are needed.
 
-        A unit that does not tell the turns of these scans is trusted in a second try: where scans are so bent or so
-        sparse that they follow their own pattern rather than the place, they are straightened and led by it. If it
-        tells the turns then, and scans fit as well or better, the scans were wrong, not the unit.
+        If the IMU does not predict the rotations of these scans, a second attempt deskews and predicts with it in any
+        case: matches of distorted or sparse scans may be wrong. If the IMU then predicts the rotations and the overlap
+        is not lower, the scans were wrong, not the IMU.
         """
         if self.name is None:
             return
@@ -394,14 +394,14 @@ class Unit(_Heard):
             if self.inertial.believed and self.inertial.known and fitted[-1] >= fitted[0]:
                 self.inertial.rewind()
                 return
-        self.inertial = InertialPredictor(self._part(0, self._heard))  # it may be believed later
+        self.inertial = InertialPredictor(self._part(0, self._heard))  # it may become reliable later
 
     def odometry(self) -> LidarOdometry:
-        """At its start."""
+        """The odometry in its initial state."""
         return LidarOdometry(self.config, self.inertial)
 
     def tilt(self, log: SensorLog, times: Array, poses: Array) -> PathGravity | None:
-        """Gravity along a path, by all readings."""
+        """Gravity along a path, from all readings."""
         if self.name is None or self.inertial is None:
             return None
         self.inertial.readings = ImuReadings(log[self.name])
@@ -409,7 +409,7 @@ class Unit(_Heard):
 
 
 class _Wheels(_Heard):
-    """The odometry of a feed, if there is one that is taken."""
+    """The odometry stream of a feed, if one is used."""
 
     def __init__(self, feed: RecordSource, name: str | None) -> None:
         super().__init__(feed, name)
@@ -417,7 +417,7 @@ class _Wheels(_Heard):
 
     @property
     def listener(self) -> WheelMotionPrior | None:
-        """What tells motions by it."""
+        """The motion prior from its records."""
         return self.reckoned
 
 
@@ -427,7 +427,7 @@ def _step(odometry: LidarOdometry, clouds: Any, k: int) -> ScanResult:
 
 
 def _bent(key: int, kept: list[FollowedScan]) -> list[Finding]:
-    """Do points without times lie on a scan that its motion has bent?"""
+    """Report point clouds without point times if the motion distorts the scans."""
     worst = 0.0
     for a, b in pairwise(kept):
         if b.sweep is None and len(b.points):
@@ -445,10 +445,10 @@ def _bent(key: int, kept: list[FollowedScan]) -> list[Finding]:
 
 
 def _uneven(key: int, kept: list[FollowedScan]) -> list[Finding]:
-    """Does the motion change so much from scan to scan that scans straightened by an even one stay bent?
+    """Report a motion that changes too much from scan to scan for deskewing at constant velocity.
 
-    If the velocity changes evenly over a scan, by Δ in all, points in its middle are off by Δ / 8 times its duration.
-    Δ is the change from one scan to the next; the duration is from the first point of a scan to its last.
+    If the velocity changes uniformly over a scan, by Δ in all, points in its middle are off by Δ / 8 times its
+    duration. Δ is the change from one scan to the next; the duration is from the first point of a scan to its last.
     """
     off = []
     for a, b, c in zip(kept, kept[1:], kept[2:]):
@@ -456,7 +456,7 @@ def _uneven(key: int, kept: list[FollowedScan]) -> list[Finding]:
             before, now = se3.se3_between(np.stack([a.pose, b.pose]), np.stack([b.pose, c.pose]))
             change = np.asarray(se3.se3_log(se3.se3_between(before, now)))
             far = float(np.median(np.linalg.norm(c.points, axis=1)))
-            share = min(c.sweep / (c.time - b.time), 1.0)  # a hand shakes faster than scans come: of time, not of Δ
+            share = min(c.sweep / (c.time - b.time), 1.0)  # a hand shakes faster than the scan rate: scale time, not Δ
             off.append(share * float(np.linalg.norm(change[3:]) + far * np.linalg.norm(change[:3])) / 8.0)
     if not off or np.median(off) <= UNEVEN:
         return []
@@ -469,7 +469,7 @@ def _uneven(key: int, kept: list[FollowedScan]) -> list[Finding]:
 
 
 def _stamped(made: list[FollowedScan]) -> tuple[Array, Array]:
-    """Stamps and poses of the scans that were matched."""
+    """Stamps and poses of the scans in the map."""
     some = [f for f in made if f.seen.state in MAPPED]
     return np.array([f.time for f in some]), np.array([f.pose for f in some]).reshape(-1, 7)
 
@@ -501,7 +501,7 @@ def _submap(
         origins.append(se3.se3_transform(T, origin))
     states = Counter(f.seen.state for f in kept[int(key > 0) :])
     overlaps = [f.seen.overlap for f in kept if np.isfinite(f.seen.overlap)]
-    # nothing holds a scan that is lost, nor one of which the map tells nothing yet
+    # all six directions are unobservable: lost scans, and matches with too few cells
     lost = sum(f.seen.unheld == 6 for f in kept[int(key > 0) :])
     report: dict[str, Any] = {
         "ended": ended,

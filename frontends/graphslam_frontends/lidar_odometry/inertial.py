@@ -1,15 +1,14 @@
-"""What an IMU knows of the motion from scan to scan and within a scan, for a start and for unbending.
+"""IMU prediction of the motion from scan to scan and within a scan, for initial guesses and deskewing.
 
-Rates and forces between two scans say how the body turned and how its velocity changed, but for the bias of the gyro,
-for the velocity itself, and for gravity. These three are learned from the poses that scans were matched to: the bias by
-how much faster the gyro turned, velocity and gravity by a fit to the positions of the last seconds. In the body at the
-last scan, at time τ since::
+Preintegrated rates and forces give rotation and velocity change between two scans, except for gyro bias, velocity and
+gravity. These three are estimated from the matched poses: the bias from the rotation difference, velocity and gravity
+from a fit to the positions of the last seconds. In the body frame at the last scan, at time τ since::
 
     R(τ) = ΔR(τ)        p(τ) = v τ + ½ g τ² + Δp(τ)
 
-Nothing of it weighs in a pose: a match begins where this leads, and its points are moved by it. It is believed as long
-as it tells the turns of the scans to some milliradians, or far better than an even motion does, so that a unit whose
-axes, stamps or units are wrong does no harm.
+It adds no information to a pose covariance: it gives initial guesses and deskews points. It is used only while it
+predicts rotations within a few milliradians, or far better than constant velocity, so that wrong axes, stamps or units
+do no harm.
 """
 
 from __future__ import annotations
@@ -24,44 +23,44 @@ from graphslam.core.geometry import Array
 from graphslam.core.imu import GRAVITY, Imu
 
 USUAL = 20
-"""Readings by which it is told how far apart they are."""
+"""Number of readings for the estimate of the sampling interval."""
 WINDOW = 5.0
-"""Positions of so many seconds are fitted."""
+"""Length of the window of positions for a fit [s]."""
 LONGEST = 3.0
-"""A motion is told for so long after the last scan that was matched [s]."""
+"""Longest prediction after the last matched scan [s]."""
 FEWEST = 5
-"""Scans that an even motion and the IMU are compared over before it is believed."""
+"""Least number of scans for the comparison with constant velocity."""
 COMPARED = 20
-"""… and over which at most."""
+"""Most scans for the comparison."""
 CLEARLY = 0.25
-"""Squared turn that the IMU misses beside that of an even motion: far better."""
+"""Largest ratio of the squared rotation errors of IMU and constant velocity, to count as far better."""
 PLACED = 0.01
 """σ of a matched position [m] …"""
 TURNED = 2e-3
-"""… and of the turn between two matched poses [rad]."""
+"""… and of the rotation between two matched poses [rad]."""
 FASTEST = 3.0
-"""σ of the velocity before anything is known of it [m/s]."""
+"""Prior σ of the velocity [m/s]."""
 MOSTLY = 0.8
-"""Share of the scans at which gravity must be seen, to be told along a path."""
+"""Least share of scans with a gravity fit, for gravity along a path."""
 FARTHEST = 5.0
-"""A match is refused where it is so many σ, and as many times as far as matches are by the median, off the place where
-readings lead, and …"""
+"""A match is rejected if it is farther from the IMU prediction than this many σ (or median distances of matches) plus …
+"""
 MISSED_FORCE = 0.5
-"""… by more than this acceleration would [m/s²]: a lever that is 0.1 m off, at 2 rad/s."""
+"""… the effect of this acceleration error [m/s²]: a lever arm error of 0.1 m at 2 rad/s gives 0.4 m/s²."""
 ON_ITS_SIDE = np.deg2rad(60.0)
-"""Pitch beyond which roll is ill defined."""
+"""Pitch above which roll is ill-defined."""
 GRAVITY_SIGMA = (1.0, 0.2)
-"""σ of gravity as the mean force tells it at first, and as the last fit does [m/s²]."""
+"""σ of gravity by the mean force at first, and by the previous fit later [m/s²]."""
 
 
 @dataclass(frozen=True, slots=True)
 class InertialMotion:
-    """The motion by readings alone, seen from the body at an anchor.
+    """Preintegrated motion from readings, relative to the body at an anchor time.
 
     Parameters
     ----------
     seconds : (m,)
-        Since the anchor; negative before.
+        Since the anchor; negative before it.
     q : (m, 4)
         ΔR.
     v, p : (m, 3)
@@ -74,13 +73,13 @@ class InertialMotion:
     p: Array
 
     def poses(self, velocity: Array, gravity: Array) -> Array:
-        """``T_anchor_body`` ``(m, 7)`` with a velocity and a gravity, both in the body at the anchor."""
+        """``T_anchor_body`` ``(m, 7)`` for a velocity and a gravity, both in the body frame at the anchor."""
         t = self.seconds[:, None]
         return np.concatenate([t * velocity + 0.5 * t**2 * gravity + self.p, self.q], axis=1)
 
 
 class ImuReadings:
-    """Readings of an IMU as the base would make them."""
+    """Readings of an IMU, rotated to the base frame."""
 
     def __init__(self, imu: Imu) -> None:
         self.noise = imu.noise
@@ -90,17 +89,17 @@ class ImuReadings:
         self.pause = max(0.1, 5.0 * self.usual)
 
     def more(self, imu: Imu, since: float) -> None:
-        """Readings that came after; those before ``since`` [s] are not asked for any more."""
+        """Append later readings; those before ``since`` [s] are no longer needed."""
         a = int(np.searchsorted(self.times, since))
         t, w, f = _turned(imu)
         self.times = np.concatenate([self.times[a:], t])
         self.rate, self.force = np.concatenate([self.rate[a:], w]), np.concatenate([self.force[a:], f])
 
     def way(self, anchor: float, at: Array, bias: Array) -> InertialMotion | None:
-        """The motion at some times ``(m,)``, seen from the body at ``anchor``; None where readings are missing."""
+        """Preintegrated motion at times ``(m,)``, relative to the body at ``anchor``; None: readings are missing."""
         first, last = min(anchor, float(at.min())), max(anchor, float(at.max()))
         t = self.times
-        # the first and the last reading hold for as long as a reading does
+        # the first and the last reading may be extrapolated by half an interval and more
         if len(t) < 2 or first < t[0] - 1.5 * self.usual or last > t[-1] + 1.5 * self.usual:
             return None
         a, b = int(np.searchsorted(t, first, side="right")), int(np.searchsorted(t, last, side="left"))
@@ -113,7 +112,7 @@ class ImuReadings:
         dt = np.diff(knots)[:, None]
         turn = 0.5 * (rate[1:] + rate[:-1]) * dt
         q = cumulative_products(se3.so3_exp(turn))
-        # a force acts, on the average, through the attitude half-way
+        # mean force, rotated by the attitude in the middle of the interval
         f = se3.quat_rotate(se3.quat_multiply(q[:-1], se3.so3_exp(0.5 * turn)), 0.5 * (force[1:] + force[:-1]))
         v = np.concatenate([np.zeros((1, 3)), np.cumsum(f * dt, axis=0)])
         p = np.concatenate([np.zeros((1, 3)), np.cumsum(v[:-1] * dt + 0.5 * f * dt**2, axis=0)])
@@ -128,7 +127,7 @@ class ImuReadings:
         )
 
     def _at_base(self, some: slice) -> Array:
-        """Forces at the base: without those of the lever as the body turns."""
+        """Specific force at the base: without the accelerations of the lever arm."""
         force, rate = self.force[some], self.rate[some]
         if not np.any(self.lever) or len(rate) < 2:
             return force
@@ -136,7 +135,7 @@ class ImuReadings:
         return np.asarray(force - np.cross(turning, self.lever) - np.cross(rate, np.cross(rate, self.lever)))
 
     def doubt(self, seconds: Array, bias_sigma: float) -> Array:
-        """Variance ``(m,)`` [m²] of a fitted position so many seconds off: its own, and what noise does to Δp."""
+        """Variance ``(m,)`` [m²] of a fitted position at times from the anchor, by match and IMU noise."""
         s, n = np.abs(seconds), self.noise
         turned = (GRAVITY * n.gyro) ** 2 * s**5 / 20.0 + (GRAVITY * bias_sigma * s**3 / 6.0) ** 2
         return np.asarray(PLACED**2 + turned + n.accelerometer**2 * s**3 / 3.0)
@@ -149,7 +148,7 @@ def _turned(imu: Imu) -> tuple[Array, Array, Array]:
 
 
 def cumulative_products(turns: Array) -> Array:
-    """Products ``(n + 1, 4)`` of the first 0, 1, 2 … of n turns ``(n, 4)``."""
+    """Products ``(n + 1, 4)`` of the first 0, 1, 2 … of n rotations ``(n, 4)``."""
     q, step = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], turns]), 1
     while step < len(q):
         q = np.concatenate([q[:step], se3.quat_multiply(q[:-step], q[step:])])
@@ -160,7 +159,7 @@ def cumulative_products(turns: Array) -> Array:
 def fit_velocity_gravity(
     way: InertialMotion, positions: Array, variance: Array, gravity: Array, sigma: float
 ) -> tuple[Array, Array, Array]:
-    """Velocity and gravity in the body at the anchor that positions ``(m, 3)`` there agree with.
+    """Least-squares velocity and gravity in the body frame at the anchor, from positions ``(m, 3)``.
 
     Parameters
     ----------
@@ -169,13 +168,13 @@ def fit_velocity_gravity(
     positions : (m, 3)
     variance : (m,)
     gravity : (3,)
-        Known before, within ``sigma``.
+        Prior, with σ ``sigma``.
 
     Returns
     -------
     velocity, gravity : (3,)
     covariance : (3, 3)
-        Of place, velocity and gravity along any axis.
+        Of position, velocity and gravity along any axis.
     """
     A = np.stack([np.ones_like(way.seconds), way.seconds, 0.5 * way.seconds**2], axis=1)
     W = A / variance[:, None]
@@ -188,19 +187,19 @@ def fit_velocity_gravity(
 
 
 class InertialPredictor:
-    """Learns what a unit does not know, and tells motions.
+    """Estimate gyro bias, velocity and gravity from matched scans, and predict motions.
 
     Parameters
     ----------
     trusted : bool
-        It is believed whatever scans say, until this is taken back.
+        Use the IMU whatever the scans show, until this is set to False.
 
     Attributes
     ----------
     bias : (3,)
-        Of the gyro [rad/s], body.
+        Of the gyro [rad/s], base frame.
     velocity, gravity : (3,)
-        In the body at the last scan that was learned [m/s], [m/s²].
+        In the body frame at the last matched scan [m/s], [m/s²].
     """
 
     def __init__(self, imu: Imu, *, trusted: bool = False) -> None:
@@ -218,21 +217,21 @@ class InertialPredictor:
 
     @property
     def up(self) -> Array | None:
-        """Unit vector ``(3,)`` in the frame of the path, as it was known last; None: never."""
+        """Unit vector ``(3,)`` in the frame of the path, latest estimate; None: not available."""
         return self._up if self.believed else None
 
     @property
     def believed(self) -> bool:
-        """Does it tell turns as well as scans do, or far better than an even motion?"""
+        """Does it predict rotations as well as scans, or far better than constant velocity?"""
         if self.trusted:
             return True
         if len(self.missed) < FEWEST:
             return False
-        own, even = np.median(self.missed, axis=0)  # the first matches of a map may be poor
+        own, even = np.median(self.missed, axis=0)  # the median, because the first matches of a map may be poor
         return bool(own <= (3.0 * TURNED) ** 2 or own <= CLEARLY * even)
 
     def ahead(self, time: float) -> Array | None:
-        """``T_first_body`` ``(7,)`` at a time after the last scan that was learned; None: it does not know."""
+        """``T_first_body`` ``(7,)`` at a time after the last matched scan; None: not available."""
         if not (self.believed and self.known) or not 0.0 < time - self.kept[-1][0] <= LONGEST:
             return None
         last, pose = self.kept[-1]
@@ -240,9 +239,9 @@ class InertialPredictor:
         return None if way is None else np.asarray(se3.se3_compose(pose, way.poses(self.velocity, self.gravity)[0]))
 
     def reach(self, time: float) -> float:
-        """Distance from where :meth:`ahead` leads that a match may be off [m]: so many σ, and what the unit may miss.
+        """Largest accepted distance of a match from :meth:`ahead` [m]: several σ plus an acceleration error.
 
-        Where most matches are farther off than that, the forces are wrong, not the matches.
+        If most matches are farther away, the forces are assumed wrong, so the median distance replaces σ.
         """
         dt = time - self.kept[-1][0]
         moved = np.array([0.0, dt, 0.5 * dt**2])
@@ -251,12 +250,12 @@ class InertialPredictor:
         return FARTHEST * max(float(sigma), float(np.median(self.shifts or 0.0))) + 0.5 * MISSED_FORCE * dt**2
 
     def within(self, time: float, ages: Array) -> Array | None:
-        """``T_now_then`` ``(m, 7)`` of the body at a time, and so many seconds ``(m,)`` before; None: not known."""
+        """``T_now_then`` ``(m, 7)`` of the body at ``time`` and ``ages`` ``(m,)`` [s] before; None: not available."""
         if not (self.believed and self.known and len(ages)) or not 0.0 <= time - self.kept[-1][0] <= LONGEST:
             return None
         last = self.kept[-1][0]
         t = self.readings.times
-        # readings are joined by straight lines; so are the motions between
+        # readings are interpolated linearly, and so are the motions between them
         knots = time - np.array([ages.max(), ages.min()])
         at = np.concatenate([knots[:1], t[(t > knots[0]) & (t < knots[1])], knots[1:]])
         way = self.readings.way(last, np.append(at, time), self.bias)
@@ -269,16 +268,16 @@ class InertialPredictor:
         return np.concatenate([x[:, 3:], se3.so3_exp(x[:, :3])], axis=1)
 
     def unsure(self, age: float) -> tuple[float, float]:
-        """Variance by axis of what is unsure of the motion within a scan of mean age ``age`` does to its pose.
+        """Variance by axis, rotation and translation, of the pose error by deskewing with a mean age ``age``.
 
-        A scan may be stamped when it begins: its points are then measured later, and their ages are negative.
+        A scan may be stamped at its begin: points are measured later, and their ages are negative.
         """
         n, age = self.readings.noise, abs(age)
         turn2 = n.gyro**2 * 2.0 * age / 3.0 + self.bias_var * age**2
         return float(turn2), float(self.cov[1, 1] * age**2)
 
     def learn(self, time: float, pose: Array, even: Array) -> None:
-        """A scan was matched at ``pose``; an even motion would have led to ``even`` (both ``T_first_body``)."""
+        """Update with a scan matched at ``pose``; constant velocity predicted ``even`` (both ``T_first_body``)."""
         if self.kept and time > self.kept[-1][0]:
             before, last = self.kept[-1]
             way = self.readings.way(before, np.array([time]), self.bias)
@@ -287,7 +286,7 @@ class InertialPredictor:
             else:
                 self._compare(time - before, se3.se3_between(last, pose), way, se3.se3_between(last, even))
         elif self.kept:
-            return  # of the same instant
+            return  # same time stamp
         self.kept.append((time, pose))
         while time - self.kept[0][0] > WINDOW:
             self.kept.popleft()
@@ -295,11 +294,11 @@ class InertialPredictor:
 
     @property
     def rehearsed(self) -> bool:
-        """Is enough known to begin anew with the first scan?"""
+        """Is enough estimated to start again from the first scan?"""
         return self.believed and self.known and self.kept[-1][0] - self.kept[0][0] >= 0.6 * WINDOW
 
     def rewind(self) -> None:
-        """Back to the first scan of those that are kept, with what was learned since as a first guess."""
+        """Go back to the first scan of the window; estimates are kept as the initial guess."""
         if self.known:
             self._place(0)
             self.bias_var = self._bias_var
@@ -308,18 +307,18 @@ class InertialPredictor:
             self.kept.append(first)
 
     def forget(self) -> None:
-        """What was before says nothing of what comes."""
+        """Discard the matched poses, because a new map begins."""
         self.kept.clear()
         self.known = False
 
     def _compare(self, dt: float, made: Array, way: InertialMotion, even: Array) -> None:
-        """The bias of the gyro by a turn that scans know (a Kalman filter), and who told the turn better."""
+        """Kalman update of the gyro bias by a matched rotation, and comparison of the rotation errors."""
         off = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], way.q[0])))
         worse = np.asarray(se3.so3_log(se3.quat_multiply(made[3:] * [-1.0, -1.0, -1.0, 1.0], even[3:])))
         self.missed.append((float(off @ off), float(worse @ worse)))
         n = self.readings.noise
         self.bias_var += n.gyro_walk**2 * dt
-        # scans that are bent tell turns worse
+        # rotations of distorted scans are noisier
         turned = max(TURNED**2, float(np.median(self.missed, axis=0)[0]) / 3.0)
         noise = (turned + n.gyro**2 * dt) / dt**2
         gain = self.bias_var / (self.bias_var + noise)
@@ -327,7 +326,7 @@ class InertialPredictor:
         self.bias_var *= 1.0 - gain
 
     def _place(self, k: int = -1) -> None:
-        """Velocity and gravity in the body at the last scan that is kept, or at another, by the positions of all."""
+        """Velocity and gravity in the body frame at scan k of the window (default: the last), from all positions."""
         anchor, pose = self.kept[k]
         at = np.array([t for t, _ in self.kept])
         way = self.readings.way(anchor, at, self.bias)
@@ -335,12 +334,12 @@ class InertialPredictor:
             self.known = False
             return
         if self.known:
-            # as the fit before has it, in the body of the last scan it knew
+            # the previous fit, rotated from the body frame of the last scan it used
             then = self.kept[-1 if k == 0 else -2][1]
             turn = se3.se3_between(pose, then)[3:]
             guess, sigma = se3.quat_rotate(turn, self.gravity), GRAVITY_SIGMA[1]
         else:
-            # the mean force, the body's own acceleration left aside
+            # the mean specific force, neglecting the acceleration of the body
             guess, sigma = -way.v[0] / way.seconds[0], GRAVITY_SIGMA[0]
         there = se3.se3_between(np.broadcast_to(pose, (len(at), 7)), np.array([p for _, p in self.kept]))[:, :3]
         variance = self.readings.doubt(way.seconds, float(np.sqrt(self.bias_var)))
@@ -350,7 +349,7 @@ class InertialPredictor:
 
 
 def align_with_gravity(pose: Array, up: Array | None) -> Array:
-    """A pose ``(7,)`` stood upright, where ``up`` ``(3,)`` is known in its frame: place and heading are kept."""
+    """Align a pose ``(7,)`` with gravity, if ``up`` ``(3,)`` is known in its frame: position and heading are kept."""
     if up is None:
         return pose
     x, y, z = se3.quat_rotate(pose[3:] * [-1.0, -1.0, -1.0, 1.0], up)
@@ -367,11 +366,11 @@ class PathGravity:
     ----------
     times : (n,)
     up : (n, 3)
-        In the frame of the path, of the body at these times.
+        In the frame of the path, at these times.
     sigma : float
         Of roll and pitch [rad].
     time : float
-        In which their errors fade [s].
+        Correlation time of their errors [s].
     """
 
     times: Array
@@ -387,21 +386,21 @@ class PathGravity:
 
 
 def gravity_along_path(inertial: InertialPredictor, times: Array, poses: Array) -> PathGravity | None:
-    """Gravity along a path, by the positions and the readings half a window before and after.
+    """Gravity along a path, from positions and readings half a window before and after each scan.
 
     Parameters
     ----------
     inertial : InertialPredictor
-        That went along.
+        After it processed the path.
     times : (n,)
-        Of scans that were matched.
+        Of matched scans.
     poses : (n, 7)
 
     Returns
     -------
     PathGravity or None
-        None: the unit is not believed, there is too little of it, or the body hangs on its side, where roll and pitch
-        are none.
+        None: the IMU is not reliable, too few scans have a fit, or the pitch is above ``ON_ITS_SIDE``, where roll is
+        ill-defined.
     """
     readings, noise = inertial.readings, inertial.readings.noise
     if not inertial.believed:

@@ -1,10 +1,10 @@
-"""Scan after scan against the map of those before it: start by search, coarse to fine, and a check before it is kept.
+"""Scan-to-map LiDAR odometry: initial guess by search, coarse-to-fine matching, and a check before a scan is mapped.
 
-What decides is the start of each match. A hand-held lidar turns by ten degrees between scans, which moves things at
-20 m by metres, while a match sees no farther than a cell. So rotations about the prediction and about the last pose are
-tried on the coarsest cells, wherever the prediction's own match is not as good as the scans before it. A scan that
-finds less of itself in the map than usual is looked for far and wide before it enters the map: a lost scan in the map
-spoils all that come after. Where a gyro says how the sensor turned, a match that is turned otherwise is refused.
+The initial guess decides whether a match succeeds: a hand-held lidar may turn by 10° between scans, which moves points
+at 20 m by metres, while a match converges only within about one cell. So rotations about the prediction and the last
+mapped pose are tried on the coarse levels if the match from the prediction is worse than those of recent scans. If the
+overlap is lower than usual, a wide range of rotations is searched first, because one misplaced scan corrupts the map
+for all later scans. With an IMU, a match with a different rotation is rejected.
 """
 
 from __future__ import annotations
@@ -34,108 +34,109 @@ from graphslam_frontends.scan_window.observability import direction_strengths
 Index = npt.NDArray[np.int64]
 
 MOST_STEPS = 12
-"""Gauss–Newton steps on a level."""
+"""Most Gauss–Newton steps on a level."""
 SCALE = 2.0
-"""Mahalanobis distance of Geman and McClure's kernel."""
+"""Scale of the Geman–McClure kernel (a Mahalanobis distance)."""
 STILL = (1e-4, 5e-4)
-"""A match stands still below this [rad], [m]."""
+"""Convergence of a match: the last step is below this [rad], [m]."""
 MOST_DESKEWED = 6
-"""Times that a scan is unbent by the motion found."""
+"""Most repetitions of deskewing and matching of a scan."""
 COARSE_POINTS = 1000
 """Points matched on all but the finest level."""
 COARSE = np.diag([1.0 / 0.05**2] * 3 + [1.0 / 0.2**2] * 3)
-"""Information of what a coarse match says [rad], [m]."""
+"""Information matrix of the result of the coarse levels, as a prior on the finest one (0.05 rad, 0.2 m)."""
 SEARCHED = 300
-"""Points of a search over rotations."""
+"""Points used in a search over rotations."""
 SEARCH_STEP, SEARCH_SIDE = np.deg2rad(4.0), 3
-"""Rotations are tried ±3 steps of 4° about every axis …"""
+"""Near search: ±3 steps of 4° about each axis."""
 WIDE_STEP, WIDE_SIDE = np.deg2rad(8.0), 8
-"""… and, where a scan is looked for far and wide, ±8 steps of 8° about one with ±1 about the others."""
+"""Wide search: ±8 steps of 8° about one axis, with ±1 step about the other two."""
 LED_AWAY = 0.5
-"""Cells of the finest level by which coarse levels may move a match before it is compared with the prediction."""
+"""If the coarse levels move a match by more than this, in cells of the finest level, the prediction is tried as well.
+"""
 LIKELY = 0.85
-"""Overlap of the prediction's match beside the running median above which rotations are not searched …"""
+"""No search over rotations if the coarse overlap is above this fraction of the running median …"""
 NEAR = (np.deg2rad(4.0), 0.6)
-"""… if it corrects the prediction by less than this [rad], [m]."""
+"""… and the match is within this of the prediction [rad], [m]."""
 FAR = 5.0
-"""What overlaps little is no new space where it corrects the prediction by so many of its σ more than that."""
+"""A scan with little overlap is lost if it is farther from the prediction than ``NEAR`` plus this many σ."""
 LATE = 2.5
-"""Time since the last scan, in usual ones, from which a scan is looked for far and wide anyhow."""
+"""A scan later than this many median intervals after the last one is searched over a wide range of rotations."""
 BETTER = 1.2
-"""A place found far and wide must overlap so many times as much."""
+"""A pose found by the wide search is accepted if its overlap is larger by this factor."""
 NEW = 0.5
-"""Share of the points of a scan without a cell on the finest level from which on the level above speaks for them: what
-lies between the rings of the scans so far is seen by wider cells alone."""
+"""Fraction of points without a cell on the finest level above which these points are matched on the next coarser level:
+points between the rings of earlier scans only fall into wider cells."""
 BEGUN = 3
-"""Scans that surfaces held in every direction before the speed is known …"""
+"""Fully observable scans after which the velocity counts as known …"""
 FASTEST = 10.0
-"""… and its σ until then [m/s]: a car in a town. Rest is the prediction, and stands for what nothing holds."""
+"""… and σ of the velocity until then [m/s], for a car in a town; the predicted velocity is 0."""
 LITTLE = 0.1
-"""Share of the points of a scan that have a cell on the finest level below which that level says nothing of the scan.
-The rings of a sparse lidar make no surfaces before several scans are laid on each other: cells of a few chance points
-once pulled the second scan of a standing car down by 0.7 m."""
+"""A match is not used if less than this fraction of the points has a cell on the finest level. The rings of a sparse
+lidar form no surfaces in the first scans; cells of a few random points once moved the second scan of a standing car by
+0.7 m."""
 FEW = 100
-"""Points below which a scan is not matched."""
+"""Scans with fewer points are not matched."""
 FITS = 0.75
-"""Quality of the fit beside the running median from which on a scan with little overlap is one of new space: where
-there is something to fit to, it fits."""
+"""A scan with little overlap is new space if its fit quality is above this fraction of the running median: its points
+fit where the map has cells."""
 REMEMBERED = 10
-"""Scans of the running medians."""
+"""Number of scans in the running medians."""
 NORMAL_SIGMA = 0.05
 """σ of the normals of cells [rad]."""
 PRETENDED = 1.5
-"""What surfaces hold a body by, in multiples of what such noise of their normals would pretend to, up to which nothing
-is known."""
+"""A direction is unobservable if its information is at most this multiple of the spurious information that noise of the
+normals causes."""
 MAPPED = ("first", "matched", "found again", "new space")
 """States of scans that enter the map."""
 LASTING = 4.0
-"""Variance of what surfaces do to the poses of a window, which see them again and again, beside that of one scan's
-residuals. Found on simulated lidars (`tests/frontends/lidar_odometry`)."""
+"""Factor on the variance of the gradient, because consecutive scans see the same surfaces and their errors are
+correlated. Found on simulated lidars (`tests/frontends/lidar_odometry`)."""
 ACCELERATION = (3.0, 2.0)
-"""What speeds may change by, beside what was seen lately [rad/s²], [m/s²]: a hand-held lidar, a car that brakes."""
+"""Lower bound of the acceleration noise [rad/s²], [m/s²]: a hand-held lidar, a car that brakes."""
 LONGEST = 30.0
-"""Of a longer time nothing less is known than of this [s]: a kilometre either way."""
+"""Longest time for which the motion covariance grows [s]."""
 LONG_SWEEP = 10.0
-"""Points are no older than so many times the motion that they are moved by."""
+"""Limit of point ages, in multiples of the motion interval."""
 GIVEN_UP = 10
-"""Scans lost in a row after which a new map begins."""
+"""Consecutive lost scans after which a new map begins."""
 MOST_KEPT = 8000
-"""Points of a scan that enter the map at most."""
+"""Most points of a scan in the map."""
 FINEST_SIGMA = 0.05
-"""σ added to the cells of the finest level [m]; coarser ones: a quarter of their edge."""
+"""σ added to the cells of the finest level [m]; on coarser levels it is a quarter of the edge."""
 WINDOW_SCANS = 100
-"""Cells of so many scans are kept at least, however far the sensor has moved since."""
+"""Cells of at least this many scans are kept, whatever the distance travelled."""
 SUSPICIOUS = 0.7
-"""Share of the running median of the overlap below which a scan is looked for far and wide."""
+"""A wide search starts if the overlap is below this fraction of the running median."""
 
 
 MOST_WEAK = 3
-"""Directions, of those that surfaces hold least, along which a match gives way to an IMU."""
+"""Most of the weakest directions in which a match may be replaced by the IMU prediction."""
 GYRO_OFF = 0.15
-"""A match that is turned further than this from what a gyro says [rad] is another place that looks alike: rooms look
-alike when turned by a right angle. A bias of 0.005 rad/s, large for a cheap gyro, turns by this in 30 s."""
+"""A match rotated by more than this from the IMU prediction is a false match [rad]: rooms look alike after a right
+angle. A gyro bias of 0.005 rad/s, large for a cheap gyro, rotates by this in 30 s."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanResult:
-    """What came of a scan.
+    """Result of the match of one scan.
 
     Parameters
     ----------
     points : int
-        Matched.
+        Number of points matched.
     overlap : float
-        Share of them on the finest cells; nan for the first scan of a map.
+        Sum of the weights on the finest level, divided by the number of points; nan for the first scan of a map.
     unheld : int
-        Number of directions, of six, that no surface holds: the prediction stands there.
+        Number of unobservable directions, of six; the prediction is used along them.
     state : str
-        "first", "matched", "new space", "found again" (far and wide), "lost" (predicted, not in the map), "empty".
+        "first", "matched", "new space", "found again" (wide search), "lost" (predicted, not in the map), "empty".
     aided : bool
-        An IMU told where the match began, or unbent the points.
+        The IMU predicted the pose or deskewed the points.
     watched : bool
-        Odometry told the motion, and was of use so far: it leads if it is better, stands where nothing is matched.
+        Odometry was available and useful.
     bridged : bool
-        The pose, or what of it no surface holds, is that of odometry.
+        The pose, or its unobservable part, is that of odometry.
     """
 
     points: int
@@ -149,7 +150,7 @@ class ScanResult:
 
 
 def _spreads() -> tuple[Array, Array]:
-    """Weighted mean of squares under Geman and McClure's weights, of Gaussians of so much variance."""
+    """Weighted mean squares of Gaussians under Geman–McClure weights, and the variances of these Gaussians."""
     variances = np.geomspace(1e-3, 30.0, 40)
     x = np.linspace(-6.0, 6.0, 2001)
     out = []
@@ -161,21 +162,21 @@ def _spreads() -> tuple[Array, Array]:
 
 
 SPREADS = _spreads()
-"""Misfit, and the variance of residuals beside what the cells say that it tells of."""
+"""Misfit against variance of the residuals relative to the cell model: a table for interpolation."""
 
 
 @dataclass(frozen=True, slots=True)
 class RawScan:
-    """Points as they were measured while the body moved.
+    """Points of a scan before deskewing.
 
     Parameters
     ----------
     points : (n, 3)
-        In the body at its time of each.
+        In the body frame at the time of each point.
     ages : (n,) or None
-        Time from each to the stamp of the scan [s].
+        Time from each point to the stamp of the scan [s].
     straight : (n, 3), optional
-        In the body at the stamp, by an IMU.
+        In the body frame at the stamp, deskewed by an IMU.
     """
 
     points: Array
@@ -183,31 +184,31 @@ class RawScan:
     straight: Array | None = None
 
     def at(self, motion: Array, dt: float) -> Array:
-        """In the body at the stamp ``(n, 3)``, where it moved by ``motion`` (7,) evenly in the ``dt`` [s] before."""
+        """Points in the body frame at the stamp ``(n, 3)``; ``motion`` (7,) is uniform in the ``dt`` [s] before it."""
         if self.ages is None or dt <= 0:
             return self.points
-        # times in another unit must not throw points out of the world
+        # ages in a wrong unit must not give unbounded points
         ages = np.clip(self.ages / dt, -LONG_SWEEP, LONG_SWEEP)
         steps = -ages[:, None] * np.asarray(se3.se3_log(motion))
         return np.asarray(se3.se3_transform(se3.se3_exp(steps), self.points))
 
 
 class LidarOdometry:
-    """Follows the scans of a lidar one by one.
+    """Track the scans of a lidar one by one.
 
     Parameters
     ----------
     inertial : InertialPredictor, optional
-        Tells where a match begins and how a scan is bent, as long as it is believed; an even motion does otherwise.
+        Predicts poses and deskews scans while it is reliable; otherwise constant velocity does both.
     reckoned : WheelMotionPrior, optional
-        Odometry: where nothing is matched, and where a match begins if no IMU tells it.
+        Odometry: used for unmatched scans, and as the initial guess if there is no IMU prediction.
 
     Attributes
     ----------
     pose : (7,)
         ``T_first_now``.
     points : (n, 3)
-        Of the last scan, thinned, in the body at its stamp.
+        Of the last scan, subsampled, in the body frame at its stamp.
     spread : (6, 6)
         Covariance of the error of the last prediction, right tangent.
     errors : WindowCovariance
@@ -256,20 +257,20 @@ class LidarOdometry:
     # --- one scan ----------------------------------------------------------------------------------------------------
 
     def predict(self, time: float) -> Array:
-        """Motion ``(7,)`` from the last scan to ``time`` at constant velocity."""
+        """Motion ``(7,)`` from the last scan to ``time`` at constant velocity, for at most two scan intervals."""
         dt = time - self.time
         ratio = min(dt / self.dt, 2.0) if self.dt > 0 and np.isfinite(dt) else 0.0
         return np.asarray(se3.se3_exp(self.twist * ratio))
 
     def step(self, cloud: Array, time: float, ages: Array | None = None) -> ScanResult:
-        """Match the next scan, and put it into the map.
+        """Match the next scan and add it to the map.
 
         Parameters
         ----------
         cloud : (m, 3)
-            In the body at ``time``, all finite.
+            In the body frame at ``time``, all finite.
         time : float
-            [s]; not before the scan before.
+            [s]; not earlier than the previous scan.
         ages : (m,), optional
             Time from each point to ``time`` [s].
         """
@@ -322,7 +323,7 @@ class LidarOdometry:
         else:
             self.lost += 1
             if self.lost >= GIVEN_UP and len(points) >= FEW:
-                # nothing of the map is here any more: what comes is matched to what comes
+                # the sensor has left the map: a new map begins with the next scan
                 self.first = self.scan + 1
                 self._begin()
         made = se3.se3_between(before, self.pose)
@@ -330,7 +331,7 @@ class LidarOdometry:
             if self.dt > 0 and not self.lost:
                 change = np.asarray(se3.se3_log(made)) / dt - self.twist / self.dt
                 self.changes.append((float(np.mean(change[:3] ** 2)), float(np.mean(change[3:] ** 2))))
-            # nobody knows how a body moves that is not seen: the guess is that it comes to rest
+            # the motion of a lost scan is unknown: the predicted velocity decays to zero
             self.twist, self.dt = (0.5 if self.lost else 1.0) * np.asarray(se3.se3_log(made)), dt
         self.time = time
         self.recent.append((time, self.pose))
@@ -345,13 +346,13 @@ class LidarOdometry:
         return seen
 
     def _instead(self, seen: ScanResult, motion: Array, Q: Array | None) -> Array | None:
-        """Covariance ``(6, 6)`` of the motion where that of an even one is not enough: of odometry in its place."""
+        """Covariance ``(6, 6)`` of the motion if it is not that of constant velocity: the odometry's if ``bridged``."""
         return Q if seen.bridged else None
 
     def _bent(self, raw: RawScan) -> Array:
-        """Covariance of what an uneven motion within a scan does to its pose.
+        """Covariance ``(6, 6)`` of the pose error caused by non-uniform motion within a scan.
 
-        The motion within a scan is off the mean one by half of what it changes by from one interval to the next.
+        The mean velocity of an interval is off by half its change to the next one.
         """
         if raw.ages is None or not len(raw.ages):
             return np.zeros((6, 6))
@@ -364,10 +365,10 @@ class LidarOdometry:
         return np.diag([turn2] * 3 + [shift2] * 3)
 
     def _since(self, raw: RawScan, time: float) -> None:
-        """Since when the motion is taken to be even: over two sweeps or more.
+        """Set the start of the constant-velocity interval: at least two sweeps back.
 
-        If a scan lasts until the next, an even motion from the last pose alone would answer an error of that pose by
-        one of the other sign, as large, in this one, and so on for ever.
+        With one sweep, if a scan lasts until the next, an error of the last pose would cause an error of the opposite
+        sign and the same size in this pose, and so on without end.
         """
         if raw.ages is None or not len(raw.ages):
             return
@@ -380,7 +381,7 @@ class LidarOdometry:
         return RawScan(points, ages, None if then is None else np.asarray(se3.se3_transform(then, points)))
 
     def _unbent(self, raw: RawScan, pose: Array, time: float) -> Array:
-        """Points of a scan where the body stands at ``pose`` (7,), at its stamp."""
+        """Deskewed points of a scan, for the body at ``pose`` (7,) at its stamp."""
         if raw.straight is not None:
             return raw.straight
         if raw.ages is None or not self.recent or time <= self.recent[0][0]:
@@ -407,11 +408,10 @@ class LidarOdometry:
         seen: ScanResult,
         reckoned: Array | None,
     ) -> None:
-        """How far the pose of now is off after an expected ``motion``, jointly with those of the window.
+        """Update the joint covariance of the current pose and the window poses, after a predicted ``motion`` (7,).
 
-        What is expected of a motion is what an even one would miss, also where an IMU predicted it: nothing of what
-        that tells is in the covariance, so that a graph may still count it. Where odometry stands for scans, what it
-        may miss is: ``reckoned`` (6, 6).
+        The motion covariance is that of constant velocity, also if an IMU predicted the pose: no IMU information
+        enters, so that the graph may still use it. If odometry replaces a match, its covariance is ``reckoned`` (6, 6).
         """
         if seen.state in MAPPED and seen.state != "first":
             off = np.asarray(se3.se3_log(se3.se3_between(even, self.pose)))
@@ -424,22 +424,22 @@ class LidarOdometry:
         turn2 = max(turn2, (0.5 * ACCELERATION[0] * dt**2) ** 2, 1e-6)
         shift2 = max(shift2, (0.5 * ACCELERATION[1] * dt**2) ** 2, 1e-6)
         self.spread = np.diag([turn2] * 3 + [shift2] * 3)
-        # a speed that nothing holds is off for as long as nothing holds it
+        # an unobservable velocity stays wrong until it is observed
         Q = self.loose**2 * self.spread
         if self.held < BEGUN:
-            # one speed all along: k² − (k − 1)² of its way's variance are of this step, also in what a refinement gets
+            # a constant velocity error: this step adds k² − (k − 1)² of its variance, also in `spread`
             unknown = np.diag([0.0] * 3 + [(2 * self.loose - 1) * (FASTEST * dt) ** 2] * 3)
             Q, self.spread = Q + unknown, self.spread + unknown
         self.held += fit is not None and not seen.unheld
         if reckoned is not None:
-            # as far as it is off in one way all along, σ grows with the time: k² − (k − 1)² of it are of this step
+            # a constant odometry error: σ grows linearly, so this step adds k² − (k − 1)² of the variance
             Q = self.spread = (2 * self.loose - 1) * reckoned
         H, M = np.zeros((max(len(self.errors.ends), 1), 6, 6)), np.zeros((6, 6))
         if fit is not None and self.errors.ends:
             H, M, G = self.levels[-1].by_slot(points, *split_pose(self.pose), SCALE, np.array(self.errors.ends))
         if fit is not None and M.any():
             M *= np.interp(fit.misfit, *SPREADS)
-            # how far residuals of a whole part of the scan agree, beside what those of one cell would
+            # ratio of the gradient variance by parts of space to that by single cells
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
             self.agreeing.append(float(np.trace(np.linalg.solve(E, G.T @ G))) / 6.0)
             M *= LASTING * float(np.mean(self.agreeing))
@@ -466,21 +466,21 @@ class LidarOdometry:
         time: float,
         by_imu: bool,
     ) -> tuple[Array, NormalEquations | None, ScanResult]:
-        """Pose of a scan, the fit there, and what came of it.
+        """Pose of a scan, the fit there, and the result.
 
         Parameters
         ----------
         chosen : (k,) int
         predicted : (7,)
-            Where the match begins.
+            Initial guess of the match.
         bridge : (7,) or None
-            Where odometry puts it; stands where no surface does.
+            Pose by odometry; used along unobservable directions.
         told : (6, 6) or None
-            Covariance of that motion; None: of an even one, as scans saw it lately.
+            Covariance of that motion; None: that of constant velocity, estimated from recent scans.
         time : float
             [s]
         by_imu : bool
-            An IMU says where ``predicted`` is and how it is turned: matches elsewhere are refused.
+            ``predicted`` is from the IMU: matches with another rotation or far from it are rejected.
         """
         inertial = self.inertial if by_imu else None
         reach = np.inf if inertial is None else inertial.reach(time)
@@ -507,7 +507,7 @@ class LidarOdometry:
         pose, points, fit = self._finish(raw, chosen, start, time)
         led = float(np.linalg.norm(se3.se3_between(predicted, start)[:3]))
         if self.held >= BEGUN and led > LED_AWAY * self.config.levels[-1]:
-            # coarse cells moved it out of reach of the prediction: the finest ones decide
+            # the coarse levels left the prediction's range of convergence: compare both on the finest level
             ahead = self._finish(raw, chosen, predicted, time)
             if ahead[2].overlap > fit.overlap:
                 start, (pose, points, fit) = predicted, ahead
@@ -523,7 +523,7 @@ class LidarOdometry:
                 pose, points, fit = self._finish(raw, chosen, start, time)
                 state = "found again"
             if few_of_it and fit.overlap < SUSPICIOUS * np.median(self.overlaps):
-                # after scans that were lost, what overlaps little is not new but elsewhere
+                # after lost scans, little overlap means a misplaced scan, not new space
                 fits = fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW
                 spread = self.spread if told is None else told
                 state = "new space" if fits and not self.lost and not _far(stands, pose, spread) else "lost"
@@ -531,7 +531,7 @@ class LidarOdometry:
         if inertial is not None and state != "lost":
             inertial.shifts.append(float(np.linalg.norm(se3.se3_between(predicted, pose)[:3])))
             while not alike(pose) and alike(pose, np.inf) and unheld < MOST_WEAK:
-                # what holds a scan least lets it slide: along a wall, say
+                # weak directions let a scan slide, for example along a wall: use the IMU along them
                 pose, unheld = self._hold(free, stands, fit, unheld + 1)
                 at_it = self.levels[-1].fit(self._unbent(raw, pose, time)[chosen], *split_pose(pose), SCALE)
                 state = "matched" if at_it.overlap > SUSPICIOUS * fit.overlap else "lost"
@@ -540,7 +540,7 @@ class LidarOdometry:
         if fit.known < LITTLE:
             return start if bridge is None else bridge, None, ScanResult(len(points), fit.overlap, 6, state, searched)
         if unheld and bridge is None and len(self.missed) < 3:
-            # nobody knows yet how it moves: rest is believed where the scan fits there as well
+            # the motion model is still unknown: zero velocity is used only if the scan fits there as well
             points = self._unbent(raw, pose, time)[chosen]
             if self.levels[-1].fit(points, *split_pose(pose), SCALE).overlap < LIKELY * fit.overlap:
                 pose = free
@@ -553,20 +553,20 @@ class LidarOdometry:
         return pose, fit, ScanResult(len(points), fit.overlap, unheld, state, searched)
 
     def _finish(self, raw: RawScan, chosen: Index, pose: Array, time: float) -> tuple[Array, Array, NormalEquations]:
-        """Match on the finest level: pose, points of the scan where that pose says they were measured, fit."""
+        """Match on the finest level: pose, points deskewed with it, fit."""
         for _ in range(MOST_DESKEWED):
             points = self._unbent(raw, pose, time)[chosen]
             before = pose
             pose, fit = self._descend(points, pose, self.levels[-1:])
             moved = se3.se3_log(se3.se3_between(before, pose))
-            # a scan that is bent by a motion that is off pulls each pose a little, and always to the same side
+            # deskewing with a wrong motion shifts each pose a little, always to the same side: repeat until convergence
             stood = np.linalg.norm(moved[:3]) < STILL[0] and np.linalg.norm(moved[3:]) < STILL[1]
             if raw.ages is None or raw.straight is not None or stood:
                 break
         return pose, points, fit
 
     def _late(self, time: float) -> bool:
-        """Is this scan later than scans use to be, so that nothing is known of the motion before it?"""
+        """Is the interval before this scan much longer than usual?"""
         usual = [b[0] - a[0] for a, b in zip(self.recent, list(self.recent)[1:])]
         return bool(usual) and time - self.time > LATE * float(np.median(usual))
 
@@ -577,7 +577,7 @@ class LidarOdometry:
         return bool(np.linalg.norm(off[:3]) < NEAR[0] and np.linalg.norm(off[3:]) < NEAR[1])
 
     def _descend(self, points: Array, pose: Array, levels: list[CellMap]) -> tuple[Array, NormalEquations]:
-        """Gauss–Newton on one level after the other; on coarse ones the start stands along what no surface holds."""
+        """Gauss–Newton on one level after the other; on coarse ones the start is kept along unobservable directions."""
         fit = None
         for level in levels:
             R, t = split_pose(pose.copy())
@@ -594,7 +594,7 @@ class LidarOdometry:
         return pose, fit
 
     def _coarser(self, points: Array, R: Array, t: Array) -> Array:
-        """Information ``(6, 6)`` that the level above the finest has of points that the finest does not know."""
+        """Information ``(6, 6)`` of the next coarser level, for the points without a cell on the finest level."""
         if len(self.levels) < 2:
             return np.zeros((6, 6))
         new = ~self.levels[-1].known(points @ R.T + t)
@@ -618,7 +618,7 @@ class LidarOdometry:
         return out
 
     def _hold(self, pose: Array, predicted: Array, fit: NormalEquations, least: int = 0) -> tuple[Array, int]:
-        """Take the prediction along directions that no surface holds, ``least`` of them or more; and their number."""
+        """Use the prediction along unobservable directions, at least ``least`` of them; and their number."""
         P = observable_projection(fit.H, fit.every, least)
         unheld = 6 - round(float(np.trace(P)))
         if unheld:
@@ -628,23 +628,23 @@ class LidarOdometry:
 
 
 def _far(predicted: Array, pose: Array, spread: Array) -> bool:
-    """Is a pose farther from the prediction than that may be off?"""
+    """Is a pose farther from the prediction than its covariance allows?"""
     off = se3.se3_log(se3.se3_between(predicted, pose))
     turn, shift = (FAR * np.sqrt(np.trace(block)) for block in (spread[:3, :3], spread[3:, 3:]))
     return bool(np.linalg.norm(off[:3]) > NEAR[0] + turn or np.linalg.norm(off[3:]) > NEAR[1] + shift)
 
 
 def observable_projection(H: Array, every: Array, least: int = 0) -> Array:
-    """Projection ``(6, 6)`` of motions onto the directions that surfaces hold.
+    """Projection ``(6, 6)`` of motions onto the observable directions.
 
     Parameters
     ----------
     H : (6, 6)
         Information of a scan.
     every : (6, 6)
-        What the same points would say with surfaces turned anyhow.
+        Information of the same points if each constrained every direction.
     least : int
-        Number of the weakest directions that are left out anyhow.
+        Number of the weakest directions that are removed in any case.
     """
     values, V, B = _directions(H, every)
     U = V[:, max(int(np.sum(values <= PRETENDED)), least) :]
@@ -652,9 +652,9 @@ def observable_projection(H: Array, every: Array, least: int = 0) -> Array:
 
 
 def observable_gradient(H: Array, every: Array, least: int = 0) -> Array:
-    """What ``(6, 6)`` takes a gradient to that part of it that is not pretended by noise of the normals.
+    """Matrix ``(6, 6)`` that removes from a gradient the spurious information caused by noise of the normals.
 
-    Nothing is left of it along the ``least`` weakest directions.
+    The ``least`` weakest directions are removed completely.
     """
     values, V, B = _directions(H, every)
     share = np.maximum(1.0 - PRETENDED / np.maximum(values, 1e-9), 0.0)

@@ -1,9 +1,8 @@
-"""What odometry of wheels knows of the motion from scan to scan: where a match begins, and where nothing is matched.
+"""Motion prior from wheel odometry: initial guess of a match, and the motion of unmatched scans.
 
-Two questions are asked of it by the scans that were matched, over the last twenty of them: does it tell their motions
-better than an even motion does? Then a match begins where it leads. And is it of any use at all, so that wrong units,
-signs or axes do no harm? Then it stands where a scan finds no place in the map, and along what no surface holds, with
-what it was seen to miss, or is stated to, whichever is more.
+The odometry is compared with the matched scans, the last 20 of them. If it predicts their motions better than constant
+velocity, it may give the initial guess. If it is useful at all (units, signs and axes are plausible), it is used for
+unmatched scans and along unobservable directions, with the larger of its given and its observed error variance.
 """
 
 from __future__ import annotations
@@ -17,35 +16,35 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Odometry
 
 FEWEST = 5
-"""Scans over which it is compared before it is doubted, or preferred."""
+"""Least number of scans for a comparison."""
 COMPARED = 20
-"""… and over which at most."""
+"""Most scans for a comparison."""
 USELESS = 0.25
-"""Square of what it misses beside that of the motion itself, from which on it tells nothing: half of the way."""
+"""Ratio of its squared error to the squared motion above which it is useless: half the motion."""
 NOISE = (2e-3, 0.01)
-"""What scans themselves are off by [rad], [m]: to miss no more is no fault."""
+"""σ of the scan matches [rad], [m]; smaller errors of the odometry are not significant."""
 
 
 class WheelMotionPrior:
-    """Tells motions by odometry, and how far they may be off.
+    """Motion prior from odometry, with its covariance.
 
     Parameters
     ----------
     odometry : Odometry
-        Of the base.
+        Of the base frame.
     """
 
     def __init__(self, odometry: Odometry) -> None:
         self.times = np.zeros(0)
         self.steps = np.zeros((0, 7))
-        """Motion up to each record, from the one before it."""
+        """Motion up to each record, from the previous one."""
         self.stated = np.zeros((0, 2))
-        """Variance of its turn and of its shift by axis."""
+        """Given variance of its rotation and translation, the largest over the axes."""
         self.missed: deque[Array] = deque(maxlen=COMPARED)
         self.more(odometry)
 
     def more(self, odometry: Odometry, since: float = -np.inf) -> None:
-        """Records that came after; those before ``since`` [s] are not asked for any more."""
+        """Append later records; those before ``since`` [s] are no longer needed."""
         d = np.diagonal(odometry.covariances, axis1=1, axis2=2)
         turn, shift = (d[:, :3], d[:, 3:]) if d.shape[1] == 6 else (d[:, 2:], d[:, :2])
         a = max(int(np.searchsorted(self.times, since)) - 1, 0)
@@ -54,10 +53,10 @@ class WheelMotionPrior:
         self.stated = np.concatenate([self.stated[a:], np.stack([turn.max(axis=1), shift.max(axis=1)], axis=1)])
 
     def motion(self, first: float, last: float) -> tuple[Array, Array] | None:
-        """Motion ``(7,)`` between two times, and the stated variance of its turn and shift by axis; None: not known.
+        """Motion ``(7,)`` between two times; given variance of rotation and translation by axis. None: not available.
 
-        The first and the last record hold for one and a half of their own time. Nothing but the records between the two
-        times enters, so that it is the same however records came.
+        The first and the last record may be extrapolated by half their interval. Only records between the two times are
+        used, so that the result does not depend on how records arrive.
         """
         t = self.times
         if len(t) < 2 or first < t[0] - 1.5 * (t[1] - t[0]) or last > t[-1] + 1.5 * (t[-1] - t[-2]):
@@ -73,31 +72,31 @@ class WheelMotionPrior:
         return motion, shares @ self.stated[i : j + 1]
 
     def learn(self, motion: Array, made: Array, even: Array) -> None:
-        """A scan was matched: the odometry's motion, the one that was found, and an even one (all ``(7,)``)."""
+        """Compare with a matched scan: motions by odometry, by the match, and by constant velocity (all ``(7,)``)."""
         rows = [se3.se3_between(motion, made), se3.se3_between(even, made), made]
         xi = np.asarray(se3.se3_log(np.array(rows)))
         self.missed.append(np.stack([(xi[:, :3] ** 2).mean(axis=1), (xi[:, 3:] ** 2).mean(axis=1)], axis=1))
 
     @property
     def better(self) -> bool:
-        """Does it tell the motions of scans better than an even motion?"""
+        """Does it predict the motion of scans better than constant velocity?"""
         return len(self.missed) >= FEWEST and bool(self._squares()[0] <= self._squares()[1])
 
     @property
     def useful(self) -> bool:
-        """Does it tell motions at all, as far as is known?"""
+        """Is it usable, as far as it was compared?"""
         if len(self.missed) < FEWEST:
             return True
         own, even, made = self._squares()
         return bool(own <= max(even, USELESS * made, 2.0))
 
     def variances(self, stated: Array) -> Array:
-        """Variance of turn and shift ``(2,)`` by axis, as it is stated or as scans saw it."""
+        """Variance of rotation and translation ``(2,)`` by axis: the larger of given and observed."""
         seen = np.mean(self.missed, axis=0)[0] if self.missed else np.zeros(2)
         return np.maximum(np.maximum(stated, seen), np.array(NOISE) ** 2)
 
     def _squares(self) -> Array:
-        """Mean squares ``(3,)`` of what it misses, what an even motion misses, and the motion; in noise of scans."""
+        """Mean squares ``(3,)`` of its error, the error of constant velocity, and the motion, in ``NOISE``²."""
         return np.asarray(np.mean(np.array(self.missed) / np.array(NOISE) ** 2, axis=0).sum(axis=1))
 
 

@@ -1,9 +1,9 @@
-"""How far the pose of now is off beside the poses of the window it was matched to.
+"""Joint covariance of the current pose and the poses of the window that it was matched to.
 
-A scan is put where the cells are, and the cells are where earlier scans were thought to be. So the error of a pose is
-the mean of the errors of the poses that made its cells, weighted by what each told of it, and something of its own. The
-covariance of all of these is carried along as a joint one (a filter that *considers* the old poses, after Schmidt, and
-no longer corrects them): what start and end of a submap share leaves its exit, and what a window shares stays in it.
+A scan is matched to cells, and cells have the errors of the poses of earlier scans. So the error of a pose is the mean
+of the errors of the poses that made its cells, weighted by their information, plus an independent part. The joint
+covariance of all of them is propagated; old poses are considered, not corrected (Schmidt–Kalman filter). Errors common
+to start and end of a submap cancel in its end pose; errors common to a window stay in it.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 
 SLOTS = 48
-"""Poses of the window that are told apart."""
+"""Most poses in the window."""
 APART = (1.0, np.deg2rad(15.0))
-"""A new one begins after so much way [m] or turn [rad] …"""
+"""A new window pose begins after this much path [m] or rotation [rad] …"""
 SCANS = 10
-"""… or so many scans."""
+"""… or this many scans."""
 
 
 class WindowCovariance:
-    """Joint covariance of the errors of the poses of a window, right tangents.
+    """Joint covariance of the pose errors of a window, right tangents.
 
-    Slot 0 is the pose of now, slot 1 that where the submap began, the others those of the window, oldest first.
+    Slot 0 is the current pose, slot 1 the first pose of the submap, the others are window poses, oldest first.
     """
 
     def __init__(self) -> None:
@@ -36,22 +36,22 @@ class WindowCovariance:
 
     @property
     def joint(self) -> Array:
-        """``(12, 12)``: of the pose where the submap began, and the pose of now."""
+        """Joint covariance ``(12, 12)`` of the first pose of the submap and the current pose."""
         at = np.r_[6:12, 0:6]
         return np.asarray(self.P[np.ix_(at, at)] + np.outer(self.offset[at], self.offset[at]))
 
     def begin(self) -> None:
-        """A submap begins at the pose of now."""
+        """Start a submap at the current pose."""
         self._clone(1)
 
     def step(self, pose: Array, motion: Array, Q: Array, H: Array, M: Array, bent: Array, off: Array) -> None:
-        """The pose of now becomes the next one.
+        """Propagate to the next pose.
 
         Parameters
         ----------
         pose : (7,)
         motion : (7,)
-            Predicted, from the last one.
+            Predicted motion from the last pose.
         Q : (6, 6)
             Covariance of its error, right tangent.
         H : (s, 6, 6)
@@ -59,9 +59,9 @@ class WindowCovariance:
         M : (6, 6)
             Covariance of the noise of the gradient.
         bent : (6, 6)
-            Covariance of what an uneven motion within the scan does to its pose.
+            Covariance of the pose error caused by non-uniform motion within the scan.
         off : (6,)
-            Known difference of ``pose`` to the best match, right tangent; its consequences are one error, as large.
+            Known offset of ``pose`` from the best match, right tangent; propagated as a deterministic error.
         """
         L = np.linalg.inv(Q)
         total = H.sum(axis=0)
@@ -81,7 +81,7 @@ class WindowCovariance:
         self.poses[0] = pose
 
     def lay(self, scan: int, alone: bool = False) -> None:
-        """The scan of the pose of now went into the map; ``alone``: its pose has an error of its own."""
+        """Add the scan of the current pose to the map; ``alone``: always as a new window pose."""
         if self.ends and not alone:
             off = se3.se3_between(self.poses[-1], self.poses[0])
             near = np.linalg.norm(off[:3]) < APART[0] and np.linalg.norm(se3.so3_log(off[3:])) < APART[1]
@@ -89,7 +89,7 @@ class WindowCovariance:
                 self.ends[-1] = float(scan) + 0.5
                 return
         if len(self.ends) == SLOTS:
-            # what the oldest made is taken for made by the next
+            # cells of the oldest pose are attributed to the next one
             self.ends.pop(0)
             self.poses = np.delete(self.poses, 2, axis=0)
             keep = np.r_[0:12, 18 : len(self.P)]
@@ -104,7 +104,7 @@ class WindowCovariance:
         self._clone(len(self.poses) - 1)
 
     def forget(self) -> None:
-        """A new map begins."""
+        """Delete the window poses, because a new map begins."""
         self.ends, self.poses = [], self.poses[:2].copy()
         self.P, self.offset = self.P[:12, :12].copy(), self.offset[:12].copy()
 

@@ -1,1 +1,1 @@
-"""Scan-to-window odometry: each scan on the surfaces of the seconds before it."""
+"""Scan-to-window odometry: each scan is matched to the surfaces of the last seconds."""

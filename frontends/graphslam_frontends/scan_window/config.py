@@ -1,4 +1,4 @@
-"""What steers scan-to-window odometry."""
+"""Configuration of scan-to-window odometry."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ import numpy as np
 from graphslam.core.errors import ConfigError
 
 MOST_STEPS = 60
-"""Steps of the window at most: of faster scans only every so many become surfaces."""
+"""Most steps in the window; with a faster scanner not all steps become surfaces."""
 DISTANCES = (1.0, 0.5, 0.3)
-"""Greatest distance of a point from its surface in each iteration [m]."""
+"""Greatest distance between a point and its surface in each iteration [m]."""
 SPENT = 1.7
-"""σ of a residual in multiples of the spread of the residuals: steps share surfaces, whose errors last."""
+"""σ of a residual, in multiples of the spread of the residuals: steps share surfaces with correlated errors."""
 LEAST_POINTS = 20
-"""A scan with fewer points on surfaces is lost: it corrects nothing."""
+"""A scan with fewer points on surfaces is lost: it is not used for a correction."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanWindowConfig:
-    """How each scan is put on the surfaces of the window before it."""
+    """Matching of each scan to the surfaces of the window before it."""
 
     seconds: float = 24.0
     """Age of the oldest surfaces of the window [s]."""
     lay: float | None = None
-    """Scans become surfaces together, so many seconds of them at a time, when those of the next lot are there too [s].
-    A surface needs neighbours on all sides, and one that was just seen says nothing of how far the path has drifted;
-    but what lies behind by then must still be in view. None: 4 s in space, where scanners spin as slowly, and 1 s in
-    the plane, where one scan sees all that it can."""
+    """Scans become surfaces in batches of this duration [s], when the next batch is complete too. A surface needs
+    neighbours on all sides, and a surface seen just now does not show the drift of the path; but it must still be in
+    view. None: 4 s in 3-D, because scanners spin slowly there, and 1 s in 2-D, where one scan covers the whole field of
+    view."""
     points: int = 250
-    """Points of a scan that are looked for on surfaces."""
+    """Most points of a scan to match to surfaces."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.seconds) and self.seconds > 0):

@@ -1,9 +1,9 @@
-"""The encoder of a scanner that turns about an upright axis: what it reads too much, from the log alone.
+"""Encoder offset of a scanner that rotates about a vertical axis, estimated from the log.
 
-Wheels roll straight on. A head whose encoder reads too much sees the world turned the other way about the robot, so
-that scans put on each other say that the robot moves askew, by that angle, all along. The tracker solves for this
-direction (:mod:`~graphslam_frontends.scan_window.tracker`); here it is found with the scans of the one head, taken off
-its angles, and looked for again until nothing is left.
+Wheels move straight ahead. With an encoder offset the scans are rotated about the robot, so that matched scans show a
+sideways motion at a constant angle. The tracker estimates this direction
+(:mod:`~graphslam_frontends.scan_window.tracker`). Here it is estimated with the scans of one scanner, subtracted from
+its angles, and estimated again until it is about zero.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from graphslam_frontends.scan_window.config import ScanWindowConfig
 from graphslam_frontends.scan_window.tracker import ScanToWindowOdometry
 
 UPRIGHT = 0.9
-"""Cosine of the tilt up to which the axis of a head counts as upright."""
+"""Least cosine of the tilt of a vertical axis."""
 NAMED = 0.006
-"""Offset from which a run says so [rad]: brackets are no better."""
+"""Offset from which a run reports it [rad]: mounts are not more accurate."""
 SECONDS = 150.0
-"""Of the log, at most, that an estimate reads: enough for a hundredth of a degree."""
+"""Longest part of the log used [s]: enough for 0.01°."""
 _ROUNDS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class EncoderOffset:
-    """What an encoder reads too much.
+    """Offset of an encoder: reading minus true angle.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class EncoderOffset:
 
 
 def turning_heads(log: SensorLog) -> dict[str, float]:
-    """Streams of scanners that turn about an upright axis: 1.0 where it points up, -1.0 where down."""
+    """Streams of scanners that rotate about a vertical axis: 1.0 if it points up, -1.0 if down."""
     out = {}
     for name, s in log.streams.items():
         if isinstance(s, RangeScans) and s.spin is not None and np.any(s.spin_rate):
@@ -64,16 +64,16 @@ def encoder_offset(
     *,
     stream: str | None = None,
 ) -> EncoderOffset:
-    """Estimate what the encoder of a turning head reads too much.
+    """Estimate the encoder offset of a rotating scanner.
 
     Parameters
     ----------
     log : SensorLog
-        With the head's scans, and motion that says which way the robot goes: wheels that do not slip to the side.
+        With scans of the scanner, and motion in a known direction: wheels without lateral slip.
     steps : StepConfig, optional
-        As the front end has it.
+        As in the front end.
     stream : str, optional
-        Of the head; by default the only one.
+        Of the scanner; by default the only one.
     """
     heads = turning_heads(log)
     if stream is None and len(heads) == 1:
@@ -110,7 +110,7 @@ def encoder_offset(
 def encoder_findings(
     log: SensorLog, steps: StepConfig, window: ScanWindowConfig, askew: float, sigma: float
 ) -> list[Finding]:
-    """A line for a head whose encoder is off, where a run went askew by so much [rad]; none where it went straight."""
+    """A finding if the encoder has an offset; only checked if ``askew`` [rad] of the run is significant."""
     heads = turning_heads(log)
     if len(heads) != 1 or abs(askew) < max(0.5 * NAMED, 5.0 * sigma):
         return []

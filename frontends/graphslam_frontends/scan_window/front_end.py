@@ -32,21 +32,21 @@ from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 LAST = "end-of-log"
 MANY = 0.2
-"""Share of lost scans from which a line of the verdict says so."""
+"""Share of lost scans above which they are reported."""
 
 LIFT = 0.25
-"""Height of the base over the lattice of its map, in voxels, where gravity is measured: a floor between two layers of
-voxels would be in one of them here and in the other there."""
+"""Height of the base above a voxel boundary, in voxels, if gravity is measured: otherwise a floor at a boundary between
+two voxel layers could be in either of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowSubmapConfig:
-    """How the path is cut into submaps, and what their grids are made of."""
+    """How the path is cut into submaps, and their grids."""
 
     length: float = 30.0
-    """Way of a submap [m]."""
+    """Path length of a submap [m] …"""
     seconds: float = 12.0
-    """… which lasts no less than this [s]."""
+    """… and its least duration [s]."""
     voxel_size: float = 0.2
     """Edge of a voxel [m]."""
     hit: float = 0.7
@@ -62,7 +62,7 @@ class WindowSubmapConfig:
         self.beam_model()
 
     def beam_model(self) -> BeamModel:
-        """What a beam says of a voxel."""
+        """Sensor model of a beam for the evidence grid."""
         return BeamModel(hit=self.hit)
 
 
@@ -71,11 +71,11 @@ class ScanWindowFrontEndConfig:
     """The front end ``scan-window``."""
 
     steps: StepConfig = field(default_factory=StepConfig)
-    """How the log becomes steps."""
+    """Conversion of the log to steps."""
     window: ScanWindowConfig = field(default_factory=ScanWindowConfig)
-    """How each scan is put on the surfaces of the window before it."""
+    """Matching of each scan to the surfaces of the window before it."""
     submap: WindowSubmapConfig = field(default_factory=WindowSubmapConfig)
-    """How the path is cut, and what the maps are made of."""
+    """Cutting of the path, and maps of the submaps."""
 
     def __post_init__(self) -> None:
         refuse_fused_steps(self.steps)
@@ -85,10 +85,9 @@ class ScanWindowFrontEndConfig:
 class ScanWindow(StepwiseFrontEnd):
     """The front end ``scan-window``.
 
-    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. It draws nothing, and
-    says of every step what the steps up to it let it say. A run that is resumed follows the path again from its start
-    (a few milliseconds a step), since the window and the errors that last go on from submap to submap, and makes the
-    maps that are missing.
+    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. It is deterministic and
+    causal. A resumed run processes the path again from its start (a few milliseconds per step), because the window and
+    the systematic errors continue from submap to submap, and outputs only the missing submaps.
     """
 
     config: ScanWindowFrontEndConfig = field(default_factory=ScanWindowFrontEndConfig)
@@ -122,7 +121,7 @@ def scan_window_submaps(
     Parameters
     ----------
     first_key : int
-        Submaps before it are not made.
+        Earlier submaps are not output.
     """
     n = len(steps)
     if n < 2:
@@ -188,7 +187,7 @@ def _submap(
 
 
 def _base(body: Array, lift: float, gravity: bool) -> Array:
-    """The frame of a submap that begins at a body."""
+    """Base frame of a submap that begins at a body pose."""
     if not gravity:
         return body
     base = remove_roll_pitch(body)
@@ -197,7 +196,7 @@ def _base(body: Array, lift: float, gravity: bool) -> Array:
 
 
 def _summary(found: list[ScanMatch]) -> dict[str, Any]:
-    """What scans said, in figures."""
+    """Summary of the scan matches."""
     lost = Counter(f.lost for f in found if f.lost and f.lost != "start")
     spreads = [f.spread for f in found if np.isfinite(f.spread)]
     overlaps = [f.overlap for f in found if np.isfinite(f.overlap)]

@@ -1,4 +1,4 @@
-"""Which directions of a body the surfaces hold that its points lie on."""
+"""Directions of a body pose that points on surfaces constrain."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 
 CLEARLY = 4.0
-"""How many times what noise of the normals would say of a direction surfaces must say of it."""
+"""Least ratio of the information of surfaces to the spurious information from noise of the normals."""
 
 
 def full_rank_information(points: Array, information: Array) -> Array:
-    """Information ``(w, w)`` of points ``(k, d)``, frame of the body, that would hold it along every axis."""
+    """Information ``(w, w)`` if each point ``(k, d)``, body frame, were constrained along every axis."""
     d = points.shape[1]
     first, second = information @ points, (points.T * information) @ points
     total = float(information.sum())
@@ -30,18 +30,17 @@ def full_rank_information(points: Array, information: Array) -> Array:
 
 
 def direction_strengths(information: Array, every: Array, sigma: float) -> tuple[Array, Array]:
-    """By how many times surfaces hold a body better than noise of their normals would pretend to, and where to.
+    """Information of surfaces along each direction, relative to the spurious information from noise of their normals.
 
-    Normals are found among points that are themselves noisy. Those of a straight wall are therefore turned a little to
-    and fro, each by some σ, and seem to hold a body along the wall too; what is not well above that is no
-    information.
+    Normals are estimated from noisy points. Those of a straight wall are rotated at random by some σ, so that they seem
+    to constrain the direction along the wall, too. Information that is not well above this is spurious.
 
     Parameters
     ----------
     information : (w, w)
         ``Jᵀ Λ J`` of points on their surfaces.
     every : (w, w)
-        Of :func:`full_rank_information`: what the same points would say with their normals turned anyhow.
+        Of :func:`full_rank_information`: of the same points, if each were constrained along every axis.
     sigma : float
         Of a normal [rad].
 
@@ -57,15 +56,15 @@ def direction_strengths(information: Array, every: Array, sigma: float) -> tuple
 
 
 def observable_directions(information: Array, every: Array, sigma: float, unheld: Array) -> Array:
-    """Rows ``(m, w)`` that take ``Jᵀ Λ r`` to m ≤ w numbers of unit noise, of the directions that surfaces hold.
+    """Matrix ``(m, w)`` from ``Jᵀ Λ r`` to m ≤ w values of unit noise, for the directions that surfaces constrain.
 
     Parameters
     ----------
     information, every, sigma
         Of one scan, as in :func:`direction_strengths`.
     unheld : (w, k)
-        Directions that are given up first, whatever this scan says of them: they are solved for and forgotten. One scan
-        alone has them a little askew, and would say across what it must not say along.
+        Directions to marginalise first: one scan estimates them slightly rotated, and would leak their error into
+        others.
     """
     w, u = len(information), unheld.shape[1]
     given_up = np.eye(w)

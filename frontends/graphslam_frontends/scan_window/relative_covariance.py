@@ -1,4 +1,4 @@
-"""Covariances of where a body is in the frame of its submap, from joint covariances of two poses."""
+"""Covariances of poses relative to their submap, from joint covariances of two poses."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 
 LEAST_POSITION, LEAST_ANGLE = 1e-3, 1e-4
-"""σ that is added to every covariance [m], [rad]: below what scans can know, and enough to make it invertible."""
+"""σ added to every covariance [m], [rad]: below the accuracy of scans, and enough to make it invertible."""
 
 
 def relative_covariance(poses: tuple[Array, Array], frames: tuple[Array, Array], joint: Array) -> Array:
     """Covariance ``(d, d)`` of the motion between two frames that are fixed to the body, right tangent.
 
-    Such a frame may stand level at the body, as bases of submaps do: it does so by what was thought of the body's roll
-    and pitch, and is as far off as these were.
+    Such a frame may be levelled, as the base of a submap is: it is levelled with the estimated roll and pitch of the
+    body, so it has their errors.
 
     Parameters
     ----------
     poses : (start, end)
-        Of the body.
+        Poses of the body.
     frames : (start, end)
-        That are fixed to the body there; those of the motion.
+        Frames fixed to the body at these poses; the motion is between them.
     joint : (2 d, 2 d)
         Joint covariance of the right tangents of the poses.
     """

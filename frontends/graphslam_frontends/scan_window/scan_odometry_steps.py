@@ -1,4 +1,4 @@
-"""Steps whose motion is that of scan-to-window odometry: for front ends that work on the motion of steps."""
+"""Steps with the motion of scan-to-window odometry, for front ends that use the motion of steps."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from graphslam_frontends.scan_window.tracker import TrackedPath, track_steps
 
 @dataclass(frozen=True, slots=True)
 class ScanOdometryErrors:
-    """Honest covariance of a followed path over any interval (`PathErrors`).
+    """Covariance of a tracked path over any interval (`PathErrors`), from scan-to-window odometry.
 
     Parameters
     ----------
     steps : Steps
-        As they were before.
+        Before their motion was replaced.
     """
 
     steps: Steps
@@ -34,7 +34,7 @@ class ScanOdometryErrors:
     _tracks: list[tuple[list[int], TrackedPath]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def prepare(self, starts: Iterable[int]) -> None:
-        """Follow the steps once for intervals that begin at ``starts`` and end no later than the next one begins."""
+        """Track the steps once for intervals that begin at ``starts`` and end no later than the next one begins."""
         begins = sorted({0, *(int(k) for k in starts)})
         if not any(set(begins) <= set(known) for known, _ in self._tracks):
             self._tracks.append((begins, track_steps(self.steps, self.config, begins)))
@@ -70,11 +70,11 @@ class ScanOdometryErrors:
 
 
 def odometry_from_scans(steps: Steps, config: ScanWindowConfig) -> Steps:
-    """Steps with the increments, and in space the roll and pitch, of scan-to-window odometry.
+    """Steps with the increments, and in 3-D the roll and pitch, of scan-to-window odometry.
 
-    What is new in an increment is no longer independent of the one before, since both lean on the same window: the
-    covariances of the increments stay those of the motion, for whom they serve as weights; :class:`ScanOdometryErrors`
-    knows how far the path is off over any interval. Roll and pitch are the path's own, and not to be doubted again.
+    Consecutive increments are correlated, because both are matched to the same window. The covariances of the
+    increments stay those of the motion, as weights; :class:`ScanOdometryErrors` gives the covariance of the path over
+    any interval. Roll and pitch are estimates of the path, so their σ is 0.
     """
     made, g = track_steps(steps, config), group_of(steps.odometry.increments)
     increments = np.concatenate([g.identity[None], g.between(made.poses[:-1], made.poses[1:])])
@@ -89,7 +89,7 @@ def odometry_from_scans(steps: Steps, config: ScanWindowConfig) -> Steps:
 
 
 def refuse_fused_steps(config: StepConfig) -> None:
-    """Refuse steps whose motion was fused with the same scans already."""
+    """Reject steps whose motion is already fused with the same scans."""
     if config.match_scans:
         raise ConfigError(
             "frontend.steps.match_scans = true fuses the motion with the scans, which scan-to-window odometry would "

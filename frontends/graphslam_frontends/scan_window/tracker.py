@@ -1,19 +1,15 @@
-"""Scan-to-window odometry: where each scan lies on the surfaces of the seconds before it, and how sure that is.
+"""Scan-to-window odometry: each scan is matched to the surfaces of the last seconds, with a consistent covariance.
 
-The state is the pose of now, with the errors of motion and gravity that last (bias of the yaw rate, scale and direction
-of the wheels, roll and pitch that gravity gets wrong, constant and fading). Each step the motion moves it, gravity and
-the scan correct it: point-to-plane distances (in the plane, point-to-line) to the surfaces that the steps of the last
-seconds saw.
+The state is the current pose and the systematic errors of motion and gravity (yaw-rate bias, scale and direction of the
+wheels, constant and time-correlated errors of roll and pitch). Each step predicts by the motion and corrects by gravity
+and the scan: point-to-plane distances (in 2-D point-to-line) to the surfaces seen in the last seconds.
 
-These surfaces lie where those steps were *thought* to be. A filter that takes them for the world believes each scan as
-if it were measured against a fixed map, and promises a path many times better than it is. So the poses of the window
-stay in the error state, as they were when their scans were laid: every distance is a statement on the difference of two
-poses, of which the older one is also uncertain, in ways that they share. Older poses are not corrected any more
-(Schmidt's filter, in which they are *considered*): what was said of a step stays said, whatever comes later, and the
-covariance of the pose of now, of any pose of the window, and of the start of the submap are joint. The exit of a submap
-gets its covariance from that joint one, so that what start and end have in common leaves it, and what the
-window shares stays in. Directions that no surface holds, as along a corridor, get no information, and their covariance
-grows as the motion's does.
+These surfaces have the errors of the poses from which they were seen. A filter that ignores them treats each scan as
+matched to an exact map and is overconfident. So the poses of the window stay in the error state: every distance depends
+on two poses with correlated errors. Older poses are considered, not corrected (Schmidt–Kalman filter), so the result is
+causal. The covariances of the current pose, the window poses and the first pose of the submap are joint. In the
+covariance of the end pose of a submap the errors common to start and end cancel, and the errors common to the window
+stay. Unobservable directions, as along a corridor, get no information, and their covariance grows with the motion.
 """
 
 from __future__ import annotations
@@ -44,37 +40,37 @@ from graphslam_frontends.scan_window.observability import (
 Index = npt.NDArray[np.int64]
 
 FREE_TILT = 0.02
-"""σ of roll and pitch of a step's motion where gravity tells them [rad]: they were made of gravity's own readings."""
+"""σ of roll and pitch of the motion of a step if gravity is measured [rad]: gravity already determined them."""
 LAY = {2: 1.0, 3: 4.0}
-"""How long scans are gathered for surfaces where nobody says so [s]."""
+"""Default batch duration for surfaces in 2-D and 3-D [s]."""
 TOLD = 1e-5
-"""σ of what gravity says beside its fading and its constant error [rad]."""
+"""White noise of roll and pitch by gravity, besides time-correlated and constant errors [rad]."""
 NORMAL_SIGMA = 0.03
-"""σ of the normal of a surface [rad]: what surfaces hold must be clearly more than it would pretend to."""
+"""σ of the normal of a surface [rad]; it sets the level of spurious information."""
 LEAST_OVERLAP = 0.1
-"""A scan of whose points a smaller share lies on surfaces is lost: it corrects nothing."""
+"""A scan with a smaller share of its points on surfaces is lost: it is not used for a correction."""
 MOST_SPREAD = 0.15
-"""… and one whose residuals are spread wider than this [m]."""
+"""A scan with residuals of a larger spread is lost [m]."""
 SURPRISE = 40.0
-"""… and one whose correction is this far from what the motion allows (χ² of up to six degrees of freedom)."""
+"""A scan is lost if the χ² of its correction is larger (up to six degrees of freedom)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanMatch:
-    """What the scan of a step said.
+    """Result of the match of the scan of a step.
 
     Parameters
     ----------
     pairs : int
-        Points on surfaces.
+        Number of points on surfaces.
     overlap : float
-        Their share of the points looked for; nan where there is no window yet.
+        Their share of the points used; nan if there is no window yet.
     spread : float
         1.48 × the median absolute residual [m].
     surprise : float
         χ² of the correction.
     lost : str
-        Why the scan corrected nothing; "" if it did; "start" where there was no window to be lost in.
+        Why the scan is not used; "" if it is; "start" if there was no window yet.
     """
 
     pairs: int
@@ -85,7 +81,7 @@ class ScanMatch:
 
 
 class ScanToWindowOdometry:
-    """Follows the steps of a log one by one."""
+    """Track the steps of a log one by one."""
 
     def __init__(self, steps: Steps, config: ScanWindowConfig) -> None:
         self.steps, self.config = steps, config
@@ -93,14 +89,14 @@ class ScanToWindowOdometry:
         self.gravity = steps.tilt is not None
         self.sigmas = s = steps.bias_sigmas
         w, self.w = g.dof, g.dof
-        # lasting states: yaw bias, scale, side (, rise (, constant roll and pitch, fading roll and pitch))
+        # systematic errors: yaw bias, scale, side (, rise (, constant roll and pitch, time-correlated roll and pitch))
         prior = [s.yaw_bias, s.scale, s.direction]
         if g.dim == 3:
             prior.append(s.direction)
         self.motion_states = len(prior)
         if self.gravity:
             prior += [s.tilt, s.tilt, steps.tilt_sigma, steps.tilt_sigma]
-        self.x = w + len(prior)  # of pose and lasting states together
+        self.x = w + len(prior)  # size of pose and systematic errors together
         self.lasting = np.zeros(len(prior))
         self.slots = MOST_STEPS + 1
         self.ANCHOR, self.NOW = self.slots, self.slots + 1
@@ -124,9 +120,9 @@ class ScanToWindowOdometry:
         self.t = np.zeros((self.slots + 2, g.dim))
         self.lay = config.lay if config.lay is not None else LAY[g.dim]
         self.free = list(range(self.slots))[::-1]
-        self.lots: list[list[tuple[int, int, float]]] = []  # (slot, points, time) of the steps of each lot
+        self.lots: list[list[tuple[int, int, float]]] = []  # (slot, points, time) of the steps of each batch
         self.waiting: list[tuple[int, int, float]] = []
-        self.flat: list[Index] = []  # rows of the surfaces of each lot
+        self.flat: list[Index] = []  # rows of the surfaces of each batch
         self.places: list[Index] = []
         self.tree: cKDTree | None = None
         self.tree_rows = np.zeros(0, np.int64)
@@ -137,7 +133,7 @@ class ScanToWindowOdometry:
     # --- one step ----------------------------------------------------------------------------------------------------
 
     def step(self) -> ScanMatch:
-        """Follow the next step of the log."""
+        """Process the next step of the log."""
         self.k += 1
         if self.k:
             self._move()
@@ -148,12 +144,12 @@ class ScanToWindowOdometry:
         return found
 
     def begin(self) -> None:
-        """A submap begins at the pose of now: its joint covariance with all later ones is kept."""
+        """Start a submap at the current pose: its joint covariance with all later poses is kept."""
         self._clone(self.ANCHOR)
 
     @property
     def joint(self) -> Array:
-        """Joint covariance ``(2 d, 2 d)`` of the pose where the submap began and the pose of now, right tangents."""
+        """Joint covariance ``(2 d, 2 d)`` of the first pose of the submap and the current pose, right tangents."""
         a = self.x + self.ANCHOR * self.w
         rows = np.concatenate([np.arange(a, a + self.w), np.arange(self.w)])
         return self.P[np.ix_(rows, rows)]
@@ -189,7 +185,7 @@ class ScanToWindowOdometry:
         self.pose = g.compose(self.pose, step)
 
     def _level(self) -> None:
-        """Roll and pitch as gravity tells them, with their constant and their fading error."""
+        """Correct roll and pitch by gravity, with its constant and time-correlated errors."""
         assert self.steps.tilt is not None
         seen, D = se3.roll_pitch_jacobian(self.pose[None])
         H = np.zeros((2, self.x))
@@ -202,7 +198,7 @@ class ScanToWindowOdometry:
     # --- corrections -------------------------------------------------------------------------------------------------
 
     def _gain(self, H: Array, G: Array, slots: Index, noise: float) -> tuple[Array, Array, Array]:
-        """Schmidt's gain for residuals that depend on the state by ``H`` and on considered slots by ``G``.
+        """Schmidt–Kalman gain of residuals with Jacobians ``H`` (state) and ``G`` (considered slots).
 
         Returns
         -------
@@ -223,15 +219,16 @@ class ScanToWindowOdometry:
         return np.asarray(K), HP, S
 
     def _correct(self, gain: tuple[Array, Array, Array], r: Array) -> None:
-        """Correct the state by residuals, and the covariances with it."""
+        """Correct the state and its covariances by residuals."""
         (K, HP, S), x, P = gain, self.x, self.P
         d = K @ r
         P[:x, x:] -= K @ HP[:, x:]
         P[x:, :x] = P[:x, x:].T
         own = P[:x, :x] - K @ S @ K.T
         P[:x, :x] = 0.5 * (own + own.T)
-        # What now and the window share, an error of the whole map, may be metres, and is told in the axes of the pose:
-        # they turn with it. Else it would seem that scans saw some of it, and what they do see would count for less.
+        # Errors common to the current pose and the window may be metres, and they are in the axes of the pose. So they
+        # must be rotated with it; otherwise scans would seem to observe a part of them, and covariances would be
+        # inconsistent.
         turned = self.group.adjoint(self.group.exp(-d[: self.w]))
         P[: self.w] = turned @ P[: self.w]
         P[:, : self.w] = P[:, : self.w] @ turned.T
@@ -254,7 +251,7 @@ class ScanToWindowOdometry:
         self.points[source], self.origins[source] = points[p], origins[p]
         towards = origins[p] - points[p]
         d = np.zeros(self.x)
-        lately = self._seen(self.pose)  # the corrections to come turn it by next to nothing
+        lately = self._seen(self.pose)  # the corrections below rotate it by a negligible angle
         for distance in DISTANCES:
             pose = g.compose(self.pose, g.exp(d[:w]))
             R = self._place(self.NOW, pose)
@@ -277,7 +274,7 @@ class ScanToWindowOdometry:
             information = 1.0 / (1.0 + (r / (2.0 * sigma)) ** 2) ** 2 / sigma**2
             slots = np.unique(slot)
             L, G, b = self._blocks(pairs, information, slots)
-            # what is measured: Jᵀ Λ r, of as many directions as surfaces hold, each of unit noise
+            # the measurement: Jᵀ Λ r in the observable directions, each with unit noise
             every = full_rank_information(points[p][near], information)
             seen = np.stack([L, every])
             M = observable_directions(L, every, NORMAL_SIGMA, self._unheld(lately + seen))
@@ -294,17 +291,17 @@ class ScanToWindowOdometry:
         return ScanMatch(n, overlap, scatter, surprise, lost)
 
     def _unheld(self, seen: Array) -> Array:
-        """Directions ``(w, m)`` that nothing has held lately, this scan included: along a corridor, say."""
+        """Directions ``(w, m)`` that no recent scan constrains, this one included, for example along a corridor."""
         values, V = direction_strengths(seen[0], seen[1], NORMAL_SIGMA)
         return V[:, values <= CLEARLY]
 
     def _seen(self, pose: Array) -> Array:
-        """What scans held of late, and what they would have along every axis ``(2, w, w)``, in the axes of a pose."""
+        """Information of recent scans, observed and full-rank ``(2, w, w)``, in the axes of a pose."""
         A = self.group.adjoint(self.group.between(self._seen_at, pose))
         return np.asarray(A.T @ self._lately @ A)
 
     def _blocks(self, pairs: PlanePairs, information: Array, slots: Index) -> tuple[Array, Array, Array]:
-        """Information of the pose of now ``(w, w)``, with the slots ``(w, w·s)``, and ``Jᵀ Λ r`` ``(w,)``."""
+        """Information of the current pose ``(w, w)``, with the slots ``(w, w·s)``, and ``Jᵀ Λ r`` ``(w,)``."""
         w, m = self.w, self.slots + 2
         H, g = np.zeros(2 * m * w * w), np.zeros((m, w))
         rank = np.ones(m, np.int64)
@@ -324,14 +321,14 @@ class ScanToWindowOdometry:
     # --- the window --------------------------------------------------------------------------------------------------
 
     def _clone(self, slot: int) -> None:
-        """The pose of now stays in the error state."""
+        """Copy the current pose to a slot of the error state."""
         x, w, P = self.x, self.w, self.P
         a = x + slot * w
         P[a : a + w] = P[:w]
         P[:, a : a + w] = P[:, :w]
 
     def _lay(self) -> None:
-        """Put the scan by for the next lot; make surfaces of a lot that is full."""
+        """Store the scan for the next batch; make surfaces if a batch is complete."""
         now = float(self.steps.times[self.k])
         if now - self.last_laid >= self.config.spacing - 1e-6:
             points, origins, returns = self.steps.scan(self.k)
@@ -357,7 +354,7 @@ class ScanToWindowOdometry:
         self._plant()
 
     def _make_surfaces(self, now: float) -> None:
-        """A lot is full: thin it, and make surfaces of the lot before, whose neighbours on both sides are there now."""
+        """A batch is complete: subsample it, and make surfaces of the previous batch, which now has both neighbours."""
         old = sum(lot[-1][2] < now - self.config.seconds for lot in self.lots)
         if old:
             self._drop(old)
@@ -367,7 +364,7 @@ class ScanToWindowOdometry:
         self.lots.append(lot)
         self.places.append(rows[thin_places(self._world(rows)[0], 0, len(rows), SURFACE.spacing, stands)])
         self.flat.append(np.zeros(0, np.int64))
-        c = max(len(self.lots) - 2, 0)  # the first lot of all at once: better a poor window than none
+        c = max(len(self.lots) - 2, 0)  # the first batch gets surfaces at once: better few neighbours than no window
         around = self.places[max(c - 1, 0) : c + 2]
         own, near = self.places[c], np.concatenate(around)
         begin = len(around[0]) if c else 0
@@ -386,19 +383,19 @@ class ScanToWindowOdometry:
         )
 
     def _plant(self) -> None:
-        """The tree of all surfaces of the window."""
+        """Build the search tree of all surfaces of the window."""
         self.tree_rows = np.concatenate([np.zeros(0, np.int64), *self.flat])
         self.tree = cKDTree(self._world(self.tree_rows)[0]) if len(self.tree_rows) else None
 
 
 def bias_effects(u: Array, dt: float) -> Array:
-    """What errors that last take off a motion ``u``: ``(d, 3|4)``, for a yaw bias, a scale, and a direction.
+    """Effect ``(d, 3|4)`` of the systematic errors on a motion ``u``: yaw bias, scale, and direction.
 
-    The odometry is measured = true × (1 + scale), led astray to the right (and in space downwards) by the direction,
-    with ``bias · dt`` more of heading; so the true motion is ``u ∘ Exp(effects @ states)``, to first order.
+    The odometry is true × (1 + scale), rotated to the right (and in 3-D downwards) by the direction, plus ``bias · dt``
+    of heading; so the true motion is ``u ∘ Exp(effects @ states)``, to first order.
     """
     d = 2 if len(u) == 3 else 3
-    moved = np.zeros((d, d))  # of the end, in the axes of the beginning
+    moved = np.zeros((d, d))  # displacement of the end, in the axes of the start
     moved[:, 0] = -u[:d]
     moved[:2, 1] = u[1], -u[0]
     if d == 3:
@@ -417,10 +414,10 @@ class TrackedPath:
     Parameters
     ----------
     poses : (n, 7) or (n, 3)
-        In the frame of the first pose, in space with gravity a level one.
+        In the frame of the first pose; in 3-D with gravity, its levelled frame.
     joints : (n, 2 d, 2 d)
-        Joint covariance of the pose where the submap of each step began, and of the step's own, right tangents. A step
-        where one submap ends and the next begins belongs to the one that ends.
+        Joint covariance of the first pose of the submap and the pose of the step, right tangents. A step between two
+        submaps belongs to the first of them.
     lasting : (n, m)
         Yaw bias [rad/s], scale, direction … after each step.
     """
@@ -432,7 +429,7 @@ class TrackedPath:
 
 
 def track_steps(steps: Steps, config: ScanWindowConfig, starts: Iterable[int] = ()) -> TrackedPath:
-    """Follow all steps; submaps begin at the first step and at the steps ``starts``."""
+    """Track all steps; submaps begin at the first step and at the steps ``starts``."""
     t = ScanToWindowOdometry(steps, config)
     n, begins = len(steps), {0, *starts}
     poses, joints = np.empty((n, t.group.size)), np.empty((n, 2 * t.w, 2 * t.w))
