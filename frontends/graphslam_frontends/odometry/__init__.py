@@ -1,1 +1,1 @@
-"""Motion of the robot: dead reckoning, recorded odometry, steps of scans and motion."""
+"""Motion of the robot: dead reckoning, recorded odometry, and steps (motion and beams at common stamps)."""

@@ -1,9 +1,9 @@
-"""Six-dimensional dead reckoning from an IMU and wheels, with a covariance that knows which errors last.
+"""3-D dead reckoning from an IMU and wheels, with a covariance that includes systematic errors.
 
-Heading comes from the gyro, roll and pitch from the unit's own attitude or (where it gives none) from gyro and gravity
-by a complementary filter, distance from the wheels. The base moves along its own x axis.
+Heading is from the gyro; roll and pitch are from the attitude of the IMU or, without one, from gyro and gravity by a
+complementary filter; distance is from the wheels. The base moves along its x axis.
 
-Gaps in the records are bridged up to a limit, with a covariance that grows, and counted; beyond it they are an error.
+Gaps in the records are bridged up to a limit, with a growing covariance, and counted; longer gaps are an error.
 """
 
 from __future__ import annotations
@@ -40,36 +40,36 @@ from graphslam_frontends.odometry.motion_prior import MotionPrior
 
 __all__ = ["DeadReckoningNoise", "integrate_imu_and_wheels"]
 
-_STEEPEST = float(np.deg2rad(80.0))  # heading means nothing on a wall
+_STEEPEST = float(np.deg2rad(80.0))  # heading is undefined near 90°
 FILTER_TIME = 5.0
-"""Time constant of the complementary filter, where the unit gives no attitude [s]."""
+"""Time constant of the complementary filter, if the IMU has no attitude [s]."""
 GAP_SPEED = 0.5
-"""σ of the speed in a gap of the wheels, constant in it [m/s]; at least, for speeds of the log that are spread more
-widely about the last one before the gap say more."""
+"""Least σ of the speed in a gap of the wheels, constant in the gap [m/s]; larger if the speeds of the log deviate more
+from the last speed before the gap."""
 GAP_RATE = 0.3
-"""σ of the yaw rate in a gap of the IMU, constant in it [rad/s], where wheels do not tell the turn."""
+"""σ of the yaw rate in a gap of the IMU, constant in the gap [rad/s], if the wheels do not measure it."""
 GAP_TILT = 0.1
 """σ of roll and pitch in a gap of the IMU [rad]."""
 FLOOR_ANGLE = 1e-5
-"""σ of the angles that every increment has at least [rad]."""
+"""Least σ of the angles of an increment [rad]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeadReckoningNoise:
-    """What the stream of the IMU does not say about the noise of dead reckoning."""
+    """Noise parameters of dead reckoning that are not in the IMU stream."""
 
     wheel: float = 0.02
-    """σ of one reading of the speed, held until the next [m/s]."""
+    """σ of one speed reading, held until the next [m/s]."""
     wheel_scale: float = 0.005
-    """σ of the scale of the wheels, which lasts."""
+    """σ of the scale of the wheels, constant."""
     lateral: float = 0.002
-    """Side slip after one metre, growing with the root of the distance [m/√m]."""
+    """σ of side slip after one metre, growing with the root of the distance [m/√m]."""
     vertical: float = 0.002
-    """The same upwards [m/√m]."""
+    """The same for vertical motion [m/√m]."""
     attitude_bias: float = float(np.deg2rad(0.1))
-    """Part that lasts of the σ of the unit's own roll and pitch [rad]; the rest of it fades."""
+    """Constant part of the σ of the IMU's roll and pitch [rad]; the rest is time-correlated."""
     floor_position: float = 1e-4
-    """σ that every increment has at least [m]."""
+    """Least σ of the position of an increment [m]."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -95,18 +95,18 @@ def integrate_imu_and_wheels(
     Parameters
     ----------
     imu : Imu
-        Brings its own noise. The part of T_base_imu that turns acts on rates and attitude; its lever arm only where
-        gravity is read off the accelerometer.
+        Has its own noise. The rotation of T_base_imu is applied to rates and attitude; its lever arm only if gravity is
+        estimated from the accelerometer.
     wheels : VelocityControls
         Only the speed is used.
     times : (n,)
-        Strictly increasing, inside the IMU's records; none before the first speed. The last speed is held.
+        Strictly increasing, within the IMU records; none before the first speed. The last speed is held.
     since : float, optional
-        Start of the path, and its frame; ``times[0]`` by default, else not after it [s].
+        Start of the path and its frame [s]; default ``times[0]``, and not later.
     longest : float
-        Longest gap in the records that is bridged [s]. In a gap of the wheels the last speed is held; its σ is how far
-        the speeds of the log are from it. In one of the IMU the wheels tell the turn if elsewhere they turn as the gyro
-        does, with what they differ by there as σ; otherwise the rate goes from the one before to the one after.
+        Longest gap in the records that is bridged [s]. In a gap of the wheels the last speed is held; σ is the RMS
+        difference of the speeds of the log from it. In a gap of the IMU the yaw rate of the wheels is used if it agrees
+        with the gyro elsewhere, with the RMS difference as σ; otherwise the rate is interpolated.
     where : str
         Name of the log, for messages.
     drops : DropCounter, optional
@@ -143,7 +143,7 @@ def integrate_imu_and_wheels(
         gap_rate = told[1]
     fine = _fine_steps(knots, tilt, rates, speed)
 
-    # variances per second of what is new: heading, distance, and along the axes of the base
+    # variances per second of the white noise: heading, distance, and along the axes of the base
     held = np.append(np.diff(wheels.times), 0.0)[active]
     held = np.where(held > 0, held, fine.h)
     in_wheels, in_imu = wheel_gaps.length_at(middle), imu_gaps.length_at(middle)
@@ -182,7 +182,7 @@ def integrate_imu_and_wheels(
 def _checked_span(
     imu: Imu, wheels: VelocityControls, times: npt.ArrayLike, since: float | None, where: str
 ) -> tuple[Array, float]:
-    """Times that lie inside the records, and where the path begins [s]."""
+    """Times within the records, and the start of the path [s]."""
     t = check_times(times, where=where)
     for name, stream in (("imu", imu), ("wheels", wheels)):
         if len(stream.times) == 0:
@@ -202,13 +202,13 @@ def _checked_span(
 
 
 _TURN_WINDOW = 1.0
-"""Turns of wheels and gyro are compared over so long [s]."""
+"""Averaging time for the comparison of wheels and gyro [s]."""
 
 
 def _turn_of_wheels(times: Array, rate: Array, wheels: VelocityControls, gaps: Gaps) -> tuple[float, float] | None:
-    """What the wheels' yaw rate is multiplied by to be the gyro's, and σ of what is left [rad/s]; None: no use.
+    """Scale from the yaw rate of the wheels to that of the gyro, and σ of the residual [rad/s]; None: not usable.
 
-    Means over a second outside the gaps; of use are wheels that explain four fifths of the variance of the gyro.
+    Means over 1 s outside the gaps; wheels are usable if they explain 80 % of the variance of the gyro.
     """
     n = int((times[-1] - times[0]) // _TURN_WINDOW)
     if n < 10 or np.ptp(wheels.yaw_rate) == 0.0:
@@ -235,7 +235,7 @@ def _interpolate(times: Array, stamps: Array, values: Array) -> Array:
 
 
 def _tilt(up: Array) -> Array:
-    """Roll and pitch ``(n, 2)`` from where up is in the base ``(n, 3)``: up = (-sin p, sin r cos p, cos r cos p)."""
+    """Roll and pitch ``(n, 2)`` from the up vector in the base ``(n, 3)``: up = (-sin p, sin r cos p, cos r cos p)."""
     u = up / np.linalg.norm(up, axis=1, keepdims=True)
     return np.column_stack([np.arctan2(u[:, 1], u[:, 2]), -np.arcsin(np.clip(u[:, 0], -1.0, 1.0))])
 
@@ -243,7 +243,7 @@ def _tilt(up: Array) -> Array:
 def _up(
     imu: Imu, wheels: VelocityControls, rate: Array, noise: DeadReckoningNoise
 ) -> tuple[Array, DeadReckoningErrorModel]:
-    """Where up is in the base at the IMU's records ``(n, 3)``, and the errors that last; ``rate``: base frame."""
+    """Up vector in the base frame at the IMU records ``(n, 3)``, and the systematic errors; ``rate``: base frame."""
     n = imu.noise
     common: dict[str, Any] = {
         "gyro_bias": n.gyro_bias,
@@ -263,8 +263,7 @@ def _up(
             attitude_walk=0.0,
         )
         return se3.quat_rotate(imu.T_base_imu[3:], up), lasting
-    # gravity = specific force less what the base accelerates: along x with the wheels, sideways by turning, and the
-    # unit about the base by its lever arm
+    # gravity = specific force minus the acceleration of the base (forward and centripetal) and that of the lever arm
     lever = imu.T_base_imu[:3]
     force = se3.quat_rotate(imu.T_base_imu[3:], imu.specific_force)
     if len(imu.times) > 1:
@@ -280,13 +279,13 @@ def _up(
             f"no gravity in the specific force of record {k}", where="imu", got=float(length[k, 0]), wanted="about 9.8"
         )
     seen = seen / length
-    # the filter needs a start as good as it is later: it first runs backwards over its own time
+    # the filter is first run backwards over 3 time constants, for a good initial state
     m = int(np.searchsorted(imu.times, imu.times[0] + 3.0 * FILTER_TIME, side="right"))
     back, up = np.empty((m, 3)), np.empty_like(seen)
     complementary_kernel(-imu.times[:m][::-1], -rate[:m][::-1], seen[:m][::-1], FILTER_TIME, seen[m - 1], back)
     complementary_kernel(imu.times, rate, seen, FILTER_TIME, back[-1], up)
-    # errors of the filter: white rates gathered over its time, white forces averaged over it; an accelerometer
-    # that is off lasts; what the bias of the gyro does is in the transition
+    # errors of the filter: gyro noise integrated over its time constant, accelerometer noise averaged over it; the
+    # accelerometer bias is constant; the effect of the gyro bias is in the transition
     T = FILTER_TIME
     fading = n.gyro**2 * T / 2.0 + (n.accelerometer / GRAVITY) ** 2 / (2.0 * T) + (noise.wheel / (GRAVITY * T)) ** 2
     return up, DeadReckoningErrorModel(
@@ -301,7 +300,7 @@ def _up(
 
 @dataclass(slots=True)
 class _Fine:
-    """Steps between neighbouring records ``(s, ...)`` and the poses ``(s + 1, 7)`` between which they lie."""
+    """Steps between neighbouring records ``(s, ...)`` and the poses ``(s + 1, 7)`` at their ends."""
 
     h: Array
     g: Array  # heading's rate per rate of the base
@@ -325,7 +324,7 @@ def _fine_steps(knots: Array, tilt: Array, rate: Array, speed: Array) -> _Fine:
     g_tilt = np.column_stack([(cr * w[:, 1] - sr * w[:, 2]) / cp, (sr * w[:, 1] + cr * w[:, 2]) * sp / cp**2])
     heading = np.concatenate([[0.0], np.cumsum(turn)])
     psi = 0.5 * (heading[1:] + heading[:-1])
-    chord = speed * h * np.sinc(turn / (2.0 * np.pi))  # an arc is longer than its chord: sin(x)/x at half the turn
+    chord = speed * h * np.sinc(turn / (2.0 * np.pi))  # an arc is longer than its chord: sin(x)/x at half the rotation
     moved = chord[:, None] * np.column_stack([np.cos(psi) * cp, np.sin(psi) * cp, -sp])
     pitched = chord[:, None] * np.column_stack([-np.cos(psi) * sp, -np.sin(psi) * sp, -cp])
     position = np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
@@ -357,7 +356,7 @@ def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], lasting: DeadReckonin
     A[:, PSI, GYRO] = h[:, None] * fine.g[i]
     A[:, PSI, FADING] = A[:, PSI, LASTING] = h[:, None] * fine.g_tilt[i]
     turned = np.column_stack([-fine.moved[i, 1], fine.moved[i, 0], np.zeros(len(i))])  # e_z × moved
-    # an error of the rate has grown to half its effect when the base is half way
+    # on average over the step, an error of the rate has half its final effect
     A[:, POS, 4:] = 0.5 * turned[:, :, None] * A[:, PSI, None, 4:]
     A[:, POS, PSI] = turned
     A[:, POS, SCALE] = fine.moved[i]
@@ -365,7 +364,7 @@ def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], lasting: DeadReckonin
     A[:, POS, LASTING.stop - 1] += fine.pitched[i]
     fade = np.exp(-h / lasting.attitude_time)
     A[:, 8, 8] = A[:, 9, 9] = fade
-    if lasting.filtered:  # de/dt = β - e/T in the body, where what stands still in the world turns backwards
+    if lasting.filtered:  # de/dt = β - e/T in the body frame, which rotates
         roll, pitch = FADING.start, FADING.start + 1
         A[:, roll, GYRO.start] = A[:, pitch, GYRO.start + 1] = h
         A[:, roll, pitch] = A[:, roll, LASTING.start + 1] = h * fine.turn[i]
@@ -381,7 +380,7 @@ def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], lasting: DeadReckonin
 
 
 def _white(poses: Array, F: Array, Q: Array, lasting: DeadReckoningErrorModel) -> Array:
-    """Covariances ``(n - 1, 6, 6)`` of increments from body to body, without the errors that last."""
+    """Covariances ``(n - 1, 6, 6)`` of increments from body to body, without systematic errors."""
     P = np.zeros((len(F) - 1, STATES + 2, STATES + 2))
     pick = np.vstack([np.eye(STATES), np.eye(STATES)[FADING]])[:, FADING]
     P[:] = lasting.attitude**2 * pick @ pick.T

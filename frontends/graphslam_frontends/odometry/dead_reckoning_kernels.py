@@ -1,4 +1,4 @@
-"""Compiled recursions of dead reckoning."""
+"""Compiled complementary filter of dead reckoning."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def complementary_kernel(times, rate, seen, time_constant, first, up):
     up[0] = u
     for k in range(1, len(times)):
         h = times[k] - times[k - 1]
-        # a fixed direction turns backwards in a turning body: du/dt = -ω × u, over h by Rodrigues' formula
+        # a fixed direction rotates backwards in a rotating body: du/dt = -ω × u, over h by Rodrigues' formula
         wx = -0.5 * (rate[k, 0] + rate[k - 1, 0]) * h
         wy = -0.5 * (rate[k, 1] + rate[k - 1, 1]) * h
         wz = -0.5 * (rate[k, 2] + rate[k - 1, 2]) * h

@@ -1,7 +1,6 @@
-"""Beams of whatever scanner, chosen evenly and moved to where the base stands when their step ends.
+"""Evenly subsampled beams of any scanner, deskewed to the base frame at the end of their step.
 
-Beams are listed first (stamp and step of each, nothing else), then chosen, and only the chosen ones are given a
-position: the thinning costs nothing and the dear part is done a few hundred times a step.
+Beams are first listed by stamp and step, then subsampled; only the selected ones are transformed, to save time.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _AT_ONCE = 1 << 18
 
 
 class BeamSource(Protocol):
-    """Beams of one stream, numbered; the readings that say nothing are left out and counted."""
+    """Beams of one stream, numbered; invalid readings are left out and counted."""
 
     times: Array
     """Stamp of each beam ``(q,)`` [s]."""
@@ -36,18 +35,18 @@ class BeamSource(Protocol):
     max_range: float
     sigma: float
     skipped: Array
-    """Stamps of the scans that were left out as repeats: the robot drove on meanwhile [s]."""
+    """Stamps of the scans left out as repetitions, during which the robot may move [s]."""
 
     def beams(self, chosen: Index) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        """Origins ``(k, dim)``, ends ``(k, dim)`` in the base at the beam's own time, and whether they met something;
-        of beams with rising numbers."""
+        """Origins ``(k, dim)``, ends ``(k, dim)`` in the base frame at the time of the beam, and whether they are
+        returns; for beams with increasing numbers."""
         ...
 
 
 def cut_beams(
     origins: Array, ends: Array, met: npt.NDArray[np.bool_], max_range: float
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Ends of beams, none farther than ``max_range``: those that go on are cut there and met nothing so far."""
+    """Ends of beams cut at ``max_range``: longer beams become beams without a return."""
     along = ends - origins
     length = np.linalg.norm(along, axis=1)
     far = length >= max_range
@@ -119,12 +118,12 @@ Scanner = RangeScans | PointClouds | LaserScans
 
 
 def repeated_scans(ranges: npt.NDArray[np.floating[Any]], max_range: float) -> npt.NDArray[np.bool_]:
-    """Which scans ``(n,)`` are the one before, number for number, and hold a return: nothing was measured anew.
+    """Which scans ``(n,)`` repeat the previous one exactly and have a return: nothing was measured.
 
     Parameters
     ----------
     ranges : (n, m)
-        NaN: no reading; ≥ ``max_range``: nothing met.
+        NaN: no reading; ≥ ``max_range``: no return.
     """
     out = np.zeros(len(ranges), dtype=np.bool_)
     if len(ranges) > 1:
@@ -136,7 +135,7 @@ def repeated_scans(ranges: npt.NDArray[np.floating[Any]], max_range: float) -> n
 
 
 def repeated_clouds(clouds: Iterable[Array]) -> npt.NDArray[np.bool_]:
-    """The same of clouds ``(m, 3)``."""
+    """The same for clouds ``(m, 3)``."""
     out, before = [], None
     for cloud in clouds:
         out.append(before is not None and len(cloud) > 0 and np.array_equal(before, cloud))
@@ -147,12 +146,11 @@ def repeated_clouds(clouds: Iterable[Array]) -> npt.NDArray[np.bool_]:
 def beam_source(
     stream: Scanner, name: str, *, min_range: float, range_sigma: float, cloud_range: float, drops: DropCounter
 ) -> BeamSource:
-    """List the beams of a stream that say something.
+    """List the valid beams of a stream.
 
-    Left out and counted: beams without a reading, what is nearer than ``min_range``, and scans that are the one before
-    number for number: a sensor that measures never repeats itself, and a map that is shown the same scan from one place
-    after the other believes that nothing moves. Scans in which no beam met anything are kept, for they say that space
-    is free, and counted.
+    Left out and counted: beams without a reading or nearer than ``min_range``, and scans that repeat the previous one
+    exactly: a real sensor never does that, and a repeated scan would make the robot seem stationary. Scans without any
+    return are kept, because they show free space, and counted.
     """
     if isinstance(stream, PointClouds):
         return _list_clouds(stream, name, min_range, range_sigma, cloud_range, drops)
@@ -200,10 +198,10 @@ def _list_clouds(
 
 
 def stratified_indices(n: int, most: int) -> Index:
-    """``most`` of ``n`` numbers, rising, one from each of as many equal stretches; all if there are no more.
+    """``most`` of ``n`` numbers, increasing, one from each of as many equal intervals; all if there are no more.
 
-    Inside its stretch the number moves by the golden ratio, so that the choice does not fall into step with the beams
-    of a scan (every second beam of each scan, never the others).
+    The offset in each interval follows the golden ratio, so that the choice is not in phase with the beams of a scan
+    (not always every second beam).
     """
     if n <= most:
         return np.arange(n, dtype=np.int64)
@@ -215,7 +213,7 @@ def stratified_indices(n: int, most: int) -> Index:
 
 
 def assign_steps(beam_times: Array, step_times: Array, begin: float) -> Index:
-    """Step ``(q,)`` that each beam belongs to: the first that ends at its stamp or after; -1 outside.
+    """Step ``(q,)`` of each beam: the first that ends at its stamp or later; -1 outside.
 
     Parameters
     ----------
@@ -236,11 +234,11 @@ def deskew_beams(
     Parameters
     ----------
     path : Trajectory
-        ``T_frame_base(t)``, covers ``times``.
+        ``T_frame_base(t)``; covers ``times``.
     step_poses : (n, 7) or (n, 3)
         Same frame.
     step, times : (q,)
-        The step follows from the time, as of :func:`assign_steps`.
+        Step and time of each beam, as of :func:`assign_steps`.
     origins, ends : (q, dim)
 
     Returns
@@ -251,7 +249,7 @@ def deskew_beams(
     group = group_of(step_poses)
     for a in range(0, len(times), _AT_ONCE):
         part = slice(a, min(a + _AT_ONCE, len(times)))
-        # beams of one stamp share one motion (a cloud has thousands)
+        # beams of one stamp share one transform (a cloud has thousands)
         stamps, first, which = np.unique(times[part], return_index=True, return_inverse=True)
         T = group.between(step_poses[step[part][first]], path.interpolate(stamps))[which]
         out_origins[part], out_ends[part] = group.transform(T, origins[part]), group.transform(T, ends[part])

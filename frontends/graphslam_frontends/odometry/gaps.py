@@ -1,4 +1,4 @@
-"""Gaps in the records of a stream: found, bridged up to a limit, named beyond it."""
+"""Gaps in the records of a stream: found, and bridged up to a limit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
 
 OPTION = "frontend.steps.longest_record"
-"""The option that limits gaps of steps, by its full name."""
+"""Full name of the option that limits gaps of steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Gaps:
     end: Array = field(default_factory=lambda: np.zeros(0))
 
     def length_at(self, times: Array) -> Array:
-        """Length of the gap that each of ``times`` lies in, 0 outside [s]."""
+        """Length of the gap at each of ``times``, 0 outside gaps [s]."""
         out = np.zeros(len(times))
         for a, b in zip(self.begin, self.end):
             out[(times > a) & (times < b)] = b - a
@@ -31,13 +31,13 @@ class Gaps:
 
 
 def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: str, drops: DropCounter | None) -> Gaps:
-    """Gaps of a stream inside ``[begin, end]``: longer than thrice the usual spacing (and than 50 ms).
+    """Gaps of a stream inside ``[begin, end]``: longer than 3 times the median interval and than 50 ms.
 
     Parameters
     ----------
     stamps : (n,)
     limit : float
-        Longest gap that may be bridged [s].
+        Longest gap that is bridged [s].
     where : str
         Name of the stream.
     drops : DropCounter or None
@@ -56,7 +56,7 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
 def refuse_long_gaps(
     stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION
 ) -> None:
-    """Raise if a gap, given by the record before it, is longer than ``limit`` seconds, which ``option`` sets."""
+    """Raise if a gap, given by the record before it, is longer than ``limit`` seconds; ``option`` sets the limit."""
     spacing = np.diff(stamps)
     if len(gaps) and spacing[gaps].max() > limit:
         worst = int(gaps[np.argmax(spacing[gaps])])

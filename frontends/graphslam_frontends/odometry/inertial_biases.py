@@ -1,7 +1,7 @@
-"""Errors of dead reckoning from an IMU and wheels that outlive a step.
+"""Systematic errors of dead reckoning from an IMU and wheels.
 
 Error state (12), true minus estimated, position in the frame of the path: heading; x, y, z; bias of the gyro (3, base
-frame); scale of the wheels; roll and pitch that fade (Ornstein-Uhlenbeck, 2); roll and pitch that last (2).
+frame); scale of the wheels; time-correlated roll and pitch (Ornstein–Uhlenbeck, 2); constant roll and pitch (2).
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ STATES = 12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeadReckoningErrorModel:
-    """σ of the errors that outlive a step, at the first record of the path, and how they walk."""
+    """σ of the systematic errors at the first record of the path, and their random walks."""
 
     gyro_bias: float
     """[rad/s]"""
     gyro_walk: float
     """[rad/s/√s]"""
     wheel_scale: float
-    """Share of the distance."""
+    """Relative error of distances."""
     attitude: float
-    """Roll and pitch, the part that fades [rad]."""
+    """Roll and pitch, time-correlated part [rad]."""
     attitude_time: float
-    """Time over which it fades [s]."""
+    """Correlation time of that part [s]."""
     attitude_bias: float
-    """Roll and pitch, the part that lasts [rad]."""
+    """Roll and pitch, constant part [rad]."""
     attitude_walk: float
-    """Walk of that part [rad/√s]."""
+    """Random walk of the constant part [rad/√s]."""
     epoch: float
-    """When the biases had the σ above [s]: the first record of the IMU."""
+    """Time of the σ above [s]: the first record of the IMU."""
     filtered: bool = False
-    """Roll and pitch come from the gyro, drawn to gravity over ``attitude_time``: then the gyro's bias tilts them."""
+    """Roll and pitch are from a filter with time constant ``attitude_time``: then the gyro bias tilts them."""
 
     def covariance(self, time: float) -> Array:
-        """Of the state ``(12, 12)`` at the start of an interval that begins at ``time`` [s]."""
+        """Covariance ``(12, 12)`` of the state at the start of an interval that begins at ``time`` [s]."""
         since = max(time - self.epoch, 0.0)
         P = np.zeros(STATES)
         P[GYRO] = self.gyro_bias**2 + self.gyro_walk**2 * since
@@ -52,7 +52,7 @@ class DeadReckoningErrorModel:
         P[LASTING] = self.attitude_bias**2 + self.attitude_walk**2 * since
         M = np.eye(STATES)
         if self.filtered:
-            # the filter's error is T times the gyro's bias, and was the opposite when it started, coming backwards
+            # error of the filter: T · gyro bias in steady state, and the opposite at its start, from the backward run
             gain = self.attitude_time * (1.0 - 2.0 * np.exp(-since / self.attitude_time))
             M[FADING.start, GYRO.start] = M[FADING.start + 1, GYRO.start + 1] = gain
         return (M * P) @ M.T
@@ -62,7 +62,7 @@ class DeadReckoningErrorModel:
 class InertialBiases:
     """Errors of a dead-reckoned path as states of a linear system.
 
-    Behind the error state stand two more: errors of roll and pitch at the start of the interval, kept as they were.
+    Two states follow the error state: the errors of roll and pitch at the start of the interval.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class InertialBiases:
     transitions, noises : (n, 12, 12)
         Of the error state from pose k - 1 to k; record 0 is identity and zero.
     floor : (6,)
-        σ that every covariance has at least: radians, metres.
+        Least σ of every covariance: radians, metres.
     """
 
     times: Array
@@ -123,9 +123,9 @@ def euler_quat(roll: Array, pitch: Array, heading: Array) -> Array:
 
 
 def tangent_of_state(start: Array, end: Array, *, level_start: bool, level_end: bool) -> Array:
-    """Right tangent of ``T_start_end`` from the error state, ``(k, 6, 14)``; poses ``(k, 7)``.
+    """Jacobian ``(k, 6, 14)`` of the right tangent of ``T_start_end`` by the error state; poses ``(k, 7)``.
 
-    ``ξ = ξ_end - Ad(T_end⁻¹ T_start) ξ_start``, each made of errors of roll, pitch, heading and position there.
+    ``ξ = ξ_end - Ad(T_end⁻¹ T_start) ξ_start``, each from the errors of roll, pitch, heading and position there.
     """
     G = np.zeros((len(end), 6, STATES + 2))
     to_end = body_rates(end)
@@ -141,7 +141,7 @@ def tangent_of_state(start: Array, end: Array, *, level_start: bool, level_end: 
 
 
 def body_rates(poses: Array) -> Array:
-    """Rotation in the body ``(k, 3, 3)`` per change of roll, pitch and heading."""
+    """Rotation in the body frame ``(k, 3, 3)`` per change of roll, pitch and heading."""
     roll, pitch, _ = np.moveaxis(euler(poses), -1, 0)
     E = np.zeros((len(poses), 3, 3))
     E[:, 0, 0] = 1.0

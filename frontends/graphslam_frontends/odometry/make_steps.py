@@ -1,7 +1,7 @@
-"""Steps: sensor data as grid front ends read it, whatever the robot.
+"""Conversion of sensor data of any robot to steps, the input of grid front ends.
 
-A step is a short stretch of time: the motion that ends at its stamp and the beams of that stretch, moved to where the
-base stands at the stamp. Front ends on grids see nothing else, so that any robot whose data become steps can be mapped.
+A step is a short time interval: the motion that ends at its stamp and the beams of the interval, deskewed to the base
+frame at the stamp. Grid front ends use nothing else.
 """
 
 from __future__ import annotations
@@ -35,24 +35,23 @@ from graphslam_frontends.odometry.steps import Steps
 _log = logging.getLogger(__name__)
 _MOST_STEPS = 1_000_000
 CLOUD_RANGE = 60.0
-"""Range of lidars whose records are clouds and do not state theirs [m]."""
+"""Range of lidars whose clouds do not give one [m]."""
 
 
 def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropCounter | None = None) -> Steps:
     """Cut a log into steps.
 
-    A step takes the beams after the stamp of the one before, up to its own stamp, each moved by the motion from its own
-    time to the step's stamp. With a ``period`` steps begin with the first beam and the last may be shorter; a step
-    without any beam is kept, for the motion goes on. With none, there is one step for every record of the first
-    scanner.
+    A step has the beams after the stamp of the previous step, up to its own stamp, each deskewed to the step's stamp.
+    With a ``period`` the first step begins with the first beam and the last may be shorter; steps without beams are
+    kept for their motion. Without a period there is one step for every record of the first scanner.
 
     Parameters
     ----------
     log : SensorLog
     config : StepConfig, optional
     drops : DropCounter, optional
-        Counts beams and scans that say nothing, beams outside the motion, beams left out by thinning, steps without a
-        beam, gaps that were bridged.
+        Counts invalid beams and scans, beams outside the motion, beams removed by subsampling, steps without a beam,
+        and bridged gaps.
 
     Returns
     -------
@@ -117,10 +116,10 @@ def make_steps(log: SensorLog, config: StepConfig | None = None, *, drops: DropC
 
 
 def level_on_the_whole(tilt: Array | None, increments: Array) -> Array | None:
-    """Roll and pitch ``(n, 2)`` [rad] without their median over the steps in which the body moved.
+    """Roll and pitch ``(n, 2)`` [rad] minus their median over the steps in which the body moved.
 
-    On level floors the body stands level whatever way it heads, and ramps are less than half of the way, and lead up as
-    often as down; so the median is that part of gravity's error that lasts.
+    On level floors the body is level at any heading. If ramps are less than half of the path, and go up as often as
+    down, the median is the constant error of gravity.
     """
     if tilt is None:
         return None
@@ -130,7 +129,7 @@ def level_on_the_whole(tilt: Array | None, increments: Array) -> Array | None:
 
 
 def scanner_names(log: SensorLog) -> tuple[str, ...]:
-    """Streams of beams that steps are made of where the configuration names none."""
+    """Default beam streams for steps."""
     for kind in (RangeScans, PointClouds, LaserScans):
         names = tuple(name for name, s in log.streams.items() if isinstance(s, kind))
         if names:
@@ -165,7 +164,7 @@ def _beam_sources(
 def _stamps(
     first: RangeScans | PointClouds | LaserScans, beams: Array, source: MotionSource, config: StepConfig
 ) -> tuple[Array, float]:
-    """Stamps of the steps and where the first begins; ``beams``: times of those inside the motion."""
+    """Stamps of the steps and start of the first; ``beams``: times of those inside the motion."""
     if config.period is None:
         last = first.beam_times[-1] if isinstance(first, RangeScans) and len(first.beam_times) else 0.0
         whole = (first.times >= source.begin) & (first.times + last <= source.end)
@@ -174,11 +173,11 @@ def _stamps(
         return first.times[whole] + last, float(first.times[whole][0])
     if len(beams):
         begin, end = float(beams.min()), float(beams.max())
-    else:  # a scanner that never saw anything: the motion is all there is
+    else:  # no valid beam at all: use the interval of the motion
         begin, end = source.begin, source.end
     n = int(np.floor((end - begin) / config.period + 1e-9))
     if n > _MOST_STEPS:
-        source.solve(np.array([begin, end]), np.zeros(0), None)  # names the gap, if that is why
+        source.solve(np.array([begin, end]), np.zeros(0), None)  # raises for a long gap, if that is the reason
         raise DataError(
             f"{n} steps", got=f"{end - begin:.0f} s in steps of {config.period} s", wanted=f"≤ {_MOST_STEPS}"
         )
@@ -186,12 +185,12 @@ def _stamps(
     if n == 0 or end - times[-1] > 1e-6:
         times = np.append(times, end)
     else:
-        times[-1] = end  # not short of the last beam by rounding
+        times[-1] = end  # not before the last beam by rounding
     return times, begin
 
 
 def _choose(step: Index, n: int, most: int) -> tuple[Index, Index, int]:
-    """Numbers of the beams kept, by step ``(k,)``; offsets ``(n + 1,)``; how many were left out."""
+    """Numbers of the selected beams, by step ``(k,)``; offsets ``(n + 1,)``; number left out."""
     order = np.argsort(step, kind="stable")
     bounds = np.searchsorted(step[order], np.arange(n + 1))
     kept = [order[a:b][stratified_indices(int(b - a), most)] for a, b in pairwise(bounds)]
@@ -201,7 +200,7 @@ def _choose(step: Index, n: int, most: int) -> tuple[Index, Index, int]:
 
 
 def _beams(sources: list[BeamSource], chosen: Index, config: StepConfig) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """Origins, ends and returns of the chosen beams, base at their own time, cut at the greatest range."""
+    """Origins, ends and returns of the selected beams, base at their own time, cut at the maximum range."""
     dim = sources[0].dim
     origins, ends, met = np.empty((len(chosen), dim)), np.empty((len(chosen), dim)), np.zeros(len(chosen), np.bool_)
     first = 0

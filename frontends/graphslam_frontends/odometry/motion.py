@@ -1,10 +1,10 @@
-"""Dead reckoning between stamps from whatever motion a log holds, with an honest covariance.
+"""Planar dead reckoning between stamps from any motion stream of a log, with covariance.
 
 Three kinds of stream: speed and steering of a car (:class:`SteeringControls`), speed and yaw rate
-(:class:`VelocityControls`), and ready-made increments with covariances of their own (:class:`Odometry`).
+(:class:`VelocityControls`), and recorded increments with their covariances (:class:`Odometry`).
 
-Noise of real vehicles is not white per control step (side slip and steering offsets last for seconds), so the noise
-model has a part that is constant over one increment and a part that grows with the distance driven.
+Noise of real vehicles is not white per control step (side slip and steering offsets are correlated over seconds), so
+the noise model has a part that is constant over one increment and a part that grows with the distance driven.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from graphslam_frontends.odometry.motion_kernels import (
 )
 
 HEADING_UNKNOWN = float(np.pi / np.sqrt(3.0))
-"""σ of a heading that may be any [rad]."""
+"""σ of a uniformly distributed heading [rad]."""
 Motion = SteeringControls | VelocityControls | Odometry
-"""Streams that can be dead-reckoned, in the order in which a log is asked for them."""
+"""Motion streams, in order of preference."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionNoise:
     """Noise of one dead-reckoning increment (right tangent at its end).
 
-    ``steering`` is for cars, ``yaw_rate`` and its fraction for streams of speed and yaw rate; a recorded odometry
-    brings its own covariances and takes none of these but the floors.
+    ``steering`` is for cars, ``yaw_rate`` and its fraction for streams of speed and yaw rate; a recorded odometry has
+    its own covariances and uses only the floors.
     """
 
     speed: float = 0.3
@@ -59,11 +59,11 @@ class MotionNoise:
     per_increment: bool = False
     """True: errors of the controls are constant over an increment; False: independent per control step."""
     lateral: float = 0.0
-    """σ of side slip per metre driven [m/m], drawn per increment."""
+    """σ of side slip per metre driven [m/m], independent per increment."""
     heading: float = 0.0
-    """σ of heading drift per metre driven [rad/m], drawn per increment."""
+    """σ of heading drift per metre driven [rad/m], independent per increment."""
     floor_position: float = 1e-4
-    """σ added to x and y of every increment [m]: keeps a standing vehicle's covariance invertible."""
+    """σ added to x and y of every increment [m]: keeps the covariance of a stationary vehicle invertible."""
     floor_heading: float = 1e-5
     """σ added to the heading of every increment [rad]."""
 
@@ -76,7 +76,7 @@ class MotionNoise:
             raise ConfigError("motion noise floors must be > 0: an increment needs an invertible covariance")
 
     def as_array(self) -> Array:
-        """The order the kernel expects."""
+        """As the array that the kernels expect."""
         return np.array(
             [
                 self.speed,
@@ -96,7 +96,7 @@ class MotionNoise:
 
 
 def motion_stream(log: SensorLog) -> tuple[str, Motion]:
-    """Name and stream to dead-reckon from: steering before velocities before recorded odometry."""
+    """Name and stream for dead reckoning: steering before velocities before recorded odometry."""
     name = motion_stream_name(log)
     if name is None:
         raise MissingDataError(
@@ -106,7 +106,7 @@ def motion_stream(log: SensorLog) -> tuple[str, Motion]:
 
 
 def motion_stream_name(log: SensorLog | RecordSource) -> str | None:
-    """Name of the stream to dead-reckon from; None: there is none."""
+    """Name of the stream for dead reckoning; None: there is none."""
     found = (log.of_type(kind) for kind in (SteeringControls, VelocityControls, Odometry))
     return next((name for name in found if name is not None), None)
 
@@ -121,10 +121,10 @@ def dead_reckoned_increments(
     times : (n,)
         Stamps of the poses [s], strictly increasing.
     noise : MotionNoise
-        Of controls; recorded odometry brings its own covariances.
+        Of controls; recorded odometry has its own covariances.
     hold : float
-        Stamps up to this long before the first control are served with that control held backwards [s]; recorded
-        odometry is continued at its first and last velocity by as much. The last *control* is held to the end.
+        Longest extrapolation before the first control, which is held backwards [s]; recorded odometry is extrapolated
+        by as much at its first and last velocity. The last *control* is held to the end.
     """
     name, stream = motion_stream(log)
     where = f"{log.name}/{name}"
@@ -151,7 +151,7 @@ def dead_reckoned_increments(
 
 
 def _fine_steps(stamps: Array, times: Array) -> tuple[Array, Array, npt.NDArray[np.intp], npt.NDArray[np.int64]]:
-    """Steps inside which the controls are constant, between the pose stamps ``times``.
+    """Steps with constant controls, between the pose stamps ``times``.
 
     Returns
     -------
@@ -171,17 +171,17 @@ def _fine_steps(stamps: Array, times: Array) -> tuple[Array, Array, npt.NDArray[
 
 
 def _start(n: int, noise: MotionNoise) -> tuple[Array, Array]:
-    """Increments and covariances to be filled: record 0 is the identity with the floor covariance."""
+    """Increments and covariances to fill: record 0 is the identity with the floor covariance."""
     increments, covs = np.zeros((n, 3)), np.zeros((n, 3, 3))
     covs[:1] = np.diag([noise.floor_position**2, noise.floor_position**2, noise.floor_heading**2])
     return increments, covs
 
 
 def velocity_odometry(controls: VelocityControls, times: Array, noise: MotionNoise) -> Odometry:
-    """Increments between consecutive ``times`` from speed and yaw rate held from stamp to stamp; exact arcs.
+    """Increments between consecutive ``times`` from zero-order-hold speed and yaw rate; exact arcs.
 
-    A control of exactly zero speed and zero rate is a base that stands: it adds no noise but the floors. With white
-    noise the mean is unbiased: a noisy rate shortens what is integrated, which is undone here as for steering.
+    Zero speed and zero rate mean a stationary base, without noise except the floors. With white noise the mean is
+    unbiased: rate noise shortens the integrated path, which is corrected as for steering.
 
     Parameters
     ----------
@@ -190,9 +190,9 @@ def velocity_odometry(controls: VelocityControls, times: Array, noise: MotionNoi
     times : (n,)
         Stamps of the poses, strictly increasing, none before the first control.
     noise : MotionNoise
-        σ² = speed² + (speed_fraction · v)² and yaw_rate² + (yaw_rate_fraction · ω)²: drawn per control, or with
-        ``per_increment`` once per increment (constant error and scale error each). Random walks of distance and
-        heading come on top, whatever the rate of the controls.
+        σ² = speed² + (speed_fraction · v)² and yaw_rate² + (yaw_rate_fraction · ω)²: independent per control, or with
+        ``per_increment`` per increment (a constant and a scale error each). Random walks of distance and heading are
+        added, independent of the control rate.
 
     Returns
     -------
@@ -208,10 +208,10 @@ def velocity_odometry(controls: VelocityControls, times: Array, noise: MotionNoi
 
 
 def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, hold: float = 0.0) -> Odometry:
-    """Increments between consecutive ``times`` composed of recorded ones and their covariances.
+    """Increments between consecutive ``times``, composed of recorded ones and their covariances.
 
-    A record that a stamp falls into is cut at constant velocity, its covariance in proportion to time (as for noise
-    that is white within it; the pieces are then independent and add up to the record's own at first order).
+    If a stamp is inside a record, the record is divided at constant velocity and its covariance in proportion to time
+    (as for white noise; the pieces are then independent and add up to the covariance of the record to first order).
 
     Parameters
     ----------
@@ -219,10 +219,10 @@ def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, hold: 
         In two or three dimensions.
     times : (n,)
     noise : MotionNoise
-        Only its floors.
+        Only its floors are used.
     hold : float
-        Reach beyond the first and the last record, continued at constant velocity [s]. Both the motion and its σ then
-        grow with time: what goes on is a guess.
+        Longest extrapolation before the first and after the last record, at constant velocity [s]; σ then grows in
+        proportion to time.
     """
     t, stamps, g = check_times(times), odometry.times, group_of(odometry.increments)
     if len(stamps) < 2:
@@ -259,7 +259,7 @@ def cut_odometry(odometry: Odometry, times: Array, noise: MotionNoise, *, hold: 
         compose_increments_kernel(pieces, added, first, increments[1:], covs[1:])
         return Odometry(times=t, increments=increments, covariances=covs)
     P, counts = np.zeros((len(t) - 1, g.dof, g.dof)), np.diff(first)
-    for m in range(int(counts.max())):  # all increments grow together, one piece each at a time
+    for m in range(int(counts.max())):  # all increments in parallel, one piece each at a time
         live = np.flatnonzero(counts > m)
         piece = pieces[first[live] + m]
         increments[live + 1] = g.compose(increments[live + 1], piece)

@@ -1,16 +1,16 @@
-"""Do scans and motion tell the same way? Pairs of neighbouring scans are matched and held against the odometry.
+"""Consistency check of scans and motion: pairs of neighbouring scans are matched and compared with the odometry.
 
-No single match is believed. Over the pairs of a whole log the matched motions are regressed on those of the odometry,
-and what comes out are the errors that a map would be wrong by without showing it:
+Single matches may be wrong. Over the pairs of the whole log the matched motions are regressed on those of the odometry.
+The coefficients are errors that would distort a map without being visible in it:
 
-- distances and turns by the odometry as multiples of those by the scans: units, signs, mirrored beams, scaled ranges;
-- angles between the axes of scanner and base: a motion ahead that scans see to the side, upwards, or tilted;
-- the lever: where the scanner stands is seen by how much it is swung by turns;
-- the time by which scans are later than the motion.
+- distances and rotations by scan matching, relative to the odometry: units, signs, mirrored beams, scaled ranges;
+- angles between the axes of scanner and base: a forward motion that scans see sideways, upwards, or tilted;
+- the lever arm: a position error of the scanner shows as a displacement in rotations;
+- the delay of the scans relative to the motion.
 
-Each has a standard error from what the regression leaves, so that corridors and bad matches make it vague, not wrong. A
-finding needs a lower bound (4 standard errors) beyond a tolerance. The tolerances are those of careful mounting and of
-wheels that slip: 10 % in scale, 4°, 0.2 m, 0.2 s make a line to look at, twice as much a bad one.
+The standard errors are estimated from the residuals, so corridors and bad matches increase them. A finding needs a
+lower bound (4 standard errors) beyond a tolerance. The tolerances allow for careful mounting and wheel slip: 10 % in
+scale, 4°, 0.2 m, 0.2 s give the level "look", twice as much "bad".
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.steps import Steps
 
 PAIRS = 36
-"""Pairs of a log that are matched, evenly spread."""
+"""Most pairs of a log to match, evenly spaced."""
 POINTS = 900
-"""Points of a cloud that is matched, at most."""
+"""Most points of a matched cloud."""
 MATCHING = RegistrationConfig(
     radii=(1.0, 0.5), near=0.25, floor_sigma=0.01, floor_turn=0.003, max_shift=6.0, max_turn=1.6,
     gates=RegistrationGates(
@@ -41,20 +41,20 @@ MATCHING = RegistrationConfig(
     ),
 )  # fmt: skip
 SURE = 4.0
-"""Standard errors that an error is larger than its tolerance by."""
+"""Standard errors subtracted from an error before it is compared with its tolerance."""
 SCALE, ANGLE, LEVER, LAG = 0.1, float(np.deg2rad(4.0)), 0.2, 0.2
-"""Tolerances: shares, radians, metres, seconds."""
+"""Tolerances: scale, angle [rad], lever arm [m], time [s]."""
 BAD = 2.0
-"""Times the tolerance from which on a line is a bad one."""
+"""Multiple of the tolerance above which a finding is "bad"."""
 LEAST_POINTS = 40
-"""Returns of a scan that is matched."""
+"""Least number of returns in a scan to match."""
 LEAST_PAIRS = 8
-"""Pairs that a regression needs, and a share of those tried that tells anything."""
+"""Least number of pairs for a regression, and for a finding on the share of matches."""
 UNLIKE, UNLIKE_NARROW = 0.5, 0.25
-"""Share of the pairs of a sound scanner that match at least: 0.8 to 1 on simulated and planar recorded logs; the other
-is for clouds as they come, 0.33 to 0.7 of lidars with a narrow field of view that are carried by hand."""
+"""Least share of matched pairs for a working scanner: 0.8 to 1 on simulated and planar recorded logs. The second value
+is for single 3-D clouds: 0.33 to 0.7 for hand-held lidars with a narrow field of view."""
 STEP = 0.02
-"""σ that every matched motion has at least, besides its own [m, and a third of it in rad]."""
+"""σ added to every matched motion [m, and a third of it in rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +67,17 @@ class FittedCoefficient:
 
 @dataclass(frozen=True, slots=True)
 class MotionCheck:
-    """What scans say of the motion.
+    """Result of the comparison of scan matches and motion.
 
     Parameters
     ----------
     tried, matched : int
-        Pairs.
+        Number of pairs.
     least_share : float
-        Of the pairs tried, for scans to be alike.
+        Least share of matched pairs for a working scanner.
     fits : dict of str to FittedCoefficient
-        ``distance`` and ``turn`` (scans over odometry); where the scanner really is, as against its mounting: ``yaw``,
-        ``pitch``, ``tilt`` [rad], ``ahead``, ``left`` [m]; ``lag`` [s]. What the drive does not show is not there.
+        ``distance`` and ``turn`` (scans over odometry); true minus configured pose of the scanner: ``yaw``, ``pitch``,
+        ``tilt`` [rad], ``ahead``, ``left`` [m]; ``lag`` [s]. Missing: those that the motion does not excite.
     moved, turned : (float, float)
         RMS motion of a pair by odometry and by scans [m], [rad].
     """
@@ -91,14 +91,14 @@ class MotionCheck:
 
 
 def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
-    """Match pairs of neighbouring scans and regress what they say on the odometry.
+    """Match pairs of neighbouring scans and regress their motions on the odometry.
 
     Parameters
     ----------
     steps : Steps
-        As made, before anything is fused with them.
+        Before their motion is fused with scan matches.
     seconds : float
-        Length of a scan: that of half a turn of a head that spins; 0: every step is a scan of its own.
+        Duration of a scan: half a revolution of a spinning scanner; 0: every step is a scan.
     """
     pairs = _pairs(steps, seconds)
     share = UNLIKE if seconds > 0 or steps.dim == 2 else UNLIKE_NARROW
@@ -129,11 +129,11 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
         ahead = _regress(columns, m[:, x], var[:, x], STEP)
         fits["distance"] = ahead[0]
         scale = ahead[0].value if abs(ahead[0].value) > 0.2 else 1.0
-        # what goes sideways and up by the odometry, too, as a body that is carried does, is no error
+        # sideways and upward motion that the odometry also measures (hand-held) is no error
         side = _regress(columns, m[:, x + 1] - scale * o[:, x + 1], var[:, x + 1], STEP)
         fits["yaw"] = FittedCoefficient(-side[0].value / scale, side[0].sigma / abs(scale))
         if len(columns) > 1:
-            # the stated place is off by (ex, ey): the base that scans see is swung by it
+            # a configured position off by (ex, ey) appears as a displacement of the base in rotations
             fits["ahead"], fits["left"] = (
                 FittedCoefficient(side[1].value, side[1].sigma),
                 FittedCoefficient(-ahead[1].value, ahead[1].sigma),
@@ -164,7 +164,7 @@ def check_motion(steps: Steps, seconds: float = 0.0) -> MotionCheck:
 
 
 def _pairs(steps: Steps, seconds: float) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Pairs of windows ``[a, b)`` of steps that follow each other, outside the gaps of the motion."""
+    """Pairs of consecutive windows ``[a, b)`` of steps, outside the gaps of the motion."""
     t = steps.times
     windows: list[tuple[int, int]] = []
     k = 1 if len(t) > 1 else 0
@@ -176,7 +176,7 @@ def _pairs(steps: Steps, seconds: float) -> list[tuple[tuple[int, int], tuple[in
         k = last
     met = np.concatenate([[0], np.cumsum(steps.returns)])[steps.offsets]
     full = [w for w in windows if met[w[1]] - met[w[0]] >= LEAST_POINTS]
-    if seconds <= 0:  # scans as they come may be dense: pairs some way apart tell more, and cost the same
+    if seconds <= 0:  # single scans may be dense: more distant pairs are more informative at the same cost
         full = _apart(steps, full)
     out = []
     for a, b in pairwise(full):
@@ -192,7 +192,7 @@ def _pairs(steps: Steps, seconds: float) -> list[tuple[tuple[int, int], tuple[in
 
 
 def _apart(steps: Steps, windows: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Of single scans those at least half a second apart."""
+    """Select single scans at least half a second apart."""
     out: list[tuple[int, int]] = []
     for w in windows:
         if not out or steps.times[w[0]] - steps.times[out[-1][0]] >= 0.5 - 1e-6:
@@ -201,7 +201,7 @@ def _apart(steps: Steps, windows: list[tuple[int, int]]) -> list[tuple[int, int]
 
 
 def _cloud(steps: Steps, poses: Array, first: int, last: int) -> Array:
-    """Ends of the beams that met something of the steps ``[first, last)``, base at the last of them."""
+    """End points of the returns of the steps ``[first, last)``, in the base frame at the last of them."""
     group = group_of(poses)
     parts = []
     for k in range(first, last):
@@ -215,7 +215,7 @@ def _cloud(steps: Steps, poses: Array, first: int, last: int) -> Array:
 
 
 def _matching(target: Target) -> RegistrationConfig:
-    """How a cloud is matched: points are alike that are as near as those of one surface are to each other."""
+    """Registration settings: the search radius is adapted to the point spacing of the cloud."""
     if len(target) < LEAST_POINTS:
         return MATCHING
     apart = float(np.median(target.tree.query(target.points, k=2)[0][:, 1]))
@@ -224,8 +224,8 @@ def _matching(target: Target) -> RegistrationConfig:
 
 
 def _match(source: Target, target: Target, T: Array, matching: RegistrationConfig) -> Registration | None:
-    """The best match of two clouds, begun at the motion of the odometry and at none; where these two end apart, also
-    where wrong signs and units lead to. None: there is none to speak of."""
+    """Best match of two clouds, started at the odometry motion and at zero; if these results differ, also at motions
+    with wrong signs and units. None: no accepted match."""
     group = group_of(T)
     xi = group.log(T)
 
@@ -237,7 +237,7 @@ def _match(source: Target, target: Target, T: Array, matching: RegistrationConfi
 
     if np.linalg.norm(xi[group.position]) < 0.2 and abs(xi[group.heading]) < 0.1:
         found = register_starts(source, target, [T], matching)
-        if not (found and found[0].accepted):  # the odometry may stand while the body moves ahead or back
+        if not (found and found[0].accepted):  # the odometry may show no motion while the body moves ahead or back
             ways = []
             for metres in (0.8, 1.6, -0.8):
                 y = xi.copy()
@@ -254,11 +254,11 @@ def _match(source: Target, target: Target, T: Array, matching: RegistrationConfi
 
 
 def _mirrored(steps: Steps, pairs: list[tuple[tuple[int, int], tuple[int, int]]]) -> float | None:
-    """σ of the turn's sign, if turns the other way explain the scans better; None: they do not.
+    """σ of the sign of rotations, if inverted rotations explain the scans better; None: they do not.
 
-    The scans of a head that spins are put together by the very motion that is to be checked, and clouds that a wrong
-    turn has bent agree with that turn. So clouds are put together by turns of either sign, in the pairs that turn most,
-    and the share of the points that then match decides.
+    The scans of a spinning scanner are assembled with the motion to be checked, so clouds distorted by a wrong rotation
+    agree with it. So clouds are assembled with rotations of either sign, for the pairs with the largest rotations, and
+    the share of matched points is compared.
     """
     paths = []
     group = group_of(steps.odometry.increments)
@@ -288,7 +288,7 @@ def _mirrored(steps: Steps, pairs: list[tuple[tuple[int, int], tuple[int, int]]]
 
 
 def _regress(columns: list[Array], y: Array, variance: Array, floor: float) -> list[FittedCoefficient]:
-    """Weighted regression of ``y`` on columns, bad rows weighed down (Cauchy); σ from what is left."""
+    """Robust weighted regression of ``y`` on columns (Cauchy weights); σ from the residuals."""
     X = np.column_stack(columns)
     w = 1.0 / (variance + floor**2)
     robust = np.ones(len(y))
@@ -301,7 +301,7 @@ def _regress(columns: list[Array], y: Array, variance: Array, floor: float) -> l
         robust = np.asarray(1.0 / (1.0 + (r / (2.385 * scale)) ** 2))
     g: Array = X * ((y - X @ beta) * w * robust)[:, None]
     A = np.asarray(np.linalg.pinv((X * (w * robust)[:, None]).T @ X))
-    P: Array = A @ (g.T @ g) @ A * len(y) / max(len(y) - X.shape[1], 1)  # sandwich: whatever the noise is like
+    P: Array = A @ (g.T @ g) @ A * len(y) / max(len(y) - X.shape[1], 1)  # sandwich estimator: for any noise
     P = np.maximum(np.diag(P), np.diag(A) * min(scale, 1.0) ** 2)
     return [FittedCoefficient(float(b), float(np.sqrt(p))) for b, p in zip(beta, P)]
 
@@ -314,10 +314,10 @@ def _headings(steps: Steps) -> Array:
 def _lag(
     times: Array, heading: Array, begin: Array, end: Array, turn: Array, variance: Array
 ) -> FittedCoefficient | None:
-    """By how much scans are later than the motion [s]: the shift that explains the matched turns best."""
+    """Delay of the scans relative to the motion [s]: the time shift that explains the matched rotations best."""
     w = 1.0 / (variance + (STEP / 3.0) ** 2)
     shifts = np.arange(-2.0, 2.001, 0.05)
-    # of the odometry at the time that the scans were really taken
+    # rotation of the odometry at the shifted times
     model = np.array([np.interp(end - s, times, heading) - np.interp(begin - s, times, heading) for s in shifts])
     r = turn - model
     r = r - np.sum(w * r, axis=1, keepdims=True) / w.sum()
@@ -338,7 +338,7 @@ def _lag(
 
 
 def motion_findings(found: MotionCheck) -> list[Finding]:
-    """Lines of the verdict on what scans say of the motion."""
+    """Findings from the comparison of scan matches and motion."""
     out: list[Finding] = []
     if found.tried >= LEAST_PAIRS and found.matched < found.least_share * found.tried:
         text = (
@@ -361,7 +361,7 @@ def motion_findings(found: MotionCheck) -> list[Finding]:
             said = f"motion between two scans: {scans:.2g} {unit} by scan matching, {odometry:.2g} by the odometry"
             out.append(Finding("bad", f"{key}-disagrees", f"{said} — the odometry seems to stand still."))
     if ("distance" in f and abs(f["distance"].value - 1.0) > 0.5) or ("turn" in f and abs(f["turn"].value - 1.0) > 0.5):
-        return out  # angles and levers mean nothing beside such errors
+        return out  # angles and levers are meaningless with such errors
     mounted: list[str] = []
     worst: Level = ""
     for key, what, tolerance, scale, unit in (
@@ -416,6 +416,6 @@ def _turn_cause(ratio: float) -> str:
 
 
 def half_turn_seconds(rates: Array | None) -> float:
-    """Seconds of half a turn of a head that spins at ``rates`` [rad/s]; 0 of one that stands."""
+    """Duration of half a revolution of a scanner that spins at ``rates`` [rad/s]; 0 if it does not spin."""
     rate = float(np.median(np.abs(rates))) if rates is not None and len(rates) else 0.0
     return float(np.pi / rate) if rate > 0.05 else 0.0

@@ -1,10 +1,9 @@
-"""Gaps in the motion of a robot in the plane: bridged by what the robot does elsewhere in the log, said, and counted.
+"""Gaps in planar motion: bridged with the usual motion of the robot, reported, and counted.
 
-Nothing tells what a robot did while its wheels were not recorded. The model: it went on at the mean of the speed and
-the yaw rate just before and just after the gap, off by an error that is constant over the gap and as large as the
-spread of all its speeds and yaw rates until then about that mean. So after a gap of T seconds the distance has
-σ = T · spread, and the heading likewise, up to that of a heading of which nothing is known. Increments that share a
-gap divide its variance by their time: their sum is right, and each of them is less certain than it need be.
+The motion in a gap is unknown. The model: speed and yaw rate are the mean of those just before and just after the gap,
+plus an error that is constant over the gap, with the spread of all speeds and yaw rates until then about that mean. So
+after a gap of T seconds σ of the distance is T · spread, and of the heading likewise, up to that of an unknown heading.
+Increments in a gap share its variance in proportion to time: their sum is right, each of them is conservative.
 """
 
 from __future__ import annotations
@@ -28,27 +27,27 @@ from graphslam_frontends.odometry.motion import (
 from graphslam_frontends.odometry.recorded import BRIDGED
 
 SHORTEST = 1.0
-"""A pause that is thrice the usual one and longer than this is a gap [s]: a robot can stop within a second."""
+"""An interval longer than this, and than 3 times the median, is a gap [s]: a robot can stop within a second."""
 AROUND = 2.0
-"""Time before and after a gap from which the mean motion in it is taken [s]."""
+"""Time before and after a gap for the mean motion in it [s]."""
 LOST = 0.5
-"""A record of odometry over a gap that tells less than this part of the way driven around it has lost its records."""
+"""A record of odometry over a gap with less than this share of the speed around it has lost motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionGap:
-    """One gap.
+    """A gap in the motion.
 
     Parameters
     ----------
     begin, end : float
         Stamps of the records around it [s].
     speed, yaw_rate : float
-        Taken for it [m/s, rad/s].
+        Assumed for it [m/s, rad/s].
     speed_sigma, yaw_rate_sigma : float
         Of the error that is constant over it.
     usual : float
-        Time from record to record elsewhere [s].
+        Median time between records [s].
     """
 
     begin: float
@@ -99,7 +98,7 @@ def dead_reckon_over_gaps(
 def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, where: str) -> list[MotionGap]:
     """Gaps of the motion between two times.
 
-    What is said of a gap rests on the records up to :data:`AROUND` after its end: later ones change nothing of it.
+    The result for a gap depends on the records up to :data:`AROUND` after its end, not on later ones.
     """
     stamps = motion.times
     if len(stamps) < 2:
@@ -126,7 +125,7 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
 
 
 def final_until(motion: Motion) -> float:
-    """Until when nothing that is still to come changes what :func:`find_motion_gaps` says of the motion [s]."""
+    """Time until which future records cannot change the result of :func:`find_motion_gaps` [s]."""
     stamps = motion.times
     if len(stamps) < 2:
         return -np.inf
@@ -135,7 +134,8 @@ def final_until(motion: Motion) -> float:
 
 
 def motion_rates(motion: Motion) -> tuple[Array, Array, Array]:
-    """Speed along x ``(n,)`` [m/s] and yaw rate ``(n,)`` [rad/s] of all records, and since when they hold [s]."""
+    """Speed along x ``(n,)`` [m/s] and yaw rate ``(n,)`` [rad/s] of all records, and the time from which they are valid
+    [s]."""
     if isinstance(motion, VelocityControls):
         return motion.speed, motion.yaw_rate, motion.times
     if isinstance(motion, SteeringControls):
@@ -161,7 +161,7 @@ def _gap(motion: Motion, begin: float, end: float, usual: float) -> MotionGap:
     sides = [m for m in (before, after) if m.any()] or [known]
     v = float(np.mean([np.mean(speed[m]) for m in sides]))
     w = float(np.mean([np.mean(rate[m]) for m in sides]))
-    if over >= 0 and abs(speed[over]) >= LOST * abs(v):  # it tells the whole way, not how it went
+    if over >= 0 and abs(speed[over]) >= LOST * abs(v):  # it has the whole motion, not the velocity within
         v, w = float(speed[over]), float(rate[over])
         return MotionGap(begin, end, v, w, BRIDGED * abs(v), BRIDGED * abs(w), usual)
     spread_v = float(np.sqrt(np.mean((speed[known] - v) ** 2)))
@@ -170,7 +170,7 @@ def _gap(motion: Motion, begin: float, end: float, usual: float) -> MotionGap:
 
 
 def _filled(motion: Motion, gap: MotionGap) -> Motion:
-    """The motion with the gap's own speed and yaw rate in it."""
+    """The motion with the speed and yaw rate of the gap inserted."""
     v, w = gap.speed, gap.yaw_rate
     if isinstance(motion, Odometry):
         increments = motion.increments.copy()
@@ -194,7 +194,7 @@ def _filled(motion: Motion, gap: MotionGap) -> Motion:
 
 
 def _widened(odometry: Odometry, gaps: list[MotionGap]) -> Array:
-    """Covariances ``(n, 3, 3)`` with what is not known of the motion in the gaps."""
+    """Covariances ``(n, 3, 3)`` with the uncertainty of the motion in the gaps."""
     t, covariances = odometry.times, odometry.covariances.copy()
     for gap in gaps:
         T = gap.end - gap.begin
@@ -204,7 +204,7 @@ def _widened(odometry: Odometry, gaps: list[MotionGap]) -> Array:
         for k in np.flatnonzero(inside > 0.0):
             h = inside[k]
             turn, way = heading * np.sqrt(T * h), abs(gap.speed) * h
-            # along: the distance, and what a bend takes off it; across: what a turn moves the end of an arc
+            # along: the distance, and its loss by a bend; across: displacement of the end of an arc by a rotation
             along = np.hypot(gap.speed_sigma * np.sqrt(T * h), way * min(turn**2, 1.0) / 4.0)
             across = way * turn / np.sqrt(3.0) + 0.1 * along
             covariances[k] += np.diag(np.square([along, across, turn]))

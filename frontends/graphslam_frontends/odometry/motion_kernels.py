@@ -1,4 +1,4 @@
-"""Compiled dead reckoning over many control steps: car-like vehicle, speed and yaw rate, recorded odometry."""
+"""Compiled planar dead reckoning over many control steps: car-like vehicle, speed and yaw rate, recorded odometry."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def steering_increments_kernel(controls, first, model, wheelbase, encoder_offset
     """
     dt, speed, steering = controls[0], controls[1], controls[2]
     sv0, sv1, sa, correlated, lateral, heading = noise[0], noise[1], noise[2], noise[3] > 0.5, noise[4], noise[5]
-    # Noise n on a steering angle shortens what is integrated: E cos(G + n) = cos(G) exp(-σ²/2), and the same for sin.
-    # At 3° that is 1.4 mm per metre, systematic, and after a long loop more than the random part. Undone here.
+    # Noise n of a steering angle shortens the integrated path: E cos(G + n) = cos(G) exp(-σ²/2), and the same for sin.
+    # At 3° that is 1.4 mm per metre, systematic, and after a long loop more than the random part. Corrected here.
     unbias = 1.0 if correlated else math.exp(0.5 * sa * sa)
     P = np.zeros((3, 3))
     S = np.zeros((3, 2))  # sensitivity to errors that stay constant over the increment
@@ -60,12 +60,12 @@ def steering_increments_kernel(controls, first, model, wheelbase, encoder_offset
                 jt_a = h * (dvc_a * ta + vc * sec2) / wheelbase
                 jx_a, jy_a = h * dvc_a, 0.5 * (h * dvc_a * dth + vc * h * jt_a)
             c, s = math.cos(dth), math.sin(dth)
-            # adjoint of step⁻¹: right-tangent errors before the step, seen after it
+            # adjoint of step⁻¹: propagates right-tangent errors over the step
             ix, iy = -c * dx - s * dy, s * dx - c * dy
             A[0, 0], A[0, 1], A[0, 2] = c, s, iy
             A[1, 0], A[1, 1], A[1, 2] = -s, c, -ix
             A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, 1.0
-            # control errors move the end of the step; position part turned into the end frame
+            # control errors move the end of the step; position part rotated to the end frame
             J[0, 0], J[1, 0], J[2, 0] = c * jx_v + s * jy_v, -s * jx_v + c * jy_v, jt_v
             J[0, 1], J[1, 1], J[2, 1] = c * jx_a + s * jy_a, -s * jx_a + c * jy_a, jt_a
             qv = sv0 * sv0 + (sv1 * v) ** 2
@@ -86,11 +86,11 @@ def steering_increments_kernel(controls, first, model, wheelbase, encoder_offset
             v = mean_speed / total
             qv = sv0 * sv0 + (sv1 * v) ** 2
             if mean_speed == 0.0:
-                qv = 0.0  # the encoder of a standing wheel does not count
+                qv = 0.0  # the encoder of a stationary wheel has no error
             for r in range(3):
                 for q in range(3):
                     P[r, q] += S[r, 0] * qv * S[q, 0] + S[r, 1] * sa * sa * S[q, 1]
-        # what no control explains: side slip and heading drift, per metre driven; floors for a standing vehicle
+        # side slip and heading drift per metre driven; floors for a stationary vehicle
         P[0, 0] += noise[6] ** 2
         P[1, 1] += noise[6] ** 2 + (lateral * dist) ** 2
         P[2, 2] += noise[7] ** 2 + (heading * dist) ** 2
@@ -115,13 +115,13 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
     J = np.zeros((3, 4))
     for k in range(len(first) - 1):
         x = y = th = dist = 0.0
-        spread = 0.0  # variance of the heading inside the increment, from errors that are white
+        spread = 0.0  # variance of the heading within the increment, from white noise
         P[:] = 0.0
         S[:] = 0.0
         for i in range(first[k], first[k + 1]):
             h, v, w = dt[i], speed[i], rate[i]
             if v == 0.0 and w == 0.0:
-                continue  # the base stands
+                continue  # stationary base
             qv, qw = walk_v / h, walk_w / h  # a walk of variance q · t is a rate of variance q / h over a step of h
             if not correlated:
                 qv += sv0 * sv0 + (sv1 * v) ** 2
@@ -138,7 +138,7 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
             c, s = math.cos(d), math.sin(d)
             jvx, jvy = h * sinc, h * cosc
             jwx, jwy = v * h * h * dsinc, v * h * h * dcosc
-            # columns: speed, speed scale, rate, rate scale; position part turned into the end frame
+            # columns: speed, speed scale, rate, rate scale; position part rotated to the end frame
             J[0, 0], J[1, 0], J[2, 0] = c * jvx + s * jvy, -s * jvx + c * jvy, 0.0
             J[0, 2], J[1, 2], J[2, 2] = c * jwx + s * jwy, -s * jwx + c * jwy, h
             for r in range(3):
@@ -152,9 +152,9 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
             for r in range(3):
                 for q in range(3):
                     P[r, q] += J[r, 0] * qv * J[q, 0] + J[r, 2] * qw * J[q, 2]
-            # A heading error n of variance q shortens what is integrated, E cos(θ + n) = cos θ exp(-q/2). Undone here,
-            # so that noisy rates do not make paths short on average. Over a step its mean variance is that before plus
-            # a third of what the step adds (∫ u² du). Beyond 0.5 rad² nothing of first order is true.
+            # A heading error n of variance q shortens the integrated path: E cos(θ + n) = cos θ exp(-q/2). Corrected
+            # here, so that paths with rate noise are unbiased. The mean variance over a step is that before it plus a
+            # third of what the step adds (∫ u² du). Above 0.5 rad² first order does not hold.
             unbias = math.exp(0.5 * min(spread + qw * h * h / 3.0, 0.5))
             dx, dy = dx * unbias, dy * unbias
             spread += qw * h * h
@@ -170,7 +170,7 @@ def velocity_increments_kernel(dt, speed, rate, first, noise, increments, covs):
                         + S[r, 2] * sw0 * sw0 * S[q, 2]
                         + S[r, 3] * sw1 * sw1 * S[q, 3]
                     )
-        # what no control explains: side slip and heading drift, per metre driven; floors for a standing vehicle
+        # side slip and heading drift per metre driven; floors for a stationary vehicle
         P[0, 0] += noise[6] ** 2
         P[1, 1] += noise[6] ** 2 + (noise[4] * dist) ** 2
         P[2, 2] += noise[7] ** 2 + (noise[5] * dist) ** 2

@@ -1,9 +1,9 @@
-"""What is known of the motion before any scan is looked at: increments, covariances, and errors that outlive a step.
+"""Motion before scans are used: increments, covariances, and systematic errors.
 
-Errors of sensors last: one bias of a gyro bends a whole path, and increments that pretend to be independent promise a
-path many times better than it is. What lasts is therefore carried in states (:class:`BiasStates`), and the covariance
-of a motion over any interval is had by running these states through the interval. There are two kinds of states: of
-odometry and controls (:class:`OdometryBiases`), and of an IMU with wheels
+Sensor errors are time-correlated: one gyro bias bends a whole path, and independent increments would be overconfident.
+Systematic errors are therefore states (:class:`BiasStates`), and the covariance of a motion over an interval is the
+covariance of these states propagated through it. There are two implementations: for odometry and controls
+(:class:`OdometryBiases`), and for an IMU with wheels
 (:class:`~graphslam_frontends.odometry.inertial_biases.InertialBiases`).
 """
 
@@ -25,49 +25,49 @@ from graphslam_frontends.odometry.gaps import Gaps
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BiasSigmas:
-    """Prior σ of the errors that outlive a step."""
+    """Prior σ of the systematic errors."""
 
     yaw_bias: float
     """Of the yaw rate [rad/s]."""
     yaw_walk: float
-    """Its walk [rad/s/√s]."""
+    """Its random walk [rad/s/√s]."""
     scale: float
-    """Share of the distance."""
+    """Of distances, relative."""
     direction: float
-    """Between the way in which the odometry says the body moves, and that in which the scanner sees it move [rad]."""
+    """Angle between the motion directions of odometry and scanner [rad]."""
     clock: float
-    """Between the clocks of motion and scans [s]."""
+    """Offset between the clocks of motion and scans [s]."""
     tilt: float
-    """Constant part of gravity's roll and pitch [rad]."""
+    """Constant error of roll and pitch by gravity [rad]."""
     bend: float
-    """Of wheels in the plane: what they turn too much for each metre driven, one being larger [rad/m]."""
+    """Planar wheels: heading error per metre, by unequal wheel radii [rad/m]."""
     turn: float
-    """Of wheels in the plane: share of the turns, the distance between them being known no better."""
+    """Planar wheels: relative error of rotations, by an error of the wheel base."""
 
     @classmethod
     def of(cls, stated: Mapping[str, float]) -> BiasSigmas:
-        """Those that the motion states, never less than :data:`LEAST`."""
+        """Those given with the motion, but not less than :data:`LEAST`."""
         found = {k: max(stated.get(k, 0.0), getattr(LEAST, k)) for k in cls.__dataclass_fields__}
-        # a walk that is greater than stated is found and widened
+        # a random walk larger than given is found and widened later
         return cls(**{**found, "yaw_walk": stated.get("yaw_walk") or LEAST.yaw_walk})
 
 
 LEAST = BiasSigmas(
     yaw_bias=2e-3, yaw_walk=5e-6, scale=0.01, direction=0.01, clock=0.02, tilt=2e-3, bend=0.03, turn=0.03
 )
-"""What no robot is known better to than from its own scans: consumer gyros, wheels under load, brackets, clocks."""
+"""Lower bounds of the σ before calibration: consumer gyros, wheels under load, brackets, clocks."""
 
 
 class BiasStates(Protocol):
-    """Errors of a motion, those that outlive a step among them, as states of a linear system."""
+    """Errors of a motion, including systematic ones, as states of a linear system."""
 
     @property
     def floor(self) -> Array:
-        """σ that every covariance has at least ``(d,)``."""
+        """Least σ of every covariance ``(d,)``."""
 
     @property
     def sigmas(self) -> Mapping[str, float]:
-        """σ by the names of :class:`BiasSigmas`, of those that are stated."""
+        """Given σ by the names of :class:`BiasSigmas`."""
 
     def initial(self, start: int) -> Array:
         """Covariance ``(s, s)`` of the states when an interval begins at step ``start``."""
@@ -76,7 +76,7 @@ class BiasStates(Protocol):
         """Transition and noise ``(s, s)`` from step k - 1 to step k."""
 
     def tangent(self, start: int, end: int, *, level_start: bool, level_end: bool) -> Array:
-        """Right tangent of the motion from step ``start`` to step ``end`` by the states at the end ``(d, s)``."""
+        """Jacobian ``(d, s)`` of the right tangent of the motion from ``start`` to ``end`` by the states at the end."""
 
 
 def interval_covariance(
@@ -99,19 +99,19 @@ class MotionPrior:
     Parameters
     ----------
     odometry : Odometry
-        Increments ``(n, 7)`` or ``(n, 3)`` with the covariance of what is new in each step: for filters that sample
-        steps as independent. Errors that last are not in it.
+        Increments ``(n, 7)`` or ``(n, 3)`` with the covariance of the white noise in each step, for filters that sample
+        independent steps; systematic errors are not included.
     poses : (n, 7) or (n, 3)
-        Frame of the path: position and heading of its start, in space level.
+        In the frame of the path: position and heading of its start, in 3-D levelled.
     path : Trajectory
-        Poses at every record of the sensors, same frame.
+        Poses at all records of the sensors, same frame.
     biases : BiasStates
     tilt : (n, 2) or None
-        Roll and pitch seen by gravity [rad].
+        Roll and pitch by gravity [rad].
     tilt_sigma, tilt_time : float
-        σ of its error [rad], and the time over which errors stay alike [s].
+        σ of its error [rad], and the correlation time of the error [s].
     gaps : Gaps
-        In the records: the motion there is a guess.
+        Gaps in the records, where the motion is extrapolated.
     """
 
     odometry: Odometry
@@ -126,16 +126,16 @@ class MotionPrior:
     def between(
         self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
     ) -> tuple[Array, Array]:
-        """Motion from pose ``start`` to pose ``end`` and its covariance, errors that last included.
+        """Motion from pose ``start`` to pose ``end`` and its covariance, including systematic errors.
 
         Parameters
         ----------
         start, end : int
             0 ≤ start ≤ end < n.
         level_start, level_end : bool
-            True: the frame there has position and heading of the body, but stands level, as frames of submaps do. Such
-            a frame is level by definition; what the sensors get wrong about it is only where it is and heads. Changes
-            nothing in the plane; refused in space where the motion does not see gravity.
+            True: the frame there has position and heading of the body but is levelled, as frames of submaps are. A
+            levelled frame has no roll and pitch error, only errors of position and heading. No effect in 2-D; an error
+            in 3-D if the motion has no gravity.
 
         Returns
         -------
@@ -154,18 +154,16 @@ class MotionPrior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryBiases:
-    """A yaw rate and a scale that are off all along; what else is wrong is new in each step.
-
-    States: error of the motion since the start of the interval (right tangent), yaw rate [rad/s], scale.
+    """Constant errors of yaw rate and scale; all other errors are white.
 
     Parameters
     ----------
     odometry : Odometry
-        Its covariances hold what is new in each step.
+        Its covariances are the white noise in each step.
     yaw_bias : float
         σ of a constant error of the yaw rate, about the z axis of the base [rad/s].
     scale : float
-        σ of the scale of all distances.
+        σ of the relative error of all distances.
     """
 
     odometry: Odometry
@@ -174,7 +172,7 @@ class OdometryBiases:
 
     @property
     def floor(self) -> Array:
-        """See :class:`BiasStates`; that of the increments is in their covariances."""
+        """See :class:`BiasStates`; the floors are in the covariances of the increments."""
         return np.zeros(self.odometry.covariances.shape[1])
 
     @property
@@ -196,7 +194,7 @@ class OdometryBiases:
         return F, _blocks(o.covariances[k], np.zeros((2, 2)))
 
     def tangent(self, start: int, end: int, *, level_start: bool, level_end: bool) -> Array:
-        """See :class:`BiasStates`; odometry in space has not seen gravity."""
+        """See :class:`BiasStates`; 3-D odometry has no gravity."""
         g = group_of(self.odometry.increments)
         if g.dim == 3 and (level_start or level_end):
             raise DataError("recorded odometry does not say where level is", wanted="an IMU")

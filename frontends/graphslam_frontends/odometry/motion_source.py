@@ -1,4 +1,4 @@
-"""Where the motion of steps comes from: an IMU and wheels, recorded odometry, or controls in the plane."""
+"""Source of the motion of steps: an IMU and wheels, recorded odometry, or planar controls."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ from graphslam_frontends.odometry.recorded import (
 from graphslam_frontends.odometry.step_config import StepConfig
 
 TILT_TIME = 10.0
-"""Time over which errors of the roll and pitch of recorded odometry stay alike [s]."""
+"""Correlation time of roll and pitch errors of recorded odometry [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSource:
-    """Motion of a log before the stamps of the steps are known.
+    """Motion of a log, before the stamps of the steps are known.
 
     Parameters
     ----------
     names : tuple of str
         Streams.
     begin, end : float
-        What they cover [s].
+        Interval with motion [s].
     solve : callable
-        (stamps of the steps, further stamps, drops) → prior whose path covers all of them.
+        (stamps of the steps, further stamps, drops) → prior with a path that covers all of them.
     """
 
     names: tuple[str, ...]
@@ -57,7 +57,7 @@ def motion_source(log: SensorLog, config: StepConfig, dim: int) -> MotionSource:
     Parameters
     ----------
     dim : int
-        Of the beams: motion of other dimensions is only taken where there is no better, or where it is named.
+        Of the beams: motion of another dimension is used only if there is no other, or if it is named.
     """
     names = config.motion or _best(log, dim)
     streams = [log[n] for n in names]
@@ -117,7 +117,7 @@ def _inertial(
 
 
 def _spacing(stamps: Array) -> float:
-    """For how long the last of held records is good: the usual time to the next [s]."""
+    """Validity of the last held record: the median interval [s]."""
     return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
 
 
@@ -184,11 +184,11 @@ def _controlled(
 
 
 def inflate_over_gaps(odometry: Odometry, controls: VelocityControls | SteeringControls, gaps: Gaps) -> Odometry:
-    """Increments in the plane whose covariances hold what a robot can have done in the gaps of its controls.
+    """Planar increments with covariances increased in the gaps of the controls.
 
-    The last control before a gap is held. Its σ, constant in the gap, is how far speeds and turns of the log are from
-    it (root of the mean square): this robot has been seen to drive like that. Errors of one gap are one error, so that
-    the variances of its pieces add up to that of the whole gap.
+    The last control before a gap is held. Its σ, constant in the gap, is the RMS difference of the speeds and yaw rates
+    of the log from it. The error is constant over a gap, so the variances of its pieces add up to that of the whole
+    gap.
     """
     if not len(gaps.begin):
         return odometry

@@ -1,4 +1,4 @@
-"""Recorded odometry in two or three dimensions: chained, bridged, and corrected."""
+"""Recorded odometry in 2-D or 3-D: integration, bridging of gaps, corrections."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry.gaps import Gaps, refuse_long_gaps
 
 BRIDGED = 0.2
-"""σ of the pieces of a bridged record together, as a share of its motion."""
+"""σ of the division of a bridged record, relative to its motion."""
 
 
 def add_yaw_bias(odometry: Odometry, rate: float) -> Odometry:
-    """The odometry of a robot whose gyro is off by ``rate`` about the z axis of the base [rad/s], all along."""
+    """Add a constant gyro error ``rate`` about the z axis of the base [rad/s] to the odometry."""
     g = group_of(odometry.increments)
     seconds = np.concatenate([[0.0], np.diff(odometry.times)])[: len(odometry.times)]
     xi = g.log(odometry.increments)
@@ -28,7 +28,7 @@ def add_yaw_bias(odometry: Odometry, rate: float) -> Odometry:
 
 
 def chain_odometry(odometry: Odometry) -> Trajectory:
-    """Poses ``(n, 3 | 7)`` of recorded increments in the frame of the first record's pose."""
+    """Poses ``(n, 3 | 7)`` of recorded increments in the frame of the first pose."""
     poses = odometry.increments.copy()
     g = group_of(poses)
     if len(poses):
@@ -41,13 +41,12 @@ def chain_odometry(odometry: Odometry) -> Trajectory:
 def bridge_gap(
     odometry: Odometry, limit: float, *, where: str, drops: DropCounter | None = None
 ) -> tuple[Odometry, Gaps]:
-    """Records of odometry that span a gap, made less certain; and the gaps.
+    """Odometry with larger covariances of records that span a gap; and the gaps.
 
-    A record tells the whole motion over its time, however long, but not how it went meanwhile: cut into pieces its
-    covariance must cover more than the record's own. Records that take longer than thrice the usual (and than 1 s) are
-    counted, and those of which the motion is cut get σ = 20 % of their motion on every axis besides their own. Where
-    the body moved before and after, and the record tells less than half of that speed, records may have been lost, and
-    with them motion: σ is then what the body drives (and, root of the mean square, turns) in that time.
+    A record gives the motion over its interval, but not the velocity within it, so pieces of it are less certain.
+    Records longer than 3 times the median (and than 1 s) are counted and get an additional σ of 20 % of their motion on
+    every axis. If the body moved before and after, and the record has less than half of that speed, records may be
+    missing: σ is then that speed (and the RMS yaw rate) times the interval.
     """
     if len(odometry.times) < 2:
         return odometry, Gaps()
@@ -65,7 +64,7 @@ def bridge_gap(
     covariances = odometry.covariances.copy()
     for i in k:
         near = [j for j in (i - 1, i + 1) if 0 <= j < len(spacing) and j not in k]
-        # beside the first and the last record there is one neighbour only: a body that stands before it sets off
+        # the first and the last record have one neighbour only: a stationary body starts or stops there
         speed = min(float(metres[j] / spacing[j]) for j in near) if len(near) == 2 else 0.0
         sigma = np.full(g.dof, BRIDGED * radians[i])
         sigma[g.position] = BRIDGED * metres[i]
@@ -77,7 +76,7 @@ def bridge_gap(
 
 
 def without_yaw_per_metre(odometry: Odometry, rate: float, *, where: str = "odometry") -> Odometry:
-    """The odometry without a turn of ``rate`` [rad/m] for each metre driven."""
+    """The odometry minus a rotation of ``rate`` [rad/m] per metre driven."""
     if odometry.increments.shape[1] != 3:
         raise ConfigError(f"{where}: yaw_per_metre is for odometry in the plane")
     xi = se2_log(odometry.increments)

@@ -1,8 +1,8 @@
-"""Odometry in the plane, mended by matching each scan with the one before (Lu and Milios 1997).
+"""Planar odometry corrected by matching each scan with the previous one (Lu and Milios 1997).
 
-Where wheels slip, a filter of some tens of particles cannot both find the heading and keep its map straight. Matches of
-neighbouring scans are fused with the odometry by their covariances: in a corridor a match holds nothing along it, and
-there the odometry stays.
+If wheels slip, a filter with some tens of particles cannot estimate the heading and keep its map straight. Matches of
+neighbouring scans are fused with the odometry by their covariances; in a corridor the odometry determines the motion
+along it.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from graphslam_frontends.odometry.steps import Steps
 
 MATCHING = RegistrationConfig(radii=(0.6, 0.3), near=0.15, floor_sigma=0.01, floor_turn=0.003)
 FITNESS = 0.6
-"""Least share of points with a neighbour: less, and the scan shows another place or people."""
+"""Least share of points with a neighbour: below it, the scan shows another place or people."""
 STILL = (0.01, 0.005)
-"""Motions smaller than this stay as they are [m, rad]: noise of matches would add up where the robot stands."""
+"""Smaller motions are not corrected [m, rad]: noise of matches would accumulate while the robot is stationary."""
 
 
 def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps:
-    """Steps whose increments are fused with matches of neighbouring scans.
+    """Steps with increments fused with matches of neighbouring scans.
 
-    Between two scans that are matched there may be steps without a beam; the correction then goes into the last
-    increment. What it knows of errors over intervals (``errors``) is lost: it was that of the odometry alone, which
-    stays in ``recorded``.
+    Between two matched scans there may be steps without a beam; the correction is then in the last increment.
+    ``errors`` (covariance over intervals) is removed, because it is that of the odometry alone; the odometry is kept in
+    ``recorded``.
 
     Parameters
     ----------
     steps : Steps
-        In the plane.
+        2-D steps.
     drops : DropCounter, optional
-        Counts scans without an accepted match, whose odometry stays.
+        Counts scans without an accepted match, where the odometry is kept.
     """
     if steps.dim != 2:
         raise ConfigError(f"{steps.name}: scans in space are not matched with their neighbours")
@@ -58,7 +58,7 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
         here = Target(cloud)
         moved = np.hypot(T[0], T[1]) > STILL[0] or abs(T[2]) > STILL[1]
         if target is not None and not moved:
-            continue  # keep the older target: the motion since then adds up until it can be told from noise
+            continue  # keep the older target until the motion since then is significant
         if target is not None:
             found = register(here, target, T, MATCHING)
             if found.converged and found.fitness >= FITNESS:
@@ -75,7 +75,7 @@ def match_neighbours(steps: Steps, *, drops: DropCounter | None = None) -> Steps
 
 
 def fuse_motions(T: Array, P: Array, T_match: Array, R: Array) -> tuple[Array, Array]:
-    """Two estimates of one motion ``(3,)`` with covariances ``(3, 3)`` as one, in the tangent of the first."""
+    """Fuse two estimates of one motion ``(3,)`` with covariances ``(3, 3)``, in the tangent of the first."""
     gain = P @ np.linalg.inv(P + R)
     x = gain @ se2_log(se2_between(T, T_match))
     Q = (np.eye(3) - gain) @ P
@@ -83,7 +83,7 @@ def fuse_motions(T: Array, P: Array, T_match: Array, R: Array) -> tuple[Array, A
 
 
 def _carried(P: Array, u: Array) -> Array:
-    """Covariance of a motion, right tangent, seen from the end of the next one."""
+    """Covariance of a motion, right tangent, propagated over the next motion."""
     c, s = np.cos(u[2]), np.sin(u[2])
     J = np.array([[c, s, -c * u[1] + s * u[0]], [-s, c, s * u[1] + c * u[0]], [0.0, 0.0, 1.0]])
     return np.asarray(J @ P @ J.T)

@@ -1,8 +1,8 @@
-"""What scans did for a path: where they could correct it, and how far off it may be where they could not.
+"""Which parts of a path scans can correct, and the covariance of the others.
 
-A filter's drift model says what scans leave of the errors of dead reckoning. Where there is no scan to speak of, or the
-motion itself is a guess (a gap in its records), nothing takes these errors away: there the covariance is that of dead
-reckoning over the stretch, carried to the end of the path.
+The drift model of a filter describes errors that remain after scans are used. Without sufficient scans, or in a gap of
+the motion, nothing corrects the errors of dead reckoning: the covariance there is that of dead reckoning over the
+stretch, propagated to the end of the path.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from graphslam_frontends.odometry.step_config import StepConfig
 from graphslam_frontends.odometry.steps import Steps
 
 FEW = 10
-"""Returns below which a step's scan does not hold a pose: a wall takes some beams to be a line."""
+"""Least number of returns in a step to constrain a pose: a wall needs several beams."""
 LONG = 2.0
-"""Stretches without a correction that are shorter are what the filter's own walks are for [s]."""
+"""Shorter stretches without a correction are covered by the random walks of the filter [s]."""
 
 
 def check_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None = None) -> Steps:
-    """Steps of a log as a front end on grids takes them: of scans that see something, and held against the motion."""
+    """Steps of a log for a grid front end: scans must have returns and are compared with the motion."""
     count = DropCounter()
     steps = make_steps(log, replace(config, match_scans=False), drops=count)
     if drops is not None:
@@ -41,13 +41,13 @@ def check_steps(log: SensorLog, config: StepConfig, drops: DropCounter | None = 
     require_returns(steps, count)
     spins = [half_turn_seconds(s.spin_rate) for s in log.streams.values() if isinstance(s, RangeScans)]
     found = tuple(motion_findings(check_motion(steps, max(spins, default=0.0))))
-    if config.match_scans:  # after the check: what is fused with the scans agrees with them
+    if config.match_scans:  # after the check, because motion fused with the scans agrees with them
         steps = match_neighbours(steps, drops=drops)
     return replace(steps, findings=found)
 
 
 def require_returns(steps: Steps, drops: DropCounter | None = None) -> None:
-    """Raise if no beam of any scan met anything: a map of nothing helps nobody."""
+    """Raise if no beam of any scan has a return."""
     if np.any(steps.returns):
         return
     counts = {} if drops is None else drops.counts
@@ -64,7 +64,7 @@ def require_returns(steps: Steps, drops: DropCounter | None = None) -> None:
 
 
 def unobserved_stretches(steps: Steps) -> list[tuple[int, int]]:
-    """Stretches ``(first, last)`` of steps, both inclusive and at least :data:`LONG`, whose motion no scan corrects.
+    """Stretches ``(first, last)`` of steps, both inclusive and at least :data:`LONG`, without scan corrections.
 
     Steps with fewer than :data:`FEW` returns, and steps in a gap of the motion.
     """
@@ -74,7 +74,7 @@ def unobserved_stretches(steps: Steps) -> list[tuple[int, int]]:
     for a, b in zip(steps.gaps.begin, steps.gaps.end):
         if b - a >= LONG:
             bad[1:] |= (steps.times[1:] > a) & (steps.times[:-1] < b)
-    bad[:1] = False  # the first step does not move
+    bad[:1] = False  # the first step has no motion
     out = []
     for a, b in np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8))).reshape(-1, 2):
         if steps.times[b - 1] - steps.times[max(a - 1, 0)] >= LONG - 1e-6 and b <= n:
@@ -83,7 +83,7 @@ def unobserved_stretches(steps: Steps) -> list[tuple[int, int]]:
 
 
 def unobserved_covariance(steps: Steps, stretches: list[tuple[int, int]], path: Array, first: int, last: int) -> Array:
-    """What stretches without a correction add at the end of a path: covariance ``(d, d)``, right tangent.
+    """Covariance ``(d, d)`` that stretches without a correction add at the end of a path, right tangent.
 
     Parameters
     ----------
@@ -109,24 +109,24 @@ def unobserved_covariance(steps: Steps, stretches: list[tuple[int, int]], path: 
 def dead_reckoning_covariance(steps: Steps, start: int, end: int, *, level_end: bool = True) -> Array:
     """Covariance of dead reckoning from step ``start`` to step ``end``, right tangent.
 
-    As the source of the motion states it, with what lasts; else of the increments, as if nothing did.
+    From the source of the motion, with systematic errors; otherwise from the increments, as white noise.
 
     Parameters
     ----------
     level_end : bool
-        The frame at the end stands level where gravity is told, as that at the start does.
+        The frame at the end is levelled if gravity is measured, as the frame at the start is.
     """
     if steps.errors is not None:
         gravity = steps.tilt is not None
         try:
             return steps.errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]
-        except DataError:  # recorded odometry does not know level frames
+        except DataError:  # recorded odometry has no levelled frames
             return steps.errors.between(start, end)[1]
     return interval_covariance(OdometryBiases(odometry=steps.odometry), start, end)
 
 
 def scan_findings(steps: Steps) -> list[Finding]:
-    """Lines of the verdict on gaps of the motion, and on stretches that no scan corrects."""
+    """Findings on gaps of the motion, and on stretches without scan corrections."""
     out = []
     gaps = [(a, b) for a, b in zip(steps.gaps.begin, steps.gaps.end) if b - a >= LONG]
     if gaps:
@@ -152,7 +152,7 @@ def scan_findings(steps: Steps) -> list[Finding]:
 
 
 def with_findings(submap: Submap, steps: Steps) -> Submap:
-    """The submap, whose report takes along what is to be said of the steps: rows for the run's verdict."""
+    """The submap with the findings of the steps in its report."""
     rows = [f.as_row() for f in (*steps.findings, *scan_findings(steps))]
     return replace(submap, report={**submap.report, "findings": rows}) if rows else submap
 

@@ -14,51 +14,50 @@ from graphslam_frontends.odometry.motion import MotionNoise
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepConfig:
-    """How a log becomes steps."""
+    """Conversion of a log to steps."""
 
     period: float | None = 0.4
     """Length of a step [s]; None: one step for every record of the first scanner, at its stamp."""
     max_range: float | None = None
-    """Beams are cut at it: what lies behind is not known to be there [m]; None: the sensor's own."""
+    """Beams are cut at this range; what is behind is unknown [m]; None: that of the sensor."""
     min_range: float = 0.1
-    """Nearer things are the robot itself or dirt: dropped [m]."""
+    """Nearer returns are the robot itself or dirt and are dropped [m]."""
     most_points: int = 400
-    """Beams kept of a step, spread evenly over it."""
+    """Most beams per step, evenly subsampled."""
     range_sigma: float = 0.03
-    """σ of a range, for sensors that do not state theirs [m]."""
+    """σ of a range, for sensors that do not give one [m]."""
     silent: Literal["free", "unknown"] = "free"
-    """What a beam says that came back with no range at all: that nothing is there as far as it reaches, or nothing. Old
-    laser scanners lose beams on glass and dark walls; taken for free space they wipe rooms out of a map."""
+    """Meaning of a beam without any range: free space up to the maximum range, or unknown. Old laser scanners lose
+    beams on glass and dark walls; as free space they erase walls from a map."""
     scanners: tuple[str, ...] = ()
-    """Streams of beams; none: all spinning scanners, else all clouds, else all planar scanners."""
+    """Streams of beams; empty: all spinning scanners, else all clouds, else all planar scanners."""
     motion: tuple[str, ...] = ()
-    """Streams of motion: an IMU and wheels, or one of odometry or controls; none: the best the log has."""
+    """Streams of motion: an IMU and wheels, or one of odometry or controls; empty: the best of the log."""
     noise: DeadReckoningNoise = field(default_factory=DeadReckoningNoise)
-    """Of an IMU and wheels."""
+    """Noise of an IMU and wheels."""
     controls: MotionNoise = field(default_factory=MotionNoise)
-    """Of controls in the plane; recorded odometry takes its floors."""
+    """Noise of planar controls; recorded odometry uses its floors."""
     yaw_bias: float = 0.0
-    """Deliberate error added to the yaw rate of all motion [rad/s]; named in the steps' name."""
+    """Deliberate error added to the yaw rate of all motion [rad/s], for tests; it is in the name of the steps."""
     lasting_yaw_bias: float = 0.0
-    """σ of an error of the yaw rate of recorded odometry or controls that lasts [rad/s]; ``yaw_bias`` counts too."""
+    """σ of a constant yaw-rate error of recorded odometry or controls [rad/s]; ``yaw_bias`` is added in quadrature."""
     lasting_scale: float = 0.0
-    """σ of an error of its distances that lasts, a share of them."""
+    """σ of a constant relative error of their distances."""
     yaw_per_metre: float = 0.0
-    """What recorded odometry in the plane turns too much for each metre driven: taken out [rad/m]. Wheels of unequal
-    size do that."""
+    """Heading error of planar recorded odometry per metre driven, to subtract [rad/m], for example by unequal wheel
+    radii."""
     match_scans: bool = False
-    """In the plane: fuse the motion with matches of neighbouring scans
-    (:mod:`graphslam_frontends.odometry.scan_matching`)."""
+    """In 2-D: fuse the motion with matches of neighbouring scans (:mod:`graphslam_frontends.odometry.scan_matching`).
+    """
     odometry_tilt_sigma: float = 0.0
-    """σ of roll and pitch of recorded odometry in space that saw gravity (lidar or visual with inertial): its poses
-    then tell them, the first being level [rad]; 0: it saw none. ``yaw_bias`` leaves them alone, as gravity would."""
+    """σ of roll and pitch of 3-D recorded odometry with gravity (lidar or visual with inertial) [rad]: its poses then
+    give them, relative to a level first pose; 0: no gravity. ``yaw_bias`` does not change them."""
     level_floors: bool = False
-    """The floors driven on are level on the whole, as in buildings: what gravity's roll and pitch show in the median
-    over the way is an error that lasts, and is taken out. Heights then drift by a third of what they did, or less."""
+    """Assume floors that are level on average, as in buildings: the median roll and pitch by gravity over the path is a
+    constant error and is subtracted. Heights then drift by a third or less."""
     longest_record: float = 20.0
-    """Longest gap in the records of the motion that is bridged [s]. In a gap the motion is a guess with a covariance
-    that says so; it is counted, and a line of the verdict. Records of odometry tell the whole motion, not how it
-    went."""
+    """Longest gap in the records of the motion that is bridged [s]. In a gap the motion is extrapolated with an
+    increased covariance; gaps are counted and reported."""
 
     def __post_init__(self) -> None:
         positive = {"period": self.period, "max_range": self.max_range}

@@ -1,4 +1,4 @@
-"""Steps: motion and beams of a log, cut at the same stamps, which every scan filter works on."""
+"""Steps: motion and beams of a log at common stamps, the input of scan filters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graphslam_frontends.odometry.motion_prior import BiasSigmas, MotionPrior
 
 
 class IntervalCovariance(Protocol):
-    """Knows how far off dead reckoning may be over an interval of steps, errors that last included."""
+    """Covariance of dead reckoning over an interval of steps, including systematic errors."""
 
     def between(
         self, start: int, end: int, *, level_start: bool = False, level_end: bool = False
@@ -38,35 +38,35 @@ class Steps:
         Stamps, the end of each step [s].
     odometry : Odometry
         Increments ``(n, 7)`` or ``(n, 3)`` at ``times``: record k moves from step k - 1 to k, record 0 is identity. The
-        covariances hold what is new in each step (white), not what lasts.
+        covariances are those of white noise, without systematic errors.
     offsets : (n + 1,) int64
         Beams of step k are rows ``offsets[k]:offsets[k + 1]``; a step may have none.
     points : (q, dim)
-        Ends of the beams, frame of the base at the step's stamp [m]; at ``max_range`` where a beam met nothing.
+        Ends of the beams, base frame at the step's stamp [m]; at ``max_range`` for beams without a return.
     origins : (q, dim)
-        Where the beams began, same frame.
+        Origins of the beams, same frame.
     returns : (q,) bool
-        Did the beam meet something?
+        Does the beam have a return?
     ages : (q,) or None
-        Time from each beam to the stamp of its step, over which motion alone places it [s]; None: no time.
+        Time from each beam to the stamp of its step [s], bridged by the motion alone; None: not known.
     max_range, range_sigma : float
         [m]
     tilt : (n, 2) or None
-        Roll and pitch of the base at the stamps, seen by gravity [rad].
+        Roll and pitch of the base at the stamps, by gravity [rad].
     tilt_sigma, tilt_time : float
-        σ of its error [rad], and the time over which errors stay alike [s].
+        σ of its error [rad], and the correlation time of the error [s].
     uses : frozenset of str
-        Streams of the log that are inside.
+        Streams of the log that were used.
     errors : IntervalCovariance or None
-        Honest covariance of dead reckoning over any interval, where the source of the motion lets it be known.
+        Covariance of dead reckoning over any interval, if the source of the motion has one.
     gaps : Gaps
-        In the records of the motion, which is a guess there.
+        Gaps in the records of the motion, which is extrapolated there.
     findings : tuple of Finding
-        What was noticed when scans and motion were put beside each other.
+        Findings from the comparison of scans and motion.
     recorded : Odometry or None
-        The motion without what scans say of it, where ``odometry`` holds that too.
+        The motion without scan matches, if ``odometry`` includes them.
     matched : bool
-        The odometry was made by matching these scans one after the other.
+        The odometry is from matching these scans one after the other.
     """
 
     times: Array
@@ -139,7 +139,7 @@ class Steps:
 
     @property
     def bias_sigmas(self) -> BiasSigmas:
-        """Prior σ of the errors that outlive a step, as the motion states them; never less than usual."""
+        """Prior σ of the systematic errors, as given with the motion, with lower bounds."""
         stated = self.errors.biases.sigmas if isinstance(self.errors, MotionPrior) else {}
         return BiasSigmas.of({"tilt": self.tilt_sigma, **stated})
 
