@@ -229,7 +229,7 @@ def assign_steps(beam_times: Array, step_times: Array, begin: float) -> Index:
 def deskew_beams(
     path: Trajectory, step_poses: Array, step: Index, times: Array, origins: Array, ends: Array
 ) -> tuple[Array, Array]:
-    """Move beams from the base at their own time to the base at the end of their step.
+    """Transform beams from the base at their own time to the base at the end of their step.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ class MotionGap:
 def dead_reckon_over_gaps(
     log: SensorLog, times: Array, noise: MotionNoise, *, hold: float, limit: float, drops: DropCounter
 ) -> tuple[Odometry, str, list[MotionGap]]:
-    """Dead reckoning (:mod:`graphslam_frontends.odometry.motion`) with the gaps of the motion bridged by this model.
+    """Dead reckoning (:mod:`graphslam_frontends.odometry.motion`), with the gaps of the motion bridged by this model.
 
     Parameters
     ----------
