@@ -3,8 +3,9 @@
 ``VERTEX_SE2 id x y θ``, ``EDGE_SE2 i j x y θ`` + 6 information entries; ``VERTEX_SE3:QUAT id x y z qx qy qz qw``,
 ``EDGE_SE3:QUAT i j x y z qx qy qz qw`` + 21; ``FIX id …``; 2-D landmarks ``VERTEX_XY id x y``,
 ``EDGE_SE2_XY i l x y`` + 3, and GTSAM's ``BR i l bearing range σ_bearing σ_range``. Upper triangles row by row.
-Priors ``EDGE_PRIOR_SE2 id x y θ`` + 6 and ``EDGE_PRIOR_SE3:QUAT id parameter x y z qx qy qz qw`` + 21 become edges from
-one more vertex, which is held at the origin.
+Priors ``EDGE_PRIOR_SE2 id x y θ`` + 6 and ``EDGE_SE3_PRIOR id parameter x y z qx qy qz qw`` + 21, with or without the
+parameter, become edges from one more vertex, which is held at the origin. Priors of a position alone are left out,
+which is said: with the full logarithm an edge cannot hold them.
 
 g2o orders a 3-D information matrix translation first; a :class:`PoseNetwork` holds rotation first. The entries
 themselves are kept as they are, as GTSAM does: g2o's own residual uses the vector part of the quaternion, half the
@@ -45,10 +46,16 @@ IGNORED = (
     *("ROBOTLASER1", "FLASER", "RLASER", "ODOM", "TRUEPOS", "MARKER", "VERTEX_ELLIPSE"),
 )
 """Records without a measurement between vertices: parameters, tags, and the sensor data that g2o keeps beside them."""
+ALIASES = {"EDGE_SE3_PRIOR": "EDGE_PRIOR_SE3:QUAT", "EDGE_PRIOR_SE3": "EDGE_PRIOR_SE3:QUAT"}
+POSITIONS = (
+    *("EDGE_PRIOR_SE2_XY", "EDGE_SE2_XY_PRIOR", "EDGE_SE3_PRIOR_XY", "EDGE_SE3_PRIOR_XYZ", "EDGE_PRIOR_SE3_XYZ"),
+    *("EDGE_PRIOR_XY", "EDGE_PRIOR_XYZ", "EDGE_POINTXYZ_PRIOR"),
+)
+"""Priors of a position alone, of GPS for example."""
 _2D = ("VERTEX_SE2", "EDGE_SE2", "EDGE_PRIOR_SE2", "VERTEX_XY", "EDGE_SE2_XY", "BR")
 _3D = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_PRIOR_SE3:QUAT")
 # g2o (translation, rotation) -> ours (rotation, translation); its own inverse
-_SWAP = np.array([3, 4, 5, 0, 1, 2])
+SWAP = np.array([3, 4, 5, 0, 1, 2])
 
 
 def read_g2o(path: str | os.PathLike[str], *, repair: bool = False, create_missing: bool = False) -> PoseNetwork:
@@ -72,7 +79,8 @@ def parse_g2o(
     path: str | os.PathLike[str], text: str, *, repair: bool = False, create_missing: bool = False
 ) -> PoseNetwork:
     """The same from the content of the file; ``path`` names it in errors."""
-    records = Records(path, text, LAYOUTS, ignored=IGNORED)
+    implied = {"EDGE_PRIOR_SE3:QUAT": (2, ["0"])}  # no parameter: no offset of the sensor
+    records = Records(path, text, LAYOUTS, ignored=(*IGNORED, *POSITIONS), aliases=ALIASES, implied=implied)
     rows = records.rows
     in_3d = [tag for tag in _3D if len(rows[tag])]
     in_2d = [tag for tag in _2D if len(rows[tag])]
@@ -81,7 +89,10 @@ def parse_g2o(
         raise FormatError(f"{in_2d[0]} and {in_3d[0]} in one file", where=records.where(line), wanted="one dimension")
     build = NetworkBuilder(records.path, 3 if in_3d else 2, records.where, repair, create_missing)
     for tag, n in records.not_read.items():
-        log.info("%s: %d records %s hold no measurement and are not read", records.path, n, tag)
+        if tag in POSITIONS:
+            log.warning("%s: %d records %s are left out: priors of a position alone are not read", records.path, n, tag)
+        else:
+            log.info("%s: %d records %s hold no measurement and are not read", records.path, n, tag)
     vertices, edges, priors = (rows[tag] for tag in (_3D if in_3d else _2D)[:3])
     width, d = (7, 6) if in_3d else (3, 3)
     ids, poses, lines = vertices.whole[:, 0], vertices.real, vertices.lines
@@ -102,7 +113,7 @@ def parse_g2o(
     build.fixed = fixed, fixed_lines
     information = upper_triangle(values[:, width:], d)
     if in_3d:
-        information = information[:, _SWAP][:, :, _SWAP]
+        information = information[:, SWAP][:, :, SWAP]
     build.add_edges(pairs, values[:, :width], information, at)
     _read_landmarks(records, build)
     return build.build()
@@ -147,7 +158,7 @@ def write_g2o(path: str | os.PathLike[str], network: PoseNetwork) -> None:
     lines += [f"FIX {v}" for v in network.ids[network.fixed]]
     information = network.information
     if network.dim == 3:
-        information = information[:, _SWAP][:, :, _SWAP]
+        information = information[:, SWAP][:, :, SWAP]
     upper = np.triu_indices(network.tangent_dim)
     for (i, j), z, omega in zip(network.ids[network.edges], network.measurements, information, strict=True):
         lines.append(f"{edge} {i} {j} {_row(z)} {_row(omega[upper])}")

@@ -1,13 +1,17 @@
-"""TORO and iSAM text graphs: ``VERTEX2``, ``EDGE2``, ``ODOMETRY`` and ``LANDMARK`` lines (two-dimensional).
+"""TORO and iSAM text graphs: ``VERTEX2``, ``EDGE2``, ``ODOMETRY``, ``LANDMARK``; in 3-D ``VERTEX3``, ``EDGE3``.
 
-The six noise columns mean different things in different programs, and no file says which:
+The noise columns mean different things in different programs, and no file says which. In 2-D:
 
 * TORO: information, in the order I_xx I_xy I_yy I_θθ I_xθ I_yθ;
 * iSAM: the upper triangle of a square root of the information, xx xy xθ yy yθ θθ;
 * GTSAM's ``load2D``: a *covariance*, xx xy xθ yy yθ θθ, for lines whose off-diagonals are zero.
 
-``noise="auto"`` reads a diagonal in TORO's places as TORO's information and a diagonal in the other places as
-``load2D`` does, and says so in ``PoseNetwork.noise``; anything else has to be asked for by name.
+``noise="auto"`` reads a diagonal in TORO's places as TORO's information, and a diagonal in the other places as
+``load2D`` does; or as iSAM does, if the turns are known better so. ``PoseNetwork.noise`` says which; anything else has
+to be asked for by name. A line that ends before its noise has unit noise, as in iSAM.
+
+In 3-D, ``x y z roll pitch yaw`` (R = R_z R_y R_x) + 21 numbers in that order: information (TORO, ``auto``), or what is
+asked for. ``EQUIV i j`` tells TORO which edges to contract; the edges themselves are read, the line is not.
 
 Poses and landmarks share one index space: a node is a landmark if it is the second index of a ``LANDMARK`` line.
 ``LANDMARK pose landmark x y c_xx c_xy c_yy``: an isotropic covariance becomes bearing and range with
@@ -26,18 +30,30 @@ import numpy as np
 from graphslam.core.errors import ConfigError, FormatError
 from graphslam.core.geometry import Array
 from graphslam.core.network import Ids, Labels, PoseNetwork
+from graphslam.core.se3 import quat_multiply
+from graphslam.io.g2o import SWAP
 from graphslam.io.network_builder import NetworkBuilder, edge_labels, sighting_labels, upper_triangle
 from graphslam.io.text_records import Records
 
 Noise = Literal["auto", "covariance", "information", "sqrt-information", "toro"]
-UNKNOWN_TURN = 0.5
-"""A measured turn of this standard deviation says hardly anything [rad]: the columns probably mean something else."""
+UNKNOWN_TURN = 0.25
+"""A measured turn of this variance says hardly anything [rad²]: the columns probably mean something else."""
 log = logging.getLogger(__name__)
 LAYOUTS: dict[str, tuple[int, int]] = {
     "VERTEX2": (1, 3),
     "EDGE2": (2, 9),
     "ODOMETRY": (2, 9),
     "LANDMARK": (2, 5),
+    "VERTEX3": (1, 6),
+    "EDGE3": (2, 27),
+}
+ALIASES = {"VERTEX": "VERTEX2", "EDGE": "EDGE2", "POSE3D_INIT": "VERTEX3"}
+IGNORED = ("EQUIV", "EDGE3_INIT", "EDGE3_TRUE", "POSE3D_TRUE", "SOLVE")
+_UNIT = ["1", "0", "0", "1", "0", "1"]
+_IMPLIED = {
+    "EDGE2": (6, _UNIT),
+    "ODOMETRY": (6, _UNIT),
+    "EDGE3": (9, [str(int(i == j)) for i in range(6) for j in range(i, 6)]),
 }
 # row-wise upper triangle of columns given as I_xx I_xy I_yy I_θθ I_xθ I_yθ
 _TORO = np.array([0, 1, 4, 2, 5, 3])
@@ -65,18 +81,23 @@ def parse_isam_graph(
     """
     if noise not in get_args(Noise):
         raise ConfigError(f"unknown noise format {noise!r}; known: {', '.join(get_args(Noise))}")
-    records = Records(path, text, LAYOUTS)
+    records = Records(path, text, LAYOUTS, ignored=IGNORED, aliases=ALIASES, implied=_IMPLIED)
     rows = records.rows
+    if in_3d := [tag for tag in ("VERTEX3", "EDGE3") if len(rows[tag])]:
+        if in_2d := [tag for tag in rows if tag not in in_3d and len(rows[tag])]:
+            where = records.where(int(rows[in_3d[0]].lines[0]))
+            raise FormatError(f"{in_2d[0]} and {in_3d[0]} in one file", where=where, wanted="one dimension")
+        return _spatial(records, NetworkBuilder(records.path, 3, records.where, repair, create_missing), noise)
     build = NetworkBuilder(records.path, 2, records.where, repair, create_missing)
     vertices = rows["VERTEX2"]
     build.add_vertices(vertices.whole[:, 0], vertices.real, vertices.lines)
     parts = rows["EDGE2"], rows["ODOMETRY"]
-    lines = np.concatenate([p.lines for p in parts])
+    lines, name = np.concatenate([p.lines for p in parts]), noise
     if len(lines):
         order = np.argsort(lines)
         pairs, lines = np.concatenate([p.whole for p in parts])[order], lines[order]
         values = np.concatenate([p.real for p in parts])[order]
-        name = _guess(values[:, 3:], records, lines) if noise == "auto" else noise
+        name = _guess(values[:, 3:], records, lines) if noise == "auto" else name
         information = _information(values[:, 3:], name, build, edge_labels(pairs))
         build.noise = {
             "toro": "information, TORO order",
@@ -85,8 +106,26 @@ def parse_isam_graph(
         }.get(name, name)
         build.add_edges(pairs, values[:, :3], information, lines)
     if len(rows["LANDMARK"]):
-        _landmarks(records, build, noise)
+        _landmarks(records, build, name)
     return build.build()
+
+
+def _spatial(records: Records, build: NetworkBuilder, noise: Noise) -> PoseNetwork:
+    vertices, edges = records.rows["VERTEX3"], records.rows["EDGE3"]
+    build.add_vertices(vertices.whole[:, 0], _euler_poses(vertices.real), vertices.lines)
+    name: Noise = "information" if noise in ("auto", "toro") else noise
+    information = _information(edges.real[:, 6:], name, build, edge_labels(edges.whole))
+    build.noise = "information, TORO order" if name == "information" else name
+    build.add_edges(edges.whole, _euler_poses(edges.real[:, :6]), information[:, SWAP][:, :, SWAP], edges.lines)
+    return build.build()
+
+
+def _euler_poses(rows: Array) -> Array:
+    """``x y z qx qy qz qw`` from ``x y z roll pitch yaw``."""
+    q = np.zeros((3, len(rows), 4))
+    for k in range(3):
+        q[k, :, k], q[k, :, 3] = np.sin(0.5 * rows[:, 3 + k]), np.cos(0.5 * rows[:, 3 + k])
+    return np.column_stack([rows[:, :3], quat_multiply(quat_multiply(q[2], q[1]), q[0])])
 
 
 def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
@@ -95,14 +134,15 @@ def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
     for name, places in patterns.items():
         wanted = np.isin(np.arange(6), places)
         if (nonzero == wanted).all():
-            turn = float(np.sqrt(np.median(columns[:, 5])))
-            if name == "covariance" and turn > UNKNOWN_TURN:
+            if name == "covariance" and (turn := float(np.median(columns[:, 5]))) > UNKNOWN_TURN:
+                # as a covariance σ is √c, as a square-root information 1 / c
+                name = "covariance" if turn <= 1.0 else "sqrt-information"
                 log.warning(
-                    "%s: noise columns are read as covariances, as GTSAM does, so that σ of a turn is "
-                    "%.0f degrees. Programs that use iSAM write the square root of the information: "
-                    "--noise sqrt-information",
+                    "%s: noise columns are read as %s, so that σ of a turn is %.2g rad; if they mean something else: "
+                    "--noise covariance (GTSAM) or sqrt-information (iSAM)",
                     records.path,
-                    np.rad2deg(turn),
+                    name,
+                    np.sqrt(turn) if name == "covariance" else 1.0 / turn,
                 )
             return name
     odd = np.flatnonzero((nonzero != np.isin(np.arange(6), [0, 3, 5])).any(axis=1))
@@ -114,14 +154,12 @@ def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
 
 
 def _information(columns: Array, noise: Noise, build: NetworkBuilder, labels: Labels) -> Array:
-    if noise == "toro":
-        return upper_triangle(columns[:, _TORO], 3)
-    if noise == "information":
-        return upper_triangle(columns, 3)
+    d = 3 if columns.shape[1] == 6 else 6
+    triangle = upper_triangle(columns[:, _TORO] if noise == "toro" else columns, d)
     if noise == "covariance":
-        return build.invert(upper_triangle(columns, 3), labels, "edge covariance matrices")
-    R = np.triu(upper_triangle(columns, 3))
-    return np.asarray(np.swapaxes(R, 1, 2) @ R)
+        return build.invert(triangle, labels, "edge covariance matrices")
+    R = np.triu(triangle)
+    return np.asarray(np.swapaxes(R, 1, 2) @ R) if noise == "sqrt-information" else triangle
 
 
 def _landmarks(records: Records, build: NetworkBuilder, noise: Noise) -> None:

@@ -102,6 +102,8 @@ class NetworkBuilder:
             raise FormatError(
                 "not a unit quaternion", where=self.where(int(lines[bad[0]])), got=poses[bad[0], 3:], wanted="length 1"
             )
+        if len(poses) and (most := float(np.abs(length - 1.0).max())) > 1e-3:
+            log.warning("%s: quaternions of a length up to %.1f %% off 1 are normalised", self.source, 100.0 * most)
         return np.concatenate([poses[:, :3], quat_normalize(poses[:, 3:])], axis=1)
 
     def add_edges(self, pairs: Ids, measurements: Array, information: Array, lines: Ids) -> None:

@@ -41,9 +41,9 @@ def read_network(
         text = read_text(path)
     other = set[str]()
     for number, tokens in tagged_lines(text):
-        if tokens[0] in g2o.LAYOUTS:
+        if tokens[0] in g2o.LAYOUTS | g2o.ALIASES:
             return g2o.parse_g2o(path, text, repair=repair, create_missing=create_missing)
-        if tokens[0] in isam_graph.LAYOUTS:
+        if tokens[0] in isam_graph.LAYOUTS | isam_graph.ALIASES:
             return isam_graph.parse_isam_graph(path, text, noise=noise, repair=repair, create_missing=create_missing)
         other.add(tokens[0][:20])
         if number > _LINES:
@@ -52,7 +52,7 @@ def read_network(
         "not a pose network",
         where=str(path),
         got="records " + ", ".join(sorted(other)[:5]) if other else "an empty file",
-        wanted="records of g2o (VERTEX_SE2, EDGE_SE3:QUAT …), TORO (VERTEX2, EDGE2 …) or iSAM (ODOMETRY …)",
+        wanted="records of g2o (VERTEX_SE2, EDGE_SE3:QUAT …), TORO (VERTEX2, EDGE2, EDGE3 …) or iSAM (ODOMETRY …)",
     )
 
 

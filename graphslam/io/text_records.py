@@ -12,9 +12,10 @@ import lzma
 import os
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import NoReturn
 
 import numpy as np
@@ -133,6 +134,10 @@ class Records:
         -1 integers means one or more and no floats: each is then a row of its own.
     ignored : tuple of str
         Tags that are skipped.
+    aliases : dict of str to str
+        Other tags of the same records.
+    implied : dict of str to tuple
+        Tag → (place, words): what a line that is shorter by so many words means there.
 
     Attributes
     ----------
@@ -148,6 +153,8 @@ class Records:
         layouts: dict[str, tuple[int, int]],
         *,
         ignored: tuple[str, ...] = (),
+        aliases: Mapping[str, str] = MappingProxyType({}),
+        implied: Mapping[str, tuple[int, list[str]]] = MappingProxyType({}),
     ) -> None:
         self.path, self.not_read = str(path), Counter[str]()
         # Packed numbers, not lists of objects: a file may hold a million edges.
@@ -156,6 +163,7 @@ class Records:
             for tag, (integers, floats) in layouts.items()
         }
         for number, tokens in tagged_lines(text):
+            tokens[0] = aliases.get(tokens[0], tokens[0])
             if tokens[0] not in raw:
                 if tokens[0] in ignored:
                     self.not_read[tokens[0]] += 1
@@ -169,6 +177,9 @@ class Records:
             each = integers < 0
             if each:
                 integers, length = len(tokens) - 1, max(len(tokens), 2)
+            at, words = implied.get(tokens[0], (0, []))
+            if words and len(tokens) + len(words) == length:
+                tokens[at:at] = words
             if len(tokens) != length:
                 raise FormatError(
                     f"{tokens[0]} record is truncated or too long",

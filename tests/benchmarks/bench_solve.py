@@ -200,7 +200,7 @@ def main() -> int:
     failed = 0
     for name, best in BEST_KNOWN.items():
         stem = Path(name).name.split(".")[0].removesuffix("_g2o")
-        if not name.startswith("posegraphs/") or args.files not in name or (args.quick and stem not in QUICK):
+        if not name.endswith(".g2o.xz") or args.files not in name or (args.quick and stem not in QUICK):
             continue
         path = str(Path(root) / name)
         a, b = best_of([path], repeat), cheapest_raw(path, best, repeat)

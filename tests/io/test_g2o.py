@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from graphslam.app.cli import app
 from graphslam.core.errors import ConfigError, CovarianceError, FormatError, MissingDataError
 from graphslam.core.network import PoseNetwork
+from graphslam.core.se3 import quat_to_matrix
 from graphslam.io.g2o import read_g2o, write_g2o
 from graphslam.io.isam_graph import parse_isam_graph
 from graphslam.io.network_file import read_network
@@ -177,10 +178,10 @@ E2 = "EDGE2 0 1 1 0 0 {}\nEDGE2 1 2 1 0 0 {}\n"
 def test_noise_columns_of_toro_and_isam_lines(tmp_path: Path) -> None:
     toro = put(tmp_path, E2.format(*["2 0 3 4 0 0"] * 2), "a.graph")
     assert np.diag(read_network(toro).information[0]).tolist() == [2, 3, 4]
-    isam = put(tmp_path, E2.format(*["2 0 0 4 0 5"] * 2), "a.txt")
-    assert np.allclose(np.diag(read_network(isam).information[0]), [0.5, 0.25, 0.2])
+    isam = put(tmp_path, E2.format(*["2 0 0 4 0 0.2"] * 2), "a.txt")
+    assert np.allclose(np.diag(read_network(isam).information[0]), [0.5, 0.25, 5])
     root = read_network(isam, noise="sqrt-information")
-    assert np.diag(root.information[0]).tolist() == [4, 16, 25]
+    assert np.allclose(np.diag(root.information[0]), [4, 16, 0.04])
     assert "square-root" in root.noise
     full = put(tmp_path, E2.format(*["2 0.1 0.2 4 0.3 5"] * 2), "b.txt")
     with pytest.raises(FormatError, match="is not clear from the numbers"):
@@ -265,13 +266,94 @@ def test_priors_are_edges_from_the_origin(tmp_path: Path) -> None:
     assert spatial.poses[np.flatnonzero(spatial.fixed)[0]].tolist() == [0, 0, 0, 0, 0, 0, 1]
 
 
-def test_noise_columns_that_say_nothing_of_the_turn_raise_a_doubt(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    text = "EDGE2 0 1 1 0 0.1 10 0 0 10 0 50\nEDGE2 1 2 1 0 0.1 10 0 0 10 0 50\n"
-    path = put(tmp_path, text, "isam.txt")
-    assert read_network(path).information[0, 2, 2] == pytest.approx(1 / 50)
-    assert "--noise sqrt-information" in caplog.text
-    asked = CliRunner().invoke(app, ["solve", str(path), "--noise", "sqrt-information", "--json"])
+def test_diagonals_of_isam_are_square_roots_of_information(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As covariances they would say nothing of turns; landmarks beside them are meant the same way."""
+    text = "EDGE2 0 1 1 0 0.1 10 0 0 10 0 50\nODOMETRY 1 2 1 0 0.1 10 0 0 10 0 50\nLANDMARK 0 3 2 1 4 0 8\n"
+    net = read_network(put(tmp_path, text, "isam.txt"))
+    assert np.diag(net.information[1]).tolist() == [100, 100, 2500]
+    assert np.diag(net.observation_information[0]).tolist() == [16, 64]
+    assert "square-root" in net.noise
+    assert "read as sqrt-information, so that σ of a turn is 0.02 rad" in caplog.text
+    doubtful = read_network(put(tmp_path, text.replace("50", "0.5"), "b.txt"))
+    assert doubtful.information[0, 2, 2] == pytest.approx(2.0)
+    assert "read as covariance, so that σ of a turn is 0.71 rad" in caplog.text
+    asked = CliRunner().invoke(app, ["solve", str(put(tmp_path, text, "isam.txt")), "--noise", "covariance", "--json"])
     assert asked.exit_code == 0, asked.output
-    assert read_network(path, noise="sqrt-information").information[0, 2, 2] == pytest.approx(2500)
+
+
+TORO_3D = """VERTEX3 0 0 0 0 0 0 0
+VERTEX3 1 1 2 3 0.3 -0.4 1.2
+VERTEX3 2 2 1 0 0 0 0
+EDGE3 0 1 1 2 3 0.3 -0.4 1.2 {a}
+EDGE3 1 2 0.4 -1 -2 0.2 0.1 -1.1 {b}
+EDGE3 0 2 1.5 1.4 0.2 0.4 -0.2 0.3 {a}
+EQUIV 0 1
+"""
+
+
+def test_three_dimensions_of_toro_and_isam(tmp_path: Path) -> None:
+    """The optimum is that of GTSAM with the same matrices, their rows put in its order (rotation first)."""
+    r = np.random.default_rng(4)
+    R = [np.triu(0.3 * r.normal(size=(6, 6)), 1) + np.diag(r.uniform(2, 9, 6)) for _ in range(2)]
+    upper = np.triu_indices(6)
+    swap = [3, 4, 5, 0, 1, 2]
+    for noise, columns, information in (
+        ("auto", [a.T @ a for a in R], [a.T @ a for a in R]),
+        ("sqrt-information", R, [a.T @ a for a in R]),
+        ("covariance", [np.linalg.inv(a.T @ a) for a in R], [a.T @ a for a in R]),
+    ):
+        a, b = (" ".join(format(v, ".17g") for v in m[upper]) for m in columns)
+        net = read_network(put(tmp_path, TORO_3D.format(a=a, b=b), "t.graph"), noise=noise)  # type: ignore[arg-type]
+        np.testing.assert_allclose(net.information[0], information[0][swap][:, swap], rtol=1e-9, atol=1e-9)
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3()))
+        values = gtsam.Values()
+        values.insert(0, gtsam.Pose3())
+        for line in TORO_3D.splitlines():
+            words = line.split()
+            if words[0] == "EQUIV":
+                continue
+            n = {"VERTEX3": 2, "EDGE3": 3}[words[0]]
+            x, y, z, roll, pitch, yaw = map(float, words[n : n + 6])
+            pose = gtsam.Pose3(gtsam.Rot3.Ypr(yaw, pitch, roll), np.array([x, y, z]))
+            if words[0] == "EDGE3":
+                m = information[int(words[-1] == "{b}")][swap][:, swap]
+                model = gtsam.noiseModel.Gaussian.Information(m)
+                graph.add(gtsam.BetweenFactorPose3(int(words[1]), int(words[2]), pose, model))
+            elif words[1] != "0":
+                values.insert(int(words[1]), pose)
+                at = list(net.ids).index(int(words[1]))
+                np.testing.assert_allclose(net.poses[at, :3], [x, y, z])
+                np.testing.assert_allclose(quat_to_matrix(net.poses[at, 3:]), pose.rotation().matrix(), atol=1e-12)
+        best = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        solved = solve_network(net)
+        assert solved.objective == pytest.approx(2.0 * graph.error(best), rel=1e-6)
+        np.testing.assert_allclose(solved.poses[2, :3], best.atPose3(2).translation(), atol=1e-4)
+
+
+def test_lines_without_noise_and_the_older_names(tmp_path: Path) -> None:
+    net = read_network(put(tmp_path, "VERTEX 0 0 0 0\nVERTEX 1 1 0 0\nEDGE 0 1 1 0 0.1\n", "a.graph"))
+    assert np.array_equal(net.information[0], np.eye(3))
+    spatial = read_network(put(tmp_path, "EDGE3 0 1 1 0 0 0 0 0.5\nPOSE3D_TRUE 0 0 0 0 0 0 0\n", "b.txt"))
+    assert np.array_equal(spatial.information[0], np.eye(6))
+    np.testing.assert_allclose(spatial.measurements[0], [1, 0, 0, 0, 0, np.sin(0.25), np.cos(0.25)])
+    with pytest.raises(FormatError, match=r"c\.txt:2: EDGE2 and EDGE3 in one file"):
+        read_network(put(tmp_path, "EDGE2 0 1 1 0 0.1 1 0 0 1 0 1\nEDGE3 0 1 1 0 0 0 0 0.5\n", "c.txt"))
+
+
+def test_priors_as_g2o_writes_them_and_those_of_a_position(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    base = read_g2o(put(tmp_path, SE3 + f"EDGE_PRIOR_SE3:QUAT 1 0 3 0 0 0 0 0 1 {INFO3}\n"))
+    for line in (f"EDGE_SE3_PRIOR 1 0 3 0 0 0 0 0 1 {INFO3}", f"EDGE_PRIOR_SE3 1 3 0 0 0 0 0 1 {INFO3}"):
+        net = read_network(put(tmp_path, line + "\n" + SE3))
+        assert np.array_equal(net.measurements, base.measurements)
+    position = read_network(put(tmp_path, SE3 + "EDGE_SE3_PRIOR_XYZ 1 3 0 0 1 0 0 1 0 1\n"))
+    assert len(position.edges) == 1
+    assert "1 records EDGE_SE3_PRIOR_XYZ are left out: priors of a position alone are not read" in caplog.text
+
+
+def test_long_quaternions_are_normalised_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    read_g2o(put(tmp_path, SE3))
+    assert "quaternions" not in caplog.text
+    net = read_g2o(put(tmp_path, SE3.replace("1.00001", "1.02")))
+    assert net.poses[1, 6] == 1.0
+    assert "quaternions of a length up to 2.0 % off 1 are normalised" in caplog.text
