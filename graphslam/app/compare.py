@@ -1,4 +1,4 @@
-"""The same submaps, joined and solved in every way there is, in one table."""
+"""Join and solve the same submaps with several methods, and compare the results in one table."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MapEstimate: TypeAlias = Union[SubmapEstimate, "GraphEstimate"]
-"""A joined map: of landmark submaps in the plane, or of any graph."""
+"""A joined map: of planar landmark submaps, or of any graph."""
 
 DEFAULT_METHODS = ("isam2", "batch", "eif-tree", "eif-sequential", "ekf")
 JSON_COLUMNS = (
@@ -45,7 +45,7 @@ JSON_COLUMNS = (
 
 
 def default_methods(submaps: Material) -> tuple[str, ...]:
-    """All five, but no dense filter where it has no room."""
+    """All five methods, without the dense EKF if the graph has too many states for it."""
     if isinstance(submaps, Sequence):
         return DEFAULT_METHODS
     from graphslam.join.graph_join import MOST_STATES
@@ -59,14 +59,14 @@ def default_methods(submaps: Material) -> tuple[str, ...]:
 def map_nees(
     estimate: MapEstimate, keys: Sequence[int], truth: MapTruth, *, chart: str | None = None
 ) -> tuple[float, int]:
-    """Joint NEES of all poses and landmarks of known truth, gauge "first base fixed", and its dimension (eq. 18).
+    """Joint NEES of all poses and landmarks with ground truth, gauge "first base fixed", and its dimension (eq. 18).
 
-    It is taken in the chart of the map, or in another (:mod:`graphslam.core.charts`).
+    Computed in the parametrisation of the map, or in another one (:mod:`graphslam.core.charts`).
 
     Parameters
     ----------
     keys : (m,)
-        Keys of the submaps that were joined.
+        Keys of the joined submaps.
     truth : MapTruth
         In the frame of the first base.
     chart : "cartesian" or "group", optional
@@ -82,7 +82,7 @@ def map_nees(
 def _errors(
     estimate: MapEstimate, keys: Sequence[int], truth: MapTruth, chart: str | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of all scalars of known truth in a chart, and where they stand in the state vector."""
+    """Errors of all scalars with ground truth, and their indices in the state vector."""
     g = group_of(estimate.poses)
     if truth.exit_poses.shape[1] != g.size:
         raise DataError("ground truth has another dimension", got=truth.exit_poses.shape, wanted=f"(m, {g.size})")
@@ -98,7 +98,7 @@ def _errors(
         columns = layout.pose_columns(rows).ravel(), layout.at("l", a).ravel()
         return np.concatenate([exits.ravel(), marks.ravel()]), np.concatenate(columns)
     m = len(estimate.poses) - 1
-    poses, landmarks = estimate.poses[1:].copy(), estimate.landmarks.copy()  # what has no truth has no error
+    poses, landmarks = estimate.poses[1:].copy(), estimate.landmarks.copy()  # without ground truth the error is zero
     poses[i] = truth.exit_poses[j]
     landmarks[a] = truth.landmarks[b]
     d, n = g.dof, g.dim
@@ -141,7 +141,7 @@ def compare_methods(
     memory: bool = True,
     progress: bool = False,
 ) -> pd.DataFrame:
-    """Every method on the same submaps with the same landmark ids, a row each.
+    """Apply every method to the same submaps with the same landmark ids; one row per method.
 
     Parameters
     ----------
@@ -150,27 +150,27 @@ def compare_methods(
     methods : sequence of str
         See :func:`join`.
     truth : MapTruth, optional
-        Gives NEES, its dimension, CI (eq. 20) and root-mean-square errors, all in the gauge "first base fixed"; of
-        dense submaps those of their exits, in right tangents.
+        Gives NEES, its dimension, CI (eq. 20) and RMS errors, all in the gauge "first base fixed". For dense submaps
+        only the end poses are compared, with errors in right tangents.
     polish : bool
-        Take every method on to the least-squares optimum.
+        Refine the result of every method to the least-squares optimum.
     associate, covariance_scale
-        See :func:`join`; landmarks are recognised once, for all methods.
+        See :func:`join`; landmarks are associated once, for all methods.
     memory : bool
-        Measure ``peak_mb``: each method runs once more in a process of its own, and the growth of its resident memory
-        while it joins is taken, native allocations included. Costs about a second a method.
+        Measure ``peak_mb``: each method runs once more in its own process, which measures the growth of its resident
+        memory, native allocations included. Takes about one second per method.
     progress : bool
         Show a progress bar.
 
     Returns
     -------
     pandas.DataFrame
-        ``objective`` is that of the method itself, ``objective_polished`` that of the optimum reached from it.
-        ``nees`` and ``ci`` are taken in the chart of the map, ``nees_plain`` of the plain vector. They and the errors
-        judge the map that is handed over: the polished one where there is a polish; ``nees_unpolished`` and
-        ``ci_unpolished`` the method's own. ``dof`` are the scalars measured less the free ones. ``seconds`` is wall
-        time, polish included and compilation excluded; ``nnz`` the stored entries of the information matrix (of the
-        dense covariance for an unpolished EKF).
+        ``objective`` is that of the method, ``objective_polished`` that after the refinement. ``nees`` and ``ci`` are
+        in the parametrisation of the map, ``nees_plain`` is that of the plain vector. They and the errors are of the
+        final map, refined with ``polish``; ``nees_unpolished`` and ``ci_unpolished`` are of the method alone. ``dof``
+        is the number of measured scalars minus the number of states. ``seconds`` is wall time with refinement, without
+        compilation; ``nnz`` the number of stored entries of the information matrix (of the dense covariance for an
+        EKF without refinement).
     """
     submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
     way = methods_for(submaps)
@@ -179,7 +179,7 @@ def compare_methods(
     association = association_of(associate)
     if association is not None and isinstance(submaps, Sequence):
         submaps = identify_landmarks(submaps, association, progress=progress)
-        # Recognised landmarks have names of their own; only the poses can be held against the truth.
+        # Associated landmarks have new ids, so only the poses can be compared with ground truth.
         truth = None if truth is None else _poses_only(truth)
     keys = submap_keys(submaps)
     rows = []
@@ -217,7 +217,7 @@ def submap_keys(submaps: Material) -> list[int]:
 
 
 def degrees_of_freedom(submaps: Material, estimate: MapEstimate) -> int:
-    """Scalars that submaps and their ties measure, less the free ones."""
+    """Number of scalars measured by submaps and constraints, minus the number of states."""
     if not isinstance(submaps, Sequence):
         return submaps.dof
     g = group_of(estimate.poses)
@@ -240,7 +240,7 @@ def _describe(method: str, submaps: Material, estimate: MapEstimate) -> dict[str
 
 
 def factor_text(submaps: Material) -> str:
-    """Number of factors of each class that every method solves, such as ``"gps 36, imu 12, submap 8"``."""
+    """Number of factors of each class in every solution, such as ``"gps 36, imu 12, submap 8"``."""
     counts = {"submap": len(submaps)} if isinstance(submaps, Sequence) else submaps.factor_counts()
     return ", ".join(f"{name} {n}" for name, n in counts.items())
 
@@ -251,7 +251,7 @@ def _poses_only(truth: MapTruth) -> MapTruth:
 
 
 def methods_json(table: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
-    """The table as ``{"methods": [{"method", "objective", …}]}``; what is not known is null."""
+    """The table as ``{"methods": [{"method", "objective", …}]}``; unknown values are null."""
     return {"methods": [_json_row(r) for r in table.to_dict("records")]}
 
 
@@ -271,13 +271,13 @@ def _json_row(row: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def before_and_after(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Objective, NEES and CI of a method's own map, and of the optimum that the refinement reached from it.
+    """Objective, NEES and CI of a method's own map, and after the refinement.
 
     Parameters
     ----------
     row : mapping
-        Of a method (:data:`JSON_COLUMNS`). Without a refinement the figures are those before it, and there are none
-        after it.
+        Of a method (:data:`JSON_COLUMNS`). Without a refinement the values are in ``before`` and those in ``after`` are
+        None.
 
     Returns
     -------
@@ -293,7 +293,7 @@ def before_and_after(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def comparison_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of :func:`methods_json` as a table for people: figures before and after the refinement side by side."""
+    """Rows of :func:`methods_json` as a readable table: values before and after the refinement side by side."""
     out = []
     for r in rows:
         n = r["nees_dof"]

@@ -1,4 +1,4 @@
-"""``graphslam data check``: a source looked at before it is computed with."""
+"""``graphslam data check``: check a source for errors before a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def check_source(source: str | Path, *, reader: str | None = None, **options: An
 
     Parameters
     ----------
-    source : card name, file or folder
+    source : data set name, file or folder
     options
         For the reader.
 
@@ -55,7 +55,7 @@ def _lost(log: SensorLog) -> list[tuple[str, int]]:
 
 
 def check_summary(found: list[StreamFinding]) -> str:
-    """The last line: whether to run."""
+    """The last line: number of errors and warnings."""
     bad = sum(n.finding.level == "bad" for n in found)
     look = sum(n.finding.level == "look" for n in found)
     if bad:

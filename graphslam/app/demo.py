@@ -1,4 +1,4 @@
-"""The first thing a newcomer sees: a robot in a garage, SegSLAM, one graph, and the map that follows it."""
+"""Demo: a simulated robot in a garage, SegSLAM, one graph, and the fused map."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from graphslam_frontends.segslam.progress import SegSlamProgress
 logger = logging.getLogger(__name__)
 
 PRESETS = {"garage": None, "quick": 5}
-"""Sizes of the demo, and their particles: the garage of two levels, 305 m, with its preset's; a court of 51 m."""
+"""Presets of the demo with their numbers of particles; None: as in the preset of the two-level garage (305 m path)."""
 
 
 def demo_log(preset: str, seed: int) -> SensorLog:
-    """The drive of a demo."""
+    """Simulated log of a demo preset."""
     if preset not in PRESETS:
         raise UnknownNameError("size of the demo", preset, PRESETS)
     if preset == "garage":
@@ -39,9 +39,9 @@ def demo_log(preset: str, seed: int) -> SensorLog:
 
 
 def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool = True) -> Run:
-    """Simulate, run SegSLAM, join its segments in a graph, fuse the map. A demo that is there already is gone on with.
+    """Simulate, run SegSLAM, join its segments in a graph, fuse the map. An interrupted demo is resumed.
 
-    ``figures/progress.png`` is drawn anew whenever a segment ends: the first thing to look at.
+    ``figures/progress.png`` is drawn again after every segment.
     """
     log = demo_log(preset, seed)
     particles = PRESETS[preset]
@@ -55,22 +55,22 @@ def run_demo(out: Path, *, seed: int = 0, preset: str = "garage", progress: bool
 
 @dataclass
 class DemoProgress(Observer):
-    """A picture of the segments so far.
+    """A picture of the segments so far, updated during the run.
 
     Parameters
     ----------
     picture : Path
     truth : Trajectory or None
-        Drawn beside the segments.
+        Drawn with the segments.
     """
 
     picture: Path
     truth: Trajectory | None = None
     drawn: int = field(default=0, init=False)
-    """Segments of the last picture."""
+    """Number of segments in the last picture."""
 
     def front_end_at(self, progress: SegSlamProgress) -> None:
-        """After every step of the filter: the picture, where there is a segment more."""
+        """After every step of the filter: draw the picture if there is a new segment."""
         if progress.segments > self.drawn:
             self.draw(progress)
             if not self.drawn:
@@ -78,11 +78,11 @@ class DemoProgress(Observer):
             self.drawn = progress.segments
 
     def draw(self, at: SegSlamProgress) -> None:
-        """The picture, in place of the one before."""
+        """Draw the picture and replace the previous one."""
         self.picture.parent.mkdir(parents=True, exist_ok=True)
         paths = at.paths()
         truth = self.truth
-        if truth is not None:  # as the map is, in the frame of the first base
+        if truth is not None:  # into the frame of the first base, as the map
             from graphslam.core.poses import group_of, remove_roll_pitch
 
             truth = truth.transformed(group_of(truth.poses).inverse(remove_roll_pitch(truth.poses[0])))

@@ -1,4 +1,4 @@
-"""Is this machine ready? Every package is imported for real, in another process."""
+"""Check the installation. Every package is imported in another process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ REQUIRED = {
 
 @dataclass(frozen=True, slots=True)
 class InstallCheck:
-    """One line of the examination."""
+    """Result of one check."""
 
     name: str
     state: Literal["ok", "missing", "conflict", "absent"]
@@ -40,7 +40,7 @@ class InstallCheck:
 
 
 def examine_installation() -> list[InstallCheck]:
-    """Python, packages, extras and what each buys, front ends, folders; "absent" is an optional part."""
+    """Python, packages, extras with their purpose, front ends, folders; "absent" marks an optional part."""
     found = [InstallCheck("python", "ok", f"{platform.python_version()}, {os.cpu_count()} cores, {platform.system()}")]
     there = {name: all(find_spec(m) for m in e.modules) for name, e in EXTRAS.items()}
     wanted = {name: f":{module}" for name, module in REQUIRED.items()}
@@ -69,7 +69,7 @@ def examine_installation() -> list[InstallCheck]:
 
 
 def other_distributions() -> list[InstallCheck]:
-    """Installed distributions that also hold an import package ``graphslam``: which one is imported is chance."""
+    """Other installed distributions with an import package ``graphslam``: it is undefined which one is imported."""
     others = sorted({n for n in packages_distributions().get("graphslam", ()) if _plain(n) != DISTRIBUTION})
     return [
         InstallCheck(
@@ -92,7 +92,7 @@ def site_packages() -> list[Path]:
 
 
 def remains(folders: Sequence[Path]) -> list[InstallCheck]:
-    """Folders of the name that an uninstall left: without an ``__init__.py`` they are imported as empty packages."""
+    """Folders that an uninstall left behind: without ``__init__.py`` they are imported as empty packages."""
     left = [f / name for f in folders for name in ("graphslam", "graphslam_frontends")]
     return [
         InstallCheck(
@@ -104,7 +104,7 @@ def remains(folders: Sequence[Path]) -> list[InstallCheck]:
 
 
 def _compiled() -> InstallCheck:
-    """Compiled code: where it is, and how much."""
+    """Compiled code: its folder and size."""
     folder, why = compiled_folder(), unwritable()
     if why:
         advice = "kernels are compiled at every start; make it writable, or set NUMBA_CACHE_DIR to a folder that is"
@@ -146,9 +146,9 @@ for word in sys.argv[1:]:
 
 
 def import_errors(wanted: list[str]) -> list[str]:
-    """Import modules one after the other in another process: the last line of each error, empty without one.
+    """Import modules in another process; returns the last line of each error, empty if there is none.
 
-    A module that ends the interpreter is an error as well; those after it are imported by a further process.
+    If a module ends the interpreter, this is an error too; the next modules are imported by another process.
 
     Parameters
     ----------

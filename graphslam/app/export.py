@@ -1,4 +1,4 @@
-"""A run for other programs: evaluation, globe, GIS, navigation; a table of writers, and those of plug-ins."""
+"""Export a run to other programs: evaluation, globe, GIS, navigation; built-in writers and plug-ins."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from graphslam.io.tum import embed_plane, write_kitti, write_tum
 from graphslam.maps.export import save_maps
 from graphslam.maps.run_map import RunMap
 
-_RING = 36  # corners of an ellipse
+_RING = 36  # corners of the polygon of an ellipse
 
 
 def map_to_enu(run: Run, heading: float | None) -> Array:
-    """``T_enu_map`` (3,): the map in east and north from the datum.
+    """``T_enu_map`` (3,) or (7,): pose of the map in an east-north frame at the datum.
 
-    Where GPS fixes were scored, their frame is east and north and its origin is the datum. Else the datum is the first
-    base, and only the user knows where it looked.
+    With GPS residuals, it is their GPS frame, whose origin is the datum. Otherwise the datum is the first base, and the
+    user must give its heading.
     """
     scored = run.gps.get("all")
     if scored is not None:
@@ -63,7 +63,7 @@ def geographic_map(
     confidence : float
         Of the ellipses.
 
-    A run in space is seen from above; it has no landmarks.
+    Of a 3-D run the path is projected to the ground plane; it has no landmarks.
     """
     if not 0 < confidence < 1:
         raise ConfigError(f"confidence = {confidence}; wanted in (0, 1)")
@@ -101,7 +101,7 @@ def parse_datum(text: str) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What a user says of an export: ``(latitude, longitude)`` of the datum [deg], heading [deg], confidence."""
+    """Export options: ``(latitude, longitude)`` of the datum [deg], heading [deg], confidence of the ellipses."""
 
     datum: tuple[float, float] | None = None
     heading: float | None = None
@@ -110,14 +110,14 @@ class WriteOptions:
 
 @dataclass(frozen=True, slots=True)
 class Writer:
-    """A format that runs are exported to; own ones are registered under the entry point ``graphslam.writers``.
+    """An export format; other formats are registered under the entry point ``graphslam.writers``.
 
     Parameters
     ----------
     write : callable (run, path, options)
         Writes a finished :class:`~graphslam.app.run.run.Run`.
     file : str or None
-        Default name in the folder of the run; None: it writes a folder, which the user must name.
+        Default name in the folder of the run; None: it writes a folder, whose name is required.
     needs_datum : bool
     """
 
@@ -168,17 +168,17 @@ def export(
     confidence: float = 0.95,
     out: str | Path | None = None,
 ) -> Path:
-    """Write a run for other programs.
+    """Export a run for other programs.
 
     Parameters
     ----------
     run : Run, or folder of one
     datum : (latitude, longitude), optional
         Of the origin of the GPS frame; of the first base in a run without GPS [deg, WGS 84]. KML and GeoJSON need it;
-        an Autoware map lies about it, or in its own frame without.
+        an Autoware map is in the frame of the datum, or without a datum in its own frame.
     format : str
-        One of those below, or the name of an own :class:`Writer`.
-        ``tum`` or ``kitti``: the path at full rate, in the frame of the first base (what evo reads). ``kml``,
+        One of the following, or the name of a registered :class:`Writer`.
+        ``tum`` or ``kitti``: the path at full rate, in the frame of the first base (input of evo). ``kml``,
         ``geojson``: path, landmarks with ellipses, fixes. ``nav2``: floor plans (map_server). ``autoware``: the map's
         points in tiles, with ``map_projector_info.yaml``.
     heading : float, optional
@@ -187,7 +187,7 @@ def export(
         Of the ellipses.
     out : path, optional
         Default: ``map.<format>`` or ``path.<format>`` in the run's folder; ``nav2`` and ``autoware`` write a folder,
-        which must be named.
+        whose name is required.
 
     Returns
     -------
@@ -199,7 +199,7 @@ def export(
     UnknownNameError
         There is no such format.
     ConfigError
-        A datum or a heading is missing, or not wanted; no place to write to.
+        A datum or a heading is missing, or must not be given; no output path.
     MissingDataError
         A run without a dense map, for ``nav2`` and ``autoware``.
     RunFolderError, FormatError
@@ -230,7 +230,7 @@ def export(
         return Path(out or "")
     with lock_folder(home):
         if not isinstance(run, Run):
-            opened = read_run_folder(home)  # as it is now that nobody else changes it
+            opened = read_run_folder(home)  # read again under the lock
         with new_generation(home) as new:
             writer.write(opened, new.path / name, options)
             new.adopt()

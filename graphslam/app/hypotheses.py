@@ -1,7 +1,7 @@
-"""Other graphs of a finished run: topologies of its SegMap, or choices of its matches and loops; the clearest is kept.
+"""Solve alternative graphs of a finished run and keep the map of lowest entropy.
 
-Which graphs there are is said in :mod:`graphslam.backend.hypotheses`, how they are judged in
-:mod:`graphslam.maps.alternatives`.
+The alternatives are topologies of its SegMap, or choices of its matches and loops
+(:mod:`graphslam.backend.hypotheses`); :mod:`graphslam.maps.alternatives` ranks them.
 """
 
 from __future__ import annotations
@@ -56,25 +56,25 @@ from graphslam_frontends.segslam.front_end import SegSlam
 
 logger = logging.getLogger(__name__)
 MOST = 16
-"""Choices of matches and loops that are solved at most."""
+"""Largest number of choices of matches and loops that are solved."""
 
 
 @dataclass(frozen=True)
 class MinimumEntropyMap:
-    """Alternative graphs of a run, judged.
+    """Ranked alternative graphs of a run.
 
     Parameters
     ----------
     choice : RankedAlternatives
         The chosen one first.
     left_out : int
-        Alternatives that were not solved.
+        Number of alternatives that were not solved.
     refined : RefinedRun or None
-        The chosen one refined by its scans; None where the run is not, or where that was refused.
+        The chosen one refined with its scans; None if the run is not refined, or the refinement was rejected.
     refined_map : RunMap or None
         Its fused map.
     findings : list of Finding
-        What the refinement, control points and check points say of it.
+        Of the refinement, control points and check points.
     """
 
     choice: RankedAlternatives
@@ -85,18 +85,17 @@ class MinimumEntropyMap:
 
 
 def minimum_entropy_loops(run: Run, made: RunMap, *, progress: bool = True) -> MinimumEntropyMap:
-    """Solve a finished run with every choice of its matches and loops, and judge the graphs and their maps.
+    """Solve a finished run with different choices of its matches and loops, and rank the graphs and their maps.
 
-    SegSLAM draws map samples and takes the one of least entropy. A run hands over one settled chain, whose matches
-    carry the share of the particles that took them, and a ledger of loops; which of them to believe is what is left to
-    choose.
+    SegSLAM chooses the map sample of lowest entropy. A run outputs only one chain of segments, with matches that have a
+    support (the share of particles that use them), and a ledger of loops; the choices are subsets of these.
 
     Parameters
     ----------
     run : Run
-        Read back with its grids (`remake_map.map_of_folder`).
+        Read with its grids (`remake_map.map_of_folder`).
     made : RunMap
-        Its fused map. Of a refined run the graphs are judged by the maps that they have before the refinement.
+        Its fused map. For a refined run the graphs are compared by their maps before the refinement.
     progress : bool
         Show a progress bar.
     """
@@ -130,19 +129,20 @@ def minimum_entropy_loops(run: Run, made: RunMap, *, progress: bool = True) -> M
 def minimum_entropy_topology(
     run: Run, most: int, *, log: str | Path | SensorLog | None = None, progress: bool = True
 ) -> MinimumEntropyMap:
-    """Solve the topologies that the particles of a SegSLAM run told, and judge the graphs and their maps.
+    """Solve the topologies in the particles of a SegSLAM run, and rank the graphs and their maps.
 
-    The folder holds one chain of segments; the others are in the particles. So the front end works through the log once
-    more, as the folder's configuration says: the same seed gives the same particles.
+    The folder has only one chain of segments. The other chains are in the particles, so the front end processes the log
+    once more with the configuration of the folder: the same seed gives the same particles.
 
     Parameters
     ----------
     run : Run
         Of the front end ``segslam``, with its folder.
     most : int
-        Topologies that are solved at most: by weight, then the first without each of its entries into older maps.
-    log : card name, folder, or SensorLog; optional
-        Where the run's log is by now; default where it was.
+        Largest number of topologies to solve: by weight, then the first one without each of its entries into older
+        maps.
+    log : data set name, folder, or SensorLog; optional
+        Where the run's log is now; default: its original location.
     progress : bool
         Show a progress bar.
     """

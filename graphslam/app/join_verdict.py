@@ -1,4 +1,4 @@
-"""What a joined map says of itself, in words: is it at its optimum, and are its covariances honest."""
+"""Verdict on a joined map: convergence, and consistency of its covariances."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from graphslam.app.verdict.figures import is_finite_number
 from graphslam.core.findings import Finding
 
 SAME = 1e-6
-"""Relative difference of two objectives that are one."""
+"""Relative difference below which two objectives count as equal."""
 
 
 def join_verdict(row: Mapping[str, Any], estimate: MapEstimate) -> list[Finding]:
-    """Lines of a verdict on one joined map.
+    """Findings on one joined map.
 
     Parameters
     ----------
     row : mapping
         Of :func:`graphslam.app.compare.join_json`.
     estimate : SubmapEstimate or GraphEstimate
-        The map that it describes.
+        The map of that row.
     """
     out = [_state(row, estimate)]
     judged = {j.code: j for j in join_consistency_tests(row)}
@@ -40,7 +40,7 @@ def join_verdict(row: Mapping[str, Any], estimate: MapEstimate) -> list[Finding]
 
 
 def join_consistency_tests(row: Mapping[str, Any]) -> list[ChiSquareTest]:
-    """Ratios that test the covariances of a joined map."""
+    """Ratios that test the covariances of a joined map: χ²/dof and NEES/n."""
     out = []
     best: Any = row["objective_polished"]
     if (dof := row.get("dof") or 0) > 0 and is_finite_number(best):
@@ -60,7 +60,7 @@ def join_headline(row: Mapping[str, Any], findings: Sequence[Finding], *, submap
     findings : sequence of Finding
         Of :func:`join_verdict`.
     submaps : int
-        That were joined.
+        Number of joined submaps.
     length : float
         Of the path through the nodes [m].
     """
@@ -85,7 +85,7 @@ def _state(row: Mapping[str, Any], estimate: MapEstimate) -> Finding:
 
 
 def compare_verdict(rows: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Whether all methods of a comparison end at one optimum; nothing where there was no refinement.
+    """Finding: do all methods of a comparison reach the same optimum? Empty if fewer than two were refined.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A run to look at while it goes on: path, map and loops in the viewer Rerun, or in a file that it replays."""
+"""Live view of a run: path, map and loops in the viewer Rerun, or in a file that Rerun replays."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from graphslam.loops.ledger import LoopDecision
 from graphslam.solve.solution import Solution
 
 POINTS = 4000
-"""Points of a submap that are sent at most, about."""
+"""Approximate largest number of points that are sent per submap."""
 PATH, LANDMARKS, BELIEVED, DOUBTED = (31, 119, 180), (214, 39, 40), (44, 160, 44), (160, 160, 160)
 
 
 class LiveView(Observer):
-    """Shows a run as it goes on.
+    """Shows a run in Rerun while it is computed.
 
-    The timeline ``submap`` counts the submaps in the graph, ``seconds`` is the clock of the log. What a submap holds is
-    sent once, in its own frame, and its place anew whenever the graph is solved: what moves is the map, as in the run.
-    Under ``map``: ``submap-…`` with ``points``, ``path`` (nodes of the graph), ``landmarks``, ``loops/…``; what was
-    decided on, in words, under ``said``. A refinement by scans comes after all that and is not shown.
+    The timeline ``submap`` counts the submaps in the graph, ``seconds`` is the clock of the log. The points of a submap
+    are sent once, in its own frame; its pose is sent again whenever the graph is solved.
+    Under ``map``: ``submap-…`` with ``points``, ``path`` (nodes of the graph), ``landmarks``, ``loops/…``; decisions on
+    loops as text under ``said``. A refinement with scans comes later and is not shown.
 
     Parameters
     ----------
     name : str
-        Of the log.
+        Name of the log.
     file : path, optional
         Recording that is written (``.rrd``) instead of opening a viewer.
     """
@@ -51,7 +51,7 @@ class LiveView(Observer):
         self.stream.log("map", self.rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
-        """What it holds, and where everything is now."""
+        """Send the points of the submap, and all current poses."""
         self.stream.set_time("submap", sequence=len(graph.submaps))
         self.stream.set_time("seconds", duration=submap.interval[1])
         points = shown_points(submap)
@@ -60,7 +60,7 @@ class LiveView(Observer):
         self._places(graph.submaps, np.asarray(graph.values.poses), np.asarray(graph.values.landmarks))
 
     def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
-        """A line from base to base, green where it was believed; and why."""
+        """A line between the two bases, green if the loop was accepted, and the reason as text."""
         nodes = {s.key: s.node for s in graph.submaps}
         ends = graph.values.poses[[nodes[decision.submap_i], nodes[decision.submap_j]], : graph.dim]
         colour = BELIEVED if decision.verdict == "accepted" else DOUBTED
@@ -70,10 +70,10 @@ class LiveView(Observer):
         self.stream.log("said", self.rr.TextLog(f"{said}, {decision.why}" if decision.why else said))
 
     def solved(self, solution: Solution) -> None:
-        """The end: everything where the optimum has it."""
+        """Send the poses of the optimum and close the recording."""
         self._places(solution.submaps, solution.poses, solution.landmarks)
         self.stream.log("said", self.rr.TextLog("solved" if solution.converged else "not solved"))
-        self.stream.disconnect()  # the file is whole
+        self.stream.disconnect()  # the file is complete
 
     def _places(self, submaps: Sequence[SubmapNode], poses: Array, landmarks: Array) -> None:
         rr, dim = self.rr, group_of(poses).dim
@@ -86,7 +86,7 @@ class LiveView(Observer):
 
 
 def shown_points(submap: Submap) -> Array:
-    """Points ``(n, 3)`` of what is solid in a submap, in the frame of its base; few enough to be sent."""
+    """Occupied points ``(n, 3)`` of a submap in the frame of its base, subsampled to about :data:`POINTS`."""
     if submap.cloud is not None:
         points = submap.cloud.points
     elif isinstance(submap.grid, EvidenceGrid):
@@ -97,13 +97,13 @@ def shown_points(submap: Submap) -> Array:
 
 
 def raise_points(points: Array) -> Array:
-    """Points in space ``(n, 3)``: those of the plane at height 0."""
+    """3-D points ``(n, 3)``; planar points get height 0."""
     points = np.asarray(points, dtype=np.float64)
     return points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
 
 
 def pose_in_space(pose: Array) -> tuple[Array, Array]:
-    """Place ``(3,)`` and quaternion ``(4,)`` x y z w of a pose ``(3,)`` or ``(7,)``."""
+    """Position ``(3,)`` and quaternion ``(4,)`` x y z w of a pose ``(3,)`` or ``(7,)``."""
     if len(pose) == 7:
         return pose[:3], pose[3:]
     half = 0.5 * float(pose[2])

@@ -1,7 +1,7 @@
-"""What of the machine a result may depend on: threads of linear algebra, and versions of what computes.
+"""Influences of the machine on a result: threads of linear algebra, and versions of the packages.
 
-The matrices are small and many: threads of a linear-algebra library wait for each other and cost up to ten times more
-than they give. The order of their sums would also depend on the machine, and the same seed must give the same bytes.
+The matrices are small and many: with several threads, linear algebra takes up to ten times longer because the threads
+wait for each other. The order of sums would also depend on the machine, but the same seed must give the same bytes.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _lock = Lock()
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Context in which BLAS works on one thread.
+    """Context in which BLAS uses one thread.
 
-    Contexts may end in any order: the caller's setting comes back at the end of the last one.
+    Contexts may end in any order; the caller's setting is restored when the last one ends.
     """
     mine = object()
     with _lock:
@@ -43,17 +43,17 @@ def one_blas_thread() -> Iterator[None]:
 
 
 class Stopwatch:
-    """Time since it was made, or since some seconds before, and what of it went into compilation [s]."""
+    """Time since its creation (plus ``before``), and the part of it that was compilation [s]."""
 
     def __init__(self, before: float = 0.0) -> None:
         self._begin, self._compiled = time.perf_counter() - before, compile_seconds()
 
     def seconds(self) -> float:
-        """All the time."""
+        """Total time [s]."""
         return time.perf_counter() - self._begin
 
     def compilation(self) -> float:
-        """The part of it in which kernels were compiled."""
+        """Time in which kernels were compiled [s]."""
         return compile_seconds() - self._compiled
 
 
@@ -61,7 +61,7 @@ PACKAGES = ("graphslam-submaps", "gtsam", "numpy", "scipy", "numba", "matplotlib
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computed the run."""
+    """Versions of Python and the packages that compute a run."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

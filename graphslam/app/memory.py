@@ -1,9 +1,8 @@
-"""Peak memory of a join, measured from outside: a process of its own, and the kernel's count of resident pages.
+"""Peak memory of a join, measured in its own process with the kernel's count of resident pages.
 
-Tracing Python's allocations would miss what SuperLU, LAPACK and gtsam take, and would slow down what is being timed. So
-each method runs once more in a fresh interpreter, which loads the submaps and every module first, resets the kernel's
-high-water mark, joins, and reports by how much the mark rose above where it was. Linux only; elsewhere there is no
-figure.
+Tracing Python's allocations would not see the memory of SuperLU, LAPACK and gtsam, and would slow down the timed code.
+So each method runs once more in a new interpreter. It loads the submaps and every module, resets the kernel's
+high-water mark, joins, and reports the rise of the mark. Only on Linux; on other systems there is no value.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ _GRAPH = "graph.npz"
 
 
 class MemoryProbe:
-    """Context in which :meth:`measure` can be asked for the peak memory of methods on the same submaps.
+    """Context for :meth:`measure`, the peak memory of methods on the same submaps.
 
-    Ask after all timing is done: the measuring processes take the cores.
+    Use it after all timing, because the measuring processes use all cores.
 
     Parameters
     ----------
@@ -63,9 +62,9 @@ class MemoryProbe:
             self._folder.cleanup()
 
     def measure(self, methods: Sequence[str], *, polish: bool) -> list[float | None]:
-        """Peak growth of resident memory [MB = 10⁶ bytes] while each method joins, or None where it is not known.
+        """Peak growth of resident memory [MB = 10⁶ bytes] while each method joins; None if unknown.
 
-        The processes share nothing, so as many run side by side as there are cores.
+        The processes share nothing; one process per core runs at the same time.
         """
         if self._folder is None:
             return [None] * len(methods)
@@ -105,11 +104,11 @@ def _read(folder: Path) -> Material:
 
 
 def _measure_here(folder: str, method: str, polish: bool) -> float:
-    """Load, settle, reset the high-water mark, join, read the mark [MB]."""
+    """Load, compile, free memory, reset the high-water mark, join, read the mark [MB]."""
     submaps = _read(Path(folder))
-    compile_method(submaps, method, polish=polish)  # and modules and thread pools that load on first use
+    compile_method(submaps, method, polish=polish)  # also loads modules and thread pools
     gc.collect()
-    trim_heap()  # or the join would reuse it unseen
+    trim_heap()  # otherwise the join would reuse freed memory, which the mark does not count
     before = _status("VmRSS")
     try:
         Path("/proc/self/clear_refs").write_text("5")
@@ -122,7 +121,7 @@ def _measure_here(folder: str, method: str, polish: bool) -> float:
 
 
 def measure_and_print(arguments: Sequence[str]) -> None:
-    """Entry of the measuring process: folder, method, polish (0 or 1); the figure goes to standard output."""
+    """Entry of the measuring process: folder, method, polish (0 or 1); prints the value to standard output."""
     folder, method, polish = arguments
     sys.stdout.write(f"{_measure_here(folder, method, polish == '1')}\n")
 

@@ -1,4 +1,4 @@
-"""Options of a run as a table: name, type, default and meaning of each."""
+"""Options of a run as a table: name, type, default and meaning."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graphslam.app.run.front_ends import config_of
 from graphslam.core.config import KEYS
 
 _ENTRY = re.compile(r"^(\w+(?:, \w+)*) : .*\n((?: {4}.*\n?)+)", re.MULTILINE)
-"""An entry of a section of a docstring: names, and the text below them."""
+"""An entry of a docstring section: names, and the text below them."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class OptionRow:
 
 
 def option_rows(frontend: str | None = None) -> list[OptionRow]:
-    """Options of a front end; without one those that every run has."""
+    """Options of a front end; without a name those of every run."""
     if frontend is not None:
         return list(_rows(config_of(frontend), "frontend"))
     return [row for row in _rows(RunConfig, "") if row.option != "frontend"]
@@ -55,7 +55,7 @@ def _rows(kind: Any, where: str) -> Iterator[OptionRow]:
             yield OptionRow(name, str(f.type), _default(f), meanings.get(f.name, ""))
         elif keys is None:
             yield from _rows(nested, ".".join(filter(None, (where, f.name))))
-        else:  # a small dataclass that is written as several keys beside the others
+        else:  # a small dataclass whose fields are written as several keys of the enclosing table
             inside = {r.option: r for r in _rows(nested, "")}
             for key, part in keys.items():
                 row = inside[part]
@@ -71,7 +71,7 @@ def _default(f: dataclasses.Field[Any]) -> str:
 
 
 def _meanings(kind: Any) -> dict[str, str]:
-    """What the fields of a dataclass mean: docstrings behind them, or entries under ``Parameters``."""
+    """Meaning of each field of a dataclass: its attribute docstring, or its entry under ``Parameters``."""
     out: dict[str, str] = {}
     for cls in reversed(kind.__mro__[:-1]):
         for names, text in _ENTRY.findall(inspect.getdoc(cls) or ""):

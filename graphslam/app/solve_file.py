@@ -1,4 +1,4 @@
-"""``graphslam solve FILE``: read a pose network, solve it, say how well, write it back."""
+"""``graphslam solve FILE``: read a pose network, solve it, report the quality, write the solution."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def solve_network_file(
     Parameters
     ----------
     path : path-like
-        Plain or compressed; the format is told by the content.
+        Plain or compressed; the format is detected from the content.
     solver : {"lm", "isam2", "gnc", "pcg"}
     repair : bool
         Project indefinite information matrices to positive definite ones (counted in ``"repaired"``) instead of
@@ -43,12 +43,12 @@ def solve_network_file(
     noise : str
         Meaning of TORO/iSAM noise columns.
     create_missing : bool
-        Make vertices that only edges name, instead of refusing the file.
+        Create vertices that only edges refer to, instead of refusing the file.
     starts : "all", name or sequence of names, optional
-        Where the descent begins; several on doubt only if not given
+        Initial values; without this option several are tried only in doubtful cases
         (:func:`graphslam.solve.network.solve.solve_network`).
     certificate : bool
-        Also say whether the answer is certified to be the global optimum (``"certificate"`` in words, its numbers in
+        Test whether the solution is certified as the global optimum (text in ``"certificate"``, values in
         ``"certificate_numbers"``).
     **options
         Of :func:`graphslam.solve.network.solve.solve_network`.
@@ -56,8 +56,8 @@ def solve_network_file(
     Returns
     -------
     dict
-        Ready for JSON. ``objective`` is ``Σ rᵀ Ω r`` without ½ and with GTSAM's residual; ``objective_g2o`` is the
-        same answer under g2o's residual.
+        JSON-serialisable. ``objective`` is ``Σ rᵀ Ω r`` without ½ and with GTSAM's residual; ``objective_g2o`` is that
+        of the same solution with g2o's residual.
     """
     network = read_network(path, noise=noise, repair=repair, create_missing=create_missing)
     solution = solve_network(network, solver, starts=starts, certificate=certificate, **options)

@@ -1,4 +1,4 @@
-"""Monte-Carlo studies: what the verbs of a notebook call, from the distribution of the studies."""
+"""Monte-Carlo studies: functions of the notebooks, implemented in the distribution of the studies."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ def study(
     quick: bool = False,
     progress: bool = True,
 ) -> Any:
-    """Run a study, or resume one: trials that are in the folder are not run again, failed ones are.
+    """Run a study, or resume one: finished trials in the folder are kept, failed ones are run again.
 
     Parameters
     ----------
     name : str
-        Registered name (``combined-slam``, ``association-ambiguity``), or a study of your own, ``module:object``.
+        Registered name (``combined-slam``, ``association-ambiguity``), or your own study as ``module:object``.
     trials : int, optional
-        Trials of each world; default the study's own.
+        Trials per world; default: that of the study.
     out : path, optional
         Folder of the study; default ``study-NAME`` in the working directory.
     worlds : sequence of str, optional
-        Some of the study's worlds; default all.
+        A subset of the study's worlds; default: all.
     seed : int
-        Root of the seed tree. Trial k has the same seed in every world, so worlds of one layout share it.
+        Root of the seed tree. Trial k has the same seed in every world, so worlds with one layout share it.
     workers : int or str, optional
-        Processes, or the address of a Dask scheduler; default none, the trials run here.
+        Number of processes, or the address of a Dask scheduler; default: none, the trials run in this process.
     quick : bool
         The study's small version.
     progress : bool
@@ -55,7 +55,7 @@ def study(
     RunFolderError
         The folder holds another study.
     KeyboardInterrupt
-        After what is done has been written.
+        After finished trials were written.
 
     Examples
     --------
@@ -76,14 +76,14 @@ def study(
 
 
 def open_study(folder: str | Path, definition: Any = None) -> Any:
-    """Read a study from its folder, finished or not, without running anything.
+    """Read a study from its folder, finished or not; nothing is run.
 
     Parameters
     ----------
     folder : path
     definition : StudyDefinition or str, optional
-        A study of your own: itself, or ``module:object``. A folder names its study, too, but a folder that somebody
-        gave you must not choose what is imported: without this argument only the registered studies are opened.
+        Your own study: the object, or ``module:object``. The folder names its study too, but a folder from another
+        person must not decide which code is imported: without this argument only registered studies are opened.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def open_study(folder: str | Path, definition: Any = None) -> Any:
 
 
 def find_study(name: str) -> Any:
-    """The study registered as ``name``, or a user's own as ``module:object``.
+    """The study registered as ``name``, or your own as ``module:object``.
 
     Parameters
     ----------
@@ -116,14 +116,14 @@ def find_study(name: str) -> Any:
     Returns
     -------
     StudyDefinition
-        Name, worlds, algorithms, and what one trial is.
+        Name, worlds, algorithms, and the function of one trial.
 
     Raises
     ------
     UnknownNameError
         Nothing is registered under that name.
     ConfigError
-        ``module:object`` cannot be imported, or is no study.
+        ``module:object`` cannot be imported, or is not a study.
 
     Examples
     --------

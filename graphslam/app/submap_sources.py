@@ -1,4 +1,4 @@
-"""Submaps to join, from wherever a user has them: a run, a folder, a card, a list."""
+"""Submaps to join, from a run, a folder, a data set, or a list."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from graphslam.join.registry import Material, are_landmark_submaps
 
 @dataclass(frozen=True, slots=True)
 class SubmapSource:
-    """What is to be joined, with what is known beside it.
+    """Input of a join, with ground truth if known.
 
     Parameters
     ----------
     submaps : list of Submap
-        None of a pose-graph file or a graph by itself.
+        Empty for a pose-graph file or a graph without submaps.
     truth : MapTruth or None
-        Landmarks only where the submaps' identities are the truth's.
+        With landmarks only if the submaps use the identities of the ground truth.
     covariance_scale : float
-        Factor that the run used in its own join; 1 elsewhere.
+        Factor that the run used in its own join; otherwise 1.
     problem : JoinProblem or None
-        The graph of a run with all its factors, or a pose-graph file that was cut into submaps.
+        The graph of a run with all its factors, or a pose-graph file cut into submaps.
     """
 
     submaps: list[Submap]
@@ -49,12 +49,12 @@ class SubmapSource:
 
     @property
     def material(self) -> Material:
-        """What is to be joined."""
+        """The problem if there is one, otherwise the submaps."""
         return self.submaps if self.problem is None else self.problem
 
     @property
     def times(self) -> list[float]:
-        """Of the nodes of a joined map [s]."""
+        """Times of the nodes of a joined map [s]."""
         if self.problem is not None:
             return self.problem.times.tolist()
         return [s.interval[0] for s in self.submaps] + [self.submaps[-1].interval[1]]
@@ -68,7 +68,7 @@ class SubmapSource:
 def source_of_graph(
     problem: JoinProblem, submaps: list[Submap], truth: MapTruth | None, covariance_scale: float
 ) -> SubmapSource:
-    """A solved graph as it is to be joined: all its factors, or landmark submaps where it holds nothing else."""
+    """A solved graph as input of a join: all its factors, or landmark submaps if it has no other factors."""
     plain = set(problem.factor_counts()) == {"submap"} and are_landmark_submaps(submaps)
     records = {r.submap_key: r for r in problem.factors if isinstance(r, SubmapRecord)} if plain else {}
     if not plain or any(r.robot >= 0 for r in records.values()) or [s.key for s in submaps] != list(records):
@@ -77,7 +77,7 @@ def source_of_graph(
 
 
 def poses_only(truth: MapTruth | None) -> MapTruth | None:
-    """Truth without its landmarks, for maps whose landmarks have names of their own."""
+    """Ground truth without landmarks, for maps with other landmark ids."""
     if truth is None:
         return None
     none = np.zeros(0, dtype=np.int64)
@@ -88,13 +88,13 @@ Source: TypeAlias = Run | SubmapSource | JoinProblem | FactorGraph | str | Path 
 
 
 def submap_source(source: Source, *, submap_poses: int | None = None) -> SubmapSource:
-    """Submaps from a run, a run folder, a submap store, a card, or a sequence.
+    """Submaps from a run, a run folder, a submap store, a data set, or a sequence.
 
     Parameters
     ----------
-    source : Run, path, card, sequence of Submap, FactorGraph or JoinProblem
+    source : Run, path, data set name, sequence of Submap, FactorGraph or JoinProblem
     submap_poses : int, optional
-        A pose-graph file is cut into submaps of so many poses.
+        Cut a pose-graph file into submaps with this number of poses.
     """
     if isinstance(source, SubmapSource):
         return source
@@ -145,7 +145,7 @@ def submap_source(source: Source, *, submap_poses: int | None = None) -> SubmapS
 
 
 def _run_facts(root: Path) -> tuple[float, str]:
-    """Covariance scale and kind of identities of a run folder; of a bare store 1 and the truth's."""
+    """Covariance scale and kind of identities of a run folder; for a store without options 1 and ``truth``."""
     values = read_options(root)
     if not values:
         return 1.0, "truth"

@@ -1,4 +1,4 @@
-"""Verbs of a notebook that have no module of their own (``compare``, ``join_submaps`` …), and lists of names."""
+"""Public functions that have no module of their own (``compare``, ``join_submaps`` …), and lists of names."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def solvers() -> list[str]:
 
 
 def joiners() -> list[str]:
-    """Names of the ways to join submaps, for :func:`join_submaps` and :func:`compare`.
+    """Names of the methods to join submaps, for :func:`join_submaps` and :func:`compare`.
 
     Examples
     --------
@@ -111,10 +111,10 @@ def options(frontend: str | None = None) -> pd.DataFrame:
 
 
 def open_run(path: str | Path) -> Run:
-    """Read a finished run folder, all of it of one state.
+    """Read a finished run folder; all files are of the same state.
 
-    Its ``graph`` and ``solution`` are solved again, and its fused map (``fused``) is made again, once, when they are
-    first asked for; the log is not read for any of them.
+    Its ``graph`` and ``solution`` are solved again, and its fused map (``fused``) is made again, once, at their first
+    use; the log is not read for any of them.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def open_run(path: str | Path) -> Run:
     RunFolderError
         Not a finished run.
     FormatError
-        A file is damaged, or not of one state with the others.
+        A file is damaged, or not of the same state as the others.
 
     Examples
     --------
@@ -163,23 +163,23 @@ def refine_path(
     steps: StepConfig | Mapping[str, Any] | None = None,
     config: RefineConfig | None = None,
 ) -> Refinement:
-    """Refine a path by the scans of a log, without any front end: clouds with poses, or a path found elsewhere.
+    """Refine a path with the scans of a log, without a front end: for clouds with poses, or a path from elsewhere.
 
     Parameters
     ----------
     source : SensorLog, data set name or folder
         With scans or clouds, and motion.
     path : Trajectory, optional
-        Of the base, where the refinement begins; gravity-aligned in space. By default the odometry of the log.
+        Initial path of the base; gravity-aligned in 3-D. Default: the odometry of the log.
     steps : StepConfig or mapping, optional
-        How the log becomes steps. By default what the preset of the log for ``segslam`` says of it, or else
+        How the log is divided into steps. Default: as in the preset of the log for ``segslam``, or else
         :class:`~graphslam_frontends.odometry.step_config.StepConfig`.
     config : RefineConfig, optional
 
     Returns
     -------
     Refinement
-        ``times``, ``poses``, ``covariances``, and how far scans agree before and after (``agreement``).
+        ``times``, ``poses``, ``covariances``, and the agreement of scans before and after (``agreement``).
 
     Raises
     ------
@@ -219,7 +219,7 @@ def compare(
 ) -> pd.DataFrame:
     """Solve the same graph by several methods: objective, time, memory, non-zeros, and NEES with ground truth.
 
-    All factors of a run or a graph are in every row (column ``factors``).
+    Every row uses all factors of the run or graph (column ``factors``).
 
     Parameters
     ----------
@@ -227,16 +227,16 @@ def compare(
     methods : sequence of str
         By default ``isam2``, ``batch``, ``eif-tree``, ``eif-sequential``, ``ekf``.
     truth : MapTruth, optional
-        Instead of the source's own.
+        Used instead of the source's own.
     submap_poses : int, optional
-        A pose-graph file is cut into submaps of so many poses.
+        Cut a pose-graph file into submaps with this number of poses.
     **options
         See :func:`graphslam.app.compare.compare_methods`.
 
     Returns
     -------
     DataFrame
-        One row a method.
+        One row per method.
 
     Raises
     ------
@@ -274,9 +274,9 @@ def join_submaps(
     method : str
         One of :func:`joiners`.
     polish : bool
-        Go on from the joined map to the least-squares optimum; ``objective`` stays that of the joined map.
+        Refine the joined map to the least-squares optimum; ``objective`` stays that of the joined map.
     submap_poses : int, optional
-        A pose-graph file is cut into submaps of so many poses.
+        Cut a pose-graph file into submaps with this number of poses.
     **options
         See :func:`graphslam.join.registry.join_by_method`.
 
@@ -291,7 +291,7 @@ def join_submaps(
     UnknownNameError
         There is no such method.
     SolverError, IndeterminateError
-        The submaps do not hang together.
+        The submaps are not connected.
     MissingDataError, FormatError, DataError
         A source without submaps, or a damaged one.
 
@@ -313,7 +313,7 @@ def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[
     Parameters
     ----------
     path : path
-        g2o, TORO or iSAM, recognised by its content.
+        g2o, TORO or iSAM, detected from the content.
     solver : str
         One of :func:`solvers`.
     **options

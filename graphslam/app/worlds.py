@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 
 GROUP = "graphslam.worlds"
-"""Entry points of worlds: a :class:`~graphslam.sim.mesh_worlds.MeshWorld`, or a function as in :data:`WORLDS`; one
-whose logs have a mesh also has ``world_of(log)``."""
+"""Entry points of worlds: a :class:`~graphslam.sim.mesh_worlds.MeshWorld`, or a function as in :data:`WORLDS`; if its
+logs have a mesh, it also has ``world_of(log)``."""
 
 
 def _landmark_field(preset: str | None, seed: int, changes: dict[str, Any]) -> SensorLog:
@@ -42,7 +42,7 @@ def _with_layout_seed(changes: dict[str, Any]) -> dict[str, Any]:
     return {("layout_seed" if name == "world_seed" else name): value for name, value in changes.items()}
 
 
-# name -> what simulates it from a preset, a seed and changed figures
+# name -> function that simulates it from a preset, a seed and changed values
 WORLDS: dict[str, Callable[[str | None, int, dict[str, Any]], SensorLog]] = {
     "landmark-field": _landmark_field,
     "mixed": _mixed,
@@ -59,35 +59,34 @@ def simulate(
     progress: bool = False,
     **changes: Any,
 ) -> SensorLog:
-    """Simulate a world, truth included.
+    """Simulate a world, with ground truth.
 
     Parameters
     ----------
     world : str
-        ``mixed``, a building in a park, in the plane, with every kind of sensor; ``landmark-field``; ``garage``;
-        ``court``, the small one. Of the studies: ``point-field``, landmarks in space; ``mine``, ``building``;
-        ``campus``.
+        ``mixed``: a building in a park, planar, with every kind of sensor; ``landmark-field``; ``garage``; ``court``, a
+        small one. From the studies: ``point-field``, 3-D landmarks; ``mine``, ``building``; ``campus``.
     seed : int
-        Of every error, and of what can be moved in the world.
+        Of all errors, and of movable objects in the world.
     preset : str, optional
-        Of the landmark field: ``A``, ``B``, ``C``, ``demo``, ``quick``; ``clutter``, ``pairs``, ``rows`` and ``hard``
-        confuse an association. Of the point field: ``flight``, ``drift``, ``quick``. Of the campus: ``full``,
+        Of the landmark field: ``A``, ``B``, ``C``, ``demo``, ``quick``; with ambiguous association: ``clutter``,
+        ``pairs``, ``rows`` and ``hard``. Of the point field: ``flight``, ``drift``, ``quick``. Of the campus: ``full``,
         ``three-blocks``, ``block``, ``quick``. Of the mixed world: ``full``, ``quick``. Of the robot in the other
         worlds: ``light``, ``full``, ``two-scanners``.
     layout : str, optional
-        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. ``drawn-17``: a plan
-        of the garage, or walls of the mine or of the building, drawn by that number.
+        Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. ``drawn-17``: a random
+        plan of the garage, or random walls of the mine or of the building, with that number as seed.
     world_seed : int, optional
-        Of the layout, or of what can be moved, where it shall not be ``seed``.
+        Of the layout, or of movable objects, if other than ``seed``.
     progress : bool
         Show a progress bar on stderr.
     **changes
-        Any figure of the world's or the robot's configuration.
+        Any value of the configuration of the world or the robot.
 
     Returns
     -------
     SensorLog
-        With its truth, in the frame of the first base [m, rad].
+        With ground truth, in the frame of the first base [m, rad].
 
     Raises
     ------
@@ -120,7 +119,7 @@ def _made_by(world: str) -> Any:
 
 
 def world_of(log: SensorLog) -> World:
-    """The world that a log of :func:`simulate` was recorded in, made again."""
+    """Make the world again in which a log of :func:`simulate` was recorded."""
     made = log.meta.get("made_with")
     if not isinstance(made, dict):
         raise ConfigError(f"log {log.name!r} does not say which world it was recorded in")
@@ -132,7 +131,7 @@ def world_of(log: SensorLog) -> World:
 
 
 def mesh_of(log: SensorLog) -> tuple[Array, Triangles]:
-    """Mesh of the world of a log, in the frame of its truth: vertices ``(v, 3)`` [m] and triangles ``(t, 3)``."""
+    """Mesh of the world of a log, in the frame of its ground truth: vertices ``(v, 3)`` [m], triangles ``(t, 3)``."""
     world = world_of(log)
     T_world_frame = log.meta["T_world_frame"]
     return se3_transform(se3_inverse(T_world_frame), world.vertices), world.triangles

@@ -1,6 +1,6 @@
-"""The command line: commands, exit codes, and the one place where errors become a line of text.
+"""The command line: commands, exit codes, and conversion of errors to one line of text.
 
-Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage; 130 interrupted, and one line how to go on.
+Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage; 130 interrupted, with the command to resume.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from graphslam.core.progress import printable, shown_bars
 
 
 class Interrupted(Exception):
-    """Ctrl-C, under a name that Typer does not know: it would leave without a word."""
+    """Ctrl-C. Typer handles ``KeyboardInterrupt`` itself and would exit without a message."""
 
 
 COMMANDS = "graphslam.commands"
 
 
 def _volume() -> list[Any]:
-    """Options of every command, before and after its name. They act when they are read; no command sees them."""
+    """Options of every command, before and after its name. Their callbacks act; they are not passed to the command."""
 
     def when_given(action: Callable[[], None]) -> Callable[[bool], None]:
         return lambda given: action() if given else None
@@ -78,12 +78,12 @@ class Commands(TyperGroup):
         return found
 
     def find(self, ctx: Any, name: str) -> Any:
-        """The command of a name, or None."""
+        """The command of that name, or None."""
         return super().get_command(ctx, name)
 
 
 class AllCommands(Commands):
-    """The commands, and those of plug-ins; Ctrl-C in one of them reaches :func:`main`."""
+    """All commands with those of plug-ins; Ctrl-C in one of them is passed on to :func:`main`."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), *plugins(COMMANDS)]
@@ -113,7 +113,7 @@ app = typer.Typer(
     help="Globally consistent maps with an uncertainty you can trust.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # or else [m] in a help text is taken for markup and disappears
+    rich_markup_mode=None,  # otherwise [m] in a help text is parsed as markup and disappears
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -158,10 +158,10 @@ def main() -> None:
 
 
 def error_line(error: BaseException) -> str:
-    """Message of an error: ours unchanged, those of the system with advice."""
+    """Message of an error: our own unchanged, system errors with advice."""
     if isinstance(error, (KeyboardInterrupt, Interrupted)):
         return f"interrupted; {_go_on(sys.argv[1:])}"
-    if isinstance(error, MemoryError):  # NumPy says how much was asked for
+    if isinstance(error, MemoryError):  # NumPy's message has the requested size
         return f"not enough memory; use a smaller part of the data, or a machine with more memory. {error}".strip()
     if isinstance(error, RecursionError):
         return "an input file is nested too deeply; check the input files for a damaged one"
@@ -185,7 +185,7 @@ def _go_on(arguments: list[str]) -> str:
 
 
 def _drop_output() -> None:
-    """Have nothing left that the interpreter would write, and fail to write, at its end."""
+    """Flush standard output; if this fails, discard it, so that the interpreter does not fail at exit."""
     try:
         sys.stdout.flush()
     except OSError:  # for example a full disk behind `graphslam … > file`

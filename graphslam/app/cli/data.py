@@ -1,4 +1,4 @@
-"""``graphslam data``: cards of recorded data sets."""
+"""``graphslam data``: recorded data sets."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def join_command(
     material = prepare_submaps(s.material, associate=associate, covariance_scale=factor)
     way = methods_for(material)
     way.check(method)
-    compile_method(material, method, polish=polish)  # not a part of the time that is printed
+    compile_method(material, method, polish=polish)  # so that the printed time excludes compilation
     filters = method in way.joiners
     estimate = own = join_by(
         material,

@@ -1,1 +1,1 @@
-"""From a log to a solved map: the pipeline, its settings, its folder and its figures."""
+"""From a log to a solved map: the pipeline, its settings, its folder and its metrics."""

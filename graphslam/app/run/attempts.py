@@ -1,4 +1,4 @@
-"""Several graphs of one log: loops are looked for, and submaps drawn anew, where the fused map contradicts itself."""
+"""Several graphs of one log: if the fused map contradicts itself, loops are searched and submaps are sampled again."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ logger = logging.getLogger(__name__)
 
 
 def best_map(inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequence[int | LoopDecision] = ()) -> Run:
-    """The run whose fused map contradicts itself least.
+    """The run whose fused map has the fewest contradictions.
 
-    Where the passes of its map contradict each other, as they do after particles diverged, particles are drawn again
-    and the better map is kept. A folder that settled on a draw before, or of which loops were taken out by hand, keeps
-    its own.
+    If traversals in the map contradict each other, as after a divergence of the particles, the submaps are made again
+    with another seed and the better map is kept. This is not done for a folder that already settled on a draw, or if
+    loops were removed by hand.
     """
     found = _MapCandidates([] if slam.settled is None else slam.settled.attempts)
     front, folder, most = slam.options.front, slam.folder, slam.options.settings.backend.draws
@@ -46,10 +46,10 @@ def best_map(inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequenc
 def _solved(
     inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequence[int | LoopDecision]
 ) -> Iterator[_MapCandidate]:
-    """The graph of the submaps; where its passes contradict each other, a second one with loops.
+    """The graph of the submaps and, if its traversals contradict each other, a second one with searched loops.
 
-    A graph without a loop and one with a wrong loop both show in the fused map: walls of one pass stand in what another
-    one saw to be free. So the front end's matches alone are tried first, then loops that the back end looks for.
+    A missing loop and a wrong loop both show in the fused map: walls of one traversal are in space that another one
+    observed to be free. So the first graph has only the front end's matches; loops of the back end are tried second.
     """
     run = run_of_solution(inputs, slam, slam.finish(undo), clock)
     first = _MapCandidate(run, slam.draw, slam.back.config.looks)
@@ -62,14 +62,14 @@ def _solved(
 
 @dataclass(frozen=True, slots=True)
 class _MapCandidate:
-    """One graph that was solved for a run.
+    """One solved graph of a run.
 
     Parameters
     ----------
     draw : int
-        Of the random numbers its submaps were made of.
+        Number of the random draw (seed) of its submaps; 0 is the first.
     loops : bool
-        With loops that the back end looked for.
+        The back end searched for loops.
     """
 
     run: Run
@@ -78,32 +78,32 @@ class _MapCandidate:
 
     @property
     def passes(self) -> Contradictions | None:
-        """What the passes of its map say of each other; None where it has no fused map."""
+        """Contradictions between traversals in its fused map; None without a fused map."""
         return None if self.run.fused is None else self.run.fused.passes
 
     @property
     def denied(self) -> bool:
-        """Do passes of its map contradict each other?"""
+        """Do traversals in its map contradict each other?"""
         return self.passes is not None and self.passes.is_contradictory
 
     def beats(self, other: _MapCandidate) -> bool:
-        """Do its passes contradict each other less?"""
+        """Are there fewer contradictions than in the other one? False if one of them has no fused map."""
         known = self.passes is not None and other.passes is not None
         return known and self.passes.agrees_better(other.passes)  # type: ignore[union-attr, arg-type]
 
     def row(self) -> dict[str, Any]:
-        """What a report says of it, JSON-serialisable."""
+        """JSON-serialisable row for the report."""
         facts = {"share": None} if self.passes is None else self.passes.facts()
         return {"draw": self.draw, "loops": self.loops, **facts}
 
 
 class _MapCandidates:
-    """Graphs that were solved for a run, of which the best is kept; maps of the others take no memory.
+    """Solved graphs of a run. Only the best one is kept; maps of the others take no memory.
 
     Parameters
     ----------
     earlier : sequence of dict
-        Rows of draws that a folder settled on not to use.
+        Rows of draws that the folder rejected before.
     """
 
     def __init__(self, earlier: Sequence[Mapping[str, Any]] = ()) -> None:
@@ -112,22 +112,22 @@ class _MapCandidates:
 
     @property
     def kept(self) -> _MapCandidate:
-        """The best one so far; there is one at least."""
+        """The best candidate so far; at least one was added."""
         assert self.best is not None
         return self.best
 
     def add(self, attempt: _MapCandidate) -> None:
-        """One more."""
+        """Add a candidate; it is kept if it is better than the best one."""
         self.rows.append(attempt.row())
         if self.best is None or attempt.beats(self.best):
             self.best = attempt
 
     def of_others(self, draw: int) -> list[dict[str, Any]]:
-        """Rows of all draws but one."""
+        """Rows of all draws except this one."""
         return [r for r in self.rows if r["draw"] != draw]
 
     def result(self) -> Run:
-        """The best run, with what became of the others in its report and verdict."""
+        """The best run; its report and verdict list the other candidates."""
         best = self.kept
         if len(self.rows) < 2:
             return best.run

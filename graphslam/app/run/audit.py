@@ -1,4 +1,4 @@
-"""Check a run's data association against identities that it never saw: the simulator's, or published ones."""
+"""Check a run's data association against reference identities that it did not use: simulated or published ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Ints = npt.NDArray[np.int64]
 
 
 def reference_identities(log: SensorLog, front: FrontEnd) -> Ints | None:
-    """Identity of every observation of a front end ``(q,)`` that it never saw; -1 = none; None = there is no reference.
+    """Reference identity of every observation ``(q,)`` of a front end, not used by it; -1: none; None: no reference.
 
     From the log itself, or published for the log of that name (plug-ins ``graphslam.identities``).
     """
@@ -45,7 +45,7 @@ def audit_association(out: Metrics, reference: Ints, observation: Ints, landmark
     reference : (q,)
         True identity of every observation of the stream; -1 = none.
     observation, landmark : (s,)
-        Index of an observation in the stream, and the landmark of the map that it saw.
+        Index of an observation in the stream, and the map landmark that it is associated with.
     """
     if len(observation) == 0:
         return

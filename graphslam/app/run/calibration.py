@@ -1,4 +1,4 @@
-"""The quick calibration inside a run: what it may look at, when it is made, and what it says."""
+"""Quick calibration inside a run: when it is made, which streams it uses, and its findings."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ from graphslam_frontends.mixed import MixedFrontEnd
 from graphslam_frontends.odometry.motion import MotionNoise
 
 LANDMARKS, SCANS = "rbpf-ekf", "segslam"
-"""Front ends whose settings are used to read a log of landmarks, or of scans, where none is named."""
+"""Front ends whose settings are used to read a log of landmarks, or of scans, if no front end is named."""
 CERTAIN, DISAGREE = 0.999, 1.5
-"""Submaps whose join has a χ² by degree of freedom above both limits disagree, and the cause is looked for."""
+"""If χ² per degree of freedom of the join is above both limits, the submaps disagree and a cause is searched."""
 OWN = "noise and calibration: preset of this data set — not estimated from the log."
 
 
 def apply_calibration(
     log: SensorLog, front: FrontEnd, config: CalibrateConfig, options: Mapping[str, Any], *, own: bool, seed: int
 ) -> tuple[SensorLog, CalibrateConfig, list[Finding], Calibration | None]:
-    """The log with corrections, the calibration options, findings, and the estimate.
+    """The corrected log, the calibration options, findings, and the estimate.
 
     Parameters
     ----------
     options : mapping
-        What the user asked for: noise that is set by hand stays.
+        Options set by the user; noise that is set here is kept.
     own : bool
-        Is there a preset for this very set?
+        There is a preset for this data set.
     """
     if isinstance(front, MixedFrontEnd):
         front = front.calibrated_part
         options = {"frontend": options.get("frontend", {}).get(front.name, {})}
     said, found = [], None
-    if config.given is not None:  # what a user wrote down stands before what would be estimated
+    if config.given is not None:  # values given by the user have priority over an estimate
         config = replace(config, given=keep_user_settings(config.given, options))
         said = [Finding("", "calibrated", "noise and calibration: calibrate.given — not estimated from the log.")]
     elif config.use == "auto" and own and front.calibrates:
@@ -70,7 +70,7 @@ def apply_calibration(
 
 
 def _path_moved(log: SensorLog, corrected: SensorLog, c: Corrections, front: FrontEnd) -> list[Finding]:
-    """A line where the corrected path is further from that of the log than the noise of both allows."""
+    """A finding if the end of the corrected path differs from that of the log by more than the noise of both allows."""
     if c.without_constants() == c:
         return []
     moved, allowed = moved_end(log, corrected, getattr(front.config, "motion", None) or MotionNoise())
@@ -102,10 +102,10 @@ def calibrate_log(
     frontend : str, optional
         Front end that reads the log. Default: by the streams of the log.
     quick : bool
-        Use a part of the log, as inside a run (some seconds).
+        Use a part of the log, as inside a run (a few seconds).
     seed : int
     config : mapping, optional
-        Options over those of the source's preset, as for a run: how scans and landmarks are read.
+        Options that override the source's preset, as for a run: how scans and landmarks are read.
     reader, reader_options, preset
         As for a run.
 
@@ -133,15 +133,15 @@ def calibrate_log(
 
 
 def uses_preset_noise(options: Mapping[str, Any]) -> bool:
-    """Does the noise of a preset count, or do figures that were estimated stand in its place?"""
+    """Is the noise of the preset used, not estimated or given corrections?"""
     asked = options.get("calibrate", {})
     return not isinstance(asked, Mapping) or ("given" not in asked and asked.get("use", "auto") != "always")
 
 
 def without_noise(suggested: Mapping[str, Any], *, mixed: bool = False) -> dict[str, Any]:
-    """A preset without its noise and constants of the sensors; what says how a log is read stays.
+    """A preset without its sensor noise and constants; settings for reading the log stay.
 
-    ``mixed``: of several front ends, whose options stand under their names.
+    ``mixed``: the preset is for several front ends, with options under their names.
     """
     front = _without_front_noise(suggested.get("frontend", {}))
     if mixed:
@@ -170,7 +170,7 @@ def calibrate_for_front_end(
 def explain_disagreement(
     log: SensorLog, config: CalibrateConfig, chi2_per_dof: float | None, dof: float, *, ranges_corrected: bool
 ) -> list[Finding]:
-    """Errors of the sensors that last, in a log that was mapped without calibration and whose submaps disagree.
+    """Systematic sensor errors of a log that was mapped without calibration and whose submaps disagree.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def explain_disagreement(
 
 
 def bias_table(graph: FactorGraph) -> list[dict[str, Any]]:
-    """Constant errors that were estimated with the map: name, value, σ, and σ beforehand, a row each."""
+    """One row per constant error that was estimated with the map: name, value, σ, and prior σ."""
     out = []
     for robot, event in enumerate(e for e in graph.events if e["event"] == "lasting"):
         g, P = graph.lasting_errors(robot)
@@ -209,7 +209,7 @@ def bias_table(graph: FactorGraph) -> list[dict[str, Any]]:
 
 
 def bias_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """What a verdict says of constant errors that were estimated with the map."""
+    """Findings on the constant errors that were estimated with the map."""
     sure = [r for r in facts if abs(r["value"]) > SURE * r["sigma"]]
     wild = [r for r in sure if abs(r["value"]) - SURE * r["sigma"] > SURE * r["beforehand"]]
     if not facts:
@@ -241,9 +241,9 @@ def _sigma_in_words(row: Mapping[str, Any]) -> str:
 
 
 def keep_user_settings(c: Corrections, options: Mapping[str, Any]) -> Corrections:
-    """What of a calibration is used where the user has set noise or constants, or a file of options has.
+    """The part of a calibration that does not override noise or constants set by the user or in an options file.
 
-    No parameter is corrected twice: a constant that the options have is not estimated as well.
+    No parameter is corrected twice: a constant that is in the options is not estimated as well.
     """
     own = options.get("frontend", {})
     noise = {**(own.get("noise") or {}), **(own.get("smoothing_noise") or {})}

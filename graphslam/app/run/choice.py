@@ -1,4 +1,4 @@
-"""What fits a log: the front end that its streams allow, and the preset that its kind has."""
+"""Choose the front end and the preset for a log from the types of its streams."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from graphslam.core.records import (
 )
 
 LEVEL = 1e-6
-"""Odometry whose heights and tilts never change by more is that of wheels, written in space [m, quaternion]."""
+"""Largest change of height and tilt [m, quaternion] of wheel odometry that is stored as 3-D poses."""
 NAMED = 0.9
-"""Share of sightings with an identity from which on identities are taken as known."""
+"""If at least this share of the observations has an identity, the preset for known identities is used."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrontEndChoice:
-    """A front end, and why.
+    """A front end with the reason for the choice.
 
     Parameters
     ----------
     why : str
-        What of the log it is for.
+        The streams that it is chosen for.
     """
 
     frontend: str
@@ -44,7 +44,7 @@ class FrontEndChoice:
 
 
 def choose_front_end(log: SensorLog) -> FrontEndChoice:
-    """The front end for what a log holds."""
+    """The front end for the streams of a log."""
 
     def has(*kinds: type) -> bool:
         return any(isinstance(s, kinds) and len(s.times) for s in log.streams.values())
@@ -71,7 +71,7 @@ def choose_front_end(log: SensorLog) -> FrontEndChoice:
 
 
 def _in_space(odometry: Odometry) -> bool:
-    """Does it tell heights and tilts, too? That of wheels does not, though it may be written as if it did."""
+    """Does the odometry measure height and tilt? Wheel odometry does not, even if it is stored as 3-D poses."""
     steps = odometry.increments
     return steps.shape[1] == 7 and len(steps) > 1 and float(np.abs(steps[1:, 2:5]).max()) > LEVEL
 
@@ -94,7 +94,7 @@ def _wanted(log: SensorLog) -> str:
 
 
 def kind_preset(log: SensorLog) -> str:
-    """Name of the preset for recorded logs of that kind; empty where there is none, and for simulated logs."""
+    """Name of the preset for a recorded log with these streams; empty if there is none, and for simulated logs."""
     if "reader" not in log.meta or log.meta.get("source") == "simulation":
         return ""
     kinds: set[object] = {type(s) for s in log.streams.values()}
@@ -107,7 +107,7 @@ def kind_preset(log: SensorLog) -> str:
 
 
 def reading_line(log: SensorLog) -> str:
-    """What was read by whom, in one line; empty for a log that was not read."""
+    """One line: reader, streams and numbers of records; empty for a log that was not read by a reader."""
     read: Any = log.meta.get("reader")
     if not isinstance(read, dict):
         return ""

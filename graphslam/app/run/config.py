@@ -1,7 +1,7 @@
 """Configuration of a run: one frozen dataclass per part, defaults in code, a TOML file optional and partial.
 
-Order of precedence: defaults, what the log says of its own noise (:mod:`graphslam.calibrate`) where no preset was made
-for it, preset of the source (``graphslam/app/presets``), the user's TOML file, ``--set a.b=c``.
+Order of precedence: defaults, noise estimated from the log (:mod:`graphslam.calibrate`) if no preset was made for it,
+preset of the source (``graphslam/app/presets``), the user's TOML file, ``--set a.b=c``.
 Unknown keys are refused with their full name; the effective configuration is written into the run folder.
 """
 
@@ -23,14 +23,14 @@ from graphslam.refine.config import RefineConfig
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class RunConfig:
-    """Everything that steers ``graphslam run`` beside the source and the seed."""
+    """All options of ``graphslam run`` except the source and the seed."""
 
     frontend: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the front end; its own dataclass validates them."""
     backend: BackEndConfig = dataclasses.field(default_factory=BackEndConfig)
     """Association, scale, merging."""
     gps: GpsOptions = dataclasses.field(default_factory=GpsOptions)
-    """GPS factors and what is withheld."""
+    """GPS factors, and withheld fixes."""
     imu: ImuOptions = dataclasses.field(default_factory=ImuOptions)
     """IMU factors, and the axes of IMUs."""
     compass: CompassOptions = dataclasses.field(default_factory=CompassOptions)
@@ -38,15 +38,15 @@ class RunConfig:
     beacons: BeaconOptions = dataclasses.field(default_factory=BeaconOptions)
     """Distances to beacons."""
     refine: RefineConfig = dataclasses.field(default_factory=RefineConfig)
-    """The path refined by its scans, of front ends that work on scans."""
+    """Path refinement with scans, for front ends that work on scans."""
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
     """The fused map."""
     calibrate: CalibrateConfig = dataclasses.field(default_factory=CalibrateConfig)
-    """Noise and lasting errors, told from the log itself before the run."""
+    """Noise and systematic errors, estimated from the log before the run."""
 
 
 def preset(name: str) -> dict[str, Any]:
-    """Recommended settings of a source, or nothing where there are none."""
+    """Recommended settings of a source; empty if there are none."""
     files = (folder / f"{name}.toml" for folder in _preset_folders())
     file = next((f for f in files if f.is_file()), None)
     return {} if file is None else tomllib.loads(file.read_text())

@@ -1,4 +1,4 @@
-"""Control and check points of a run: what enters its report and its verdict."""
+"""Report and verdict of a run on its control points and check points."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ MEANINGS = {
     "wrong": "errors are more than three standard deviations on average; the map or the rows are wrong",
     "not tested": "the rows are too few or too uncertain to show a covariance that is too small by two",
 }
-"""Of the words of a test."""
+"""Meaning of each result of the test."""
 SHOWN = 5
-"""Refused rows that a finding names; the report lists all."""
+"""Largest number of refused rows in a finding; the report lists all."""
 
 
 def control_facts(graph: FactorGraph, table: ControlTable) -> dict[str, Any]:
-    """What ``run.json`` holds of the control rows."""
+    """The control rows in ``run.json``."""
     events = [e for e in graph.events if e.get("event") == "control-refused"]
     refused = sorted([*table.refused, *((int(e["line"]), str(e["why"])) for e in events)])
     used = [r for r in graph.records.values() if isinstance(r, (ControlRecord, DistanceRecord))]
@@ -47,7 +47,7 @@ def control_facts(graph: FactorGraph, table: ControlTable) -> dict[str, Any]:
 
 
 def check_metrics(out: Metrics, found: CheckPoints) -> None:
-    """The test in figures."""
+    """Add the metrics of the test on check points."""
     out.add("check_rows", len(found.rows))
     if not found.rows:
         return
@@ -62,7 +62,7 @@ def check_metrics(out: Metrics, found: CheckPoints) -> None:
 
 
 def left_out_of_refinement(held: int, used: int) -> Finding:
-    """Control rows of the graph that do not hold the refined path."""
+    """Finding: control rows of the graph that do not constrain the refined path."""
     text = (
         f"control points: {held} of {used} rows hold the refined path — landmarks, distances, and rows beside GPS "
         "fixes are in the initial graph only. To do: compare with a run without refinement (--set refine.use=false)."

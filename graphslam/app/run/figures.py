@@ -22,7 +22,7 @@ from graphslam.plots.trajectory import plot_gps_residuals
 
 
 def _as_solved(run: Run) -> list[Submap]:
-    """Submaps with the paths that their inner nodes have bent, where they have any."""
+    """Submaps with their solved trajectories (inner nodes change them); unchanged if there are no inner nodes."""
     m = run.map
     if len(m.node_poses) == len(m.base_poses):
         return list(run.submaps)
@@ -70,10 +70,10 @@ FIGURES: dict[str, Callable[[Run], Any]] = {
     "gps_innovations.png": _innovations,
     "loops.png": _loops,
 }
-"""Figures of a run by the name of their file: axes, or None where the run has nothing to draw."""
+"""Plots of a run by file name; each function returns axes, or None if there is nothing to draw."""
 
 
 def save_figures(run: Run, folder: Path) -> list[Path]:
-    """Every figure of :data:`FIGURES` for which the run has something to draw, as PNG files."""
+    """Write each plot of :data:`FIGURES` that has something to draw as a PNG file."""
     drawn = ((name, draw(run)) for name, draw in FIGURES.items())
     return [save_figure(ax, folder / name) for name, ax in drawn if ax is not None]

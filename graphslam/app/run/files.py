@@ -1,6 +1,6 @@
-"""The files of a run folder, read: each with the shape that it must have, and refused where it has not.
+"""Read the files of a run folder. Each must have its expected shape; otherwise it is refused.
 
-Nothing here imports, runs or opens what a file names.
+Nothing here imports, runs or opens a file that is named in another one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from graphslam.loops.ledger import EVENT, LoopDecision, LoopLedger, ledger_of_ev
 from graphslam.maps.global_map import GlobalMap
 
 GENERATION_EVENT = "generation"
-"""First line of ``events.jsonl``: which state of the folder it is of."""
+"""First line of ``events.jsonl``: id of the state of the folder that the file belongs to."""
 RUN_FORMAT = "graphslam.run/1"
 MERGE_FORMAT = "graphslam.merge/1"
 MAP_FORMAT = "graphslam.map/1"
@@ -165,7 +165,7 @@ EVENTS: dict[str, dict[str, Any]] = {
     "removed": {"factor_id?": int, "reason?": str},
     "split": {"new": int},
 }
-"""Of the events that are used again when a folder is read; of others only ``event`` must be text."""
+"""Fields of events that are used when a folder is read; in other events only ``event`` must be text."""
 VERDICTS = ("accepted", "rejected", "switched-off", "undone")
 LEDGER: dict[str, type] = {
     **{"factor_id": int, "factor": str, "stream": str, "t_start": float, "t_end": float, "kind": str, "note": str}
@@ -183,7 +183,7 @@ def read_merge_report(root: Path) -> dict[str, Any]:
 
 
 def read_options(root: Path) -> dict[str, Any]:
-    """``config.toml`` of a run: tables of options by name; nothing where there is none."""
+    """``config.toml`` of a run: tables of options by name; empty if there is no file."""
     file = root / "config.toml"
     if not file.exists():
         return {}
@@ -227,14 +227,14 @@ def read_map(root: Path) -> GlobalMap:
 
 
 def _check_covariances(covariances: Array, what: str, where: str) -> None:
-    """Symmetric, and without a variance that rounding does not explain."""
+    """Refuse covariances that are not symmetric, or have a negative variance that rounding does not explain."""
     bad = first_no_covariance(covariances)
     if bad is not None:
         raise FormatError(f"{what}: number {bad} is no covariance", where=where, got=covariances[bad].tolist())
 
 
 def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
-    """Landmark identities that a run's back end gave, by submap key."""
+    """Landmark identities assigned by a run's back end, by submap key."""
     file = root / "association.npz"
     a = read_npz(file, fmt=ASSOCIATION_FORMAT, fields=ASSOCIATION)
     o = a["offsets"]
@@ -244,9 +244,7 @@ def read_association(root: Path) -> dict[int, npt.NDArray[np.int64]]:
 
 
 def read_metrics(root: Path, name: str = "metrics.json") -> pd.DataFrame:
-    """``metrics.json``, or ``timings.json``, as a table ``key, value, unit, direction``; a value that was
-    not a number is NaN.
-    """
+    """``metrics.json``, or ``timings.json``, as a table ``key, value, unit, direction``; a missing value is NaN."""
     file = root / name
     rows = check_json(parse_json(read_text(file), str(file)), [METRIC], str(file))
     table = FigureTable(rows, columns=["key", "value", "unit", "direction"])
@@ -272,7 +270,7 @@ def read_events(root: str | Path, *, home: str | Path | None = None) -> list[dic
 
 
 def check_state(root: Path) -> None:
-    """Hold the ids of generations in plain files of a run against each other; files of older versions have none."""
+    """Check that plain files of a run have the same generation id; files of older versions have none."""
     known = read_report(root).get("generation")
     for file in (root / n for n in ("map.npz", "association.npz", "fixes.npz", "taken.npz")):
         if file.is_file():
@@ -302,7 +300,7 @@ def _check_decision(event: Mapping[str, Any], where: str) -> None:
 
 
 def read_ledger(root: Path) -> pd.DataFrame:
-    """``ledger.csv`` as a table: which factor spent which stream when."""
+    """``ledger.csv`` as a table: which factor used which stream in which time interval."""
     file = root / "ledger.csv"
     try:
         lines = list(csv.reader(io.StringIO(read_text(file)), strict=True))
@@ -347,7 +345,7 @@ def read_gps_residuals(file: Path) -> GpsResiduals:
 
 
 def read_fixes(root: Path) -> Gps | None:
-    """``fixes.npz``; None where there is none."""
+    """``fixes.npz``; None if there is no file."""
     file = root / "fixes.npz"
     if not file.is_file():
         return None
@@ -359,13 +357,13 @@ def read_fixes(root: Path) -> Gps | None:
 
 
 def loops_of_run(folder: str | Path) -> LoopLedger:
-    """Ledger of all loops of a run: those that were decided on, then the front end's matches that were not."""
+    """Ledger of all loops of a run: first those with a decision, then the front end's matches without one."""
     events = read_consistently(folder, lambda root: read_events(root, home=folder))
     return ledger_of_events(events, where=str(Path(folder) / "events.jsonl"))
 
 
 def removed_loops_of_run(folder: str | Path) -> list[LoopDecision]:
-    """Loops that were taken out of a finished run by hand; none where a run was not finished."""
+    """Loops that were removed from a finished run by hand; empty if the run is not finished."""
     if not (current_outputs(folder) / "events.jsonl").is_file():
         return []
     return [d for d in loops_of_run(folder).current() if d.verdict == "undone"]

@@ -1,6 +1,6 @@
 """The folder of a run: complete after a crash up to the last finished submap, resumable from there.
 
-``config.toml`` (effective) and ``submaps/`` are written while the run goes on; everything else is one state, written by
+``config.toml`` (effective) and ``submaps/`` are written during the run; everything else is one state, written by
 :mod:`graphslam.app.run.outputs` and replaced as a whole (:mod:`graphslam.app.folders.generations`).
 """
 
@@ -36,14 +36,14 @@ _ANOTHER = re.compile(r"submaps-(beaten|\d)")
 
 @dataclass(frozen=True, slots=True)
 class SeedChoice:
-    """Which draw of random numbers the submaps of a folder are, where there were several.
+    """Random draw of the submaps in a folder, if several were made.
 
     Parameters
     ----------
     draw : int
-        0 of the first one.
+        0 is the first one.
     attempts : list of dict
-        What was solved, in order, and what the passes of each map said.
+        Rows of the rejected draws: loops, and contradictions in their maps.
     """
 
     draw: int
@@ -61,17 +61,17 @@ class RunFolder:
     def start(
         cls, path: str | os.PathLike[str] | None, config: Mapping[str, Any], *, resume: bool
     ) -> Iterator[RunFolder | None]:
-        """Make a new folder, or reopen one whose configuration and log are the same; no other process writes into it
-        until the block ends. Without a path there is none.
+        """Make a new folder, or reopen one with the same configuration and log. It is locked for other processes until
+        the block ends. Without a path there is no folder.
 
-        A folder in which a run left no finished submap is begun anew.
+        A folder without a finished submap is started anew.
         """
         if path is None:
             yield None
             return
         folder = cls(path)
         make_folder(folder.path)
-        if not (folder.path / CONFIG).is_file() and not is_empty(folder.path):  # before a lock is put there
+        if not (folder.path / CONFIG).is_file() and not is_empty(folder.path):  # before a lock file is created
             raise RunFolderError(f"{folder.path}: not empty and not a run folder; choose another --out")
         with lock_folder(folder.path):
             check_links(folder.path)
@@ -89,22 +89,22 @@ class RunFolder:
             yield folder
 
     def describe(self, config: Mapping[str, Any]) -> None:
-        """Write the configuration anew, with what is known of the log at its end."""
+        """Write the configuration again, with the digest of the complete log."""
         with atomic_open(self.path / CONFIG, "w") as stream:
             stream.write(dump_toml(config))
 
     def removed_loops(self) -> list[LoopDecision]:
-        """Loops that were taken out of the run by hand."""
+        """Loops that were removed from the run by hand."""
         return removed_loops_of_run(self.path)
 
     def _begun(self) -> bool:
-        """Is there a run with anything to lose?"""
+        """Is there a finished result or a finished submap?"""
         if not (self.path / CONFIG).is_file():
             return False
         return (current_outputs(self.path) / "run.json").is_file() or len(self.submaps) > 0
 
     def _check_same(self, old: Path, config: Mapping[str, Any]) -> None:
-        """A resumed run must be the run that was stopped."""
+        """A resumed run must have the configuration and the log of the interrupted run."""
         try:
             before = read_toml(old)
         except ConfigError as error:
@@ -120,14 +120,14 @@ class RunFolder:
         return self.submaps_with(None)
 
     def submaps_with(self, load_grid: GridLoader | None, draw: int | None = None) -> SubmapStore:
-        """Store of the finished submaps, whose grids are read too where a reader is given.
+        """Store of the finished submaps; with ``load_grid`` their grids are read too.
 
-        Those of another draw than the folder settled on, which are being made, have a store of their own.
+        A draw that is being made, other than the one in the folder, has its own store.
         """
         return SubmapStore(self.path / (SUBMAPS if draw is None else f"{SUBMAPS}-{draw}"), load_grid=load_grid)
 
     def settled(self) -> SeedChoice | None:
-        """Which draw the submaps are, where several were made and one was chosen."""
+        """Draw of the submaps, if several were made and one was chosen."""
         file = resolve_inside(self.path, DRAWS, str(self.path))
         if not file.exists():
             return None
@@ -135,10 +135,9 @@ class RunFolder:
         return SeedChoice(said["draw"], said["attempts"])
 
     def settle(self, draw: int, attempts: list[dict[str, Any]]) -> None:
-        """Keep the submaps of one draw as those of the run, and drop the others.
+        """Keep the submaps of one draw as those of the run, and delete the others.
 
-        Until the file that says so is written, a folder that was left half way is put back as it was
-        (:meth:`_undo_settling`).
+        If the process is killed before ``draws.json`` is written, :meth:`_undo_settling` restores the earlier state.
         """
         if draw:
             (self.path / SUBMAPS).rename(self.path / _BEATEN)
@@ -152,11 +151,11 @@ class RunFolder:
                 shutil.rmtree(old, ignore_errors=True)
 
     def _undo_settling(self) -> None:
-        """After a kill: what was not settled begins where it was; what was is cleared up."""
+        """After a kill: restore the first draw if ``draws.json`` was not written, otherwise delete the other draws."""
         if (self.path / DRAWS).is_file():
             self._drop_beaten()
         elif (self.path / _BEATEN).is_dir():
-            if (self.path / SUBMAPS).is_dir():  # the draw that had won is made again
+            if (self.path / SUBMAPS).is_dir():  # the chosen draw is made again
                 shutil.rmtree(self.path / SUBMAPS)
             (self.path / _BEATEN).rename(self.path / SUBMAPS)
 

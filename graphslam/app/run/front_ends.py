@@ -25,7 +25,7 @@ def front_end_names() -> list[str]:
 
 
 def check_name(name: str) -> None:
-    """See that a front end of that name is installed."""
+    """Raise an error if no front end of that name is installed."""
     known = front_end_names()
     if name not in known:
         raise unknown(GROUP, "front end", name, known)
@@ -35,7 +35,7 @@ FrontEndLike: TypeAlias = str | FrontEnd | type[FrontEnd]
 
 
 def name_of(front: FrontEndLike | Sequence[FrontEndLike]) -> str | list[str]:
-    """Name of a front end that is given by its name, as a class or as an object; of several of them their names."""
+    """Name of a front end that is given as a name, class or object; a list of names for several ones."""
     if isinstance(front, MixedFrontEnd):
         return [p.name for p in front.parts]
     if isinstance(front, (list, tuple)):
@@ -80,8 +80,8 @@ def make_front_end(
     Parameters
     ----------
     front : str, class or object, or a sequence of these
-        An object has its configuration and is taken as it is. Several map one log together
-        (:class:`~graphslam_frontends.mixed.MixedFrontEnd`); the options of each stand under its name.
+        An object has its own configuration and is returned unchanged. Several front ends map one log together
+        (:class:`~graphslam_frontends.mixed.MixedFrontEnd`); the options of each are under its name.
     where : str
         Table of the options, in errors.
     """
@@ -108,7 +108,7 @@ def make_front_end(
 
 
 def options_of_scans(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Options of the front end of a run that works on scans, of several the one that has ``steps``."""
+    """Options of the front end that works on scans; of several front ends the one that has ``steps``."""
     own: Mapping[str, Any] = values.get("frontend", {})
     if isinstance(values.get("run", {}).get("frontend"), list):
         return next((v for v in own.values() if "steps" in v), {})
@@ -116,17 +116,17 @@ def options_of_scans(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def recommended_options(log: SensorLog, frontend: str | Sequence[str], preset: str | None = None) -> dict[str, Any]:
-    """Preset of a source for a front end: a shipped TOML, and a simulated log's own stated noise.
+    """Preset of a source for a front end: a shipped TOML file, and the noise that a simulated log states.
 
     Logs of one data set (``mrclam-dataset7/robot1``) share the preset of the set, layouts of a simulated world
-    (``garage-A``) that of the world. A recorded log without one has that of its reader, or else of its kind.
+    (``garage-A``) that of the world. A recorded log without one uses that of its reader, or of its kind.
 
     Parameters
     ----------
     frontend : str or sequence of str
-        Of several, the options of each stand under its name, and the rest is that of all together.
+        For several front ends, the options of each are under its name; the other options are merged.
     preset : str, optional
-        Name of a preset instead; ``none``: defaults.
+        Name of a preset to use instead; ``none``: defaults.
     """
     if not isinstance(frontend, str):
         out: dict[str, Any] = {}
@@ -150,7 +150,7 @@ def recommended_options(log: SensorLog, frontend: str | Sequence[str], preset: s
 
 
 def named_preset(frontend: str, preset: str | None) -> dict[str, Any]:
-    """Settings of a preset for a front end; of ``none``, and of None, nothing."""
+    """Settings of a preset for a front end; empty for ``none`` and None."""
     if preset is None or preset == "none":
         return {}
     known = cfg.preset_names(frontend)
@@ -160,10 +160,9 @@ def named_preset(frontend: str, preset: str | None) -> dict[str, Any]:
 
 
 def preset_of(log: SensorLog, frontend: str | Sequence[str]) -> tuple[str, bool]:
-    """Name of the preset that :func:`recommended_options` takes, empty where there is none; and is it made for this
-    very set?
+    """Name of the preset used by :func:`recommended_options` (empty if there is none), and whether its noise applies.
 
-    That of a reader or of a kind of log says how it is read; its noise is that of other robots.
+    The preset of a reader or of a kind of log sets how the log is read; its noise is that of other robots.
     """
     if not isinstance(frontend, str):
         found = [preset_of(log, name) for name in frontend]

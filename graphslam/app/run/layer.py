@@ -1,4 +1,4 @@
-"""Layers over the map of a finished run: terrain, surface, and what else is made from the log along the solved path."""
+"""Layers over the map of a finished run (terrain, surface, …), computed from the log along the solved path."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ class Layer(ABC):
     Attributes
     ----------
     name : str
-        Of its files: ``NAME*`` and ``figures/NAME*.png``.
+        Prefix of its files: ``NAME*`` and ``figures/NAME*.png``.
     """
 
     name: ClassVar[str]
 
     @abstractmethod
     def make(self, run: Run, *, log: str | Path | SensorLog | None = None, progress: bool = True) -> Any:
-        """Read the log of a run in space once more, along its solved path.
+        """Read the log of a 3-D run once more, along its solved path.
 
         Parameters
         ----------
-        log : card name, folder, or SensorLog; optional
-            Where the run's log is by now; default where it was.
+        log : data set name, folder, or SensorLog; optional
+            Where the run's log is now; default: its original location.
 
         Returns
         -------
@@ -53,7 +53,7 @@ class Layer(ABC):
 def make_layer(
     folder: str | Path, layer: Layer, *, log: str | Path | SensorLog | None = None, progress: bool = True
 ) -> tuple[Any, list[Path], list[Path]]:
-    """Make a layer of a finished run, and write it with its pictures and the page of the run.
+    """Make a layer of a finished run; write its files, its pictures and the report page of the run.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def make_layer(
     """
     home = Path(folder)
     if not (current_outputs(home) / "run.json").is_file():
-        read_run_folder(home)  # says what is wrong
+        read_run_folder(home)  # raises the error
     with lock_folder(home):
         run = read_run_folder(home)
         made = layer.make(run, log=log, progress=progress)

@@ -1,4 +1,4 @@
-"""Submaps of a log without joining them: what a front end hands over, to look at and to compare."""
+"""Submaps of a log as the front end outputs them, without joining, for inspection and comparison."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def local_maps(
     seed : int
         Root of the seed tree.
     options : mapping, optional
-        Of the front end, over the source's preset, e.g. ``{"particles": 500, "stopping": {"scans": 59}}``.
+        Of the front end, overriding the source's preset, e.g. ``{"particles": 500, "stopping": {"scans": 59}}``.
     progress : bool
         Show a progress bar.
 
@@ -83,12 +83,12 @@ def first_particles(
     seed: int = 0,
     options: Mapping[str, Any] | None = None,
 ) -> tuple[Submap, ParticleSet]:
-    """The first submap of a log with the particles it was made of, as they stood at its last scan.
+    """The first submap of a log, with its particles at the last scan of the submap.
 
     Parameters
     ----------
     source, frontend, seed, options
-        As in :func:`local_maps`; slice the log to begin elsewhere.
+        As in :func:`local_maps`; slice the log to start later.
 
     Returns
     -------

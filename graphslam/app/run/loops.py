@@ -1,4 +1,4 @@
-"""Loops taken out of a finished run, or in again: the run is made again from its folder."""
+"""Remove loops from a finished run, or restore them; the run is solved again from the data in its folder."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from graphslam.loops.overlap_constraints import overlap_entries
 
 
 def undo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLedger:
-    """Take a loop out of a finished run: its graph is made again from what the folder holds, solved without the loop,
-    and everything in the folder is written anew.
+    """Remove a loop from a finished run. Its graph is built from the folder and solved without the loop.
 
-    Loops that were undone before stay so, as this one does whenever the run is resumed (:func:`redo_loop` takes it in
-    again). What was found with the loop in the graph stays too.
+    All files are written anew. Loops that were undone before stay undone, and so does this one if the run is resumed;
+    :func:`redo_loop` restores it. Other loops that were found while this loop was in the graph stay, too.
 
     Parameters
     ----------
@@ -39,7 +38,7 @@ def undo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLe
 
 
 def redo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLedger:
-    """Take in again a loop that :func:`undo_loop` took out, a match with its ties; others that were undone stay so.
+    """Restore a loop that :func:`undo_loop` removed; a match with its overlap constraints. Others stay undone.
 
     Parameters and errors are those of :func:`undo_loop`.
     """
@@ -58,9 +57,9 @@ def redo_loop(folder: str | Path, loop: int, *, progress: bool = True) -> LoopLe
 def _again(
     folder: str | Path, without: Callable[[LoopLedger, list[LoopDecision]], list[LoopDecision]], progress: bool
 ) -> LoopLedger:
-    """Make a run again without the loops that are chosen from its ledger and from those that are undone."""
-    without(loops_of_run(folder), [])  # a folder that is no run is not locked, nor made
-    with lock_folder(folder):  # from the look at the ledger on
+    """Run again without the loops that ``without`` selects from the ledger and the undone loops."""
+    without(loops_of_run(folder), [])  # checks first, so that a folder that is not a run is neither locked nor created
+    with lock_folder(folder):  # before the ledger is read again
         undone = without(loops_of_run(folder), removed_loops_of_run(folder))
         rerun_without_loops(folder, sorted(undone, key=lambda x: x.loop), progress=progress)
     return loops_of_run(folder)

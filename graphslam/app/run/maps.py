@@ -1,7 +1,7 @@
-"""The fused map of a run: pieces led by the graph's own nodes, at their solved poses; files, pictures, figures.
+"""The fused map of a run, with pieces placed along the solved nodes of the graph: its files, pictures and metrics.
 
-No scan is read: front ends store a grid or a cloud with each submap, so that a map can be made again
-from a run folder alone (``graphslam map``).
+No scan is read: front ends store a grid or a cloud with each submap, so that a map can be made again from the run
+folder alone (``graphslam map``).
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ def write_run_map(folder: OutputFiles, run_map: RunMap, generation: str | None =
 
 
 def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth: Any = None) -> list[Path]:
-    """Pictures of the fused map: from above, each storey, and cut from the side.
+    """Pictures of the fused map: from above, each level, and a vertical section.
 
     Parameters
     ----------
     path : Trajectory
         Solved.
     figures : Path
-        Folder that is there.
+        Existing folder.
     name : str
-        Of the run.
+        Name of the run.
     truth : Trajectory, optional
-        The true path, drawn beside the solved one.
+        Ground-truth path, drawn with the solved one.
     """
     from graphslam.plots.evidence import plot_heights, plot_section
     from graphslam.plots.fused_map import plot_cut, plot_storey
@@ -48,7 +48,7 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
 
     def save(ax: Any, file: Path) -> Path:
         out = saved(ax, file)
-        gc.collect()  # what a picture holds refers to itself, and is as large as the picture
+        gc.collect()  # figures contain reference cycles and are large
         trim_heap()
         return out
 
@@ -75,6 +75,6 @@ def draw_run_map(run_map: RunMap, path: Any, figures: Path, *, name: str, truth:
 
 
 def sensor_reach(values: Mapping[str, Any]) -> float | None:
-    """Range at which the front end cut its beams [m], from the options of a run; None where they do not say."""
+    """Maximum range of the beams in the front end [m], from the options of a run; None if it is not set."""
     reach = options_of_scans(values).get("steps", {}).get("max_range")
     return float(reach) if isinstance(reach, (int, float)) else None

@@ -1,4 +1,4 @@
-"""What a run is made with: front end, solver, seed, and every option with its value."""
+"""Options of a run: front end, solver, seed, and every option with its value."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ FrontEnds = FrontEndLike | Sequence[FrontEndLike]
 
 
 def check_names(frontend: FrontEnds | None, solver: str) -> None:
-    """See that what is named is there, before anything is read."""
+    """Raise an error for an unknown front end or solver, before anything is read."""
     for each in frontend if isinstance(frontend, (list, tuple)) else [frontend]:
         if isinstance(each, str):
             check_name(each)
@@ -57,7 +57,7 @@ def _estimates_nothing(asked: Mapping[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a run is made with.
+    """Options of a run.
 
     Parameters
     ----------
@@ -65,11 +65,11 @@ class RunOptions:
     named : mapping
         Source, front end, solver, seed, the digest of the log, and the lines of control and check points.
     front : FrontEnd or None
-        None where submaps come from a folder.
+        None if submaps come from a folder.
     asked : mapping
-        What the user set: calibration leaves it alone.
+        Options set by the user; calibration does not change them.
     own : bool
-        Is there a preset for this very data set?
+        There is a preset for this data set.
     """
 
     settings: RunConfig
@@ -83,7 +83,7 @@ class RunOptions:
     def for_log(
         cls, log: SensorLog, frontend: FrontEnds | None, solver: str, seed: int, config: Mapping[str, Any] | None
     ) -> RunOptions:
-        """Front end and options for a log: defaults, below the preset, below what the user set.
+        """Front end and options for a log: defaults, overridden by the preset, overridden by the user.
 
         ``config["preset"]`` names another preset than that of the log; ``"none"``: defaults.
         """
@@ -103,7 +103,7 @@ class RunOptions:
         if read:
             names = name if isinstance(name, str) else ", ".join(name)
             logger.warning("front end: %s (%s); preset: %s", names, why, preset or taken or "none")
-        # noise and constants of another set's preset are not those of this log: they are estimated, unless that is off
+        # noise and constants of another set's preset do not fit this log: they are estimated, unless that is off
         own = bool(suggested) and (for_this_set if preset in (None, taken) else _estimates_nothing(asked))
         if isinstance(frontend, FrontEnd) and not isinstance(frontend, type):
             suggested = {k: v for k, v in suggested.items() if k != "frontend"}
@@ -118,7 +118,7 @@ class RunOptions:
     def for_records(
         cls, name: str, frontend: str, solver: str, seed: int, config: Mapping[str, Any] | None
     ) -> RunOptions:
-        """Options for records that are still to come: nothing is estimated from them."""
+        """Options for records that arrive later; with ``calibrate.use=auto`` nothing is estimated."""
         asked = dict(config or {})
         points = _points_of(asked)
         options = merge_options(named_preset(frontend, asked.pop("preset", None)), asked)
@@ -131,7 +131,7 @@ class RunOptions:
 
     @classmethod
     def of_folder(cls, root: Path) -> RunOptions:
-        """Those of a run folder."""
+        """Options of a run folder."""
         stored = read_options(root)
         points = {"source": str, "rows": [str]}
         names = {"source": str, "frontend": object, "solver": str, "seed": int, "control?": points, "check?": points}
@@ -145,7 +145,7 @@ class RunOptions:
         return str(self.named["solver"])
 
     def table(self, name: str) -> ControlTable | None:
-        """Rows of ``control`` or ``check``; None: there are none."""
+        """Rows of ``control`` or ``check``; None if there are none."""
         given = self.named.get(name)
         return None if given is None else ControlTable.parse(given["source"], given["rows"])
 
@@ -155,15 +155,15 @@ class RunOptions:
         return bool(self.settings.backend.looks or self.settings.map.fuse)
 
     def with_digest(self, log: SensorLog) -> RunOptions:
-        """With what tells a log from others, for a folder."""
+        """With the digest of the log, which a run folder stores to recognise it."""
         return replace(self, named={**self.named, "log": log_digest(log)})
 
     def searching_loops(self) -> RunOptions:
-        """The same with loops that the back end looks for."""
+        """The same options with loop search in the back end."""
         return replace(self, settings=replace(self.settings, backend=replace(self.settings.backend, loops=True)))
 
     def calibrated(self, log: SensorLog) -> tuple[SensorLog, RunOptions, list[StreamFinding]]:
-        """The log with corrections, the options that go with it, and the report on them."""
+        """The log with corrections, the options for it, and the findings."""
         assert self.front is not None
         asked = self.asked or {}
         log, applied, said, found = apply_calibration(
@@ -179,18 +179,18 @@ class RunOptions:
         return log, options, [StreamFinding("", f) for f in said]
 
     def as_config(self) -> dict[str, Any]:
-        """What ``config.toml`` holds: names, seed, and every option with its value."""
+        """Content of ``config.toml``: names, seed, and every option with its value."""
         if self.stored is not None:
             return dict(self.stored)
         assert self.front is not None
         parts = ("backend", "gps", "imu", "compass", "beacons", "refine", "map", "calibrate")
         out = {"run": dict(self.named), "frontend": options_dict(self.front.config)}
         out |= {name: options_dict(getattr(self.settings, name)) for name in parts}
-        return tomllib.loads(dump_toml(out)) if "log" in self.named else out  # as it comes back from the folder
+        return tomllib.loads(dump_toml(out)) if "log" in self.named else out  # the same values as read from the folder
 
 
 def _points_of(asked: dict[str, Any]) -> dict[str, Any]:
-    """Lines of control and check points, taken out of what the user asked for; what cannot be read is refused here."""
+    """Lines of control and check points, removed from the user's options; unreadable ones are refused."""
     given: dict[str, Any] = {name: control_lines(asked.pop(name)) for name in ("control", "check") if name in asked}
     for lines in given.values():
         ControlTable.parse(lines["source"], lines["rows"])

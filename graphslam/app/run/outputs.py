@@ -1,4 +1,4 @@
-"""What a run leaves on disk beside its submaps: one state, written and replaced as a whole."""
+"""Write and read the outputs of a run, except its submaps: one state, replaced as a whole."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ from graphslam.maps.refined import base_frames
 
 logger = logging.getLogger(__name__)
 OF_THE_CLOCK = ("seconds", RESUMED)
-"""Parts of a run's report that are not in ``run.json``, which no clock and no kill changes, but in ``timings.json``."""
+"""Parts of a run's report that depend on time or on resuming: in ``timings.json``, not in ``run.json``."""
 
 
 SAME_BYTES = (
@@ -72,9 +72,9 @@ SAME_BYTES = (
     *("map*.pgm", "map*.yaml", "figures/map.png", "figures/side.png", "figures/submaps.png", "figures/loops.png"),
     *("figures/gps_*.png", "figures/fused*.png"),
 )
-"""Files of a run folder that are the same bytes after a kill and a resume, after undoing and redoing a loop, and in two
-runs of one configuration. The others hold times (``timings.json``, and the part of ``report.html`` that shows them), or
-were drawn on the way (``figures/progress.png``)."""
+"""Files of a run folder that have the same bytes after a kill and a resume, after undoing and redoing a loop, and in
+two runs of one configuration. The others contain times (``timings.json``, and a part of ``report.html``), or were drawn
+during the run (``figures/progress.png``)."""
 _MADE_OF_MAP = (
     "map.grid.npz",
     "map.kml",
@@ -86,23 +86,23 @@ _MADE_OF_MAP = (
     "path.tum",
     "path.kitti.txt",
 )
-"""What other verbs made of a map, which stays where the map does."""
+"""Files that other commands made from a map; they stay as long as the map is the same."""
 
 
 TWO_MAPS = ("two_maps/first", "two_maps/second")
-"""Path (``.tum``) and loops (``.csv``) of two maps of which nothing told which is right."""
+"""Path (``.tum``) and loops (``.csv``) of two contradictory maps, if it is undecided which one is right."""
 REFINED = "refined"
-"""Folder of a run in which the submaps along the refined path lie."""
+"""Folder with the submaps along the refined path."""
 SAME_FRAME = 1e-6
-"""By how much exits of the refined submaps and the nodes of the map may differ [m], [rad]."""
+"""Largest difference between end poses of the refined submaps and nodes of the map [m], [rad]."""
 
 
 GRAPH = "graph.npz"
-"""The graph with all its factors and values, as the joiners take it."""
+"""The graph with all its factors and values, as input of the map-joining methods."""
 
 
 def write_outputs(folder: Path, run: Run) -> Run:
-    """Write a new state of a run folder: everything but ``config.toml`` and ``submaps/``, which are there already.
+    """Write a new state of a run folder: everything except ``config.toml`` and ``submaps/``, which exist already.
 
     Returns
     -------
@@ -117,9 +117,9 @@ def write_outputs(folder: Path, run: Run) -> Run:
 
 
 def _write_paths(new: FolderTransaction, run: Run) -> None:
-    """The solved path and what it is compared with; of two maps that contradict each other, the path of either.
+    """The solved path and paths to compare it with; for two contradictory maps the path of each.
 
-    The ledger of each of the two accepts the loops that only it holds.
+    Each of the two has a ledger in which the loops of that map only are accepted, too.
     """
     m = run.map
     paths = {"trajectory": m.trajectory, "nodes": Trajectory(m.node_times, m.node_poses), "truth": run.truth_path}
@@ -197,7 +197,7 @@ def _write_fused_map(new: FolderTransaction, run: Run) -> None:
 
 
 def _write_report(new: FolderTransaction, run: Run) -> None:
-    """The page. It is made of the files; those that other verbs made of the same map are kept before."""
+    """The report page, made from the files. If the map is the same, files that other commands made of it are kept."""
     before = new.before
     if before is not None and _same_file(before / "map.npz", new.path / "map.npz"):
         for pattern in _MADE_OF_MAP:
@@ -209,27 +209,27 @@ WRITERS: tuple[Callable[[FolderTransaction, Run], None], ...] = (
     *(_write_paths, _write_map, _write_graph, _write_refined, _write_gps, _write_inputs, _write_tables),
     *(_write_figures, _write_fused_map, _write_report),
 )
-"""What writes a part of a run folder each, in this order."""
+"""Functions that each write a part of a run folder, in this order."""
 
 
 def _write_marked(new: FolderTransaction, run: Run, name: str, arrays: dict[str, Any]) -> None:
-    """Arrays with the id of the generation that they belong to."""
+    """Write arrays with the id of the generation that they belong to."""
     write_npz(new.path / name, {**arrays, "generation": run.report["generation"]})
 
 
 def metric_rows(run: Run) -> list[dict[str, Any]]:
-    """Rows of ``metrics.json``: what the run found."""
+    """Rows of ``metrics.json``: all metrics except times."""
     return [r for r in run.metrics.to_dict("records") if not is_time(r["key"])]
 
 
 def timing_rows(run: Run) -> list[dict[str, Any]]:
-    """Rows of ``timings.json``: how long it took, and how much of it was there already."""
+    """Rows of ``timings.json``: times, and the number of submaps that were resumed."""
     resumed = {"key": RESUMED, "value": float(run.report.get(RESUMED, 0)), "unit": "", "direction": "none"}
     return [*(r for r in run.metrics.to_dict("records") if is_time(r["key"])), resumed]
 
 
 def generation_id(run: Run) -> str:
-    """Digest of what a run found: the same map, events and figures have the same id."""
+    """Digest of the results: the same map, identities, events and metrics have the same id."""
     parts: list[tuple[str, Any]] = sorted(_map_arrays(run.map).items())
     parts += sorted(_association_arrays(run.submaps).items())
     parts += [(n, json_lines(rows).encode()) for n, rows in (("events", run.events), ("metrics", metric_rows(run)))]
@@ -280,7 +280,7 @@ def _association_arrays(submaps: Any) -> dict[str, Any]:
 
 
 def identified_submaps(path: str | Path) -> list[Submap]:
-    """Submaps of a store or of a run folder; a run's carry the identities of its back end."""
+    """Submaps of a store or of a run folder; those of a run have the identities of its back end."""
     return read_consistently(path, lambda root: _identified(Path(path), root))
 
 
@@ -296,7 +296,7 @@ def _identified(home: Path, root: Path) -> list[Submap]:
 
 
 def read_run_folder(path: str | Path) -> Run:
-    """Read a finished run folder, all of it of one state.
+    """Read a finished run folder; all files are of the same state.
 
     Examples
     --------
@@ -317,11 +317,11 @@ def _open(home: Path, root: Path) -> Run:
     if (root / "timings.json").is_file():
         timings = read_metrics(root, "timings.json")
         values = dict(zip(timings["key"], timings["value"]))
-        values = {k: v for k, v in values.items() if v == v}  # what is no number was not measured
+        values = {k: v for k, v in values.items() if v == v}  # NaN: not measured
         report[RESUMED] = int(values.pop(RESUMED, 0.0))
         report["seconds"] = {k.removeprefix("seconds_"): v for k, v in values.items() if k.startswith("seconds_")}
         metrics = FigureTable(pd.concat([metrics, timings[timings["key"] != RESUMED]], ignore_index=True))
-    if root == home:  # plain files: a copy, or of an older version
+    if root == home:  # plain files: a copy, or from an older version
         check_state(root)
     _check_submaps(home, root)
     return Run(
@@ -344,7 +344,7 @@ def _open(home: Path, root: Path) -> Run:
 
 
 def refined_submaps_of(run: Run) -> list[Submap]:
-    """Submaps of a run along its refined path, with their dense maps; none without refinement."""
+    """Submaps of a run along its refined path, with their dense maps; empty without refinement."""
     if run.refined is not None:
         return run.refined.submaps
     if run.folder is None:
@@ -376,7 +376,7 @@ def _refined_of(run: Run, store: Path) -> list[Submap]:
 
 
 def _check_submaps(home: Path, root: Path) -> None:
-    """A run whose store was damaged and cut is not the run that its map is of."""
+    """Raise an error if the submaps in the store are not those of the map, for example after damage."""
     if not (root / "association.npz").is_file():
         return
     have, wanted = [e["key"] for e in SubmapStore(home).entries], [*read_association(root)]
@@ -399,7 +399,7 @@ def _two_maps(root: Path, dim: int) -> tuple[Trajectory, Trajectory] | None:
 
 
 def graph_metrics(graph: FactorGraph, classes: Mapping[str, ClassConsistency]) -> dict[str, Any]:
-    """JSON-serialisable figures of a graph at its optimum.
+    """JSON-serialisable metrics of a graph at its optimum.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Raw log → submaps → graph → map: the main line of the project, one step after the other."""
+"""Main pipeline: raw log → submaps → graph → map."""
 
 from __future__ import annotations
 
@@ -35,17 +35,16 @@ def run(
     resume: bool = False,
     progress: bool | Sequence[Observer] = True,
 ) -> Run:
-    """Run a front end over a log, join its submaps in a graph, and score what can be scored.
-
+    """Run a front end over a log, join its submaps in a graph, and compute the metrics.
     Parameters
     ----------
     source : data set name, file, folder, or SensorLog
-        What another reader than the default one shall read is loaded first (:func:`graphslam.load`).
+        To use another reader than the default one, load the log first (:func:`graphslam.load`).
     frontend : str, class or object, or a list of these, optional
-        Registered name; by default the one that fits what the log holds (:mod:`graphslam.app.run.choice`). Or a class
-        that inherits from :class:`~graphslam_frontends.base.FrontEnd`, or an object of one, which has its own options.
-        One of landmarks and one of planar scans map a log together: each the intervals that suit it
-        (:mod:`graphslam_frontends.mixed`), in one graph.
+        Registered name; by default the one that fits the streams of the log (:mod:`graphslam.app.run.choice`). Or a
+        class that inherits from :class:`~graphslam_frontends.base.FrontEnd`, or an object of one, which has its own
+        options. One of landmarks and one of planar scans can map a log together in one graph, each the intervals that
+        suit it (:mod:`graphslam_frontends.mixed`).
     solver : str
         Registered name.
     seed : int
@@ -55,13 +54,13 @@ def run(
     config : mapping, optional
         Nested options over the source's preset: ``{"frontend": {...}, "backend": {...}, "gps": {...}}``; ``"preset"``
         names another preset than that of the log, its reader or its kind, ``"none"`` for defaults. ``"control"`` and
-        ``"check"``: control points and distances that enter the graph, and check points that are held back to test the
+        ``"check"``: control points and distances that enter the graph, and check points that are withheld to test the
         result; each a CSV file, a table, or a list of mappings (:mod:`graphslam.core.control`).
     resume : bool
-        Go on after the last finished submap of ``out``, to the same result. Loops that were undone stay so.
+        Continue after the last finished submap of ``out``, to the same result. Loops that were undone stay undone.
     progress : bool or sequence of Observer
-        Show a progress bar on stderr; or observers of what the run does: steps of a front end, submaps, loops,
-        the solution (`graphslam.backend.back_end.Observer`). A `RunBar` among them is the bar.
+        Show a progress bar on stderr; or observers of the run: steps of a front end, submaps, loops, the solution
+        (`graphslam.backend.back_end.Observer`). A `RunBar` among them is used as the progress bar.
 
     Returns
     -------
@@ -71,7 +70,7 @@ def run(
     Raises
     ------
     GraphSlamError
-        Or one of its children; says what, where, got, wanted.
+        Or one of its children; the message has what, where, got, wanted.
 
     Examples
     --------
@@ -107,7 +106,7 @@ def run(
 def finish_run(
     log: SensorLog, slam: SubmapSlam, clock: RunClock, noticed: Sequence[StreamFinding], undone: Sequence[Any] = ()
 ) -> Run:
-    """The run of a log that is whole: the last submaps, then the graph, its maps, and the verdict."""
+    """Finish the run of a complete log: the last submaps, then the graph, its maps, and the verdict."""
     slam.step()
     if not slam.submaps:
         raise MissingDataError("the log gave no submap", where=log.name)

@@ -1,4 +1,4 @@
-"""The fused map of a finished run, made again from its folder, as a new state of the folder."""
+"""Make the fused map of a finished run again from its folder; the result is a new state of the folder."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from graphslam.maps.run_map import MapConfig, RunMap, has_maps, make_run_map
 
 @dataclass(frozen=True)
 class RemadeMap:
-    """What was made.
+    """Result of :func:`remake_map`.
 
     Parameters
     ----------
     clearest : MinimumEntropyMap or None
-        Choices of matches and loops, where they were asked for.
+        Choices of matches and loops, if requested.
     files, figures : list of Path
-        Written.
+        Written files.
     """
 
     map: RunMap
@@ -56,18 +56,18 @@ def remake_map(
     high: float | None = None,
     progress: bool = True,
 ) -> RemadeMap:
-    """Make the fused map of a run again, and write it with its pictures and the page of the run.
+    """Make the fused map of a run again, and write it with its pictures and the report page of the run.
 
     Parameters
     ----------
     grid : bool
         Write the evidence grid itself too.
     minimum_entropy : bool
-        Solve the run with other choices of its matches and loops, and keep the clearest map and the others.
+        Solve the run with other choices of its matches and loops; keep the map of lowest entropy and the others.
     hypotheses : int
-        Instead so many topologies that SegSLAM's particles told are solved, for which the log is read once more.
-    log : card name, folder, or SensorLog; optional
-        Where the run's log is by now; default where it was.
+        Solve this number of topologies from the SegSLAM particles instead; the log is read once more.
+    log : data set name, folder, or SensorLog; optional
+        Where the run's log is now; default: its original location.
     low, high : float, optional
         Heights of the floor plans above the path [m]; default the run's.
     """
@@ -75,7 +75,7 @@ def remake_map(
         raise ConfigError("minimum_entropy and hypotheses exclude each other; give one of them")
     home = Path(folder)
     if not (current_outputs(home) / "run.json").is_file():
-        read_run_folder(home)  # says what is wrong
+        read_run_folder(home)  # raises the error
     with lock_folder(home):
         run, made = map_of_folder(home, low=low, high=high)
         found = minimum_entropy_loops(run, made, progress=progress) if minimum_entropy else None
@@ -92,13 +92,13 @@ def remake_map(
                 files += write_minimum_entropy(new.path, found, bands=made.bands)
                 old += ["clearest*", "alternatives/*"]
             new.adopt(drop=old)
-            add_report(new)  # the page of the run shows the pictures and the choices
+            add_report(new)  # the report page shows the pictures and the choices
     files, figures = ([home / p.relative_to(new.path) for p in written] for written in (files, figures))
     return RemadeMap(made, found, files, figures)
 
 
 def map_of_folder(path: str | Path, *, low: float | None = None, high: float | None = None) -> tuple[Run, RunMap]:
-    """The fused map of a finished run, made again from its folder alone; and the run, its submaps with their maps.
+    """The run with its dense submaps, and its fused map made again from the folder alone.
 
     Parameters
     ----------
@@ -122,5 +122,5 @@ def map_of_folder(path: str | Path, *, low: float | None = None, high: float | N
     made = make_run_map(submaps, frames, reach=sensor_reach(values), config=config)
     if refined and {"map_entropy_open_chain", "map_known_volume_open_chain"} <= set(run.metrics["key"]):
         entropy, volume = (run.metric(f"map_{what}_open_chain") for what in ("entropy", "known_volume"))
-        made = replace(made, open_entropy=entropy, open_volume=volume)  # of the front end's exits, as the run has them
+        made = replace(made, open_entropy=entropy, open_volume=volume)  # computed with the front end's end poses
     return replace(run, submaps=submaps, fused=made), made

@@ -1,4 +1,4 @@
-"""The graph of a finished run, from what its folder holds: no log is read, and no submap made."""
+"""Rebuild the graph of a finished run from its folder; no log is read and no submap is made."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from graphslam.solve.solution import Solution
 
 
 def rerun_without_loops(folder: str | Path, undo: Sequence[LoopDecision], *, progress: bool = True) -> Run:
-    """Make a finished run again from what its folder holds, without these loops, and write its files anew.
+    """Solve a finished run again from its folder without these loops, and write its files anew.
 
     Parameters
     ----------
     undo : sequence of LoopDecision
-        Loops that are taken out.
+        Loops to remove.
     progress : bool
         Show a progress bar on stderr.
     """
@@ -56,7 +56,7 @@ def resolve_from_folder(folder: str | Path) -> tuple[FactorGraph, Solution]:
         inputs, _ = read_consistently(root, read_inputs)
         options = RunOptions.of_folder(root)
         attempts = read_consistently(root, read_report).get("map_attempts", [])
-        if any(a["kept"] and a["loops"] for a in attempts):  # of "auto", once its first map contradicted itself
+        if any(a["kept"] and a["loops"] for a in attempts):  # "auto": loops were searched after a contradictory map
             options = options.searching_loops()
         slam = SubmapSlam(options, RecordSource(inputs.log), [], RunFolder(root))
         solution = slam.back.finish(removed_loops_of_run(root))

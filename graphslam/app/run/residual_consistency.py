@@ -33,9 +33,9 @@ from graphslam.evaluate.residual_consistency import NOT_TESTED, ClassConsistency
 from graphslam.graph.factor_graph import FactorGraph
 
 OF_THE_MAP = ("submap", "lasting", "dense-submap", "match", "loop")
-"""Classes of factors whose χ² covers motion and sightings."""
+"""Factor classes whose χ² covers motion and observations."""
 MOST_FORETOLD = {2: 1000, 3: 300}
-"""Withheld fixes whose prediction is looked at, spread evenly over the run, by dimension of the graph."""
+"""Largest number of withheld fixes that are predicted, spread evenly over the run, by dimension of the graph."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class ResidualConsistency:
     classes : dict of str to ClassConsistency
         χ² and effective dof of every class of factors.
     gps : GpsInnovations or None
-        Withheld fixes; None where none were withheld or the graph has no GPS.
+        Withheld fixes; None if none were withheld or the graph has no GPS.
     loops : LoopConsistency or None
-        None where no two submaps share two landmarks.
+        None if no two submaps share two landmarks.
     fixes : FixDistances or None
-        Of a log whose fixes had no part in the map.
+        If the fixes are not in the graph.
     """
 
     classes: dict[str, ClassConsistency]
@@ -80,8 +80,8 @@ class ResidualConsistency:
         Parameters
         ----------
         refined : bool
-            The result is a path refined by its scans. The factors of the graph were its start only, and its own noise
-            was estimated from its own residuals, so that of all tests only those of fixes say anything of it.
+            The result is a path refined by its scans. The graph was only its initial guess, and its noise was estimated
+            from its own residuals, so only tests with GPS fixes are valid for it.
         """
         rows = self._evidence(submaps)
         return [r for r in rows if r.of == "fixes"] if refined else rows
@@ -91,7 +91,7 @@ class ResidualConsistency:
         for name, c in ((n, c) for n, c in self.classes.items() if n not in NOT_TESTED):
             of: Of = "map" if name in OF_THE_MAP else "fixes" if name == "gps" else "other"
             chi2, dof = c.chi2, c.dof
-            if name == "gps" and "gps-bias" in self.classes:  # a bias for each fix takes up what the fix says
+            if name == "gps" and "gps-bias" in self.classes:  # a bias per fix absorbs part of its residual
                 b = self.classes["gps-bias"]
                 chi2, dof = chi2 + b.chi2, dof + b.dof
             if name != "gps-bias" and dof > 0:
@@ -105,7 +105,7 @@ class ResidualConsistency:
                 if r["test"] == "joint" and np.isfinite(r["autocorrelation"]):
                     score = two_sided_width(0.95) * r["autocorrelation"] / r["white"]
                     out.append(largest_score_test("autocorrelation of withheld GPS errors", "fixes", score))
-        if self.fixes is not None and self.fixes.ratio > 1.0:  # one-sided: fixes that lie close say nothing
+        if self.fixes is not None and self.fixes.ratio > 1.0:  # one-sided: small distances are no evidence
             f = self.fixes
             out.append(ConsistencyTest("squared distances from GPS fixes", "fixes", f.ratio, 1.0, f.chance, 1.0))
         if self.loops is not None:
@@ -139,7 +139,7 @@ def check_residual_consistency(
     poses : (m + 1, 3|7)
         Solved bases of the submaps and end of the last.
     gps : Gps or None
-        The log's fixes, used and withheld.
+        GPS fixes of the log, used and withheld.
     """
     classes = class_consistency(graph)
     for name, c in classes.items():
@@ -166,13 +166,13 @@ def check_residual_consistency(
         out.add("gps_distance_expected", fixes.expected, "m")
         out.add("gps_distance_chance", fixes.chance)
     loops = None
-    if graph.dim == 3:  # no landmarks to compare loops by
+    if graph.dim == 3:  # loops are compared by landmarks, which a 3-D graph does not have
         return ResidualConsistency(classes, innovations, None, fixes)
     try:
         known = [graph.as_known(s) for s in submaps]
         found = find_landmark_loops(known, poses, covariance_scale=settings.backend.covariance_scale)
         loops = loop_consistency(found)
-    except DataError:  # a chain without a loop has nothing to compare, and the metrics then hold none of it
+    except DataError:  # a chain without a loop has nothing to compare and adds no metrics
         return ResidualConsistency(classes, innovations, None, fixes)
     test = loops.test()
     for key in ("value", "low", "high", "dof", "loops", "inside", "shape"):
@@ -191,5 +191,5 @@ def _innovations(graph: FactorGraph, gps: Gps | None, settings: RunConfig) -> Gp
     try:
         same = c.segment_gap if c.bias_time is None else max(c.segment_gap, c.bias_every)
         return gps_innovations(graph, withheld, sigma=c.sigma, bias_sigma=c.bias_sigma, segment_gap=same)
-    except DataError:  # no withheld fix on the path: the counts of the GPS residuals say so
+    except DataError:  # no withheld fix on the path; the GPS residuals report the counts
         return None

@@ -1,4 +1,4 @@
-"""A finished run as a value: what a notebook holds in its hand."""
+"""Result of a run: submaps, map, metrics, events and verdict."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from graphslam.solve.solution import Solution
 
 _MAX_STRETCH = 2.5
-"""A dead-reckoned path this many times larger than the map is not drawn: the map would be a dot."""
+"""Dead reckoning is not plotted if its extent is larger than this multiple of the map's extent."""
 
 
 class DeferredPart:
-    """A part of a run that is made when it is first asked for.
+    """A part of a run that is computed at its first use.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Run:
     ----------
     name : str
     submaps : list of Submap
-        With the landmark identities that the back end gave them.
+        With the landmark identities assigned by the back end.
     map : GlobalMap
     metrics : DataFrame
         ``key, value, unit, direction``.
@@ -80,11 +80,11 @@ class Run:
         ``run.json``: versions, seed, counts of records read, used and dropped; and the seconds of ``timings.json``.
     events : list of dict
     ledger : DataFrame or None
-        Which factor used which stream when.
+        Which factor used which stream in which time interval.
     gps : mapping of str to GpsResiduals
-        ``all`` and, where GPS was in the graph, ``withheld``; empty for a run read back from disk.
+        ``all`` and, if GPS is in the graph, ``withheld``.
     fixes : Gps or None
-        What of GPS became factors.
+        GPS fixes that became factors.
     folder : Path or None
     log : SensorLog or None
     inputs : RunInputs or None
@@ -94,20 +94,20 @@ class Run:
     truth_path, dead_reckoning : Trajectory or None
         In the frame of the first base.
     solution, graph : Solution, FactorGraph or None
-        The solver's own view. Of a run that :func:`graphslam.open_run` read they are solved again, once, when they are
-        first asked for; None where its folder does not hold what that needs.
+        State of the solver. After :func:`graphslam.open_run` they are solved again, once, at their first use; None if
+        the inputs are not in the folder.
     checks : ResidualConsistency or None
-        Consistency checks without ground truth; None for a run read back from disk, whose metrics hold the figures.
+        Consistency checks without ground truth; None for a run read from disk, whose metrics have their values.
     fused : RunMap or None
-        Fused evidence grid of submaps that have grids. Of a run that :func:`graphslam.open_run` read it is made again,
-        once, when it is first asked for.
+        Fused evidence grid of submaps that have grids. After :func:`graphslam.open_run` it is computed again, once, at
+        its first use.
     graph_path : Trajectory or None
-        Of a refined run the path of the graph, where the refinement began; from disk without covariances.
+        For a refined run the path of the graph, its initial guess; from disk without covariances.
     refined : RefinedRun or None
-        The path refined by its scans; None for a run read back from disk, whose ``map`` has the refined path.
+        The path refined with its scans; None for a run read from disk, whose ``map`` has the refined path.
     two_maps : tuple of two Trajectory, or None
-        Where two groups of loops cannot both be right and nothing told which is: the path of the graph with either,
-        of which ``map`` has neither; from disk without covariances. What is in dispute is in ``report["two_maps"]``.
+        If two groups of loops contradict each other and it is undecided which is right: the path of the graph with each
+        of them. ``map`` uses neither; from disk without covariances. ``report["two_maps"]`` lists the loops.
 
     Examples
     --------
@@ -142,7 +142,7 @@ class Run:
     two_maps: tuple[Trajectory, Trajectory] | None = None
 
     def holds(self, part: str) -> bool:
-        """Is ``solution``, ``graph`` or ``fused`` there, made already?"""
+        """Is ``solution``, ``graph`` or ``fused`` available without computing it?"""
         return self.__dict__[part] is not None and not isinstance(self.__dict__[part], DeferredPart)
 
     def metric(self, key: str) -> float:
@@ -171,21 +171,21 @@ class Run:
 
     @property
     def check_points(self) -> pd.DataFrame:
-        """Check points, a row each: ``line``, ``name``, ``place``, ``frame``, ``error`` [m] and its predicted
-        ``sigma`` [m], ``nis``, ``dof``; none where the run had no check rows. The test of all of them together is in
+        """Check points, one per row: ``line``, ``name``, ``place``, ``frame``, ``error`` [m] and its predicted
+        ``sigma`` [m], ``nis``, ``dof``; empty if the run had no check rows. Their joint test is in
         ``report["check_points"]``."""
         columns = ["line", "name", "place", "frame", "error", "sigma", "nis", "dof"]
         return pd.DataFrame(self.report.get("check_points", {}).get("rows", []), columns=columns)
 
     def to_pandas(self) -> pd.DataFrame:
-        """The path at full rate, a row an instant, in the frame of the first base: :meth:`Trajectory.to_pandas`."""
+        """The path at full rate, one row per pose, in the frame of the first base: :meth:`Trajectory.to_pandas`."""
         return self.map.trajectory.to_pandas()
 
     def plot(self, ax: Any = None, *, plane: str = "xy") -> Any:
         """Map with path, landmarks and 95 % ellipses, GPS fixes and ground truth.
 
-        In the GPS frame (east, north) where fixes were scored, else in the frame of the first base. A map in space is
-        drawn by its path in ``plane``, ``"xy"`` or ``"xz"``.
+        In the GPS frame (east, north) if GPS residuals exist, otherwise in the frame of the first base. Of a 3-D map
+        only the path is drawn, in ``plane``, ``"xy"`` or ``"xz"``.
         """
         if self.map.dim == 3:
             return self._plot_paths(ax, plane)
@@ -224,7 +224,7 @@ class Run:
         return axes
 
     def _plot_paths(self, ax: Any, plane: str) -> Any:
-        """Path of a map in space with its ellipses, ground truth and dead reckoning."""
+        """Path of a 3-D map with its ellipses, ground truth and dead reckoning."""
         from graphslam.plots.paths import GRAPH, plot_paths
 
         paths = {"path": self.map.trajectory}
@@ -237,7 +237,7 @@ class Run:
         return plot_paths(ax, paths, truth=self.truth_path, ellipses=12, plane=plane, title=title)
 
     def _fitting_dead_reckoning(self) -> Trajectory | None:
-        """Dead reckoning, if it does not make the map a dot in the figure."""
+        """Dead reckoning; None if it is missing or much larger than the map."""
         if self.dead_reckoning is None:
             return None
         own = np.ptp(self.dead_reckoning.positions, axis=0).max()

@@ -1,4 +1,4 @@
-"""One bar of progress over all stages of a run."""
+"""Progress bar over all stages of a run."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ STAGES = {
     "reading": 2.0, "calibration": 8.0, "front end": 50.0, "graph": 5.0, "refinement": 18.0, "fused map": 6.0,
     "evaluation": 4.0, "figures": 7.0,
 }  # fmt: skip
-"""Stages of a run in their order, and about what share of its time each takes [%]."""
+"""Stages of a run in order, with the approximate share of time of each [%]."""
 
 
 def bar_among(progress: bool | Sequence[Observer]) -> tuple[RunBar, list[Observer]]:
-    """The bar of a run, shown or not, and the other observers behind it."""
+    """The progress bar of a run, and all observers with the bar first."""
     told = [] if isinstance(progress, bool) else list(progress)
     bar = next((o for o in told if isinstance(o, RunBar)), None) or RunBar(progress is True)
     return bar, [bar, *(o for o in told if o is not bar)]
 
 
 class RunBar(Observer):
-    """How far a run is, on stderr: the stage, and in the front end the time of the log and the submaps so far.
+    """Progress of a run on stderr: the stage, and in the front end the time in the log and the submaps so far.
 
     Parameters
     ----------
     shown : bool
-        Whether there is a bar.
+        Show the bar.
     """
 
     def __init__(self, shown: bool) -> None:
@@ -60,24 +60,24 @@ class RunBar(Observer):
         self._bar.close()
 
     def stage(self, name: str) -> None:
-        """The bar moves to the beginning of a stage."""
+        """Move the bar to the start of a stage."""
         self._stage = name
         self._bar.set_description_str(f"{list(STAGES).index(name) + 1}/{len(STAGES)} {name}", refresh=False)
         self._move(0.0)
         self._bar.say("")
 
     def log_read(self, log: SensorLog) -> None:
-        """The interval in which submaps will come."""
+        """Set the time interval of the log, for the progress of the front end."""
         self._first, self._duration = log.interval[0], max(log.duration, 1e-9)
 
     def front_end_at(self, progress: Any) -> None:
-        """A step of a front end that counts them; the progress of another front end moves nothing."""
+        """Update by a step of a front end that counts its steps; otherwise no change."""
         steps = getattr(progress, "steps", 0)
         if steps:
             self._move(progress.step / steps, f"{progress.length:.0f} m, {progress.segments} segments")
 
     def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
-        """A submap: how far the front end is in the log."""
+        """Update by the end time of a submap in the log."""
         if self._stage != "front end":
             return
         done = submap.interval[1] - self._first

@@ -1,7 +1,7 @@
-"""What a run takes of its log beside the submaps: enough to make its graph, figures and files again without the log.
+"""Inputs of a run besides its submaps, from which its graph, metrics and files can be made again without the log.
 
-Fixes, used and withheld, IMUs, motion and truth are kept as they are; of streams that only the front end reads, stamps
-alone. In a run folder: ``inputs/`` (a log, :mod:`graphslam.io.log_store`) and ``taken.npz``.
+Fixes, used and withheld, IMUs, motion and ground truth are kept unchanged; of streams that only the front end reads,
+only the time stamps. In a run folder: ``inputs/`` (a log, :mod:`graphslam.io.log_store`) and ``taken.npz``.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ KEPT = (Gps, Imu, LandmarkObservations, Odometry, SteeringControls)
 
 
 def _is_kept(stream: Any) -> bool:
-    """Is the stream kept with a run, and not its stamps alone?"""
+    """Are all data of the stream kept, not only its time stamps?"""
     return isinstance(stream, (*KEPT, *PLAIN.values()))
 
 
 @dataclass(frozen=True, slots=True)
 class TimestampsOnly:
-    """A stream of which the stamps alone are kept.
+    """A stream reduced to its time stamps.
 
     Parameters
     ----------
@@ -65,18 +65,18 @@ class TimestampsOnly:
 
 @dataclass(frozen=True)
 class RunInputs:
-    """What the back end and the figures of a run are made of, beside its submaps.
+    """Inputs of the back end and of the metrics of a run, besides its submaps.
 
     Parameters
     ----------
     log : SensorLog
-        Its ``read`` counts every stream, its ``dropped`` what the reader and the front end dropped.
+        Its ``read`` counts every stream, its ``dropped`` the records dropped by the reader and the front end.
     identities : (q,) int64 or None
-        Of the log's observations of landmarks, by a reference that the run never saw (−1 = none).
+        Reference identities of the log's landmark observations, not used by the run (−1 = none).
     noticed : tuple of StreamFinding
-        What was seen in its streams before the run.
+        Findings on its streams before the run.
     scans : Scans or None
-        What a refinement of the path reads; None where there is none.
+        Scans for a refinement of the path; None if there is no refinement.
     """
 
     log: SensorLog
@@ -92,7 +92,7 @@ def collect_inputs(
     noticed: Sequence[StreamFinding] = (),
     scans: Scans | None = None,
 ) -> RunInputs:
-    """What is kept of a log; ``dropped`` counts what its front end dropped."""
+    """Inputs to keep from a log; ``dropped`` counts the records dropped by its front end."""
     streams: dict[str, Any] = {n: s if _is_kept(s) else TimestampsOnly(s.times) for n, s in log.streams.items()}
     read = dict(log.read) or {k: len(s.times) for k, s in log.streams.items()}
     return RunInputs(
@@ -101,7 +101,7 @@ def collect_inputs(
 
 
 def write_inputs(folder: Path, taken: RunInputs, generation: str) -> None:
-    """Write it into the folder of a run's files."""
+    """Write the inputs into the folder of a run's files."""
     log = taken.log
     save_log(replace(log, streams={n: s for n, s in log.streams.items() if _is_kept(s)}), folder / INPUTS)
     arrays: dict[str, Any] = {"format": TAKEN_FORMAT, "generation": generation, "names": np.array([*log.streams], "U")}
@@ -118,7 +118,7 @@ def write_inputs(folder: Path, taken: RunInputs, generation: str) -> None:
 
 
 def read_inputs(folder: Path) -> tuple[RunInputs, str | None]:
-    """Read it, and the generation that it is of."""
+    """Read the inputs, and the id of their generation."""
     if not (folder / "taken.npz").is_file() or not (folder / INPUTS / INDEX_NAME).is_file():
         raise MissingDataError(
             "the run folder has no inputs of its graph (taken.npz, inputs/)",

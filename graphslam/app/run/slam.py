@@ -1,4 +1,4 @@
-"""SLAM of records as they come: for people who feed their own sensors."""
+"""Online SLAM: records are added one after the other."""
 
 from __future__ import annotations
 
@@ -33,23 +33,22 @@ from graphslam.solve.solution import make_solution
 
 
 class Slam:
-    """SLAM of records as they come: what :func:`graphslam.run` does over a stored log, fed from the outside.
+    """Online SLAM: the same as :func:`graphslam.run`, but records are added from outside.
 
-    Records are added in the order of their stamps. A submap is in the graph, and the graph is solved with it, as soon
-    as the records that make it have come; :attr:`map` and :attr:`path` are those of the graph. What only the whole log
-    allows is done by :meth:`finish`: loops are looked for a last time, the path is refined by its scans, maps are
-    fused, and the verdict is given. The result is that of ``gs.run`` over the same records, to the last byte, with the
-    same options.
+    Records are added in the order of their time stamps. A submap enters the graph, which is then solved, as soon as its
+    records are complete; :attr:`map` and :attr:`path` are those of the graph. Steps that need the whole log are in
+    :meth:`finish`: the last search for loops, refinement with scans, map fusion, and the verdict. The result has the
+    same bytes as that of ``gs.run`` with the same records and options.
 
-    Beams that were used are freed; they are on disk until the end, where the verdict and a refinement ask for them
-    once more. Work is done inside :meth:`add`, in the caller's thread, on one BLAS thread: where sensors cannot wait,
-    put a queue between them and it.
+    Used beams are freed from memory; they stay on disk until the end, where the verdict and a refinement read them
+    once more. The work is done inside :meth:`add`, in the caller's thread, with one BLAS thread. If sensors cannot
+    wait, put a queue in between.
 
-    Some things cannot be done before all is known, and :attr:`waits_for` names the first of them; then records are
-    only kept, and :meth:`finish` is a run over them: front ends that decide late (``segslam``, ``rbpf-grid``), whose
-    steps are made of the whole log (``scan-window``), or that make a single map of it; an IMU, a compass or beacons in
-    the graph; figures of a calibration (``calibrate.given``, ``calibrate.use = "always"``). With ``"auto"`` nothing is
-    estimated from records that are still to come: noise is that of the options.
+    Some steps need the whole log; :attr:`waits_for` names the first of them. Then records are only stored, and
+    :meth:`finish` runs over them. This applies to front ends that decide late (``segslam``, ``rbpf-grid``), compute
+    their steps from the whole log (``scan-window``), or make a single map; to an IMU, a compass or beacons in the
+    graph; and to calibration (``calibrate.given``, ``calibrate.use = "always"``). With ``"auto"`` nothing is estimated
+    from records that arrive later; the noise is that of the options.
 
     Parameters
     ----------
@@ -65,14 +64,14 @@ class Slam:
         Nested options: ``{"frontend": {...}, "backend": {...}, "gps": {...}}``; ``"preset"`` names a source whose
         recommended settings are used, by default none.
     observers : sequence of Observer
-        Told what goes on while it does (:class:`graphslam.backend.back_end.Observer`).
+        Notified during the run (:class:`graphslam.backend.back_end.Observer`).
     records : path, optional
-        Folder for beams while they are recorded; by default a temporary one, gone at the end.
+        Folder for beams during recording; default: a temporary folder, deleted at the end.
 
     Raises
     ------
     GraphSlamError
-        Or one of its children; says what, where, got, wanted.
+        Or one of its children; the message has what, where, got, wanted.
 
     Examples
     --------
@@ -98,7 +97,7 @@ class Slam:
     ) -> None:
         options = RunOptions.for_records(name, frontend, solver, seed, config)
         self.waits_for = _waits_for(options)
-        """What has to wait for the end of the log; empty where submaps are made while records come."""
+        """The part that needs the whole log; empty if submaps are made while records arrive."""
         self._asked: dict[str, Any] = {
             "frontend": frontend, "solver": solver, "seed": seed, "out": out,
             "config": {"preset": "none", **(config or {})}, "progress": list(observers) or False,
@@ -117,23 +116,23 @@ class Slam:
             self._slam = SubmapSlam(options, self._feed, observers, self._folder)
 
     def add(self, records: Stream, stream: str | None = None) -> None:
-        """Take one record or more of a sensor, and go on as far as they allow.
+        """Add one or more records of a sensor, and process all that is complete.
 
         Parameters
         ----------
         records : Stream
-            Of any kind that a log holds, such as :class:`graphslam.PointClouds` with one scan; mounting, limits and
-            noise of the sensor are the same every time.
+            Of any type that a log can have, such as :class:`graphslam.PointClouds` with one scan; mounting, limits and
+            noise of the sensor must be the same every time.
         stream : str, optional
-            Name of the sensor; by default that of the kind of its records (``PointClouds``: ``point-clouds``).
+            Name of the sensor; default: name of the type of its records (``PointClouds``: ``point-clouds``).
 
         Raises
         ------
         DataError
-            The records are not later than those before them, or of another sensor: they are not taken, and others may
+            The records are not later than the previous ones, or of another sensor. They are not added; others may
             follow.
         GraphSlamError
-            What the front end or the graph cannot use; nothing more is taken then.
+            The front end or the graph cannot use the records; no more records are accepted.
         """
         if self._feed.ended or self._closed:
             raise DataError("records after the end", where=self._feed.name, wanted="a new Slam")
@@ -149,12 +148,12 @@ class Slam:
 
     @property
     def submaps(self) -> Sequence[Submap]:
-        """Those that are finished, and in the graph."""
+        """Finished submaps, which are in the graph."""
         return () if self._slam is None else tuple(self._slam.submaps)
 
     @property
     def map(self) -> GlobalMap:
-        """The map so far: trajectory, nodes and landmarks of the graph; after :meth:`finish` that of the run.
+        """The current map: trajectory, nodes and landmarks of the graph; after :meth:`finish` that of the run.
 
         Raises
         ------
@@ -175,21 +174,21 @@ class Slam:
 
     @property
     def path(self) -> Trajectory:
-        """The path so far, in the frame of the first base, up to the end of the last submap: see :attr:`map`."""
+        """The current path, in the frame of the first base, up to the end of the last submap: see :attr:`map`."""
         return self.map.trajectory
 
     @property
     def log(self) -> SensorLog:
-        """All records, once :meth:`finish` was called; they are gone from disk when the folder ``records`` is."""
+        """All records, after :meth:`finish`; their data are on disk in the folder ``records``."""
         return self._feed.log
 
     def finish(self) -> Run:
-        """No more records will come: the last submap, loops, the refined path, maps, and the verdict.
+        """End of the records: the last submap, loops, the refined path, maps, and the verdict.
 
         Raises
         ------
         GraphSlamError
-            The records make no map.
+            No map can be made from the records.
         """
         if self._run is not None:
             return self._run
@@ -202,7 +201,7 @@ class Slam:
         return self._run
 
     def close(self) -> None:
-        """Give back what is held, without a result where :meth:`finish` was not called."""
+        """Release locks and files; without :meth:`finish` there is no result."""
         self._closed = True
         self._stack.close()
 
@@ -216,7 +215,7 @@ class Slam:
         return run(self._feed.log, **self._asked)
 
     def _finished(self, slam: SubmapSlam) -> Run:
-        log, clock = self._feed.log, RunClock(self._seconds)  # time in which records were waited for is nobody's
+        log, clock = self._feed.log, RunClock(self._seconds)  # without the time between records
         noticed = check_streams(log)
         if self._folder is not None:
             slam.options = slam.options.with_digest(log)
@@ -231,7 +230,7 @@ class Slam:
 
 
 def _waits_for(options: RunOptions) -> str:
-    """What has to wait for the end of the log; empty where nothing has."""
+    """The part that needs the whole log; empty if there is none."""
     front, settings = options.front, options.settings
     assert front is not None
     if not front.incremental():

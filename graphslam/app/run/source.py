@@ -1,4 +1,4 @@
-"""A log, whatever names it."""
+"""Load a log from a name, file or folder, or the log of a run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def load(source: str | Path | SensorLog, *, reader: str | None = None, **options
     Parameters
     ----------
     source : str, path or SensorLog
-        Name of a data set (``graphslam data list``), or a file or folder in a known format. A log is returned as it is.
+        Name of a data set (``graphslam data list``), or a file or folder in a known format. A log is not changed.
     reader : str, optional
         Name of the reader (``graphslam data readers``). Default: the one that recognises the source.
     **options
@@ -50,14 +50,14 @@ def load(source: str | Path | SensorLog, *, reader: str | None = None, **options
 
 
 def log_of_run(said: Mapping[str, Any], log: str | Path | SensorLog | None = None) -> SensorLog:
-    """The log of a run, read once more.
+    """Read the log of a run once more.
 
     Parameters
     ----------
     said : mapping
-        What the run's ``config.toml`` says of it: ``source``, as it was given, and the digest ``log``.
+        Table ``run`` of the run's ``config.toml``: ``source`` as given by the user, and the digest ``log``.
     log : str, path or SensorLog, optional
-        Where the log is now. Default: where it was; a relative path begins where the command is started.
+        Where the log is now. Default: its original location; a relative path starts at the working directory.
     """
     try:
         source = load(said["source"] if log is None else log)

@@ -1,4 +1,4 @@
-"""From a solved graph to a run: the path refined, maps fused, everything evaluated, and the verdict."""
+"""From a solved graph to a run: path refinement, map fusion, evaluation, and verdict."""
 
 from __future__ import annotations
 
@@ -76,12 +76,12 @@ logger = logging.getLogger(__name__)
 
 
 class RunClock:
-    """Seconds of the parts of a run.
+    """Run time of the parts of a run [s].
 
     Parameters
     ----------
     before : float
-        Seconds that were worked before.
+        Seconds of earlier work.
     """
 
     def __init__(self, before: float = 0.0) -> None:
@@ -90,12 +90,12 @@ class RunClock:
         self._last = time.perf_counter()
 
     def lap(self, part: str) -> None:
-        """What was done since the part before was this one."""
+        """Assign the time since the previous call to this part."""
         now = time.perf_counter()
         self.seconds[part], self._last = now - self._last, now
 
     def until_now(self, slam: SubmapSlam) -> dict[str, float]:
-        """Seconds by part, those of front end and back end among them."""
+        """Seconds per part, including front end and back end."""
         back = slam.back.seconds
         spent = self.seconds | {"frontend": slam.timing.seconds} | {f"backend_{k}": v for k, v in back.items()}
         spent |= {"backend": sum(back.values()), "compilation": self.watch.compilation()}
@@ -104,16 +104,16 @@ class RunClock:
 
 @dataclass
 class SolvedMap:
-    """A solved graph on its way to a run: every stage adds to it.
+    """A solved graph to which each stage of the run adds its results.
 
     Parameters
     ----------
     map : GlobalMap
         Of the graph, or along the refined path.
     findings : list of Finding
-        Of the refinement.
+        Of refinement and map fusion.
     truth, truth_path, base
-        What is known of the map, in its frame.
+        Ground truth of the map, in its frame; pose of the first base in the world.
     """
 
     inputs: RunInputs
@@ -144,20 +144,20 @@ class SolvedMap:
         return None if name is None else self.inputs.log[name]
 
     def fuse(self, submaps: list[Submap], frames: GlobalMap) -> None:
-        """The fused map of dense submaps; or why there is none where there could have been one."""
+        """Fuse the dense submaps; if this fails, keep the reason."""
         self.fused, self.why_no_map = None, ""
         config = self.slam.options.settings.map
         if not (config.fuse and has_maps(submaps)):
             return
         try:
             self.fused = make_run_map(submaps, frames, reach=sensor_reach(self.config), config=config)
-        except GraphSlamError as error:  # a run that is solved is not thrown away for its map
+        except GraphSlamError as error:  # a failed map does not discard the solved run
             logger.warning("no fused map: %s", error)
             self.why_no_map = str(error)
 
 
 def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clock: RunClock) -> Run:
-    """The run of a solved graph: refined, fused, evaluated, with a verdict."""
+    """Make the run of a solved graph: refine, fuse, evaluate, and add the verdict."""
     hits, settings = slam.back.landmark_hits(slam.submaps), slam.options.settings
     graph_map = make_global_map(solution, slam.submaps, hits, settings.backend.confirmed_hits)
     made = SolvedMap(
@@ -213,7 +213,7 @@ def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clo
 
 
 def _refine(made: SolvedMap) -> None:
-    """The path by its own scans; the map of the graph stays until its fused map is made."""
+    """Refine the path with its scans; the map of the graph is replaced after its fused map was made."""
     clock, settings = time.perf_counter(), made.slam.options.settings
     gps, submaps, graph = made.gps, made.slam.submaps, made.slam.back.graph
     fixes = None
@@ -236,7 +236,7 @@ def _refine(made: SolvedMap) -> None:
             held = len(made.control_rows)
             if held < len(control.used):
                 made.findings.append(left_out_of_refinement(held, len(control.used)))
-            if own is not None and control.frame != "gps":  # the frame of the survey is not that of the fixes
+            if own is not None and control.frame != "gps":  # the frame of the control points is not the GPS frame
                 made.refined = replace(made.refined, map=replace(made.refined.map, T_gps_world=None))
         made.seconds["refine"] = time.perf_counter() - clock
         made.seconds["total"] += made.seconds["refine"]
@@ -256,9 +256,9 @@ def _fuse(made: SolvedMap, graph_map: GlobalMap) -> None:
             unit = "m³" if made.fused.fused.dim == 3 else "m²"
             made.out.add("map_entropy_graph", made.fused.fused.entropy(), f"nat {unit}")
             made.out.add("map_known_volume_graph", made.fused.fused.known_volume(), unit)
-            # the open chain is that of the front end, whose exits the refinement replaced
+            # the open chain uses the front end's end poses, which the refinement replaced
             chain = made.fused.open_entropy, made.fused.open_volume
-            made.fused = None  # two maps of a long run at once would take twice the memory
+            made.fused = None  # free the first map: two maps of a long run would take twice the memory
             made.fuse(refined.submaps, map_of_frames(refined.map))
             if made.fused is not None:
                 made.fused = replace(made.fused, open_entropy=chain[0], open_volume=chain[1])
@@ -284,7 +284,7 @@ def _time_and_way(made: SolvedMap) -> None:
 
 
 def _gps(made: SolvedMap) -> None:
-    """Against the fixes, those of the graph and those withheld; and dead reckoning beside it."""
+    """Compare the path with the fixes, used and withheld, and add dead reckoning."""
     path, gps = made.map.trajectory, made.gps
     made.dead_reckoning = dead_reckoned_path(made.inputs.log, path)
     if gps is None:
@@ -296,7 +296,7 @@ def _gps(made: SolvedMap) -> None:
 
 
 def _check(made: SolvedMap) -> None:
-    """Against the check points."""
+    """Compare the path with the check points."""
     table, r = made.slam.check, made.refined
     if table is not None:
         refined = None if r is None else (r.refinement, r.map.trajectory)
@@ -305,7 +305,7 @@ def _check(made: SolvedMap) -> None:
 
 
 def _truth(made: SolvedMap, graph_path: Trajectory) -> str:
-    """Against ground truth, where it is known; returns whose identities the landmarks have."""
+    """Compare with ground truth, if known; returns the source of the landmark identities, ``truth`` or ``run``."""
     log, submaps, out, path, refined = (
         made.inputs.log,
         made.slam.submaps,
@@ -336,7 +336,7 @@ def _truth(made: SolvedMap, graph_path: Trajectory) -> str:
 
 
 def _report(made: SolvedMap, checks: ResidualConsistency, identities: str) -> dict[str, Any]:
-    """What ``run.json`` holds, but the verdict."""
+    """Content of ``run.json`` without the verdict."""
     log, back, config, fused = made.inputs.log, made.slam.back, made.config, made.fused
     submaps, refined, settings = made.slam.submaps, made.refined, made.slam.options.settings
     names, dropped = config["run"]["frontend"], {**log.dropped, **made.drops.counts}
@@ -389,7 +389,7 @@ def _report(made: SolvedMap, checks: ResidualConsistency, identities: str) -> di
 
 
 def _verdict(made: SolvedMap, report: dict[str, Any]) -> None:
-    """The use of every stream, and the findings: into the report."""
+    """Add the use of every stream, and the findings, to the report."""
     log, submaps, graph = made.inputs.log, made.slam.submaps, made.slam.back.graph
     settings, dropped = made.slam.options.settings, report["records_dropped"]
     used = frozenset().union(*(s.uses | s.assisting_streams for s in submaps))

@@ -1,4 +1,4 @@
-"""Use of every stream of a log in a run: records offered, records used, and why the others were not."""
+"""Use of every stream of a log in a run: number of records, number of used records, and the reason for the rest."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class StreamUse:
     role : str
         ``input`` of the front end, the kind of a sensor of the graph, or ``unused``.
     offered : int
-        Records that the log holds.
+        Records in the log.
     used : int
-        Records that a factor uses (by the ledger).
+        Records that a factor uses (from the ledger).
     asked : bool
-        The configuration asks for it by a setting of its own.
+        The configuration requests the stream.
     why : str
-        Why records were not used; empty where all were.
+        Why records were not used; empty if all were.
     """
 
     name: str
@@ -64,7 +64,7 @@ def stream_use(
     dropped : mapping of str to int
         Records dropped by the front end and the graph, per ``"stream: reason"``.
     streams_used : frozenset of str
-        Streams that the submaps say they used.
+        Streams that the submaps list as used.
     """
     spans: dict[str, list[tuple[float, float]]] = {}
     for e in graph.ledger.entries():
@@ -129,7 +129,7 @@ def _always(kind: type[SensorFactors], stream: Any) -> bool:
 
 
 def _idle_options(log: SensorLog, settings: RunConfig, streams: list[StreamUse]) -> list[tuple[str, str]]:
-    """Options that ask for sensors of a kind that the log does not have, or that a front end used, and why."""
+    """Options that request a sensor that the log does not have, or that only the front end used; with the reason."""
     out = []
     for name, kind in sensor_kinds().items():
         use = getattr(getattr(settings, name, None), "use", "none")

@@ -1,4 +1,4 @@
-"""Submaps in, a solved graph out: `run` feeds it from a whole log, `gs.Slam` from records as they come."""
+"""Front end and back end together: `run` uses it with a whole log, `gs.Slam` with records as they arrive."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FrontEndTiming:
-    """What the front end did in this session.
+    """Timing of the front end in this session.
 
     Parameters
     ----------
     resumed : int
-        Submaps that were there already.
+        Submaps that were already in the folder.
     per_scan : (k,)
-        Seconds a scan of each submap but the first, which may have compiled.
+        Seconds per scan for each submap except the first, which may include compilation.
     """
 
     seconds: float
@@ -53,16 +53,16 @@ class FrontEndTiming:
 
 
 class SubmapSlam:
-    """A front end and a back end: every submap is in the graph, and stored, as soon as the records that make it came.
+    """A front end and a back end. Every submap is added to the graph and stored as soon as its records are complete.
 
     Parameters
     ----------
     feed : RecordSource
-        Of the log.
+        Records of the log.
     observers : sequence of Observer
-        Told what goes on.
+        Notified of the progress.
     folder : RunFolder, optional
-        Where submaps are stored; those that are there already are not made again.
+        Folder for the submaps; those that it already has are not made again.
     """
 
     def __init__(
@@ -76,11 +76,11 @@ class SubmapSlam:
         self.control, self.check = options.table("control"), options.table("check")
         feed.places = measured_places(self.control, self.check)
         self.settled = None if folder is None else folder.settled()
-        """What earlier draws of the folder came to, where that is decided."""
+        """Decision between earlier draws of the folder, if there was one."""
         self._begin(0 if self.settled is None else self.settled.draw, observers)
 
     def _begin(self, draw: int, observers: Sequence[Observer]) -> None:
-        """Begin with a draw of random numbers: the submaps of it that the folder holds are added, the rest follows."""
+        """Start with a random draw: submaps of it that are in the folder are added; the others follow."""
         self.draw, self.drops = draw, DropCounter()
         self.back = self._back_end(self.options, observers)
         self._seconds, self._since, self._cost = 0.0, 0.0, list[float]()
@@ -107,25 +107,25 @@ class SubmapSlam:
         return self.options.front.follow(self.feed, seed=drawn, after=last, drops=self.drops, watch=self._watch)
 
     def _back_end(self, options: RunOptions, observers: Sequence[Observer]) -> BackEnd:
-        """A back end that has its IMUs, and the fixes that are to be used."""
+        """A back end with its IMUs, and the fixes to use."""
         feed, settings = self.feed, options.settings
         imu, fixes = ImuSource(feed, settings.imu), GpsSource(feed, settings.gps)
         others = OtherSources(feed)
         back = BackEnd(settings.backend, options.solver, imu=imu, observers=observers, fixes=fixes, others=others)
         back.control = self.control
-        if feed.ended:  # compasses and beacons are given whole
+        if feed.ended:  # compasses and beacons need the whole log
             for name, readings, config in optional_sensors(feed.log, settings.compass, settings.beacons):
                 back.add_sensor(name, readings, config)
         return back
 
     def step(self) -> None:
-        """Use what has come; at the end of the log everything is used."""
+        """Process the records so far; after the end of the log all of them."""
         while True:
             start = time.perf_counter()
             submap = next(self._stream, None)
             spent = time.perf_counter() - start
             self._seconds, self._since = self._seconds + spent, self._since + spent
-            if submap is None:  # more records are wanted, or there are none
+            if submap is None:  # needs more records, or the log has ended
                 return
             if isinstance(submap.grid, EvidenceGrid):
                 submap.grid.pool.release_scratch()
@@ -138,12 +138,12 @@ class SubmapSlam:
             self._since = 0.0
 
     def finish(self, undo: Sequence[int | LoopDecision] = ()) -> Solution:
-        """Last factors, loops, and the optimum; without the loops ``undo``."""
+        """Last factors, loops, and the optimum; without the loops in ``undo``."""
         tell_stage(self.back.observers, "graph")
         return self.back.finish(undo)
 
     def inputs(self, log: SensorLog, noticed: Sequence[StreamFinding]) -> RunInputs:
-        """What the graph and its evaluation need of the log; the memory of the front end is freed."""
+        """Inputs of the graph and its evaluation; frees the memory of the front end."""
         front = self.options.front
         assert front is not None
         steps = front.steps(log) if self.options.settings.refine.use else None
@@ -159,7 +159,7 @@ class SubmapSlam:
         trim_heap()
 
     def next_draw(self) -> SubmapSlam:
-        """The same log with the next draw of random numbers: all submaps made anew."""
+        """The same log with the next random draw; all submaps are made anew."""
         bars = self._bars()
         tell_stage(bars, "front end")
         made = copy.copy(self)
@@ -171,7 +171,7 @@ class SubmapSlam:
         return made
 
     def searching_loops(self) -> SubmapSlam:
-        """The same submaps in another graph, with loops that the back end looks for."""
+        """The same submaps in another graph, with loop search in the back end."""
         made = copy.copy(self)
         made.back = self._back_end(self.options.searching_loops(), self._bars())
         for s in self.submaps:
@@ -180,7 +180,7 @@ class SubmapSlam:
 
     @property
     def timing(self) -> FrontEndTiming:
-        """What the front end did so far."""
+        """Timing of the front end so far."""
         return FrontEndTiming(self._seconds, self._resumed, np.array(self._cost[1:]))
 
     def _bars(self) -> list[Observer]:
@@ -192,6 +192,6 @@ class SubmapSlam:
 
 
 def tell_stage(observers: Sequence[Observer], name: str) -> None:
-    """Tell them that a stage of the run begins."""
+    """Notify the observers that a stage of the run begins."""
     for o in observers:
         o.stage(name)

@@ -1,6 +1,6 @@
-"""The first line of a verdict: one of five words, main values, and the most important next step.
+"""The first line of a verdict: one of five results, main values, and the most important next step.
 
-The words are *consistent*, *conservative*, *not tested*, *overconfident* and *wrong* (:func:`verdict_word`).
+The results are *consistent*, *conservative*, *not tested*, *overconfident* and *wrong* (:func:`verdict_word`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ START: dict[str, str] = {
     "overconfident": "Overconfident: errors are larger than the covariances",
     "wrong": "Wrong: do not rely on this",
 }
-"""Start of the line, by the word of the verdict."""
+"""Start of the line for each result."""
 CONSISTENCY_CODES = frozenset(
     {"chi2", "nees", "trust", "consistency-test", "correlated", "gps-correlated", "imu-contradicted", "check-points"}
 )
-"""Codes of findings on the size of errors. Where one of them is bad, the result is overconfident; where another finding
-is bad, it is wrong."""
+"""Codes of findings on the size of errors. If one of them is bad, the result is overconfident; if another finding is
+bad, it is wrong."""
 
 ADVICE: dict[str, str] = {
-    # what cannot be right in the log comes first: everything else may follow from it
+    # errors in the log come first: everything else may follow from them
     "unreadable": "give a log that can be read",
     "refused": "correct the log as the error says",
     "no-front-end": "give a log with scans, clouds or landmark observations",
@@ -77,7 +77,7 @@ ADVICE: dict[str, str] = {
     "calibration-contradiction": "run `graphslam data check` to find the stream that is wrong",
     "calibration": "correct the calibration error that is named below",
     "lasting": "check unit, sign and mounting of the sensor whose error is named below",
-    # then what the run did with it
+    # then what the run did with the log
     "sightings-not-used": "check units, signs and ids of the observations",
     "*-not-used": "correct the cause for which a stream was not used",
     "no-effect": "leave the option out, or give a log that has its sensor",
@@ -105,7 +105,7 @@ ADVICE: dict[str, str] = {
     "control-points-*": "compare with a run without refinement (--set refine.use=false)",
     "gps-contradicts": "use the GPS fixes (--set gps.use=all) and check the new contradictions",
     "interrupted": "resume it: the same command with --resume",
-    # then what its covariances say
+    # then the covariances
     "nees": "repeat with other seeds (--seed 1, 2, …) before you use its covariances",
     "trust": "model time-correlated errors or increase the noise before you use its covariances",
     "refine-contradicted": "check the loop closures that the scans contradict (`graphslam loops RUN`)",
@@ -137,7 +137,7 @@ ADVICE: dict[str, str] = {
     "assumed": "check what was assumed because the log does not state it",
     "stamps-dense": "give the time stamps of the measurements",
 }
-"""Next step for a finding, by its code. Of several findings of one level the earliest in this list counts: causes
+"""Next step for a finding, by its code. Of several findings of one level the first one in this list is used: causes
 come before their effects."""
 JUDGED = frozenset({"chi2", "nees", "trust"})
 """Codes of findings that may be conservative."""
@@ -170,9 +170,9 @@ def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
 
 
 def _with_check_points(figures: RunMetrics) -> CovarianceAssessment | None:
-    """The assessment; check points decide where nothing else tests the map, and wherever they show larger errors."""
+    """The assessment; check points replace it if it is "not tested", or if they show larger errors."""
     found, checked = covariance_assessment(figures), figures.part("check_points")
-    word = checked.get("word", "wrong")  # a wrong map has a finding of its own
+    word = checked.get("word", "wrong")  # a wrong map has its own finding
     if found is None or word == "wrong" or (found.word != "not tested" and word != "overconfident"):
         return found
     return replace(found, word=word, power=float(checked.get("power", 0.0)))
@@ -181,12 +181,12 @@ def _with_check_points(figures: RunMetrics) -> CovarianceAssessment | None:
 def verdict_word(
     findings: Iterable[Finding], tests: Sequence[ChiSquareTest], assessment: CovarianceAssessment | None
 ) -> tuple[str, float]:
-    """One of five words on a result, and the power of the tests behind it (see :data:`START`).
+    """One of the five results, and the power of the tests behind it (see :data:`START`).
 
     Parameters
     ----------
     tests : sequence of ChiSquareTest
-        NEES where ground truth is known; χ² where there is no assessment.
+        NEES if ground truth is known; χ² if there is no assessment.
     assessment : CovarianceAssessment or None
         Tests without ground truth.
     """
@@ -199,7 +199,7 @@ def verdict_word(
     if bad or "overconfident" in words:
         return "overconfident", 0.0
     power = max((j.power for j in used), default=0.0)
-    if "conservative" in {j.word for j in nees}:  # small residuals alone may be those of correlated errors
+    if "conservative" in {j.word for j in nees}:  # not from χ² alone: correlated errors give small residuals, too
         return "conservative", power
     if power >= LEAST_POWER and {j.word for j in used} == {"consistent"}:
         return "consistent", power
@@ -219,11 +219,11 @@ def headline(
     Parameters
     ----------
     facts : sequence of str
-        The result, in a few words each.
+        The result, in short phrases.
     tests : sequence of ChiSquareTest
         Ratios of the findings with the codes ``chi2`` and ``nees``.
     known : bool
-        Is there a reference to compare the result with?
+        There is a reference to compare the result with.
     assessment : CovarianceAssessment or None
         Tests of the covariances without ground truth.
     """
@@ -244,7 +244,7 @@ def headline(
 
 
 def consistency_line(j: ChiSquareTest, findings: Sequence[Finding]) -> str:
-    """Are the covariances consistent, and by which ratio?"""
+    """One phrase on the consistency of the covariances, with the ratio."""
     ratio = f"{j.name} {j.ratio:.3g}"
     if j.code == "chi2" and any(f.code == "consistency-test" for f in findings):
         return f"some measurements contradict the others (all: {ratio})"
@@ -310,7 +310,7 @@ def _error(figures: RunMetrics) -> str:
 
 
 def length_text(x: float) -> str:
-    """A length in words: ``4.01 km``, ``305 m``, ``1.26 m``, ``4.1 cm``, ``6.3 mm``."""
+    """A length with three digits and its unit: ``4.01 km``, ``305 m``, ``1.26 m``, ``4.1 cm``, ``6.3 mm``."""
     for least, unit, each, digits in ((1e3, "km", 1e3, 3), (1.0, "m", 1.0, 3), (0.01, "cm", 0.01, 2)):
         if x >= least:
             return f"{x / each:.{digits}g} {unit}" if x / each < 1e3 else f"{x / each:.0f} {unit}"

@@ -1,4 +1,4 @@
-"""The surface of a finished run: its log is read once more along the solved path."""
+"""The surface of a finished run; its log is read once more along the solved path."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from graphslam.maps.terrain.pyramid import ClassGrid
 
 FORMAT = "graphslam.surface/1"
 COLOURS = ("height", "piece", "session", "sigma", "terrain")
-"""What a surface may be coloured by: height, the node it hangs on, the session of that node, σ of its place that comes
-of it, class of terrain below it."""
+"""Colours of a surface: height, node that the vertex is attached to, session of that node, σ of the position due to
+the node's pose, or terrain class below the vertex."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,9 +43,9 @@ class ScannedPath:
     Parameters
     ----------
     path : Trajectory
-        ``T_world_base`` in space.
+        ``T_world_base``, 3-D.
     node_times, node_poses : (k,), (k, 7)
-        In time order; a scan goes with the last node before it.
+        In time order; a scan is attached to the last node before it.
     node_covariances : (k, 6, 6), optional
         In the right tangent of each node.
     """
@@ -58,7 +58,7 @@ class ScannedPath:
     stream: str = "scans"
 
     def inside(self) -> npt.NDArray[np.int64]:
-        """Numbers of the scans that lie within the path in time."""
+        """Indices of the scans within the time of the path."""
         times = self.scans.times
         inside = (times >= self.path.times[0]) & (times <= self.path.times[-1])
         if isinstance(self.scans, RangeScans):
@@ -69,27 +69,27 @@ class ScannedPath:
         return at
 
     def nodes_of(self, at: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Node that each of these scans goes with."""
+        """Index of the node that each of these scans is attached to."""
         node = np.searchsorted(self.node_times, self.scans.times[at], side="right") - 1
         return np.clip(node, 0, len(self.node_poses) - 1)
 
 
 @dataclass(frozen=True)
 class RunSurface:
-    """What was made.
+    """Result of :func:`read_surface`.
 
     Parameters
     ----------
     layer : SurfaceLayer
-        A piece for each node of the graph.
+        One piece per node of the graph.
     owner : (v,)
-        Node that each vertex hangs on, those of all sessions counted on; −1 none.
+        Node that each vertex is attached to, numbered over all sessions; −1 none.
     session : (v,)
         Session of that node, in the order of the paths; −1 none.
     sigma : (v,)
-        σ of its place that comes of the pose of that node [m]; NaN where it is not known.
+        σ of the vertex position due to the pose of that node [m]; NaN if unknown.
     read_s, seconds : float
-        CPU time to read the scans into pieces, and to make the surface of the pieces.
+        CPU time to read the scans into pieces, and to make the surface from the pieces.
     """
 
     layer: SurfaceLayer
@@ -103,7 +103,7 @@ class RunSurface:
     seconds: float
 
     def facts(self) -> dict[str, Any]:
-        """What ``surface.json`` holds."""
+        """Content of ``surface.json``."""
         known = self.sigma[np.isfinite(self.sigma)]
         return {
             "format": FORMAT,
@@ -143,7 +143,7 @@ class RunSurface:
 
 @dataclass(frozen=True)
 class Surface(Layer):
-    """The level-set surface of a run in space, as PLY, GLB and OBJ.
+    """The level-set surface of a 3-D run, as PLY, GLB and OBJ.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class Surface(Layer):
 
     def make(self, run: Run, *, log: str | Path | SensorLog | None = None, progress: bool = True) -> RunSurface:
         """See :meth:`Layer.make`."""
-        self.terrain_of(run)  # a run without one is refused before the work
+        self.terrain_of(run)  # a missing terrain is refused before the work
         return read_surface([scanned_path(run, log=log)], config=self.config, progress=progress)
 
     def write(self, made: RunSurface, folder: OutputFiles, run: Run) -> list[Path]:
@@ -171,7 +171,7 @@ class Surface(Layer):
         return write_surface(folder, made, colour=self.colour, terrain=terrain, generation=generation)
 
     def terrain_of(self, run: Run) -> ClassGrid | None:
-        """The terrain of the run, where it gives the colours."""
+        """The terrain of the run, if the surface is coloured by it."""
         if self.colour != "terrain" or run.folder is None:
             return None
         return read_terrain_file(current_outputs(run.folder))
@@ -182,7 +182,7 @@ class Surface(Layer):
 
 
 def scanned_path(run: Run, *, log: str | Path | SensorLog | None = None) -> ScannedPath:
-    """The scans of a run in space along its solved path."""
+    """The scans of a 3-D run along its solved path."""
     name, scans = scans_of_run(run, log, what="a surface")
     m = run.map
     return ScannedPath(
@@ -194,12 +194,12 @@ def scanned_path(run: Run, *, log: str | Path | SensorLog | None = None) -> Scan
 def read_surface(
     paths: Sequence[ScannedPath], *, config: SurfaceConfig | None = None, progress: bool = True
 ) -> RunSurface:
-    """The surface of scans along paths in one frame, a piece for each node.
+    """The surface of scans along paths in one frame, with one piece per node.
 
     Parameters
     ----------
     paths : sequence of ScannedPath
-        One for each session.
+        One per session.
     """
     layer = SurfaceLayer(config)
     covariances: dict[PieceId, Array] = {}
@@ -249,7 +249,7 @@ def write_surface(
     terrain: ClassGrid | None = None,
     generation: str | None = None,
 ) -> list[Path]:
-    """Write ``surface.ply``, ``surface.glb``, ``surface.obj`` in the colours asked for, and ``surface.json``."""
+    """Write ``surface.ply``, ``surface.glb``, ``surface.obj`` in the chosen colours, and ``surface.json``."""
     colours = made.colours(colour, terrain)
     files = [save_mesh(made.mesh, folder.path / f"surface{ending}", colours) for ending in (".ply", ".glb", ".obj")]
     folder.write_json("surface.json", {**made.facts(), "colour": colour, "generation": generation})
@@ -257,7 +257,7 @@ def write_surface(
 
 
 def draw_surface(made: RunSurface, figures: Path, *, name: str) -> list[Path]:
-    """Pictures from aslant: by height, by session where there are several, and by σ of its place where it is known."""
+    """Oblique views: by height, by session if there are several, and by σ of the position if it is known."""
     from graphslam.plots.save import save_figure
     from graphslam.plots.surface import plot_surface
 

@@ -1,4 +1,4 @@
-"""The terrain of a finished run: its log is read once more along the solved path."""
+"""The terrain of a finished run; its log is read once more along the solved path."""
 
 from __future__ import annotations
 
@@ -42,31 +42,31 @@ from graphslam.maps.terrain.vehicle import LineSensor, Vehicle
 FORMAT = "graphslam.terrain/1"
 Ints = npt.NDArray[np.int64]
 _EVERY_POINT = 7
-"""Of which one is enough to find the ground."""
+"""Every n-th point is used to find the ground."""
 _SAMPLE = 60
-"""Scans that tell where up is, and how high the scanner stands about."""
+"""Number of scans for the up direction and the approximate height of the scanner."""
 _AROUND, _LOOK = 6, 3
-"""The height of a scanner is the median of what the ground says in every so many scans so far before and after."""
+"""The scanner height is the median over every third scan up to 6 scans before and after."""
 
 
 @dataclass(frozen=True)
 class RunTerrain:
-    """What was found.
+    """Result of :func:`read_terrain`.
 
     Parameters
     ----------
     layer : TerrainLayer
-        A piece for each node of the graph, in the level frame.
+        One piece per node of the graph, in the level frame.
     rotation : (3, 3)
-        From the frame of the run to the level one.
+        From the frame of the run to the level frame.
     path : (n, 3)
-        Places of the nodes in the level frame [m].
+        Positions of the nodes in the level frame [m].
     missing : int
-        Scans in which the ground was looked for and not found: the height of their neighbours was taken.
+        Scans in which the ground was not found; the height of their neighbours is used.
     moved : int
-        Points of the scans that were left out, because something that moved was there.
+        Points of the scans that were removed because they are on a moving object.
     read_s, seconds : float
-        CPU time to read the lines into pieces, and to make the map of the pieces.
+        CPU time to read the lines into pieces, and to make the map from the pieces.
     """
 
     layer: TerrainLayer
@@ -82,7 +82,7 @@ class RunTerrain:
     stream: str
 
     def facts(self) -> dict[str, Any]:
-        """What ``terrain.json`` holds."""
+        """Content of ``terrain.json``."""
         sensor, vehicle, tables = self.layer.sensor, self.layer.vehicle, self.layer.tables
         cells = {k.name.lower(): int(np.count_nonzero(self.map.classes == k)) for k in TerrainClass}
         return {
@@ -109,13 +109,13 @@ class RunTerrain:
 
 @dataclass(frozen=True)
 class Terrain(Layer):
-    """Where a vehicle can drive, from the point clouds of a run in space, or else from the lines of a laser.
+    """Traversability, from the point clouds of a 3-D run, or else from its line laser.
 
     Parameters
     ----------
     sensor_height : float, optional
-        Of the scanner above the ground [m]; default found from the ground in its scans. A line laser needs it: its base
-        is taken to drive on the ground.
+        Of the scanner above the ground [m]; default: estimated from the ground in point clouds. For a line laser it is
+        the height of the mount above the base, which assumes that the base is on the ground.
     """
 
     name: ClassVar[str] = "terrain"
@@ -134,7 +134,7 @@ class Terrain(Layer):
         return write_terrain(folder, made, generation=run.report.get("generation"))
 
     def draw(self, made: RunTerrain, figures: Path, *, name: str) -> list[Path]:
-        """Pictures of the classes, and in green, red and white."""
+        """Pictures of the classes, and of free, hazard and unknown cells."""
         from graphslam.plots.save import save_figure
         from graphslam.plots.terrain import plot_terrain
 
@@ -145,7 +145,7 @@ class Terrain(Layer):
 
 
 def scans_of_run(run: Run, log: str | Path | SensorLog | None, *, what: str) -> tuple[str, PointClouds | RangeScans]:
-    """Name and records of the scans of a run in space, from its log; errors say what is missing."""
+    """Name and records of the scans of a 3-D run, from its log; errors name the missing part."""
     if run.folder is None:
         raise RunFolderError("the run has no folder to read its configuration from; wanted a run with out=…")
     if run.map.dim != 3:
@@ -171,21 +171,21 @@ def read_terrain(
     sensor_height: float | None = None,
     progress: bool = True,
 ) -> RunTerrain:
-    """Terrain of scans along a path, a piece for each node.
+    """Terrain of scans along a path, with one piece per node.
 
     Parameters
     ----------
     solved : GlobalMap
-        In space; the z axis of the world points upwards within 20°. A scan goes with the last node before it.
+        3-D; the z axis of the world points upwards within 20°. A scan is attached to the last node before it.
     moved : mapping, optional
-        By number of a node: points ``(m, 3)`` of things that moved while it was made, in the world. Clouds of that
-        time are read without what stands where they are.
+        By node index: points ``(m, 3)`` of objects that moved during that submap, in the world frame. Points of
+        the clouds of that time that are on these objects are removed.
     stream, sensor_height, progress
-        Of the scanner above the ground [m]; None: found from the ground in its scans.
+        Name of the scans; see :class:`Terrain`; show a progress bar.
     """
     path, node_times, node_poses = solved.trajectory, solved.node_times, solved.node_poses
     inside = (scans.times >= path.times[0]) & (scans.times <= path.times[-1])
-    if isinstance(scans, RangeScans):  # beams are read after the stamp of their line
+    if isinstance(scans, RangeScans):  # beams are measured after the time stamp of their line
         inside &= scans.times + scans.beam_times.max() <= path.times[-1]
     at: Ints = np.flatnonzero(inside).astype(np.int64)
     if not len(at):
@@ -208,7 +208,7 @@ def read_terrain(
     turns = None
     if isinstance(scans, PointClouds):
         places = {k: MovedObjects(np.asarray(se3.se3_transform(turn, p))) for k, p in (moved or {}).items()}
-        # the scan at a node is in the submap that ends there
+        # a scan at the time of a node belongs to the submap that ends there
         ends = np.searchsorted(node_times, scans.times[at], side="left") - 1
         gone = [places.get(k) for k in np.maximum(ends, 0).tolist()]
         turns = _Turns(scans, at, level, height, sensor_height is None, gone)
@@ -230,7 +230,7 @@ def read_terrain(
 
 
 def _sweep(scans: PointClouds | RangeScans, at: Ints) -> float:
-    """Time until a scanner has looked everywhere once [s]; of a line that pans, until it turns back."""
+    """Time for one full coverage of the field of view [s]; for a panning line, until it reverses."""
     if isinstance(scans, RangeScans) and scans.spin_rate is not None:
         turns = np.flatnonzero(np.diff(np.sign(scans.spin_rate[at])) != 0)
         if len(turns) > 1:
@@ -239,7 +239,7 @@ def _sweep(scans: PointClouds | RangeScans, at: Ints) -> float:
 
 
 def _posed(scans: PointClouds, k: int, path: Trajectory) -> tuple[Array, Array]:
-    """Points of a scan, and where the scanner was, in the frame of the path."""
+    """Points of a scan, and position of the scanner, in the frame of the path."""
     T = se3.se3_compose(path.interpolate(scans.times[k : k + 1])[0], scans.T_base_sensor)
     return se3.se3_move(T, np.asarray(scans.cloud(k), dtype=np.float64)), T[:3]
 
@@ -247,7 +247,7 @@ def _posed(scans: PointClouds, k: int, path: Trajectory) -> tuple[Array, Array]:
 def _ground_of_clouds(
     scans: PointClouds, at: Ints, path: Trajectory, height: float | None
 ) -> tuple[Array, float, float]:
-    """Rotation to a level frame, height of the scanner and angle between its beams, of some scans along the path."""
+    """Rotation to a level frame, height of the scanner and angle between its beams, from a sample of the scans."""
     some = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), _SAMPLE)).astype(np.int64))]
     posed = [_posed(scans, k, path) for k in some.tolist()]
     up, about = np.array([0.0, 0.0, 1.0]), height
@@ -261,7 +261,7 @@ def _ground_of_clouds(
 
 
 def _moved(run: Run) -> dict[int, Array]:
-    """Points of things that moved, in the world, by node of a run whose submaps have grids and clouds."""
+    """Points of moving objects in the world frame, by node, for a run whose submaps have grids and clouds."""
     if run.folder is None or not any(s.cloud is not None for s in run.submaps):
         return {}
     submaps = read_submaps(run.folder, load_grid=load_spilled)
@@ -274,20 +274,20 @@ def _moved(run: Run) -> dict[int, Array]:
 
 
 class _Turns:
-    """Lines of clouds, each decoded once: the height above the ground is the median of some scans around.
+    """Lines of clouds, each decoded once; the height above the ground is the median over neighbouring scans.
 
     Parameters
     ----------
     at : (k,)
-        Scans that are asked for, in this order.
+        Scans to read, in this order.
     level : Trajectory
         In the level frame.
     height : float
-        Of the scanner above the ground, about [m].
+        Approximate height of the scanner above the ground [m].
     look : bool
-        Find it in the scans themselves.
+        Estimate the height from the scans.
     gone : list of k MovedObjects or None
-        What moved while each scan was made, in the level frame.
+        Moving objects at the time of each scan, in the level frame.
     """
 
     def __init__(
@@ -307,13 +307,13 @@ class _Turns:
         self.missing = self.left_out = 0
 
     def lines(self, k: int) -> ScanLines:
-        """Of one scan."""
+        """Lines of one scan."""
         i = self.place[k]
         while self.coming and self.place[self.coming[0]] <= i + (_AROUND if self.look else 0):
             self._decode(self.coming.popleft())
         points, origin = self.read.pop(k)
         for old in [j for j in self.below if j < i - _AROUND]:
-            if len(self.below) > 1:  # where no ground is found for long, the last one counts
+            if len(self.below) > 1:  # if no ground is found for long, the last height is used
                 del self.below[old]
         height = float(np.median(list(self.below.values()))) if self.below else self.height
         return lines_of_clouds(points, origin, float(origin[2] - height))
@@ -334,14 +334,14 @@ class _Turns:
 
 
 def _beam_step(points: Array, origin: Array) -> float:
-    """Angle between neighbouring beams below the horizon, of columns half a degree wide [rad]."""
+    """Median angle between neighbouring beams below the horizon, within columns of half a degree [rad]."""
     d = points - origin
     column = np.floor(np.arctan2(d[:, 1], d[:, 0]) * 720.0 / (2.0 * np.pi)).astype(np.int64)
     elevation = np.arctan2(d[:, 2], np.hypot(d[:, 0], d[:, 1]))
     low = elevation < -0.03
     order = np.lexsort((elevation[low], column[low]))
     gap = np.diff(elevation[low][order])[np.diff(column[low][order]) == 0]
-    gap = gap[gap > 1e-3]  # neighbours in azimuth lie side by side
+    gap = gap[gap > 1e-3]  # smaller gaps are between neighbours in azimuth
     return float(np.clip(np.median(gap), 2e-3, 0.1)) if len(gap) else 0.01
 
 
@@ -352,7 +352,7 @@ def _lines(scans: RangeScans, at: Ints, level: Trajectory, height: float) -> Sca
 
 
 def read_terrain_file(folder: Path) -> ClassGrid:
-    """The terrain of a run folder."""
+    """Read the terrain of a run folder."""
     facts = read_json(folder / "terrain.json", fmt=FORMAT, shape={"rotation_level_run": [(float,) * 3]})
     a = read_npz(
         folder / "terrain.npz", fmt=FORMAT, fields={"origin": floats(2), "cell": floats(), "classes": ints("ny", "nx")}
