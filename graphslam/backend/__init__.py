@@ -1,4 +1,4 @@
-"""Layer 8: submaps and sensor streams in, a solved graph out. Reads and writes no files."""
+"""Layer 8: from submaps and sensor streams to a solved graph. Reads and writes no files."""
 
 from graphslam.core.lazy_exports import lazy_exports
 

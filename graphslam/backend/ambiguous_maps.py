@@ -1,7 +1,7 @@
-"""Two maps of one log: the graph with either of two groups of loops that cannot both be right, if nothing tells.
+"""Two maps of one log, if two groups of loops contradict each other and it is undecided which group is right.
 
-The graph that is the result has neither group, so that its covariance allows for both; with one group or the other it
-is another map, and one of these two is the right one.
+The resulting graph has neither group, so its covariance includes both cases. The graph with either group is one of the
+two maps; one of them is right.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class AlternativeMap:
     Parameters
     ----------
     loops : tuple of int
-        Of those in dispute the ones that are in it, by their numbers in the ledger; the others are those of the result.
+        Numbers (in the ledger) of the disputed loops in this map; all other loops are those of the result.
     path : Trajectory
         At full rate with covariances, in the frame of the first base.
     node_times, node_poses : (m + 1,), (m + 1, 7|3)
@@ -41,21 +41,21 @@ class AlternativeMap:
 
 @dataclass(frozen=True, slots=True)
 class AmbiguousMaps:
-    """Both maps, and what is in dispute between them.
+    """Both maps, and the disputed loops.
 
     Parameters
     ----------
-    maps : (Rival, Rival)
+    maps : (AlternativeMap, AlternativeMap)
     places : list of dict
-        Of each pair of groups: ``loops``, numbers of either group; ``nodes`` and ``times`` [s], first and last of the
-        earlier ends and of the later ones.
+        For each pair of groups: ``loops``, the numbers in each group; ``nodes`` and ``times`` [s], first and last, of
+        the earlier ends and of the later ends.
     """
 
     maps: tuple[AlternativeMap, AlternativeMap]
     places: list[dict[str, Any]]
 
     def facts(self) -> dict[str, Any]:
-        """What the report of a run says of them, JSON-serialisable; lengths in metres, times in seconds."""
+        """JSON-serialisable entries for the report; lengths in metres, times in seconds."""
         a, b = self.maps
         dim = 3 if a.node_poses.shape[1] == 7 else 2
         apart = np.linalg.norm(a.node_poses[:, :dim] - b.node_poses[:, :dim], axis=1)
@@ -71,16 +71,16 @@ class AmbiguousMaps:
 
 
 def ambiguous_maps(graph: FactorGraph, solver: Solver, closer: LoopCloser) -> AmbiguousMaps | None:
-    """The graph with either side of what could not be decided; None where all could be, or it bears neither side.
+    """The graph with each of the undecided groups; None if nothing is undecided, or the graph accepts neither group.
 
-    The graph is left as it was, at its optimum.
+    Afterwards the graph is unchanged, at its optimum.
 
     Parameters
     ----------
     solver : Solver
         Of that graph.
     closer : LoopCloser
-        What decided on its loops.
+        That decided on its loops.
     """
     pairs = closer.undecided
     if not pairs:

@@ -1,4 +1,4 @@
-"""Submaps in, a solved graph out: association, factors, solver, merging. One call per finished submap."""
+"""Back end: association, factors, solver, merging of landmarks, loops. One call per finished submap."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ from graphslam.solve.solution import Solution
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 MERGE_REACH = 5.0
-"""Landmarks farther apart than this are not tested for merging by covariance [m]."""
+"""Landmarks that are farther apart are not tested for merging by covariance [m]."""
 LOOP_OVERLAP = 8.0
-"""Maps of two places are matched if the places may be nearer than this [m] …"""
+"""Maps of two places are matched if their distance may be smaller than this [m] …"""
 LOOP_HEIGHT = 1.0
-"""… and not farther above each other than this [m]."""
+"""… and their height difference not larger than this [m]."""
 
 
 def find_config(c: BackEndConfig) -> FindConfig:
-    """How the back end looks for loops, the front end's matches among them."""
+    """Configuration of the loop search; front-end matches are included."""
     return FindConfig(
         candidates=CandidateConfig(overlap=LOOP_OVERLAP, height=LOOP_HEIGHT, least_support=c.match_support),
         appearance=AppearanceConfig() if c.loop_appearance else None,
@@ -56,30 +56,30 @@ def find_config(c: BackEndConfig) -> FindConfig:
 
 
 class Observer:
-    """Told what a run does while it does it: a progress bar, a live view. A subclass takes what it needs.
+    """Notified during a run, for example a progress bar or a live view. Subclasses override the methods they need.
 
-    Nothing that an observer does changes the run; what it raises ends it.
+    An observer cannot change the run; an exception in it ends the run.
     """
 
     def stage(self, name: str) -> None:
         """A stage of the run begins, such as ``"front end"`` (:data:`graphslam.app.run.run_bar.STAGES`)."""
 
     def front_end_at(self, progress: Any) -> None:
-        """A front end that can be watched has made a step; ``progress`` is of its own kind."""
+        """A front end has made a step; the type of ``progress`` depends on the front end."""
 
     def submap_added(self, submap: Submap, graph: FactorGraph) -> None:
-        """A submap is in the graph, and the graph is solved with it."""
+        """A submap was added to the graph, and the graph was solved."""
 
     def loop_decided(self, decision: LoopDecision, graph: FactorGraph) -> None:
-        """A loop was believed or not, and why."""
+        """A loop was accepted or rejected; ``decision.why`` has the reason."""
 
     def solved(self, solution: Solution) -> None:
-        """All submaps are in, and everything is solved."""
+        """All submaps were added, and the graph was solved."""
 
 
 @dataclass
 class BackEnd:
-    """A pose graph that grows by submaps and is solved after each.
+    """A pose graph to which submaps are added; it is solved after each of them.
 
     Parameters
     ----------
@@ -90,37 +90,37 @@ class BackEnd:
     config: BackEndConfig
     solver_name: str
     graph: FactorGraph = field(default_factory=FactorGraph)
-    """Of two dimensions until a submap of three comes first."""
+    """2-D until the first submap is added; replaced if that is 3-D."""
     seconds: dict[str, float] = field(default_factory=lambda: {"associate": 0.0, "solve": 0.0, "merge": 0.0})
     per_submap_s: list[float] = field(default_factory=list)
     submaps: list[Submap] = field(default_factory=list)
-    """With their maps; kept only where loops are looked for."""
+    """With their maps; kept only if loops are searched."""
     imu: ImuSource | None = None
-    """IMUs of the log; None where there is no log."""
+    """IMUs of the log; None without a log."""
     fixes: GpsSource | None = None
-    """Fixes of the log, where they are to be used as they come."""
+    """Fixes of the log that are added during the run."""
     others: OtherSources | None = None
-    """Sensors of the log that have no options."""
+    """Sensors of the log without options."""
     observers: Sequence[Observer] = ()
     control: ControlTable | None = None
-    """Control points and distances, which enter when all submaps are there."""
+    """Control points and distances, which are added in :meth:`finish`."""
     two_maps: AmbiguousMaps | None = None
-    """Once it is finished: the graph with either of two groups of loops that cannot both be right, if nothing told."""
+    """After :meth:`finish`: the graph with each of two contradictory groups of loops, if undecided."""
 
     def __post_init__(self) -> None:
         self.solver = make_solver(self.solver_name, self.graph)
         self._waiting: list[tuple[Gps, GpsOptions]] = []
-        self._later: list[Callable[[FactorGraph], object]] = []  # until the first submap says which dimension it is
+        self._later: list[Callable[[FactorGraph], object]] = []  # until the first submap, which sets the dimension
         self._loops: LoopSearch | None = None
-        self._noted = 0  # decisions on loops that are among the events
+        self._noted = 0  # number of loop decisions that are already in the events
         self._association = AssociationConfig(
             method=self.config.method, gate=self.config.gate, covariance_scale=self.config.covariance_scale
         )
 
     def add_gps(self, gps: Gps, config: GpsOptions) -> None:
-        """Give the graph the fixes that count; they wait for the submaps that hold them.
+        """Add fixes to the graph; they become factors when the submaps of their times are added.
 
-        Before the first submap it is not known whether the graph is in the plane: there fixes lose their height.
+        Before the first submap the fixes are stored. In a planar graph they lose their height.
         """
         if not self.graph.submaps:
             self._waiting.append((gps, config))
@@ -131,11 +131,11 @@ class BackEnd:
         self.graph.add_sensor(gps, config=config)
 
     def add_sensor(self, name: str, readings: Any, config: Any) -> None:
-        """Give the graph the readings of a sensor; they wait for the submaps that hold them."""
+        """Add the readings of a sensor to the graph; they become factors when the submaps of their times are added."""
         self._later.append(lambda graph: graph.add_sensor(readings, stream=name, config=config))
 
     def add(self, submap: Submap) -> None:
-        """Associate, add, solve; now and then merge landmarks that turned out to be one."""
+        """Associate, add and solve; landmarks are merged and loops are searched after every n-th submap."""
         start = time.perf_counter()
         associated = self.append(submap)
         self.solver.update()
@@ -152,14 +152,14 @@ class BackEnd:
             o.submap_added(submap, self.graph)
 
     def _look(self) -> None:
-        """While the run goes on: what IMUs say of the submaps so far, and loops."""
+        """During the run: add IMU factors of the submaps so far, and search for loops."""
         if self.imu is not None and self.imu.attach(self.graph, more=True):
             self.solver.update()
         if self.config.looks:
             self.find_loops(last=False)
 
     def append(self, submap: Submap) -> float:
-        """Associate and add without solving; returns the time at which it was associated [s]."""
+        """Associate and add without solving; returns the time after the association (``perf_counter``) [s]."""
         if submap.dim != self.graph.dim and not self.graph.submaps:
             self.graph = FactorGraph(submap.dim)
             self.solver = make_solver(self.solver_name, self.graph)
@@ -198,7 +198,7 @@ class BackEnd:
             self.others.give(self.graph, until)
 
     def _add_matches(self, submap: Submap) -> None:
-        """Re-entries that the front end found, as far as enough particles took them; the others stay in the events."""
+        """Add front-end matches with enough support as factors; the others are logged as events."""
         for m in submap.matches:
             if m.support >= self.config.match_support:
                 self.graph.add_match(submap.key, m, robust=MATCH_KERNEL)
@@ -208,7 +208,7 @@ class BackEnd:
                 )
 
     def merge(self) -> int:
-        """Merge landmarks by joint covariance, then by distance, and solve again; returns the number merged."""
+        """Merge landmarks by joint covariance, then by distance, and solve; returns the number of merges."""
         start = time.perf_counter()
         merged = 0
         if self.config.associate and len(self.graph.values.landmarks) > 1:
@@ -226,13 +226,13 @@ class BackEnd:
         return merged
 
     def finish(self, undo: Sequence[int | LoopDecision] = ()) -> Solution:
-        """Merge until nothing merges any more, go to the optimum, and return the solution.
+        """Add the last factors, solve to the optimum, merge landmarks, decide on loops, and return the solution.
 
         Parameters
         ----------
         undo : sequence of int or LoopDecision
-            Loops that are taken out again: by their numbers in the ledger of loops; or as an earlier ledger of the same
-            submaps has them, and then one that is not in this graph is noted and stays undone.
+            Loops to remove: by their numbers in the loop ledger, or as decisions from an earlier ledger of the same
+            submaps. If such a loop is not in this graph, this is logged and it stays undone.
         """
         self._give_fixes(np.inf)
         if self.control is not None:
@@ -266,14 +266,14 @@ class BackEnd:
         return solution
 
     def find_loops(self, *, last: bool = True) -> LoopLedger:
-        """Look for loops between the submaps, take those that are believed, and note every decision.
+        """Search for loops between the submaps, add the accepted ones, and log every decision.
 
-        The front end's matches are among them: until now each had a factor by its support alone.
+        The front end's matches are decided on as well; until now each was a factor because of its support alone.
 
         Parameters
         ----------
         last : bool
-            No more submaps will come (:class:`~graphslam.loops.find_loops.LoopSearch`).
+            No more submaps follow (:class:`~graphslam.loops.find_loops.LoopSearch`).
         """
         start = time.perf_counter()
         for fid in [f for f, r in self.graph.records.items() if isinstance(r, BetweenRecord) and r.group == "match"]:
@@ -293,7 +293,7 @@ class BackEnd:
         return ledger
 
     def undo_loop(self, loop: int) -> None:
-        """Take a loop, or a front end's match with its ties, out of the graph; what was found with it in stays."""
+        """Remove a loop, or a match with its overlap constraints; other loops found with it stay in the graph."""
         ledger = ledger_of_events(self.graph.events)
         d = ledger.of(loop)
         if d.verdict != "accepted" or d.factor_id not in self.graph.records:
@@ -307,13 +307,13 @@ class BackEnd:
             x = ledger.of(number)
             matched = self.graph.records[x.factor_id]
             self.graph.remove(x.factor_id, reason="undone")
-            if isinstance(matched, BetweenRecord) and matched.group != "match":  # of a match the removal says it
+            if isinstance(matched, BetweenRecord) and matched.group != "match":  # for a match the removal is the event
                 event = replace(x, verdict="undone", why=reason, weight=0.0, factor_id=-1).event()
                 self.graph.log_event(event.pop("event"), **event)
         self.solver.solve_to_optimum()
 
     def _stay_undone(self, before: LoopDecision) -> None:
-        """Take out a loop that was undone in an earlier run of the same submaps."""
+        """Remove a loop that was undone in an earlier run of the same submaps."""
         ledger = ledger_of_events(self.graph.events)
         d = same_loop(before, ledger)
         if d is not None:
@@ -322,11 +322,11 @@ class BackEnd:
         what = f"loop {before.loop} of submaps {before.submap_i} and {before.submap_j}"
         logger.warning("%s was undone before and was not found this time", what)
         number = 1 + max((x.loop for x in ledger.decisions), default=-1)
-        event = replace(before, loop=number, why="undone before; not found this time").event()  # for the next time
+        event = replace(before, loop=number, why="undone before; not found this time").event()  # for the next run
         self.graph.log_event(event.pop("event"), **event)
 
     def split_wrong_identities(self) -> int:
-        """Split off sightings that contradict the map, the worst one at a time, until none does; returns how many."""
+        """Split off observations that contradict the map, the worst first, until none does; returns their number."""
         split = 0
         while self.config.identity_gate > 0 and split < 10 * len(self.graph.submaps):
             doubts = find_association_outliers(self.graph, self.config.identity_gate)
@@ -338,7 +338,7 @@ class BackEnd:
         return split
 
     def landmark_hits(self, submaps: list[Submap]) -> dict[int, int]:
-        """Sightings of every landmark over all submaps (1 a submap where a submap does not count them)."""
+        """Observations of every landmark over all submaps (1 per submap that does not count them)."""
         hits: dict[int, int] = {int(i): 0 for i in self.graph.values.landmark_ids}
         for s in submaps:
             if s.landmarks is None:
@@ -351,7 +351,7 @@ class BackEnd:
         return hits
 
     def observation_labels(self, submaps: list[Submap]) -> tuple[Ints, Ints]:
-        """(observation index in the log, landmark id) of every sighting, for audits of the association."""
+        """(observation index in the log, landmark id) of every observation, for audits of the association."""
         rows: list[Any] = [np.zeros((0, 2), dtype=np.int64)]
         for s in submaps:
             if s.landmarks is not None and s.landmarks.sightings is not None:

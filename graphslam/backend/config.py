@@ -1,4 +1,4 @@
-"""What steers the back end: association, merging, loops; GPS and IMU as far as the graph does not say it."""
+"""Options of the back end: association, merging, loops; use of GPS, IMU, compasses and beacons."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from graphslam.graph.sensors.gps import GpsConfig
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class GpsOptions(GpsConfig):
-    """Which GPS fixes enter the graph, and how; the others are kept back to score it."""
+    """Which GPS fixes enter the graph, and how; the others are withheld to test it."""
 
     use: Literal["none", "all", "every-second", "even-segments", "odd-segments"] = "none"
-    """Fixes that become factors; the rest is withheld and scored. Segments are runs of fixes without a gap."""
+    """Fixes that become factors; the others are withheld as a test. Segments are sequences of fixes without a gap."""
     every: float = 0.0
-    """Of these at most one in so many seconds becomes a factor; the rest is withheld, too [s]."""
+    """Minimum time between two fixes that become factors [s]; the others are withheld, too."""
     robust: RobustKernel = flattened_field(RobustKernel("cauchy", 2.385), robust="kind", robust_width="k")
-    """Robust kernel on every GPS factor, and its width in standard deviations; less costs accuracy where fixes are good
-    (docs/notes/segmap-graph.md)."""
+    """Robust kernel on every GPS factor, and its width in standard deviations; a smaller width costs accuracy if the
+    fixes are good (docs/notes/segmap-graph.md)."""
 
     def __post_init__(self) -> None:
         GpsConfig.__post_init__(self)
@@ -55,56 +55,56 @@ class BeaconOptions(BeaconConfig):
     """Which distances to beacons enter the graph, and how."""
 
     use: str = "none"
-    """``"none"``, or the name of a stream of sightings with known identities that the front end does not use."""
+    """``"none"``, or the name of a stream of observations with known identities that the front end does not use."""
 
 
 MATCH_KERNEL = RobustKernel("cauchy", 2.385)
-"""Robust kernel on every match of a front end and on every loop: 95 % efficient where all are right."""
+"""Robust kernel on every front-end match and every loop: 95 % efficiency if all are inliers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndConfig:
-    """From submaps to a solved graph."""
+    """Options from submaps to a solved graph."""
 
     covariance_scale: float = 1.0
-    """Factor on every submap covariance in the join; 1 = trust the front end. Choose it so that join χ²/dof is 1."""
+    """Factor on every submap covariance in the join; 1: as given by the front end. Choose it so that χ²/dof is 1."""
     associate: bool = True
-    """Associate landmarks without identity to the graph's (joint compatibility); identities in the submaps win."""
+    """Associate landmarks without identity with those in the graph; identities in the submaps have priority."""
     method: Literal["joint-compatibility", "nearest-neighbour"] = "joint-compatibility"
-    """How landmarks are associated."""
+    """Method of landmark association."""
     gate: float = 11.8
-    """χ² gate of one pairing given the ones before (2 dof: 99.7 %)."""
+    """χ² gate of one pairing given the previous ones (2 dof: 99.7 %)."""
     identity_gate: float = 0.0
-    """At the end, a sighting that contradicts the map by this χ² (2 dof) becomes a landmark of its own; 0 = never."""
+    """At the end, an observation that contradicts the map by this χ² (2 dof) becomes a separate landmark; 0 = never."""
     merge_distance: float = 0.0
-    """Landmarks nearer than this after the join are one [m]; 0 = never merge by distance."""
+    """Landmarks closer than this after the join are merged [m]; 0 = never merge by distance."""
     merge_every: int = 20
-    """Look for landmarks to merge after this many submaps, and at the end."""
+    """Search for landmarks to merge after this number of submaps, and at the end."""
     confirmed_hits: int = 1
-    """Landmarks of the final map were sighted at least this often over all submaps."""
+    """Minimum number of observations, over all submaps, of a landmark in the final map."""
     node_spacing: float = 3.0
-    """Dense submaps get an inner node about every so many metres of their path [m]; 0 = none."""
+    """Approximate distance between inner nodes along the path of a dense submap [m]; 0 = no inner nodes."""
     level_sigma: float = 0.0
-    """In space: bases are levelled, each by itself, with this σ of roll and pitch [rad]; 0 = exits say it."""
+    """3-D: σ of roll and pitch of an independent attitude factor on each base [rad]; 0 = end poses include attitude."""
     match_support: float = 0.5
-    """A front end's match becomes a factor if at least this share of the particles took it; above 1 = none does."""
+    """Minimum share of the particles that a front-end match needs to become a factor; above 1 = none does."""
     loops: Literal[True, False, "auto"] = "auto"
-    """Look for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
-    The front end's matches are decided on with them; without, each that has the support is a factor. "auto": a run
-    looks for them where passes of its fused map deny each other, and keeps the map in which fewer points are denied."""
+    """Search for loops between dense submaps; every decision is in ``events.jsonl`` (``graphslam loops``).
+    Front-end matches are then decided on as well; without the search, each match with enough support is a factor.
+    "auto": search if traversals of the fused map contradict each other, and keep the map with fewer contradictions."""
     draws: int = 3
-    """A run whose maps are still denied makes its submaps anew of other random numbers, so many draws in all, and keeps
-    the map in which the fewest points are denied; 1 = never."""
+    """If the maps still contradict themselves, submaps are made again with other random numbers. Largest number of
+    draws; the map with the fewest contradictory points is kept; 1 = never."""
     look_every: int = 5
-    """While the run goes on, tie in IMUs and look for loops after every so many submaps, too; 0 = at the end only."""
+    """During the run, add IMU factors and search for loops after this number of submaps; 0 = only at the end."""
     loop_ties: bool = True
-    """With loops: also along submaps, where their bodies were in a map that held them."""
+    """With loops: also overlap constraints along submaps that re-entered an older map."""
     loop_appearance: bool = False
-    """Also try places that look alike, wherever they are."""
+    """Also test places that look alike, at any distance."""
 
     @property
     def looks(self) -> bool:
-        """Are loops looked for from the start?"""
+        """Are loops searched from the start?"""
         return self.loops is True
 
     def __post_init__(self) -> None:

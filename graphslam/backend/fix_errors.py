@@ -1,16 +1,16 @@
-"""How large the errors of fixes are, and how long they last: fitted to the log, before the graph believes the fixes.
+"""Error model of GPS fixes, fitted to the log: bias σ, correlation time and white noise.
 
-A receiver states a σ, as if each fix were drawn anew; errors of real ones last for a minute. The model is
+A receiver states a σ as if its errors were independent, but real errors are correlated over about a minute. Model::
 
     z = T_gps_world(p) + b + w,      b Gauss–Markov (σ s_b, time constant τ),  w white (m times the stated σ),
 
-and (s_b, τ, m) are those under which the fixes are likeliest, given where the map *without* fixes has the antenna: the
-innovations of some of them, with their joint covariance, at the values of the robust optimum. The bias is believed if
-twice the gain in log-likelihood over white noise of any size is above :data:`GATE`; then every fix has one, and each
-follows from the one before. Without it a larger white part is believed by the same gate, a smaller one never.
+(s_b, τ, m) maximise the likelihood of the innovations of a subset of the fixes against the antenna positions of the map
+*without* fixes, with their joint covariance, at the values of the robust optimum. The bias is accepted if twice its
+gain in log-likelihood over white noise of any size is above :data:`GATE`; then every fix has a bias, linked to that of
+the previous fix. Without a bias, larger white noise is accepted by the same gate; smaller noise is never used.
 
-Before that, fixes that lie farther than :data:`WILD` of their own σ from the robust optimum go: a Gaussian bias would
-bend after them. Where no kernel was asked for, none go.
+Before that, fixes farther than :data:`WILD` σ from the robust optimum are removed, because a Gaussian bias would follow
+them. Without a robust kernel none are removed.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from graphslam.graph.noise import whitener
 from graphslam.graph.sensors.gps import FixErrors, GpsFactors
 
 GATE = 8.0
-"""Twice the gain in log-likelihood: for two more parameters white noise exceeds it once in 50 logs."""
+"""Gate on twice the gain in log-likelihood: with two more parameters, white noise exceeds it in one of 50 logs."""
 WILD = 4.0
-"""Of its σ; a fix that lies farther off is wild."""
+"""A fix farther off than this multiple of its σ is an outlier."""
 LEAST = 24
-"""Fewer fixes do not tell how long their errors last."""
+"""Minimum number of fixes to estimate the correlation time."""
 MOST = {2: 200, 3: 130}
-"""Fixes whose innovations are looked at, by dimension."""
+"""Largest number of innovations, by dimension."""
 EVERY = 3
-"""At most so many fixes are passed over from one of these to the next; of a longer log …"""
+"""Every fix up to every third one is used; from a longer log …"""
 TOGETHER = 40
-"""… stretches of so many are looked at, so that short and long times are both told."""
+"""… blocks of this number of fixes, so that short and long correlation times can be estimated."""
 NAT = 0.5
-"""Of parameters whose log-likelihood is this near to the best, those with the strongest lasting part are taken: a bias
-that is believed too small makes a map overconfident, one that is believed too large costs accuracy."""
+"""Of all parameters with a log-likelihood this close to the best, those with the strongest bias are used: a bias that
+is too small makes a map overconfident, one that is too large costs accuracy."""
 LOOSE = 1e3
-"""σ of each number of the datum, of which fixes tell nothing here."""
+"""Prior σ of each component of the datum, which is unobservable without fixes."""
 
 
 def fit_fix_errors(graph: FactorGraph) -> FixErrors | None:
-    """Fit the errors of the fixes of a graph at its optimum, and put what was found into it.
+    """Fit the errors of the fixes of a graph at its optimum, and update the graph.
 
-    The graph is to be solved anew then. None: nothing was changed.
+    The caller must solve the graph again. Returns None if nothing was changed.
     """
     gps = GpsFactors.of(graph)
     fixes = sorted((r for r in graph.records.values() if isinstance(r, GpsRecord)), key=lambda r: r.time)
@@ -65,7 +65,7 @@ def fit_fix_errors(graph: FactorGraph) -> FixErrors | None:
     try:
         seen = _Innovations.of(graph, kept)
         found = seen.fit()
-    except (IndeterminateError, np.linalg.LinAlgError):  # without fixes there is no map to hold them against
+    except (IndeterminateError, np.linalg.LinAlgError):  # without fixes there is no map to compare with
         return None
     if found is None and not wild:
         return None
@@ -88,24 +88,24 @@ def _batch(graph: FactorGraph, fixes: list[GpsRecord]) -> GpsBatch:
 
 
 def _distances(graph: FactorGraph, fixes: list[GpsRecord]) -> Array:
-    """Residuals in units of the σ of the fix, by coordinate."""
+    """Residual norm of each fix in units of its σ."""
     return np.asarray(np.sqrt(_batch(graph, fixes).squared(graph.values)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Innovations:
-    """Fixes less where the map without fixes has the antenna, in the frame of the fixes.
+    """Fixes minus predicted antenna positions of the map without fixes, in the frame of the fixes.
 
     Parameters
     ----------
     times : (n,)
     y : (n d,)
     known : (n d, n d)
-        Covariance of the prediction, arms included.
+        Covariance of the prediction, with that of the lever arms.
     stated : (n, d, d)
-        As the receiver says.
+        Stated by the receiver.
     span : float
-        Of the whole log [s].
+        Duration of the whole log [s].
     """
 
     times: Array
@@ -116,7 +116,7 @@ class _Innovations:
 
     @classmethod
     def of(cls, graph: FactorGraph, fixes: list[GpsRecord]) -> _Innovations:
-        """At the graph's values: one Gauss–Newton step from there to the optimum without fixes."""
+        """At the graph's values: one Gauss–Newton step towards the optimum without fixes."""
         flat, values, d = graph.flat(), graph.values, graph.dim
         w = np.array([0.0 if isinstance(r, GpsRecord) else 1.0 for r in flat.records])
         free = flat.evaluate(values, weights=w)
@@ -139,7 +139,7 @@ class _Innovations:
         step = -covariance.solve(free.g)[needed]
         known = M @ covariance.columns(needed) @ M.T
         stated = np.stack([np.asarray(f.stated) for f in chosen])
-        for k, f in enumerate(chosen):  # what the arm is unsure of
+        for k, f in enumerate(chosen):  # uncertainty of the lever arm
             own = np.linalg.inv(f.whitener.T @ f.whitener)
             arm = turn[k] @ own @ turn[k].T - stated[k]
             known[d * k : d * k + d, d * k : d * k + d] += 0.5 * (arm + arm.T)
@@ -147,7 +147,7 @@ class _Innovations:
         return cls(np.array([f.time for f in chosen]), r.ravel() + M @ step, known, stated, span)
 
     def likelihood(self, bias: float, time: float, white: float) -> float:
-        """Log-likelihood, but for a constant; -inf where it cannot be told."""
+        """Log-likelihood up to a constant; -inf if it cannot be computed."""
         n, d = len(self.times), self.stated.shape[1]
         C = self.known.copy().reshape(n, d, n, d)
         k = np.arange(n)
@@ -164,7 +164,7 @@ class _Innovations:
         return float(-0.5 * np.sum(white_y**2) - np.sum(np.log(np.diag(L))))
 
     def fit(self) -> FixErrors | None:
-        """What is believed; None: fixes are as they say."""
+        """The accepted error model; None: the fixes are used as stated."""
         size = float(np.sqrt(np.median(plane_variance(self.stated))))
         spacing = float(np.median(np.diff(self.times)))
         alone = optimize.minimize_scalar(
@@ -209,7 +209,7 @@ def plane_variance(stated: Array) -> Array:
 
 
 def spread_fixes(n: int, most: int) -> npt.NDArray[np.intp]:
-    """Numbers of at most so many of n fixes: at even steps, or in stretches that are evenly spread."""
+    """Indices of at most ``most`` of n fixes: with a constant step, or in evenly spread blocks."""
     step = -(-n // most)
     if step <= EVERY:
         return np.arange(0, n, step)
@@ -218,14 +218,14 @@ def spread_fixes(n: int, most: int) -> npt.NDArray[np.intp]:
 
 
 def _put(graph: FactorGraph, fixes: list[GpsRecord], errors: FixErrors) -> None:
-    """A bias for every fix, each following from the one before; whiteners of the white part."""
+    """Add a bias to every fix, linked to the previous one, and scale the white noise."""
     before, previous = None, 0.0
     for r in fixes:
         stated = np.asarray(r.stated)
         W = r.whitener
         if errors.white != 1.0:
             own = np.linalg.inv(W.T @ W)
-            round_ = not (r.uneven or r.point is not None)  # in the node's axes, where it is the same
+            round_ = not (r.uneven or r.point is not None)  # isotropic, so equal in the axes of the node
             part = stated if not round_ else stated[0, 0] * np.eye(len(stated))
             W = whitener(own + (errors.white**2 - 1.0) * part, what=r.label())
         bias = None

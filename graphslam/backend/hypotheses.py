@@ -1,8 +1,8 @@
-"""Other graphs of the same log: topologies that SegSLAM's particles tell, and choices of a run's matches and loops.
+"""Alternative graphs of one log: topologies of SegSLAM's particles, and choices of a run's matches and loops.
 
-Each becomes a graph of its own; which of them is right is judged only then (:mod:`graphslam.maps.alternatives`): the
-entropy of a map sample says more of how its segments happen to hang together than of which topology is right. SegSLAM's
-authors take the sample of least entropy.
+Each becomes a graph; only solved graphs are compared (:mod:`graphslam.maps.alternatives`), because the entropy of a map
+sample depends more on errors between its segments than on its topology. The authors of SegSLAM use the sample of lowest
+entropy.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def build_back_end(
     Parameters
     ----------
     fixes : Gps, optional
-        Those that count.
+        Fixes that become factors.
     imu, control : ImuSource, ControlTable, optional
-        Of this graph alone; control rows, which enter when the graph is finished.
+        For this graph only; control rows are added when the graph is finished.
     """
     back = BackEnd(config, "batch", imu=imu, control=control)
     if fixes is not None:
@@ -68,19 +68,19 @@ def build_back_end(
     for s in submaps:
         if fixes is None:
             back.append(s)
-        else:  # where GPS begins is told by the graph as it is by then
+        else:  # the start of GPS depends on the solved graph at that time
             back.add(s)
     return back
 
 
 LEAST_SUPPORT = 0.02
-"""Share of the particles' weight below which a topology is left out."""
+"""Topologies with a smaller share of the particles' weight are not used."""
 LOOP = -1
-"""In place of the key of a submap: what follows is the number of a loop."""
+"""Used in place of a submap key; the second number is then that of a loop."""
 
 
 Chosen = frozenset[tuple[int, int]]
-"""Matches as (key of the submap, place among its matches), loops that were looked for as (LOOP, number)."""
+"""Matches as (key of the submap, index among its matches), searched loops as (LOOP, number)."""
 
 
 def choices_of_matches(
@@ -90,17 +90,16 @@ def choices_of_matches(
     loops: Sequence[LoopDecision] = (),
     undone: frozenset[tuple[int, int]] = frozenset(),
 ) -> dict[str, Chosen]:
-    """Choices by name: the run's own, every threshold of support, and the run's own less each match and loop.
+    """Choices by name: the run's own, every threshold of support, and the run's own without each match and loop.
 
     Parameters
     ----------
     support : float
         The run's own threshold (``backend.match_support``).
     loops : sequence of LoopDecision
-        Loops of the run's ledger that are in its graph and no matches of the front end.
+        Accepted loops of the run's ledger that are not front-end matches.
     undone : frozenset of (int, int)
-        Matches that are not in the run's graph, refused or taken out by hand: keys of the submap and of the one it
-        entered.
+        Matches that are not in the run's graph, rejected or undone: keys of the submap and of the one that it entered.
     """
     every = {(s.key, i): m for s in submaps for i, m in enumerate(s.matches)}
     found_loops: Chosen = frozenset((LOOP, d.loop) for d in loops)
@@ -114,13 +113,13 @@ def choices_of_matches(
     for key, i in sorted(taken):
         found[f"without {key} → {every[key, i].target}"] = own - {(key, i)}
     alone = [d for d in loops if d.source != TIE]
-    for d in sorted(alone, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # the most doubtful first
+    for d in sorted(alone, key=lambda x: -x.chi2 if math.isfinite(x.chi2) else 0.0):  # largest χ² first
         found[f"without loop {d.loop} ({d.submap_j} → {d.submap_i})"] = own - {(LOOP, d.loop)}
     needs = {(LOOP, d.loop): overlap_entries(d.gates) for d in loops}
     out: dict[str, Chosen] = {}
     for name, chosen in found.items():
         entries = {(every[k].target, k[0]) for k in chosen if k in every}
-        kept = frozenset(k for k in chosen if needs.get(k, set()) <= entries)  # a tie goes with its match
+        kept = frozenset(k for k in chosen if needs.get(k, set()) <= entries)  # no overlap constraint without its match
         if kept not in out.values():
             out[name] = kept
     return out
@@ -142,14 +141,14 @@ def solve_choice(
     config : BackEndConfig
         The run's.
     loops : sequence of LoopDecision
-        With their measurements; those that are chosen become factors as they were in the run.
+        With their measurements; chosen ones become factors as in the run.
     decided : sequence of LoopDecision
-        Matches that the run decided on with its loops: in the graph as loops are, where they are chosen.
+        Front-end matches that the run decided on together with loops; if chosen, they are added like loops.
     **streams
         ``fixes``, ``gps``, ``imu`` and ``control`` of :func:`build_back_end`.
     """
     bare = []
-    # two matches of one pair of submaps are told apart by their support
+    # two matches of one pair of submaps are distinguished by their support
     as_loops = {(d.submap_j, d.submap_i, round(d.score, 9)): d for d in decided}
     taken = [d for d in loops if (LOOP, d.loop) in chosen]
     for s in submaps:
@@ -179,10 +178,10 @@ Topology = tuple[tuple[int, int, str, int], ...]
 
 
 def topology(segmap: SegMap, chain: Sequence[int] | Ints) -> Topology:
-    """What makes chains of segments different maps: intervals, how each was entered, and whose map was entered.
+    """Topology of a chain of segments: intervals, how each segment was entered, and which map was entered.
 
-    Segments of different particles are one where they say the same of that; of an entry into an older map counts when
-    that map was begun.
+    Segments of different particles are the same if these are equal; for an entry into an older map the start of that
+    map counts.
     """
     t = segmap.table
     out = []
@@ -196,7 +195,7 @@ def topology(segmap: SegMap, chain: Sequence[int] | Ints) -> Topology:
 
 
 def topologies(result: SegSlamResult) -> list[tuple[int, float, Ints]]:
-    """Different topologies that particles tell: the heaviest particle of each, its support, its chain; by support."""
+    """Different topologies of the particles: heaviest particle, support and chain of each; sorted by support."""
     groups: dict[Topology, list[tuple[float, int, Ints]]] = {}
     for p in np.argsort(-result.weights, kind="stable").tolist():
         chain = common_ancestor_chain(result.segmap, int(result.closed[p]))
@@ -206,7 +205,7 @@ def topologies(result: SegSlamResult) -> list[tuple[int, float, Ints]]:
 
 
 def _sampled(result: SegSlamResult, count: int, known: Sequence[Ints]) -> list[Ints]:
-    """Chains of map samples that are different, and not known yet."""
+    """Chains of map samples that differ from each other and from the known ones."""
     seen = {c.tobytes() for c in known}
     out = []
     for number in range(count):
@@ -219,21 +218,21 @@ def _sampled(result: SegSlamResult, count: int, known: Sequence[Ints]) -> list[I
 
 @dataclass(frozen=True, eq=False)
 class TopologyHypothesis:
-    """A topology that particles tell, as submaps.
+    """A topology of the particles, as submaps.
 
     Parameters
     ----------
     particle : int
-        Whose chain speaks for it: the heaviest; -1 of a map sample.
+        Heaviest particle with this topology; -1 for a map sample.
     support : float
-        Share of the particles' weight that tells this topology; of one that withdraws an entry, the share that did not
-        make it when it was made; of a map sample the share that tells the same.
+        Share of the particles' weight with this topology; for a withdrawn entry times the share that did not make it;
+        for a map sample the share with the same topology.
     withdrawn : (int, int) or None
         Keys of the submaps whose entry is withdrawn.
     chain : (m,) int64
         Segments.
     grids : dict of int to EvidenceGrid
-        By submap key, what it saw itself.
+        By submap key, only its own observations.
     """
 
     particle: int
@@ -245,11 +244,11 @@ class TopologyHypothesis:
 
     @property
     def entries(self) -> list[tuple[int, int]]:
-        """Entries into older maps that its own chain makes: keys of the submap entered and of the one that entered."""
+        """Entries into older maps in its chain: keys of the entered submap and of the entering one."""
         return [(s.matches[0].target, s.key) for s in self.submaps if s.report.get("entered") == "match" and s.matches]
 
     def facts(self, loops: int) -> dict[str, Any]:
-        """What is told of it beside the figures of its graph."""
+        """Facts for the report besides the values of its graph."""
         return {
             "support": round(self.support, 6),
             "withdrawn": None if self.withdrawn is None else list(self.withdrawn),
@@ -280,28 +279,29 @@ def hypotheses_of(
     samples: int = 0,
     least_support: float = LEAST_SUPPORT,
 ) -> tuple[list[TopologyHypothesis], int]:
-    """Topologies of a SegMap: those that particles tell, by weight, then the first of them less each of its entries.
+    """Topologies of a SegMap: those of the particles, by weight, then the first one without each of its entries.
 
-    Particles that entered different older maps, or none, tell different topologies; and of each entry it may be asked
-    what the map would be without it, which is the null match that every particle could have drawn.
+    Particles that entered different older maps, or none, have different topologies. The map without an entry is that of
+    the null match, which every particle could have sampled.
 
     Parameters
     ----------
     most : int
-        Hypotheses that are looked at, at least one; the map samples come on top.
+        Largest number of hypotheses, at least one; map samples are added to it.
     drift : FilterDrift
-        Of exits.
+        Of end poses.
     handover : HandoverConfig, optional
-        How segments become submaps.
+        Options for converting segments to submaps.
     samples : int
-        So many map samples are looked at, whose segments come from different particles.
+        Number of map samples to add, whose segments come from different particles.
     least_support : float
-        Share of the particles' weight below which a topology is left out.
+        Topologies with a smaller share of the particles' weight are not used.
 
     Returns
     -------
+    hypotheses : list of TopologyHypothesis
     left_out : int
-        Topologies with too little weight, or beyond the number that was asked for.
+        Number of topologies with too little weight, or beyond the requested number.
     """
     if most < 1:
         raise ConfigError(f"number of hypotheses = {most}; wanted at least 1")
@@ -330,30 +330,30 @@ def solve_hypotheses(
     streams: Callable[[], Mapping[str, Any]] = dict,
     progress: bool = False,
 ) -> list[Alternative]:
-    """A graph of each topology, with loops of its own, at its optimum; entries are decided on like all other loops.
+    """Solve a graph of each topology with its own loops; entries are decided on like all other loops.
 
     Parameters
     ----------
     config : BackEndConfig
-        Of the run; nodes, level bases and scale are taken from it.
+        Of the run: its nodes, attitude factors and covariance scale are used.
     find : FindConfig, optional
-        How loops are looked for.
+        Options of the loop search.
     division : DivisionConfig, optional
-        How maps are cut into pieces; give the sensor's reach.
+        Options for cutting maps into pieces; set the sensor's maximum range.
     streams : callable
-        Makes ``fixes``, ``gps``, ``imu`` and ``control`` of one graph more; see :func:`build_back_end`.
+        Returns ``fixes``, ``gps``, ``imu`` and ``control`` for a new graph; see :func:`build_back_end`.
     progress : bool
         Show a bar.
     """
     find = find_config(config) if find is None else find
-    # no match is a factor at once: `find_loops` decides on them
+    # no match is a factor at first: `find_loops` decides on them
     options = replace(config, match_support=math.inf, loops=False)
     pieces: dict[int, DividedSubmaps] = {}
     out = []
     for number, h in enumerate(Bar(told, "hypotheses", shown=progress)):
         back = build_back_end(h.submaps, options, **streams())
         back.solver.solve_to_optimum()
-        # what is withdrawn must not come back by registration: that is the other hypothesis
+        # a withdrawn entry must not be found again by registration: that is the other hypothesis
         looked = find if h.withdrawn is None else replace(find, rounds=0, appearance=None)
         ledger = find_loops(back.graph, back.solver, h.submaps, looked).ledger
         solution = back.finish()

@@ -1,4 +1,4 @@
-"""The refinement at the end of a run: from the solved map to the refined one, or why it stays as it is."""
+"""Refine the solved map of a run with its scans, or state why the map is unchanged."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from graphslam.refine.scans import Scans
 logger = logging.getLogger(__name__)
 
 CONTRADICTED = 3.0
-"""χ² of the walk of the yaw bias by its degrees of freedom beyond which scans of passes and motion contradict."""
+"""Limit on χ²/dof of the yaw-bias random walk; above it, scans of different traversals contradict the motion."""
 WIDENED = 1.5
-"""Ratio of estimated to assumed σ of the motion from which it is reported."""
+"""From this ratio of estimated to assumed σ of the motion on, it is reported."""
 NAMED = {
     "scale": (0.03, "odometry distances {v:.1%} too {sign} (wheel scale)", 1.0, ("long", "short")),
     "side": (
@@ -58,9 +58,9 @@ class RefinedRun:
     map : GlobalMap
         With the refined path and nodes.
     submaps : list of Submap
-        Along the refined path; empty where the run's have no grids.
+        Along the refined path; empty if the run's have no grids.
     graph_path : Trajectory
-        Path of the graph, where the refinement began.
+        Path of the graph, the initial guess.
     """
 
     refinement: Refinement
@@ -80,25 +80,25 @@ def refine_run(
     progress: Callable[[str], Any] | None = None,
     fixes: str = "GPS fixes",
 ) -> tuple[RefinedRun | None, list[Finding]]:
-    """Refine the solved map of a run, and say what was found.
+    """Refine the solved map of a run.
 
     Parameters
     ----------
     scans : Scans or None
-        None: the front end works on no scans.
+        None: the front end does not use scans.
     m : GlobalMap
         Solved.
     gps : (Gps, GpsConfig), optional
-        Fixes that are in the graph, and their options; the refined path uses them, too.
+        Fixes in the graph, and their options; the refined path uses them, too.
     graph : FactorGraph, optional
         The graph of the map; its loop closures are compared with the refined path.
     fixes : str
-        What ``gps`` holds, for the findings.
+        Name of the content of ``gps``, for the findings.
 
     Returns
     -------
     refined : RefinedRun or None
-        None where the path of the graph stays the result.
+        None if the path of the graph is the result.
     findings : list of Finding
         Lines of the verdict.
     """
@@ -127,7 +127,7 @@ def refine_run(
         refined = refined_map(m, found, submaps)
         grids = all(isinstance(s.grid, EvidenceGrid) for s in submaps)
         drawn = refined_submaps(submaps, refined, found, scans) if grids else []
-    except GraphSlamError as error:  # a run that is solved is not thrown away for its refinement
+    except GraphSlamError as error:  # a failed refinement does not discard the solved run
         logger.warning("refinement failed: %s", error)
         return None, [
             Finding("look", "refine-failed", f"refinement: failed — {error}. The graph's path is the result.")
@@ -137,7 +137,7 @@ def refine_run(
 
 
 def _input(r: Refinement) -> list[Finding]:
-    """Is the odometry that came in better than what came out?"""
+    """Finding, if the scans agree better along the input odometry than along the result."""
     if r.left is not None:
         text = (
             f"scan agreement: odometry {r.reckoned:.1%}, graph {r.agreement[0]:.1%}, refined {r.left:.1%} of the "
@@ -154,12 +154,12 @@ def _input(r: Refinement) -> list[Finding]:
 
 
 def wrong_loops(graph: FactorGraph, m: GlobalMap) -> list[tuple[int, int, float, float]]:
-    """Loops and matches of a graph that a refined map contradicts by more than scans could bridge.
+    """Loops and matches of a graph that a refined map contradicts by more than :data:`FAR`.
 
     Returns
     -------
     list of (i, j, metres, radians)
-        Nodes, and by how much the factor is off; the farthest first.
+        Nodes, and the error of the factor; the largest distance first.
     """
     ends = [r for r in graph.records.values() if isinstance(r, BetweenRecord) and abs(r.i - r.j) > 1]
     if not ends:
@@ -182,9 +182,9 @@ def refined_ledger(
     ledger : Ledger
         Of the graph.
     submaps : sequence of Submap
-        That say which streams their front end used.
+        With the streams that their front end used.
     control : sequence of str
-        Control rows that hold the refined path, as the ledger names them.
+        Control rows used by the refinement, with their names in the ledger.
 
     Returns
     -------
@@ -193,7 +193,7 @@ def refined_ledger(
     """
     out, entries = ledger.as_start(), ledger.entries()
     streams = frozenset().union(*(s.uses for s in submaps))
-    # gravity that the front end had of a stream which it used for nothing else that weighs
+    # streams that the front end used only for the gravity direction
     gravity = frozenset().union(*(s.assisting_streams for s in submaps)) if "gravity" in r.parts else frozenset()
     out.spend(SCAN_PAIRS, "scan-pairs", streams | gravity, (float(r.times[0]), float(r.times[-1])))
     held = {e.stream for e in entries if e.kind == EXCLUSIVE and e.factor.startswith("GPS fix")} if r.fixes else set()
@@ -217,20 +217,20 @@ def refined_ledger(
 
 
 SCAN_PAIRS = -1
-"""Number of the refinement in a ledger of factors, which are counted from 0."""
+"""Id of the refinement in a ledger of factors, whose ids start at 0."""
 
 
 def refinement_findings(
     r: Refinement, wrong: Sequence[tuple[int, int, float, float]] | None = None, fixes: str = "GPS fixes"
 ) -> list[Finding]:
-    """Findings of a refinement, as lines of the verdict.
+    """Findings of a refinement.
 
     Parameters
     ----------
     wrong : sequence of (i, j, metres, radians), optional
-        Loops of the graph that it contradicts (:func:`wrong_loops`); None: the graph is not known.
+        Contradicted loops of the graph (:func:`wrong_loops`); None: the graph is not known.
     fixes : str
-        What holds the path beside scans.
+        Measurements used besides scans.
     """
     if r.left is not None:
         return _input(r)

@@ -1,4 +1,4 @@
-"""A session of dense submaps tied to one that is in the graph: by places that look alike and agree, or by GPS."""
+"""Attach a session of dense submaps to one in the graph: by places that look alike and agree, or by GPS."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from graphslam.solve.registry import Solver
 
 @dataclass(frozen=True)
 class IntraSessionLoop:
-    """A factor between two nodes of one run that are no neighbours: a re-entry or a loop."""
+    """A factor between two non-adjacent nodes of one run: a re-entry or a loop."""
 
     i: int
     j: int
@@ -47,22 +47,22 @@ class IntraSessionLoop:
 
 @dataclass(frozen=True)
 class DenseSession:
-    """A run of dense submaps, ready to be put into a graph.
+    """A run of dense submaps, prepared for a graph.
 
     Parameters
     ----------
     submaps : list of Submap
-        Keys and clock of the common graph.
+        With keys and times of the common graph.
     inner : list of IntraSessionLoop
-        Nodes counted from the session's first base.
+        Nodes are numbered from the session's first base.
     shift : float
-        Seconds that were added to its clock.
+        Time offset that was added [s].
     fixes : Gps or None
-        On the common clock.
+        With the times of the common graph.
     T_gps_base : (7,) or (3,) or None
-        First base in the GPS frame by the run's own graph.
+        First base in the GPS frame, from the run's own graph.
     refined : bool
-        Its submaps lie along a path refined by scans, which spent every scan: it has no ties of its own.
+        Its submaps are along a path refined with scans, which used every scan: it has no loop closures of its own.
     """
 
     name: str
@@ -78,7 +78,7 @@ class DenseSession:
 
     @property
     def chain(self) -> Array:
-        """Its nodes by its own exits and paths alone, in the frame of its first base ``(m + 1, 7|3)``."""
+        """Poses from its end poses and paths alone, in the frame of its first base ``(m + 1, 7|3)``."""
         T = self.map.increments
         g = group_of(T)
         out = [g.identity]
@@ -88,16 +88,16 @@ class DenseSession:
 
 
 def loops_of_graph(graph: FactorGraph) -> list[IntraSessionLoop]:
-    """Factors of the graph of a run beside its chain."""
+    """Factors of the graph of a run that are not in its chain."""
     rows = [r for r in graph.records.values() if isinstance(r, BetweenRecord) and r.group != "dense-submap"]
     return [IntraSessionLoop(r.i, r.j, r.T_ij, _inverse(r.whitener.T @ r.whitener), r.robust) for r in rows]
 
 
 def loops_of_network(net: PoseNetwork, kernel: RobustKernel) -> list[IntraSessionLoop]:
-    """The same of the file of a graph, which holds no kernels."""
+    """The same from the file of a graph, which has no robust kernels."""
     out, chained = [], set()
     for (i, j), T, info in zip(net.edges.tolist(), net.measurements, net.information):
-        if j == i + 1 and i not in chained:  # the chain itself is made again from the submaps
+        if j == i + 1 and i not in chained:  # the chain is built from the submaps
             chained.add(i)
             continue
         out.append(IntraSessionLoop(i, j, T, _inverse(info), kernel))
@@ -115,12 +115,12 @@ def _inverse(information: Array) -> Array:
 
 
 def add_session(graph: FactorGraph, session: DenseSession, start: Array | None = None) -> int:
-    """Add the chain of a session, its own ties and its fixes to a graph; where it hangs is another matter.
+    """Add the chain of a session, its own loop closures and its fixes to a graph, without attaching it.
 
     Parameters
     ----------
     start : (7,) or (3,), optional
-        Where it is thought to begin; None for the first session, which begins at the origin.
+        Initial pose of its first base; None for the first session, which starts at the origin.
 
     Returns
     -------
@@ -154,18 +154,18 @@ SESSION = "session"
 
 @dataclass(frozen=True)
 class ConnectedSession:
-    """A session that was tied to another one in a graph.
+    """A session that was attached to another one in a graph.
 
     Parameters
     ----------
     known : DenseSession
-        What it was tied to.
+        The session that it is attached to.
     ties : InterSessionLoops or None
-        By appearance; None where GPS said where the session lies.
+        Candidates by appearance; None if GPS gave the alignment.
     used : list of Loop
-        Ties in the graph at the end, those by proximity included; nodes of the graph.
+        Loop closures in the final graph, with those by proximity; nodes of the graph.
     dropped : int
-        Ties that the solved graph contradicted.
+        Loop closures that the solved graph contradicted.
     """
 
     first_node: int
@@ -186,10 +186,10 @@ def connect_session(
     config: InterSessionConfig | None = None,
     progress: bool = False,
 ) -> ConnectedSession:
-    """Tie a session to one that is in the graph, and solve; with its fixes, if it has any.
+    """Attach a session to one in the graph, and solve; with its fixes, if it has any.
 
-    First by places that look alike and agree; then, when it is known where it lies, by places that are near each other,
-    each of which the graph has to expect.
+    First by places that look alike and agree. Then, with this alignment, by places that are near each other in
+    the graph.
 
     Parameters
     ----------
@@ -199,8 +199,8 @@ def connect_session(
         One that is in the graph.
     known_node : int
         Node of its first base.
-    found : (TwoSessions, Ties), optional
-        What was found already.
+    found : (TwoSessions, InterSessionLoops), optional
+        Result of an earlier search.
     """
     c = InterSessionConfig() if config is None else config
     if found is None:
@@ -244,7 +244,7 @@ def connect_by_gps(
     *,
     places: bool = True,
 ) -> ConnectedSession:
-    """Tie a session to one that is in the graph by the fixes that both have, and solve.
+    """Attach a session to one in the graph by the fixes of both, and solve.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def _add(graph: FactorGraph, x: Loop, known: DenseSession, new: DenseSession) ->
 
 
 def _winnow(graph: FactorGraph, solver: Solver, factors: dict[int, Loop]) -> int:
-    """Take out, worst first, ties that the solved graph contradicts; how many."""
+    """Remove loop closures that contradict the solved graph, worst first; returns their number."""
     g = graph.values.group
     limit, taken = chi2_quantile(0.9999, g.dof), 0
     while factors:
@@ -303,7 +303,7 @@ def _winnow(graph: FactorGraph, solver: Solver, factors: dict[int, Loop]) -> int
 def _near(
     graph: FactorGraph, two: TwoSessions, known_node: int, node: int, tied: Sequence[Loop], progress: bool
 ) -> tuple[list[Loop], int]:
-    """More ties, where places of the two sessions are near each other by now, and how many were tried.
+    """Loop closures between places of the two sessions that are near each other now, and the number of candidates.
 
     Nodes are those of the graph.
     """

@@ -1,4 +1,4 @@
-"""Which fixes and IMUs of a log the graph gets: those to be used; IMUs as soon as their axes can be believed."""
+"""Fixes, IMUs and other sensors of a log as inputs of the graph; IMUs once their axes were checked."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from graphslam.solve.registry import Solver
 Mask = npt.NDArray[np.bool_]
 
 CHECKED_AFTER = 30.0
-"""Path that is there before axes are first looked at [s]."""
+"""Duration of the path before the axes of an IMU are checked [s]."""
 RECENTRED = 4
-"""Times that ways are preintegrated anew about their bias, at most."""
+"""Largest number of repeated preintegrations about the estimated bias."""
 
 
 def used_fixes(gps: Gps, config: GpsOptions) -> Mask:
@@ -58,7 +58,7 @@ def split_fixes(gps: Gps, config: GpsOptions) -> tuple[Gps, Gps]:
 
 
 class GpsSource:
-    """The fixes of a run: the graph is given them submap by submap, as they come."""
+    """The GPS fixes of a run; they are added to the graph submap by submap."""
 
     def __init__(self, feed: RecordSource, config: GpsOptions) -> None:
         self.feed, self.config = feed, config
@@ -66,7 +66,7 @@ class GpsSource:
         self._all: Gps | None = None
 
     def next(self, until: float) -> Gps | None:
-        """Fixes up to a time [s] that count and were not given before; None: there is none."""
+        """Fixes up to a time [s] that become factors and were not returned before; None if there are none."""
         name = self.feed.of_type(Gps)
         if name is None or self.config.use == "none":
             return None
@@ -81,14 +81,14 @@ class GpsSource:
 
 
 class OtherSources:
-    """Sensors of a log that have no options: the graph is given their readings submap by submap, as they come."""
+    """Sensors of a log without options; their readings are added to the graph submap by submap."""
 
     def __init__(self, feed: RecordSource) -> None:
         self.feed = feed
         self._given: dict[str, int] = {}
 
     def give(self, graph: FactorGraph, until: float) -> None:
-        """Readings up to a time [s] that were not given before."""
+        """Add the readings up to a time [s] that were not added before."""
         for kind in sensor_kinds().values():
             if kind.options is not None or graph.dim not in kind.dims:
                 continue
@@ -102,14 +102,14 @@ class OtherSources:
 
 
 def imus_of(feed: RecordSource) -> dict[str, Imu]:
-    """The IMUs of a log by name, as far as they have come."""
+    """The IMUs of a log by name, with the records so far."""
     return {name: feed.part(name) for name in feed.names(Imu)}  # type: ignore[misc]
 
 
 def optional_sensors(
     log: SensorLog, compass: CompassOptions, beacons: BeaconOptions
 ) -> Iterator[tuple[str, Any, CompassOptions | BeaconOptions]]:
-    """Compasses and distances to beacons that are to be used: name of the stream, readings, options."""
+    """Compasses and distances to beacons to use: name of the stream, readings, options."""
     for kind, config, option in ((Compass, compass, "compass.use"), (LandmarkObservations, beacons, "beacons.use")):
         found = {name: s for name, s in log.streams.items() if isinstance(s, kind)}
         words = ("none", "auto") if kind is Compass else ("none",)
@@ -126,7 +126,7 @@ def optional_sensors(
 
 
 class ImuSource:
-    """The IMUs of a run: axes are looked at, and factors are made, while it goes on."""
+    """The IMUs of a run; their axes are checked, and factors are added, during the run."""
 
     def __init__(self, feed: RecordSource, config: ImuOptions) -> None:
         self.feed, self.config = feed, config
@@ -142,13 +142,13 @@ class ImuSource:
 
     @property
     def imus(self) -> dict[str, Imu]:
-        """Those of the log by name, as far as they have come."""
+        """The IMUs of the log by name, with the records so far."""
         return imus_of(self.feed)
 
     def look(self, graph: FactorGraph) -> None:
-        """Hold the axes of every IMU against the path, once, as soon as there is enough of it.
+        """Compare the axes of every IMU with the path, once, as soon as the path is long enough.
 
-        Those the front end uses, too: a path that is made with wrong axes contradicts the forces.
+        IMUs used by the front end are checked, too: a path made with wrong axes contradicts the specific forces.
         """
         if self.config.axes == "ignore" or not graph.submaps:
             return
@@ -160,17 +160,17 @@ class ImuSource:
                 ImuFactors.of(graph).check(imu, stream=name, axes=self.config.axes)
 
     def attach(self, graph: FactorGraph, *, more: bool = False) -> int:
-        """Give the graph the IMUs that are to be used; returns the number of new factors.
+        """Add factors of the selected IMUs to the graph; returns the number of new factors.
 
         Parameters
         ----------
         more : bool
-            More submaps will come: what is said once of an IMU is said later.
+            More submaps follow, so one-time messages on an IMU are deferred.
         """
         made = 0
         for name in self._wanted(graph):
             imu = self.imus[name]
-            if name in self._given:  # its readings are there already: only submaps are new
+            if name in self._given:  # its readings were added before; only submaps are new
                 imu = imu.take(np.zeros(len(imu.times), dtype=bool))
             made += len(ImuFactors.of(graph).add(imu, stream=name, config=self.config, more=more))
             self._given.add(name)
@@ -186,7 +186,7 @@ class ImuSource:
 
 
 def repreintegrate_until_converged(graph: FactorGraph, solver: Solver) -> None:
-    """Solve, preintegrate anew about the biases found, and solve again, until nothing moves."""
+    """Solve, preintegrate about the estimated biases and solve again, until the biases are unchanged."""
     solver.solve_to_optimum()
     for _ in range(RECENTRED):
         if not ImuFactors.of(graph).recentre():

@@ -105,7 +105,7 @@ def map_command(
 
 
 def _clearest(found: MinimumEntropyMap) -> tuple[dict[str, Any], str]:
-    """The candidates of a choice of maps, as values and as text."""
+    """The ranked alternatives as values and as text."""
     rows, why = found.choice.rows(), found.choice.why()
     value: dict[str, Any] = {"candidates": rows, "chosen_because": why, "left_out": found.left_out}
     text = f"\n\n{text_table(rows, [c for c in CANDIDATES if c in rows[0]])}\nchosen: {why}"

@@ -1,4 +1,4 @@
-"""``graphslam loops``, ``report``, ``export``: what a finished run holds."""
+"""``graphslam loops``, ``report``, ``export``: outputs of a finished run."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from graphslam.core.reading import set_size_limit
 
 
 def _limit(size: str | None) -> str | None:
-    """Set the limit for this process: a number of bytes, or with K, M or G of thousands, millions, 10⁹ of them."""
+    """Set the size limit for this process: a number of bytes, with K, M or G for 10³, 10⁶ or 10⁹ bytes."""
     if size is not None:
         found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?([kKmMgG]?)B?", size.strip())
         n = 0 if found is None else int(float(found[1]) * 1000 ** " KMG".index(found[2].upper() or " "))
@@ -55,7 +55,7 @@ SHORT = (
     *("gps_rmse", "gps_withheld_rmse", "path_rmse", "path_rmse_aligned", "landmark_rmse_aligned"),
     *("nees_per_dof", "nees_dof", "ci", "map_entropy", "seconds_total", "times_real_time"),
 )
-"""Figures that are printed without ``--all``."""
+"""Metrics that are printed without ``--all``."""
 EVERY = typer.Option(False, "--all", help="Print all metrics. Default: a summary.")
 
 
@@ -138,16 +138,16 @@ def run_command(
 
 
 def run_options(config: Path | None, settings: list[str]) -> dict[str, Any]:
-    """Options of a TOML file, and over them those that were set one by one."""
+    """Options of a TOML file, overridden by single settings."""
     values: dict[str, Any] = read_toml(config) if config else {}
-    values.pop("run", None)  # an effective config.toml of another run may be given as it is
+    values.pop("run", None)  # so that the config.toml of another run can be used unchanged
     for text in settings:
         values = merge_options(values, parse_setting(text))
     return values
 
 
 def metric_lines(result: Any, every: bool) -> list[str]:
-    """Table of the metrics of a run, and how many of them are not shown."""
+    """Table of the metrics of a run, and the number of hidden ones."""
     rows = result.metrics.to_dict("records")
     shown = [r for r in rows if every or r["key"] in SHORT]
     left = len(rows) - len(shown)
@@ -166,7 +166,7 @@ def _summary(result: Any, out: Path, every: bool = False) -> str:
 
 
 def time_notes(report: Mapping[str, Any], submaps: int) -> list[str]:
-    """What the times of a run leave out: submaps of an earlier session, and compilation."""
+    """Notes on the times of a run: submaps of an earlier session are not included, compilation is."""
     resumed, compilation = report["resumed_submaps"], report["seconds"].get("compilation", 0.0)
     lines = []
     if resumed >= submaps:
@@ -182,11 +182,11 @@ CAUSES = frozenset(
     {"residuals", "calibration", "sightings-not-used", "motion-gap", "particles", "gps-mirrored", "gps-scale"}
     | {"gps-correlated", "ranges-constant", "bearings-degrees", "steering-degrees", "scans-repeated", "ranges-and-way"}
 )
-"""Lines of a verdict that name why submaps fit each other badly."""
+"""Codes of findings that explain disagreement between submaps."""
 
 
 def join_note(result: Any) -> list[str]:
-    """What to do about submaps that fit each other worse or better than they say, beyond what chance does."""
+    """Advice if χ²/dof of the join is significantly above or below 1."""
     from graphslam.app.verdict.figures import CERTAIN
     from graphslam.evaluate.residual_consistency import two_sided_bounds
 

@@ -1,4 +1,4 @@
-"""What the command line prints: one JSON object or a table on stdout, everything else on stderr."""
+"""Output of the command line: one JSON object or a table on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def text_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None 
 
 
 def verdict_text(headline: Finding, findings: Sequence[Finding]) -> list[str]:
-    """Lines of a verdict: what all of it says, then each finding behind its level."""
+    """Lines of a verdict: the headline, then each finding with its level."""
     return [f"verdict: {headline.text}", *(f"  {line}" for line in str(Findings(findings)).splitlines())]
 
 
@@ -46,7 +46,7 @@ def _cell(value: Any) -> str:
 
 
 class _Messages(logging.StreamHandler):
-    """Messages of the library, above a bar of progress and without control characters."""
+    """Messages of the library, printed above a progress bar and without control characters."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -57,24 +57,24 @@ class _Messages(logging.StreamHandler):
 
 
 def log_to_stderr() -> None:
-    """Library messages on stderr, so that stdout holds the result alone: warnings and errors."""
+    """Print warnings and errors of the library on stderr, so that stdout has only the result."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[_Messages(sys.stderr)], force=True)
     Bar.hidden = False
 
 
 def be_verbose() -> None:
-    """Progress messages as well."""
+    """Print progress messages too."""
     logging.getLogger().setLevel(logging.INFO)
 
 
 def be_quiet() -> None:
-    """Errors only, and no bar of progress."""
+    """Print errors only, and no progress bar."""
     logging.getLogger().setLevel(logging.ERROR)
     Bar.hidden = True
 
 
 class _Lost(io.FileIO):
-    """Stderr; what cannot be written is dropped."""
+    """Stderr; failed writes are ignored."""
 
     def write(self, data: Any) -> int:
         try:
@@ -84,11 +84,11 @@ class _Lost(io.FileIO):
 
 
 def outlive_stderr() -> None:
-    """Go on where stderr is closed, full, or a broken pipe: messages are lost then, and the result is not."""
+    """Continue if stderr is closed, full, or a broken pipe: messages are lost, the result is not."""
     if sys.stderr is None:
         try:
             os.fstat(2)
-        except OSError:  # closed: the next file that is opened would get its messages
+        except OSError:  # closed: otherwise the next opened file would get descriptor 2 and the messages
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     elif sys.stderr is sys.__stderr__:

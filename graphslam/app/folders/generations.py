@@ -7,15 +7,14 @@
     RUN/run.json -> current/run.json
     RUN/figures/map.png -> ../current/figures/map.png
 
-A verb writes a new generation beside the present one and brings it to the disk. Then ``current`` is replaced by one
-rename: whoever looks at the plain paths sees the old state or the new one. Links to new names are made before that,
-and lead nowhere until then; links to names that are gone are removed after it, then the generation before. A kill
-anywhere leaves one of both states, and remains that the next writer sweeps.
+A command writes a new generation next to the current one and syncs it to disk. Then ``current`` is replaced by one
+rename, so readers of the plain paths see the old state or the new one. Links to new names are made before that and are
+dangling until then; links to removed names are deleted after it, then the old generation. After a kill at any time one
+of the two states remains, and stale files that the next writer removes.
 
 Readers resolve ``current`` once (:func:`read_consistently`) and read everything from that folder. A folder of plain
-files was copied without its links, was written by an older version, or lies where there are no symbolic links: its
-readers hold the ids inside the files against each other (:func:`check_same`), and the first writer turns it into
-generations.
+files was copied without its links, was written by an older version, or is on a file system without symbolic links. Its
+readers compare the ids inside the files (:func:`check_same`), and the first writer converts it to generations.
 """
 
 from __future__ import annotations
@@ -47,11 +46,11 @@ OWNED = (
     *("map.grid.npz", "map.kml", "map.geojson", "clearest.*", "clearest-*", "alternatives/*.tum", "alternatives/*.g2o"),
     *("report.html", "report.md", "table.csv", "timings.csv", "figures/*.png", "refined/*.npz", "refined/index.json"),
 )
-"""Files that verbs write, in folders of plain files, where nothing else says which are ours."""
+"""Files written by commands; used in folders of plain files, where other files may exist."""
 NOT_OWNED = ("figures/progress.png",)
-"""Written while a run goes on, and of no generation."""
+"""Written during a run; part of no generation."""
 _PARTS = ("figures", "alternatives", "inputs", "refined")
-"""Folders of a state."""
+"""Subfolders of a state."""
 _FOLDERS = (GENERATIONS, "submaps", "submaps-*", "trials", *_PARTS)
 _READ = (
     *OWNED,
@@ -63,7 +62,7 @@ _READ = (
     "draws.json",
     "study.json",
 )
-"""Names, as shell patterns, that our readers follow and our writers write to."""
+"""Names, as shell patterns, that graphslam reads from or writes to."""
 _NUMBER = re.compile(r"\d{6,}")
 T = TypeVar("T")
 
@@ -76,9 +75,9 @@ class FolderTransaction(OutputFiles):
     path : path
         Its folder inside ``generations``.
     home : path
-        The folder that it is a state of.
+        The folder that has these states.
     before : path or None
-        The files of the present state.
+        Folder with the files of the current state.
     """
 
     def __init__(self, path: Path, home: Path, before: Path | None) -> None:
@@ -86,7 +85,7 @@ class FolderTransaction(OutputFiles):
         self.home, self.before = home, before
 
     def adopt(self, *, only: str = "*", drop: Iterable[str] = ()) -> None:
-        """Take over what the present state has and this one has not: names like ``only``, none like ``drop`` (shell
+        """Link files of the current state that are missing in this one: names like ``only``, none like ``drop`` (shell
         patterns)."""
         if self.before is None:
             return
@@ -101,7 +100,7 @@ class FolderTransaction(OutputFiles):
 
 
 def current_outputs(folder: str | os.PathLike[str]) -> Path:
-    """Where the files of the present state of a folder are: its generation, or itself where it has none."""
+    """Folder with the files of the current state: its generation, or the folder itself if it has none."""
     home = Path(folder)
     target = _current(home)
     if target is None:
@@ -112,7 +111,7 @@ def current_outputs(folder: str | os.PathLike[str]) -> Path:
 
 
 def read_consistently(folder: str | os.PathLike[str], read: Callable[[Path], T]) -> T:
-    """Read files of one state: ``read`` gets the folder that holds them, again if another state was committed
+    """Read files of one state with ``read(folder)``; repeated if another state was committed
     meanwhile."""
     while True:
         root = current_outputs(folder)
@@ -127,8 +126,8 @@ def read_consistently(folder: str | os.PathLike[str], read: Callable[[Path], T])
 
 
 def check_links(folder: str | os.PathLike[str]) -> None:
-    """Refuse a folder in which a name of ours is a link that leads out of it: a folder that somebody else made chooses
-    neither which other files are read, nor where is written. Links of other names are left alone.
+    """Refuse a folder in which a name from :data:`_READ` is a link to the outside, so that a folder from another person
+    cannot redirect reading or writing. Links with other names are not checked.
     """
     home = Path(folder)
     real = os.path.realpath(home)
@@ -145,7 +144,7 @@ def _links(home: Path) -> Iterator[Path]:
     for name in ("", *_FOLDERS):
         top = home / name
         if top.is_symlink() and name:
-            continue  # found in the folder that holds it
+            continue  # found as an entry of its parent folder
         for at, folders, files in os.walk(top):
             yield from (p for n in (*folders, *files) if (p := Path(at, n)).is_symlink())
             if not name:
@@ -153,7 +152,7 @@ def _links(home: Path) -> Iterator[Path]:
 
 
 def check_same(first: tuple[Path, Any], *others: tuple[Path, Any]) -> None:
-    """Hold ids of generations inside files against each other; files of older versions have none (None)."""
+    """Compare generation ids inside files; files of older versions have none (None)."""
     file, known = first
     for other, found in others:
         if found is not None and known is not None and str(found) != str(known):
@@ -167,12 +166,12 @@ def check_same(first: tuple[Path, Any], *others: tuple[Path, Any]) -> None:
 
 @contextmanager
 def new_generation(folder: str | os.PathLike[str]) -> Iterator[FolderTransaction]:
-    """Write a new state of a folder that is ours; it is committed when the block ends, and dropped if that raises.
+    """Write a new state of a run folder; it is committed when the block ends, and dropped if that raises.
 
     Parameters
     ----------
     folder : path
-        The caller has looked whether it is one of ours.
+        The caller has checked that it is a run folder, or empty.
     """
     home = Path(folder)
     with lock_folder(home):
@@ -204,13 +203,13 @@ def new_generation(folder: str | os.PathLike[str]) -> Iterator[FolderTransaction
 def _commit(home: Path, staged: Path, names: list[str]) -> None:
     for name in names:
         _point(home, name)
-    _symlink(f"{GENERATIONS}/{staged.name}", home / CURRENT)  # the new state, from here on
+    _symlink(f"{GENERATIONS}/{staged.name}", home / CURRENT)  # from here on the new state is current
     sync_to_disk(home)
     remove_stale_files(home)
 
 
 def _replace_plainly(home: Path, staged: Path, names: list[str]) -> None:
-    """Without links: file by file, the one that says "finished" last; ids inside tell a mixture from a state."""
+    """Without links: replace file by file, ``run.json`` or ``merge.json`` last; the ids inside reveal mixed states."""
     last = [n for n in names if n in ("run.json", "merge.json")]
     gone = set(_names(home, everything=False)) - set(names)
     for name in [*(n for n in names if n not in last), *last]:
@@ -223,8 +222,8 @@ def _replace_plainly(home: Path, staged: Path, names: list[str]) -> None:
 
 
 def remove_stale_files(folder: str | os.PathLike[str]) -> None:
-    """Remove what killed writers left in a folder that is ours: halves of files, states that were never committed or
-    are superseded, and links to files that are gone. The caller holds the lock."""
+    """Remove files of killed writers in a run folder: partial files, states that were never committed or are
+    superseded, and dangling links. The caller has locked the folder."""
     home = Path(folder)
     target = _current(home)
     for name in _numbers(home):
@@ -240,18 +239,18 @@ def remove_stale_files(folder: str | os.PathLike[str]) -> None:
 
 
 def name_inside(folder: str | os.PathLike[str], file: str | os.PathLike[str]) -> str | None:
-    """Name of a file directly in a folder, which is then one of its present state; None for a file elsewhere."""
+    """Name of a file directly in the folder, which is then part of its current state; None for other files."""
     path = Path(file)
     return path.name if os.path.realpath(path.parent) == os.path.realpath(folder) else None
 
 
 def is_empty(folder: str | os.PathLike[str]) -> bool:
-    """Is there nothing in a folder but what a killed writer of ours may have left?"""
+    """Is the folder empty, except for files that a killed writer may have left?"""
     home = Path(folder)
     ours = is_lock(home / LOCK)
     for path in home.iterdir():
         if path.name == LOCK:
-            if not ours and path.stat().st_size > 0:  # made, and not yet written
+            if not ours and path.stat().st_size > 0:  # an empty lock file was created but not yet written
                 return False
         elif path.name == GENERATIONS and ours and path.is_dir():
             if any(not _NUMBER.fullmatch(p.name) for p in path.iterdir()):
@@ -266,7 +265,7 @@ def is_empty(folder: str | os.PathLike[str]) -> bool:
 
 
 def _current(home: Path) -> str | None:
-    """What ``current`` names; None where it is no link of ours."""
+    """Target of the link ``current``; None if it is not a link to a generation."""
     try:
         target = os.readlink(home / CURRENT)
     except OSError:
@@ -281,7 +280,7 @@ def _numbers(home: Path) -> list[str]:
 
 
 def _names(root: Path, *, everything: bool) -> list[str]:
-    """Files below a folder, or those of them that are ours where it holds others too."""
+    """All files below a folder, or only those that match :data:`OWNED`."""
     if everything:
         found = [p for p in root.rglob("*") if p.is_file() and not is_part(p.name)]
         return sorted(p.relative_to(root).as_posix() for p in found)
@@ -292,7 +291,7 @@ def _names(root: Path, *, everything: bool) -> list[str]:
 
 
 def _into_generations(home: Path) -> None:
-    """Turn a folder of plain files into one with a generation; at every moment the paths hold what they held."""
+    """Convert a folder of plain files to one with a generation; at every moment the paths have the same content."""
     target = _current(home)
     if target is None:
         names = [n for n in _names(home, everything=False) if not (home / n).is_symlink()]
@@ -301,7 +300,7 @@ def _into_generations(home: Path) -> None:
         (home / GENERATIONS).mkdir(exist_ok=True)
         number = 1 + max([0, *(int(n) for n in _numbers(home))])
         copied = home / CURRENT
-        if copied.is_dir() and not copied.is_symlink():  # of a copy that followed the links
+        if copied.is_dir() and not copied.is_symlink():  # a copy that followed the links
             copied.rename(home / GENERATIONS / f"{number:06d}")
             number += 1
         target = f"{GENERATIONS}/{number:06d}"
@@ -311,7 +310,7 @@ def _into_generations(home: Path) -> None:
             sync_to_disk(home / target / name)
         sync_to_disk(home / target)
         _symlink(target, home / CURRENT)
-    for name in _names(home / target, everything=True):  # all of them plain, or some after a kill just here
+    for name in _names(home / target, everything=True):  # all are plain files, or only some after a kill here
         path = home / name
         if path.is_file() and not path.is_symlink() and filecmp.cmp(path, home / target / name, shallow=False):
             _point(home, name)
@@ -334,13 +333,13 @@ def _symlink(target: str, path: Path) -> None:
 
 
 def _is_ours(home: Path, path: Path) -> bool:
-    """Is a link one that :func:`_point` makes?"""
+    """Is it a link made by :func:`_point`?"""
     name = path.relative_to(home).as_posix()
     return path.name != CURRENT and os.readlink(path) == "../" * name.count("/") + f"{CURRENT}/{name}"
 
 
 def _link(source: Path, target: Path) -> None:
-    """The same file under another name; a copy where the system has no such links."""
+    """Hard link; a copy if the system has no hard links."""
     try:
         os.link(source, target)
     except OSError:

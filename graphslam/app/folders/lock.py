@@ -1,4 +1,4 @@
-"""One writer at a time: a folder held against other processes."""
+"""Lock a folder so that only one process writes into it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from graphslam.core.errors import RunFolderError
 
 try:
     import fcntl
-except ImportError:  # not of this system: there two writers are not kept apart
+except ImportError:  # not on this system; writers are not locked there
     fcntl = None  # type: ignore[assignment]
 
 LOCK = ".lock"
 _HEAD = "graphslam: this folder is written by process"
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-"""It is written, so a link under its name must not lead to another file."""
+"""The lock file is written to, so it must not be a link to another file."""
 _guard = threading.Lock()
 _held: dict[str, int] = {}
 
 
 def make_folder(folder: str | os.PathLike[str]) -> Path:
-    """Make a folder and those above it, unless it is there."""
+    """Make a folder with its parents, unless it exists."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -38,9 +38,9 @@ def make_folder(folder: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def lock_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold a folder against other processes that would write into it; made if missing.
+    """Lock a folder against writing by other processes; it is created if missing.
 
-    The system gives the lock back when a process ends, however it ends. A thread may lock a folder again that it holds.
+    The system releases the lock whenever the process ends. A thread may lock a folder again that it has locked.
     """
     home = make_folder(folder)
     real = os.path.realpath(home)
@@ -77,14 +77,14 @@ def _take(home: Path) -> Any:
         raise RunFolderError(f"{home}: process {said} is writing into it; wait until it has ended") from None
     except OSError:  # a file system without locks
         pass
-    handle.write(f"{_HEAD} {os.getpid()} on {socket.gethostname()}\n")  # never empty again: is_empty() reads it
+    handle.write(f"{_HEAD} {os.getpid()} on {socket.gethostname()}\n")  # the file stays non-empty: is_empty() reads it
     handle.truncate()
     handle.flush()
     return handle
 
 
 def is_lock(file: Path) -> bool:
-    """Is it a file that :func:`lock_folder` made?"""
+    """Is it a lock file of :func:`lock_folder`?"""
     with contextlib.suppress(OSError), open(file, "rb") as stream:
         return stream.read(len(_HEAD)) == _HEAD.encode()
     return False

@@ -1,4 +1,4 @@
-"""Files that a verb writes, each whole or not at all."""
+"""Files that a command writes, each completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from graphslam.core.json_file import json_values
 
 
 class OutputFiles:
-    """Writes files of a folder, each whole or not at all."""
+    """Writes files of a folder, each completely or not at all."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
 
     @property
     def figures(self) -> Path:
-        """Folder for PNG files, made when asked for."""
+        """Folder for PNG files, created at first use."""
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
         return folder
@@ -49,5 +49,5 @@ class OutputFiles:
 
 
 def json_lines(rows: Iterable[Mapping[str, Any]]) -> str:
-    """One JSON object a line."""
+    """One JSON object per line."""
     return "".join(json.dumps(json_values(row), allow_nan=False) + "\n" for row in rows)

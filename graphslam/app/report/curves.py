@@ -1,4 +1,4 @@
-"""Curves of a report: is the run honest from one pose to the next, and where is it not? Drawn by ``curves.js``."""
+"""Curves of a report: consistency of the run along its path. Drawn by ``curves.js``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from graphslam.maps.global_map import GlobalMap
 from graphslam.plots import style
 
 MOST = 2_000
-"""Points of a curve; of more, the least and the largest of every so many, and both ends."""
+"""Largest number of points of a curve; longer curves keep both ends, and minimum and maximum of each interval."""
 SIGMAS = 2.0
 """Half width of the bands around errors and innovations."""
 _BOUNDS = f"{100 * CONFIDENCE:g} %"
@@ -34,19 +34,19 @@ Rows = npt.NDArray[np.intp]
 
 
 def report_curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
-    """Panels of a finished run, the most telling first; none where there is nothing to show.
+    """Panels of a finished run, the most important first; empty if there is nothing to show.
 
-    With truth: NEES by degree of freedom of every pose with the two-sided bounds of a single one, and its errors with
-    ± 2 σ, first base fixed. Withheld fixes against their prediction; without a prediction, distances to the fixes.
-    Without truth also χ² by kind of factor.
+    With ground truth: NEES per degree of freedom of every pose with the two-sided bounds of a single pose, and its
+    errors with ± 2 σ, first base fixed. Innovations of withheld fixes; without these, distances to the fixes.
+    Without ground truth also χ² by factor class.
 
     Returns
     -------
     list of dict
-        ``name``, ``said``, ``unit`` and ``kind``. Of the kinds ``line`` and ``dots``: ``t`` [s] since the path begins,
-        ``s`` [m] travelled, ``xyz`` [m], ``value``, as base64 of float32; ``log``; ``honest``, or none; ``bounds``: two
-        numbers, or ``half``: half width of the band at each point; ``cut``: points before which the line breaks. Of the
-        kind ``rows``: ``rows``, each ``name``, ``value``, ``low``, ``high``.
+        ``name``, ``said``, ``unit`` and ``kind``. For the kinds ``line`` and ``dots``: ``t`` [s] from the start of the
+        path, ``s`` [m] path length, ``xyz`` [m], ``value``, as base64 of float32; ``log``; ``honest``: consistent value
+        or None; ``bounds``: two numbers, or ``half``: half width of the band at each point; ``cut``: points before
+        which the line breaks. For the kind ``rows``: ``rows``, each ``name``, ``value``, ``low``, ``high``.
     """
     judged = _against_truth(folder, m)
     panels = [*judged, *_fixes(folder, m.trajectory)]
@@ -55,18 +55,18 @@ def report_curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class _Axis:
-    """Where and when the points of a panel are."""
+    """Times and positions of the points of a panel."""
 
     t: Array
     s: Array
     xyz: Array
     piece: npt.NDArray[np.int64]
-    """Points of one piece are joined by a line."""
+    """Index of the piece of each point; points of one piece are joined by a line."""
     kind: str
 
     @classmethod
     def of(cls, path: Trajectory, rows: Rows) -> _Axis:
-        """At poses of the path; where one is left out between two, the line breaks."""
+        """At poses of the path; the line breaks where poses are omitted."""
         piece = np.cumsum(np.diff(rows, prepend=rows[:1]) > 1, dtype=np.int64)
         t, s = path.times[rows] - path.times[0], arc_length(path.positions)[rows]
         return cls(t, s, path.positions[rows], piece, "line")
@@ -108,7 +108,7 @@ class _Axis:
 
 
 def extreme_rows(values: Array, most: int) -> Rows:
-    """Rows of at most ``most`` of the values ``(n,)``: the ends, and of every so many the least and the largest."""
+    """At most ``most`` rows of the values ``(n,)``: both ends, and minimum and maximum of each interval."""
     n = len(values)
     if n <= most:
         return np.arange(n)
@@ -118,7 +118,7 @@ def extreme_rows(values: Array, most: int) -> Rows:
 
 
 def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
-    """NEES and errors of every pose; nothing where the run was not judged by a truth in the frame of its first base."""
+    """NEES and errors of every pose; empty without ground truth in the frame of the first base."""
     file = folder.path / "truth.tum"
     if not file.is_file():
         return []
@@ -156,12 +156,12 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
 
 
 def chart_of(folder: ReportFolder) -> str:
-    """In which coordinates the NEES of the run is taken; older runs do not say it, and those of most were in this."""
+    """Parametrisation of the NEES of the run; older runs do not store it, and most of them used ``group``."""
     return "cartesian" if folder.report.get("nees_chart") == "cartesian" else "group"
 
 
 def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
-    """Withheld fixes against their prediction; where there is none, distances to the fixes."""
+    """Innovations of withheld fixes; without these, distances to the fixes."""
     found = _innovations(folder)
     if found is not None:
         times, v, sigma, nis = found
@@ -193,7 +193,7 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
 
 
 def _innovations(folder: ReportFolder) -> tuple[Array, Array, Array, Array] | None:
-    """Times, innovations, σ and NIS of withheld fixes; None where the run has none."""
+    """Times, innovations, σ and NIS of withheld fixes; None if the run has none."""
     found = folder.part("gps_innovations")
     if not found.get("times"):
         return None
@@ -206,7 +206,7 @@ def _innovations(folder: ReportFolder) -> tuple[Array, Array, Array, Array] | No
 
 
 def _kinds(folder: ReportFolder) -> list[dict[str, Any]]:
-    """χ²/dof by kind of factor with its bounds."""
+    """χ²/dof by factor class with its bounds."""
     rows = [
         {"name": str(r.get("class")), **{k: round(float(r[k]), 6) for k in _ROW}, "value": _six(r["chi2_per_dof"])}
         for r in class_rows(metrics_of_folder(folder))

@@ -1,4 +1,4 @@
-"""Pictures of a report: those that the run drew, and two that are drawn from its folder: its loops, its NEES."""
+"""Pictures of a report: those of the run, and two drawn from its folder: loops, and NEES of the submaps."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ CAPTIONS = {
 }
 
 MOST_NAMES = 60
-"""More loops than these are drawn without their numbers."""
+"""If there are more loops, they are drawn without their numbers."""
 
 
 def report_pictures(folder: ReportFolder) -> Markup:
-    """Pictures, the map first."""
+    """All pictures, the map first."""
     made = dict(folder.figures())
     parts: list[Any] = []
     order = [n for n in CAPTIONS if n in made and n != "progress.png"]
@@ -74,7 +74,7 @@ def _caption(name: str) -> str:
 
 
 def _drawn(folder: ReportFolder) -> list[Markup]:
-    """Loops over the path, NEES submap by submap: from what the folder holds."""
+    """Loops over the path, and NEES by submap, drawn from the data in the folder."""
     if folder.kind == "interrupted":
         return [missing_note("loop closures on the path, and NEES by submap: the run is not finished.")]
     if folder.kind == "merged":
@@ -92,7 +92,7 @@ def _drawn(folder: ReportFolder) -> list[Markup]:
 
 
 def _session_ties(folder: ReportFolder) -> list[Markup]:
-    """Ties between sessions over the paths of both."""
+    """Loop closures between sessions over the paths of both."""
     from graphslam.plots.loops import plot_loops
     from graphslam.plots.save import figure_png
 
@@ -102,7 +102,7 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
     try:
         nodes = read_merged_dense(folder.path)["nodes"]
         paths = [read_tum(f).positions[:, :2] for f in sorted(folder.path.glob("trajectory_*.tum"))]
-        gap = np.full((1, 2), np.nan)  # lifts the pen
+        gap = np.full((1, 2), np.nan)  # interrupts the line
         path = np.concatenate([x for p in paths for x in (p, gap)])
         ends = [(e["i"], e["j"], "accepted") for e in ties]
         ax = plot_loops(None, path, nodes, ends, title="loop closures between sessions, from above")
@@ -112,7 +112,7 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
 
 
 def _said(folder: ReportFolder, error: Exception) -> str:
-    """An error without the place of the folder: the page may be moved, and says the same wherever it was made."""
+    """Text of an error without the folder's path, so that the page is the same wherever it was made."""
     return " ".join(str(error).replace(f"{folder.path}/", "").replace(f"{folder.home}/", "").split())
 
 
@@ -123,7 +123,7 @@ def _loops(folder: ReportFolder, nodes: np.ndarray, path: np.ndarray) -> list[Ma
     n = len(nodes)
     rows = [r for r in folder.loop_rows if 0 <= r["i"] < n and 0 <= r["j"] < n]
     if not folder.loop_rows:
-        return []  # the part on loops says why there are none
+        return []  # the section on loops gives the reason
     try:
         ends = [(int(r["i"]), int(r["j"]), str(r["verdict"])) for r in rows]
         names = [r["loop"] for r in rows] if len(rows) <= MOST_NAMES else None

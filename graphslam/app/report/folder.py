@@ -1,4 +1,4 @@
-"""What a report is made of, read from a folder; what is not there, or damaged, is noted and not fatal."""
+"""Data of a report, read from a folder; missing or damaged parts are recorded and are not fatal."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ Kind = Literal["run", "interrupted", "merged"]
 T = TypeVar("T")
 _PNG_HEAD, _PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 MOST_BYTES = 8_000_000
-"""A picture larger than this is left out of the page."""
+"""A larger picture is not included in the page [bytes]."""
 
 
 @dataclass
 class ReportFolder:
-    """Everything a report says, as it stands in a folder.
+    """All data of a report from one state of a folder.
 
     Parameters
     ----------
     path : Path
-        Where the files of its present state are.
+        Folder with the files of the current state.
     home : Path
         The folder itself: configuration, submaps.
     kind : {"run", "interrupted", "merged"}
-        A finished run, one that has no ``run.json`` yet, or several runs merged.
+        A finished run, one without ``run.json``, or merged runs.
     """
 
     path: Path
@@ -52,13 +52,13 @@ class ReportFolder:
     submaps: list[dict[str, Any]] = field(default_factory=list)
     """Index of the store."""
     clearest: dict[str, Any] | None = None
-    """Other choices of matches, where they were asked for."""
+    """Other choices of matches, if requested."""
     problems: dict[str, str] = field(default_factory=dict)
     """Part of the folder → why it is not in the report."""
 
     @property
     def name(self) -> str:
-        """What was run."""
+        """Source of the run, or names of the merged sessions."""
         if self.kind == "merged":
             return " + ".join(str(s.get("name", "?")) for s in self.sessions) or "merged runs"
         said = self.config.get("run", {})
@@ -66,12 +66,12 @@ class ReportFolder:
 
     @property
     def sessions(self) -> list[dict[str, Any]]:
-        """Of a merged folder."""
+        """Sessions of a merged folder."""
         found = self.report.get("sessions", [])
         return [s for s in found if isinstance(s, dict)] if isinstance(found, list) else []
 
     def values(self) -> dict[str, float]:
-        """Metrics by key; those without a number are left out."""
+        """Metrics by key; those without a number are omitted."""
         return {
             str(r.get("key")): float(r["value"])
             for r in self.metrics
@@ -79,14 +79,14 @@ class ReportFolder:
         }
 
     def part(self, name: str) -> dict[str, Any]:
-        """A mapping inside the report; empty where it is none."""
+        """A mapping inside the report; empty if it is missing or of another type."""
         found = self.report.get(name)
         return found if isinstance(found, dict) else {}
 
     def figures(self) -> list[tuple[str, bytes]]:
-        """Name and bytes of every picture, in the order of their names."""
+        """Name and bytes of every picture, sorted by name."""
         out = []
-        found = {f.name: f for f in (self.home / "figures").glob("progress.png")}  # drawn while the run went on
+        found = {f.name: f for f in (self.home / "figures").glob("progress.png")}  # drawn during the run
         found |= {f.name: f for f in (self.path / "figures").glob("*.png")}
         for _, file in sorted(found.items()):
             if file.name.startswith("."):
@@ -106,7 +106,7 @@ class ReportFolder:
 
 
 def read_folder(path: str | Path, root: Path) -> ReportFolder:
-    """Read what there is, of one state of the folder, whose files are in ``root``."""
+    """Read all existing parts of one state of the folder, whose files are in ``root``."""
     home = Path(path)
     if (root / "merge.json").is_file():
         kind: Kind = "merged"
@@ -161,7 +161,7 @@ def _options(root: Path) -> dict[str, Any]:
 
 
 def _metrics(root: Path, name: str) -> list[dict[str, Any]]:
-    """Rows of the metrics; what is no number has no value."""
+    """Rows of the metrics; NaN becomes None."""
     rows = [{str(k): v for k, v in r.items()} for r in read_metrics(root, name).to_dict("records")]
     return [r if r["value"] == r["value"] else {**r, "value": None} for r in rows]
 

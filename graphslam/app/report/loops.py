@@ -1,4 +1,4 @@
-"""Parts of a report: the ledger of loops, ties between sessions, hypotheses and runners-up."""
+"""Sections of a report: loop ledger, loop closures between sessions, alternative hypotheses."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ COLUMNS = {
     **{"sigma": "σ [m]", "chi2": "χ²", "weight": "weight", "effect_predicted": "effect foreseen", "effect": "effect"},
     **{"effect_earlier": "on earlier factors", "factor_id": "factor", "why": "why", "gates": "gates"},
 }
-"""Keys as ``graphslam loops --json`` has them."""
+"""Keys as in ``graphslam loops --json``, with their headings."""
 
 
 def loops_section(folder: ReportFolder) -> Markup:
-    """Every loop with the decision in force: those in the graph, those taken out again, those refused."""
+    """Every loop with its current decision: accepted, switched off, undone, rejected."""
     title = "Loops"
     if folder.loops is None:
         why = folder.problems.get("events.jsonl", "does not say")
@@ -33,7 +33,7 @@ def loops_section(folder: ReportFolder) -> Markup:
     counts = folder.loops.counts()
     said = ", ".join(f"{counts[v]} {v}" for v in (*ORDER, *sorted(set(counts) - set(ORDER))) if v in counts)
     rows = sorted(folder.loop_rows, key=_rank)
-    # what the registration itself refused is most of a long run, and least of what one looks for
+    # candidates that the registration rejected are the most frequent and the least interesting
     short = [r for r in rows if not str(r["why"]).startswith("registration")]
     hidden = [r for r in rows if str(r["why"]).startswith("registration")]
     parts: list[Any] = [
@@ -77,7 +77,7 @@ def _ledger(rows: list[dict[str, Any]]) -> Markup:
 
 
 def _history(folder: ReportFolder) -> list[Markup]:
-    """Decisions that are not in force any more."""
+    """All decisions on loops that have more than one."""
     assert folder.loops is not None
     times = Counter(d.loop for d in folder.loops.decisions)
     rows = [
@@ -93,7 +93,7 @@ def _history(folder: ReportFolder) -> list[Markup]:
 
 
 def _ties(folder: ReportFolder) -> list[Markup]:
-    """Places by which sessions were tied, or not."""
+    """Candidates of loop closures between sessions, accepted or rejected."""
     if folder.kind != "merged":
         return []
     rows = []

@@ -1,6 +1,6 @@
-"""Parts of the report's page.
+"""HTML parts of the report page.
 
-A page needs no network and no other file: pictures, style and the script of its map and curves are in it.
+The page needs no network and no other file: it includes pictures, style, and the script of its map and curves.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from typing import Any
 from graphslam.core.markup import Markup, html_element, join_parts, template_environment
 
 SCRIPTS = ("viewer.js", "curves.js")
-"""Joined, the one script of a page."""
+"""Joined to the only script of a page."""
 
 
 def folded_section(summary: str, body: Markup) -> Markup:
-    """What is opened by hand."""
+    """A section that is collapsed until the user opens it."""
     return html_element("details", html_element("summary", summary), body)
 
 
 def remark(*text: Any) -> Markup:
-    """A remark."""
+    """A note."""
     return html_element("p", *text, class_="note")
 
 
 def missing_note(*text: Any) -> Markup:
-    """That something is not there, and why."""
+    """A note that something is missing, and why."""
     return html_element("p", "Missing: ", *text, class_="missing")
 
 
 def page_section(name: str, title: str, *parts: Any) -> Markup:
-    """A part of the page, under a name that links lead to."""
+    """A section of the page with an anchor for links."""
     return html_element("section", html_element("h2", title), join_parts(parts, "\n"), id=name)
 
 
@@ -43,7 +43,7 @@ def compact_json(value: Any) -> str:
 
 
 def whole_page(**values: Any) -> str:
-    """A whole page: ``title``, ``headline``, ``findings``, ``parts`` and ``scene`` in the template ``page.html``."""
+    """The complete page: ``title``, ``headline``, ``findings``, ``parts``, ``scene`` in the template ``page.html``."""
     pages = template_environment("graphslam.app.report")
     templates = files("graphslam.app.report") / "templates"
     viewer = "".join((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)

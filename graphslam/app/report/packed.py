@@ -1,4 +1,4 @@
-"""Numbers inside a page: base64 of float32, little-endian."""
+"""Arrays inside a page: base64 of float32, little-endian."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from graphslam.core.geometry import Array
 
 
 def base64_floats(values: Array) -> str:
-    """Any values, row by row."""
+    """Base64 of an array in row-major order."""
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
 
 
 def space(points: Array) -> Array:
-    """Points ``(n, 3)``: those of the plane at z = 0."""
+    """Points ``(n, 3)``; planar points get z = 0."""
     return points if points.shape[1] == 3 else np.hstack([points, np.zeros((len(points), 1))])
 
 

@@ -1,4 +1,4 @@
-"""What the refinement by scans found: before and after, constants, rounds."""
+"""Section of a report on the refinement with scans: before and after, constants, rounds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MEANING = {
     "bend": ("wheel turn error per metre", "rad/m"),
     "turn": ("wheel turn error per radian", "share"),
 }
-"""Systematic errors: in words, and their unit."""
+"""Description and unit of each systematic error."""
 PATHS = ("odometry", "graph", "refined")
 CANDIDATES = (
     ("path error, aligned [m]", "", "path_rmse_aligned_graph", "path_rmse_aligned"),
@@ -28,11 +28,11 @@ CANDIDATES = (
     ("entropy of the fused map [nat m³, in the plane nat m²]", "", "map_entropy_graph", "map_entropy"),
     ("known volume of the fused map [m³, in the plane m²]", "", "map_known_volume_graph", "map_known_volume"),
 )
-"""What is compared, and the metrics of each of the paths."""
+"""Compared quantities, with the metric of each path."""
 
 
 def refinement_section(folder: ReportFolder) -> Markup:
-    """The path of the graph and the refined one in figures, and what else the scans determined."""
+    """Metrics of the path of the graph and of the refined one, and other quantities estimated from the scans."""
     title = "Refinement by scans"
     found = folder.part("refine")
     if folder.kind != "run":

@@ -1,4 +1,4 @@
-"""``report.html``: what a run did, decided and measured, on one page that needs no network and no other file."""
+"""``report.html``: steps, decisions and metrics of a run on one page that needs no network and no other file."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ _PARTS = {
     "evidence": evidence_section,
     "events": events_section,
     "times": times_section,
-    "missing": problems_section,  # last: the others note what they did not find
+    "missing": problems_section,  # last, because the other sections record problems
 }
 _TITLES = {"run": "Report of a run", "interrupted": "Report of an unfinished run", "merged": "Report of a merge"}
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A page.
+    """A report page.
 
     Parameters
     ----------
@@ -67,14 +67,14 @@ class Report:
     problems: dict[str, str]
 
     def _repr_html_(self) -> str:
-        """The page inside a notebook, apart from the notebook's own style and scripts."""
+        """The page in a notebook, isolated from the notebook's own style and scripts."""
         return html_element("iframe", srcdoc=self.html, style="width: 100%; height: 46rem; border: 0")
 
 
 def make_report(folder: str | Path) -> Report:
     """The page of a run folder or a merged folder, finished or not.
 
-    The same folder gives the same page. Two runs of the same configuration differ in its part ``times`` alone.
+    The same folder gives the same page. Two runs with the same configuration differ only in the part ``times``.
     """
     return read_consistently(folder, lambda root: _page(Path(folder), root))
 
@@ -105,7 +105,7 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
 
 
 def report_and_file(folder: str | Path, out: str | Path | None = None) -> tuple[Report, Path]:
-    """Write the page of a folder; the page, and its file. See :func:`write_report`."""
+    """Write the page of a folder; returns the page and its file. See :func:`write_report`."""
     home, report = Path(folder), make_report(folder)
     name = PAGE if out is None else name_inside(home, out)
     if name is None:
@@ -128,7 +128,7 @@ def _save(report: Report, file: Path) -> Path:
 
 
 def add_report(new: FolderTransaction) -> None:
-    """Write the page of a state that is being written; its failure is said, and undoes nothing."""
+    """Write the page of a state that is being written; a failure is logged and does not stop the writing."""
     try:
         _save(_page(new.home, new.path), new.path / PAGE)
     except GraphSlamError as error:

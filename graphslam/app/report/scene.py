@@ -1,4 +1,4 @@
-"""What the map of a report shows: layers of points, lines, ellipses and loops, in the frame of the first base."""
+"""Layers of the map in a report: points, lines, ellipses and loops, in the frame of the first base."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from graphslam.plots import style
 from graphslam.plots.paths import position_covariances
 
 MOST_POINTS = 60_000
-"""Of a map in the page; of more, every so manieth."""
+"""Largest number of map points in the page; larger maps are subsampled."""
 MOST_PLACES = 4_000
-"""Of a path."""
+"""Largest number of points of a path, about."""
 ELLIPSES = 60
-"""Along the path."""
+"""Largest number of ellipses along the path."""
 CHI2_95 = -2.0 * math.log(0.05)
-"""Of two degrees of freedom: closed form."""
+"""95 % quantile of χ² with two degrees of freedom (closed form)."""
 
 
 def report_scene(folder: ReportFolder) -> dict[str, Any] | None:
-    """The layers of a finished run; None where there is no map to show.
+    """The layers of a finished run; None if there is no map to show.
 
     Returns
     -------
     dict
         ``dim``, ``layers``: each ``name``, ``kind`` (points, line, ellipses, loops), ``colour``, ``on``, and its data:
-        ``xyz`` as base64 of float32 ``(n, 3)`` [m]; of ellipses ``cov`` as well, ``(n, 3)``: xx, xy, yy of the 95 %
-        ellipse [m²]; of loops ``rows``: number, verdict, and both ends. ``curves``: panels of
+        ``xyz`` as base64 of float32 ``(n, 3)`` [m]; of ellipses also ``cov``, ``(n, 3)``: xx, xy, yy of the 95 %
+        ellipse [m²]; of loops ``rows``: number and both ends. ``curves``: panels of
         :func:`~graphslam.app.report.curves.report_curves`.
     """
     if folder.kind != "run":
@@ -47,7 +47,7 @@ def report_scene(folder: ReportFolder) -> dict[str, Any] | None:
     try:
         m = read_map(folder.path)
     except GraphSlamError:
-        return None  # the part on figures says why
+        return None  # the section on figures gives the reason
     below, above = _references(folder, m.dim)
     layers = [*_map(folder), *below, _line("path", style.ESTIMATE, m.trajectory.positions)]
     if m.trajectory.covariances is not None:
@@ -78,7 +78,7 @@ def _map(folder: ReportFolder) -> list[dict[str, Any]]:
 
 
 def _references(folder: ReportFolder, dim: int) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Dead reckoning, the graph before the refinement and GPS, drawn below the path; truth, drawn above it."""
+    """Dead reckoning, the graph before the refinement and GPS, drawn below the path; ground truth, drawn above it."""
     below: list[dict[str, Any]] = []
     above: list[dict[str, Any]] = []
     for name, file, colour, on in (

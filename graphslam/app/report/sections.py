@@ -1,4 +1,4 @@
-"""Parts of a report: what was run, records, metrics, times, the graph, its evidence, events."""
+"""Sections of a report: options, records, metrics, times, the graph, use of streams, events."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from graphslam.graph.ledger import EXCLUSIVE
 BETTER = {"lower": "lower is better", "higher": "higher is better", "one": "1 is consistent"}
 ROUTINE = frozenset(
     {"submap", "attitude", "between", "loop", "match-not-used"}
-)  # told elsewhere in the page, or once a submap
+)  # reported elsewhere in the page, or once per submap
 _UNFINISHED = "the run is not finished."
 
 
 def what_was_run(folder: ReportFolder) -> Markup:
-    """Names, seed, versions; every option with its value."""
+    """Names, seed, versions, and every option with its value."""
     r, said = folder.report, folder.config.get("run", {})
     parts: list[Any] = []
     if folder.kind == "merged":
@@ -74,7 +74,7 @@ def what_was_run(folder: ReportFolder) -> Markup:
 
 
 def records_section(folder: ReportFolder) -> Markup:
-    """What was read, what was dropped and why, what was flagged."""
+    """Numbers of records read and dropped with the reasons, and flagged submaps."""
     if folder.kind == "merged":
         return page_section("records", "Records", remark("A merge reads submaps, not records."))
     title = "Records read, dropped, flagged"
@@ -103,7 +103,7 @@ def _use(stream: str, ledger: pd.DataFrame | None) -> str:
 
 
 def metrics_section(folder: ReportFolder) -> Markup:
-    """Every figure but times, with its unit, which way is better, and bounds where it has some."""
+    """Every metric except times, with its unit, the better direction, and bounds if there are any."""
     rows = [r for r in folder.metrics if not is_time(r.get("key")) and r.get("key") != RESUMED]
     if not rows:
         said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "metrics.json")
@@ -129,7 +129,7 @@ def metrics_section(folder: ReportFolder) -> Markup:
 
 
 def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str]]:
-    """Bounds and verdict by metric; and the keys of the bounds themselves, which need no row of their own."""
+    """Bounds and result of the test by metric; and the keys of the bounds, which get no row of their own."""
     out, folded_in = {}, set()
     for key in m:
         if not key.endswith("_low") or (stem := key.removesuffix("_low")) + "_high" not in m:
@@ -150,7 +150,7 @@ def _bounds(m: Mapping[str, float]) -> tuple[dict[str, tuple[str, str]], set[str
 
 
 def control_section(folder: ReportFolder) -> Markup:
-    """Check points with their errors, and rows of control and check points that were refused."""
+    """Check points with their errors, and refused rows of control and check points."""
     checked, control = folder.part("check_points"), folder.part("control_points")
     if not checked and not control:
         return Markup("")
@@ -175,7 +175,7 @@ def control_section(folder: ReportFolder) -> Markup:
 
 
 def times_section(folder: ReportFolder) -> Markup:
-    """Seconds of each stage: the one part of the page that differs when the same run is made again."""
+    """Seconds of each stage: the only part of the page that differs between two equal runs."""
     timed = [r for r in folder.metrics if is_time(r.get("key"))]
     seconds = {str(r["key"])[8:]: r.get("value") for r in timed if str(r["key"]).startswith("seconds_")}
     seconds = seconds or folder.part("seconds")
@@ -193,7 +193,7 @@ def times_section(folder: ReportFolder) -> Markup:
 
 
 def graph_section(folder: ReportFolder) -> Markup:
-    """Nodes, factors by kind, χ² by kind with two-sided bounds."""
+    """Number of nodes and factors, χ² by factor class with two-sided bounds."""
     if folder.kind == "interrupted":
         return page_section("graph", "Graph", missing_note("the graph; ", _UNFINISHED))
     m, g = folder.values(), folder.part("graph")
@@ -229,7 +229,7 @@ def graph_section(folder: ReportFolder) -> Markup:
 
 
 def evidence_section(folder: ReportFolder) -> Markup:
-    """Which streams were spent where, and what was declared to be shared."""
+    """Use of each stream by factors, and declared exceptions such as shared scans."""
     title = "Evidence: use of each stream"
     if folder.ledger is None:
         return page_section("evidence", title, missing_note("the ledger of evidence; ", _why(folder, "ledger.csv")))
@@ -267,7 +267,7 @@ def _exceptions(t: pd.DataFrame) -> Markup:
 
 
 def _kind_of_factor(label: str) -> str:
-    """``levelled of x20 (factor 21)`` → ``levelled``: words before the first with a digit."""
+    """``levelled of x20 (factor 21)`` → ``levelled``: words before the first one with a digit."""
     words: list[str] = []
     for w in label.split():
         if any(c.isdigit() for c in w):
@@ -279,7 +279,7 @@ def _kind_of_factor(label: str) -> str:
 
 
 def events_section(folder: ReportFolder) -> Markup:
-    """What else was decided or dropped, one line an event; routine ones as counts."""
+    """Other decisions and dropped data, one line per event; routine events only as counts."""
     if folder.events is None:
         said = _UNFINISHED if folder.kind == "interrupted" else _why(folder, "events.jsonl")
         return page_section("events", "Events", missing_note("events; ", said))
@@ -301,7 +301,7 @@ def _line(event: Mapping[str, Any]) -> Markup:
 
 
 def problems_section(folder: ReportFolder) -> Markup:
-    """What is not in the page, and why."""
+    """Parts that are missing in the page, and why."""
     lines = [join_parts([html_element("code", name), " ", why]) for name, why in sorted(folder.problems.items())]
     body = item_list(lines) if lines else remark("Nothing.")
     return page_section("missing", "What is missing", body)
@@ -341,7 +341,7 @@ def verdict_lines(folder: ReportFolder) -> tuple[Finding, list[Finding]]:
 
 
 def interruption_lines(folder: ReportFolder) -> list[Finding]:
-    """Lines of a run that was not finished."""
+    """Findings on a run that was not finished."""
     return [
         Finding("bad", "interrupted", f"run: not finished — {stopping_line(folder)}"),
         Finding("", "resume", "resume: run the same command again (`graphslam run` with --resume)."),
@@ -349,7 +349,7 @@ def interruption_lines(folder: ReportFolder) -> list[Finding]:
 
 
 def stopping_line(folder: ReportFolder) -> str:
-    """Where an interrupted run stopped."""
+    """Submap and time at which an interrupted run stopped."""
     if not folder.submaps:
         return "it stopped before the first submap was finished."
     last = folder.submaps[-1]

@@ -1,4 +1,4 @@
-"""A run of dense submaps as a session of a larger graph: its chain, ties and fixes, put back from what it saved."""
+"""A run of dense submaps as a session of a larger graph: chain, loop closures and fixes, read from its folder."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from graphslam.maps.moving import static_submaps
 from graphslam.maps.refined import base_frames
 
 SPACING = 3.0
-"""Of the nodes of a run that has none inside its submaps [m]: places to be tied are needed."""
+"""Node spacing if a run has no nodes inside its submaps [m]; loop closures need them."""
 
 
 def run_is_dense(run: Run) -> bool:
-    """Whether the submaps of a run are without landmarks."""
+    """Are all submaps of a run without landmarks?"""
     return bool(run.submaps) and all(s.landmarks is None for s in run.submaps)
 
 
 def submaps_with_maps(run: Run) -> list[Submap]:
-    """The submaps of a run with their dense maps, without what moved, along its refined path where it has one."""
+    """The submaps of a run with their dense maps, without moving objects, along its refined path if it has one."""
     refined = refined_submaps_of(run)
     submaps = refined or list(run.submaps)
     if run.folder is not None and any(s.grid is None for s in submaps):
@@ -49,7 +49,7 @@ def submaps_with_maps(run: Run) -> list[Submap]:
 
 
 def back_end_config(run: Run) -> BackEndConfig:
-    """The back end's options of a run, as it says them itself."""
+    """The back-end options of a run, from its report or configuration."""
     made: BackEndConfig = _options(run, "backend", BackEndConfig)
     return made if made.node_spacing > 0 else replace(made, node_spacing=SPACING)
 
@@ -66,10 +66,10 @@ def _options(run: Run, part: str, kind: Any) -> Any:
 
 
 def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.inf) -> DenseSession:
-    """A run as a session of a common graph: its keys follow ``first_key``, its clock goes on ``after`` [s].
+    """A run as a session of a common graph: its keys start at ``first_key``, its times are after ``after`` [s].
 
-    Of a refined run the chain is that of its refined submaps, and nothing else: its re-entries and loops were made of
-    the scans that the refinement spent, and enter no sum a second time.
+    For a refined run it has the chain of its refined submaps only: re-entries and loops were measured with the scans
+    that the refinement used, and must not be used twice.
     """
     config = back_end_config(run)
     begin = run.submaps[0].interval[0]
@@ -79,7 +79,7 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
     refined = all(s.report.get("refined") is True for s in found)
     submaps = [_in_common(s, keys, name, shift) for s in found]
     inner = [] if refined else _inner(run, config)
-    if refined:  # gravity is in the refined exits, with a σ of its own
+    if refined:  # the refined end poses include gravity with its own σ
         config = replace(config, level_sigma=0.0)
     fixes = None if run.fixes is None else replace(run.fixes, times=run.fixes.times + shift)
     return DenseSession(
@@ -89,7 +89,7 @@ def session_of(run: Run, name: str, *, first_key: int = 0, after: float = -np.in
 
 
 def _in_common(s: Submap, keys: dict[int, int], name: str, shift: float) -> Submap:
-    """A submap with key, clock and streams of the common graph; its matches come from the run's graph."""
+    """A submap with key, times and streams of the common graph; its matches come from the run's graph."""
     path = s.trajectory
     moved = None if path is None else Trajectory(path.times + shift, path.poses, path.covariances)
     a, b = s.interval
@@ -97,7 +97,7 @@ def _in_common(s: Submap, keys: dict[int, int], name: str, shift: float) -> Subm
 
 
 def _inner(run: Run, config: BackEndConfig) -> list[IntraSessionLoop]:
-    """Factors of a run's graph beside the chain: of the graph itself, or of its file."""
+    """Factors of a run's graph that are not in the chain, from the graph or from its file."""
     if _options(run, "backend", BackEndConfig).node_spacing != config.node_spacing:
         raise DataError(
             "a run whose submaps have no inner nodes cannot be tied", where=run.name, wanted="backend.node_spacing > 0"
@@ -111,7 +111,7 @@ def _inner(run: Run, config: BackEndConfig) -> list[IntraSessionLoop]:
 
 
 def _graph_of(run: Run, root: Path) -> PoseNetwork | None:
-    """The graph of the state that a run was read in."""
+    """The graph file of the state in which the run was read."""
     if not (root / "graph.g2o").is_file():
         return None
     now, then = read_report(root).get("generation"), run.report.get("generation")

@@ -1,4 +1,4 @@
-"""Where a submap, or a stretch of a log, lies in a saved map."""
+"""Localise submaps, or a part of a log, in a saved map."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from graphslam.solve.registry import make_solver
 
 @dataclass(frozen=True, slots=True)
 class LocalisationResult:
-    """Where something lies in a saved map, or why that is not known.
+    """Pose in a saved map, or the reason why none was found.
 
     Parameters
     ----------
     why : str
-        Why nothing is known; empty if it was found.
+        Reason why no pose was found; empty if one was found.
     ties : InterSessionLoops
-        Every place that was tried, and what came of it.
+        All tested candidates with their results.
     used : list of Loop
-        Ties that the pose rests on.
+        Loop closures that determine the pose.
     T_map_base, covariance : (7,) or (3,), (d, d); or None
-        The first base of what was looked for, in the frame of the map's first base; right tangent. What the map itself
-        does not know of that place is in it.
+        Pose of the first base of the source in the frame of the map's first base, and its covariance (right tangent),
+        which includes the uncertainty of the map there.
     T_map_end, end_covariance : same
-        Where the body was at the end of it.
+        Pose of the body at the end of the source.
     """
 
     why: str
@@ -59,11 +59,11 @@ class LocalisationResult:
 
     @property
     def found(self) -> bool:
-        """Whether the pose is known."""
+        """Was a pose found?"""
         return not self.why
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row a candidate, with the reason for or against it."""
+        """One row per candidate, with the reason for its acceptance or rejection."""
         return self.ties.rows()
 
     def __repr__(self) -> str:
@@ -84,15 +84,15 @@ def localise(
 ) -> LocalisationResult:
     """Find a submap, a chain of them, or a stretch of a log in the map of a finished run.
 
-    Nothing is assumed of where it may lie. Places of the map that look like places of it are registered; the pose is
-    believed if enough of them agree with each other, and then solved for in the graph of the run.
+    No initial pose is needed. Similar places of source and map are registered. The result is accepted if enough of them
+    are consistent with each other; then the pose is solved for in the graph of the run.
 
     Parameters
     ----------
     run : Run or run folder
         Of dense submaps.
     source : Submap, sequence of Submap, or SensorLog
-        A log goes through the front end of the run, with its options: slice it to the stretch that is to be found.
+        A log is processed by the front end of the run, with its options; slice the log to the part to localise.
     config : InterSessionConfig, optional
     solver : str
     progress : bool
@@ -102,12 +102,12 @@ def localise(
     -------
     LocalisationResult
         ``T_map_base`` ``(3,)`` or ``(7,)`` in the frame of the run's map, its covariance (right tangent), and ``why``
-        nothing was found.
+        if no pose was found.
 
     Raises
     ------
     DataError
-        A run or submaps that cannot be used. That a place is not found is an answer, not an error.
+        Unusable run or submaps. If no pose is found, no error is raised.
 
     Examples
     --------
@@ -137,13 +137,13 @@ def source_of(
     reader: str | None = None,
     reader_options: Mapping[str, Any] | None = None,
 ) -> Sequence[Submap] | SensorLog:
-    """What is to be found: submaps of a run folder, or a stretch of a log.
+    """Source of a localisation: submaps of a run folder, or a part of a log.
 
     Parameters
     ----------
-    source : path or card name
+    source : path or data set name
     keys : sequence of int
-        Of a run folder, only these submaps, which must follow one another.
+        Of a run folder, only these consecutive submaps.
     begin, end : float, optional
         Of a log [s].
     """
@@ -167,7 +167,7 @@ def source_of(
 
 
 def submaps_of_stretch(run: Run, log: SensorLog) -> list[Submap]:
-    """Submaps that the front end of a run makes of a log, with the options of the run."""
+    """Submaps of a log made by the front end of a run with the options of the run."""
     folder = None if run.folder is None else Path(run.folder) / "config.toml"
     if folder is None or not folder.is_file():
         raise DataError("a run without a folder does not say its front end's options", where=run.name)
@@ -208,7 +208,7 @@ def _localise(
 
 
 def _query(run: Run, known: DenseSession, submaps: list[Submap]) -> DenseSession:
-    """What is looked for, as a session of the run's graph: keys and clock go on after the map's."""
+    """The source as a session of the run's graph: keys and times follow those of the map."""
     config = back_end_config(run)
     last = known.submaps[-1]
     shift = max(0.0, last.interval[1] + 1000.0 - submaps[0].interval[0]) if submaps else 0.0

@@ -1,4 +1,4 @@
-"""Several runs, of several robots or days, merged into one map by the landmarks they share."""
+"""Merge several runs, of several robots or days, into one map; here by common landmarks."""
 
 from __future__ import annotations
 
@@ -60,22 +60,22 @@ def merge(
     Parameters
     ----------
     runs : sequence of Run or run folder
-        At least two. A run joins when it shares landmarks with those that are in already, most shared first.
+        At least two. A run joins if it shares landmarks with the joined ones, those with most shared landmarks first.
     by : {"auto", "identity", "constellation", "places", "gps"}
-        Landmarks are the same by their identities, or by the pattern they form. ``auto``: by identity where every run
-        took the identities of its log, else by constellation. Dense submaps are tied by ``places`` or by ``gps``
+        Landmarks are matched by their identities, or by their constellation. ``auto``: by identity if every run used
+        the identities of its log, else by constellation. Dense submaps are aligned by ``places`` or by ``gps``
         (:func:`graphslam.app.sessions.merge_dense.merge_dense`).
     solver : str
         Registered solver.
     identity_gate : float
-        At the end, observations that contradict the map by this χ² (2 dof) are split off; 0 = never.
+        After the solution, observations with a larger χ² (2 dof) become separate landmarks; 0 = never.
     tolerance : float
         Landmarks of two maps within this distance after alignment agree [m].
     out : path, optional
         Folder for the merged map.
     surface : SurfaceConfig, optional
-        Runs of dense submaps in space: write the surface of all sessions into ``out`` as well; their logs are read once
-        more (:func:`graphslam.app.sessions.merge_surface.surface_of_sessions`).
+        Runs of 3-D dense submaps: also write the surface of all sessions into ``out``; their logs are read once more
+        (:func:`graphslam.app.sessions.merge_surface.surface_of_sessions`).
     colour : {"session", "height", "piece", "sigma"}
         Of that surface.
 
@@ -89,9 +89,9 @@ def merge(
     ConfigError
         Fewer than two runs, or an unknown option.
     RunFolderError
-        ``out`` holds something already, or is being written by another process.
+        ``out`` is not empty, or another process writes into it.
     DataError
-        Runs that share fewer than two landmarks, or whose landmarks do not say how they lie; names the run.
+        Runs that share fewer than two landmarks, or whose landmarks do not determine the alignment; names the run.
 
     Examples
     --------
@@ -146,7 +146,7 @@ def _merged(
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
-    """A name a run, fit for a file, each once."""
+    """Unique names of the runs that are valid in file names."""
     out: list[str] = []
     for r in runs:
         stem = re.sub(r"[^A-Za-z0-9_.-]+", "-", r.name).strip("-.") or "run"
@@ -234,7 +234,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
 
 
 def _confirmed(run: Run) -> int:
-    """Sightings that a landmark of the run's own map had at least."""
+    """Smallest number of observations of a landmark in the run's own map."""
     return int(run.map.landmark_hits.min(initial=1)) if len(run.map.landmark_hits) else 1
 
 
@@ -267,7 +267,7 @@ def _sessions(
 
 
 def _sightings(sessions: list[Session], graph: FactorGraph, solution: Solution) -> tuple[Ints, Ints]:
-    """Sightings, and number of sessions, of every landmark of the solution."""
+    """Number of observations, and of sessions, of every landmark of the solution."""
     row = {int(i): k for k, i in enumerate(solution.landmark_ids)}
     hits = np.zeros(len(row), dtype=np.int64)
     seen = np.zeros((len(sessions), len(row)), dtype=np.bool_)
@@ -294,9 +294,9 @@ def _with_landmarks(m: GlobalMap, solution: Solution, P: Array, hits: Ints, keep
 
 
 def continue_runs(saved: Sequence[Run | str | Path], run: Run, out: str | Path) -> MergedMap | MergedSubmaps:
-    """Put a new run into the graph of saved ones, tied where it was localised in them; the first one's base is fixed.
+    """Add a new run to the graph of saved ones, attached where it is localised in them; the first base is fixed.
 
-    What was there before is replaced: the run itself may have been resumed.
+    An earlier result in ``out`` is replaced, because the run may have been resumed.
     """
     from graphslam.app.sessions.merge_outputs import merged_folder, write_merged
 

@@ -1,4 +1,4 @@
-"""How runs of landmarks lie to each other, and which of their landmarks are the same."""
+"""Align runs of landmarks, and match their landmarks."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from graphslam.loops.sessions import Alignment, align_by_constellation, align_by
 logger = logging.getLogger(__name__)
 Ints = npt.NDArray[np.int64]
 By = Literal["auto", "identity", "constellation", "places", "gps"]
-"""How runs may be tied; the last two are for dense submaps."""
+"""Methods to align runs; the last two are for dense submaps."""
 
 
 def _own_identities(run: Run) -> set[int]:
-    """Landmarks that the run's back end made when it split a sighting off: their ids mean nothing to other runs."""
+    """Ids of landmarks that the run's back end made by splitting an observation off; they are local to the run."""
     return {int(e["new"]) for e in run.events if e.get("event") == "split"}
 
 
 def align_runs(
     runs: list[Run], names: list[str], by: By, tolerance: float
 ) -> tuple[list[int], dict[int, Alignment | None], dict[int, dict[int, int]]]:
-    """Find how runs of landmarks lie to each other, and which of their landmarks are the same.
+    """Align runs of landmarks, and match their landmarks.
 
-    The first run is the reference; of the others the one that shares most landmarks with those that are in joins next.
+    The first run is the reference; then the run that shares most landmarks with the joined ones joins next.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ def align_runs(
     Returns
     -------
     order : list of int
-        In which they join.
+        Order in which the runs join.
     alignments : dict of int to Alignment or None
-        Start of every run in the first one's frame; None for the first.
+        Initial pose of every run in the first one's frame; None for the first.
     renamed : dict of int to dict of int to int
-        Of every run, its landmarks' ids and those in the common graph.
+        For every run, its landmark ids and those in the common graph.
     """
     fresh = 1 + max((int(s.landmarks.ids.max(initial=-1)) for r in runs for s in r.submaps if s.landmarks), default=0)
     renamed: dict[int, dict[int, int]] = {}
@@ -115,7 +115,7 @@ def align_runs(
 
 
 def submap_of_session(submap: Submap, key: int, session: str, renamed: dict[int, int]) -> Submap:
-    """The submap with its key and landmark ids in the common graph; its streams are those of its own robot."""
+    """The submap with its key and landmark ids in the common graph; its streams get the name of the session."""
     s = replace(submap.of_session(session), key=key)
     if s.landmarks is None:
         return s

@@ -1,4 +1,4 @@
-"""Runs of dense submaps merged into one graph: tied by GPS, by places that both have seen, or by both."""
+"""Merge runs of dense submaps into one graph: by GPS, by common places, or by both."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ class PlacedSession:
     Parameters
     ----------
     session : DenseSession
-        Its submaps with the keys and the clock of the common graph.
+        Its submaps with the keys and the times of the common graph.
     attached : ConnectedSession or None
-        How it hangs on another session; None for the one whose first base is fixed.
+        Connection to another session; None for the one whose first base is fixed.
     trajectory : Trajectory
-        Its path in the common frame, on its own clock, with covariances.
+        Its path in the common frame, with its own times and covariances.
     T_world_base, covariance : (7,) or (3,), (d, d)
-        Its first base in the common frame; zeros for the one that is fixed.
+        Its first base in the common frame; zeros for the fixed one.
     """
 
     name: str
@@ -96,17 +96,17 @@ class MergedSubmaps:
 def merge_dense(runs: Sequence[Run], names: Sequence[str], *, by: By = "auto", solver: str = "batch") -> MergedSubmaps:
     """Merge runs of dense submaps into one graph, and solve it as one problem.
 
-    The first base of the first run is fixed. Every other run hangs on one that is in already: by GPS where both have
-    fixes in their graphs (their frames must be one), by places that look alike, register and agree, or by both. Chains,
-    re-entries and loops of every run are those of its own graph; of a run refined by its scans the refined submaps are
-    its chain, and it has no ties of its own.
+    The first base of the first run is fixed. Every other run is attached to one that is already in the graph: by GPS if
+    both have fixes in their graphs (in the same frame), by places that look alike, register and agree, or by both.
+    Chains, re-entries and loops of every run are those of its own graph. Of a run refined with its scans, the chain
+    consists of the refined submaps, and it has no loop closures of its own.
 
     Parameters
     ----------
     names : sequence of str
-        Of the sessions, each once.
+        Unique names of the sessions.
     by : {"auto", "places", "gps"}
-        ``auto``: GPS where both have it, and then places that it brings together; else places.
+        ``auto``: GPS if both have it, and then places that are near each other; otherwise places.
     """
     if by not in ("auto", "places", "gps"):
         raise ConfigError(f"by = {by!r}; known for dense submaps: auto, places, gps")
@@ -183,10 +183,10 @@ def _placed(
 
 
 def _metrics(placed: Sequence[PlacedSession], solution: Solution) -> pd.DataFrame:
-    """Figures of a merged graph.
+    """Metrics of a merged graph.
 
-    ``path_rmse_aligned`` is one alignment of all sessions together onto one truth, where the logs share its world: what
-    is askew between the sessions is not excused. ``<name>_path_rmse_alone`` is what that run had, aligned by itself.
+    ``path_rmse_aligned`` uses one common alignment of all sessions to one ground truth, if the logs share its world, so
+    it includes errors between the sessions. ``<name>_path_rmse_alone`` is that of the single run, aligned separately.
     """
     out = Metrics()
     out.add("sessions", len(placed))
@@ -211,7 +211,7 @@ def _metrics(placed: Sequence[PlacedSession], solution: Solution) -> pd.DataFram
 
 
 def _score(out: Metrics, placed: Sequence[PlacedSession]) -> None:
-    """Errors against truths that share a world."""
+    """Errors against ground truths in a common world."""
     bases = [s.run.report.get("T_world_base") for s in placed]
     shared = all("T_world_frame" in s.run.report.get("source_meta", {}) for s in placed)
     if not shared or any(b is None for b in bases) or any(s.run.truth_path is None for s in placed):

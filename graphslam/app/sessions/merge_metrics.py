@@ -1,4 +1,4 @@
-"""Figures of a merged map: how well the runs fit together, and, where the truth is known, how far off it is."""
+"""Metrics of a merged map: agreement of the runs and, with ground truth, errors."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def merge_metrics(
     *,
     identities: bool,
 ) -> pd.DataFrame:
-    """Score of a merged map; with the truth's identities also errors and NEES, all after *one* rigid alignment.
+    """Metrics of a merged map; with true identities also errors and NEES, all after *one* rigid alignment.
 
-    The alignment is that of the landmarks of the whole map to the truth; the paths are judged in it, too, so a robot
-    whose path is well shaped but lies askew in the common map is not excused. ``<name>_landmark_rmse_alone`` is what
-    that run had by itself, aligned by itself.
+    The alignment fits the landmarks of the whole map to the ground truth, and is used for the paths too, so it does not
+    hide a wrong alignment of one run in the common map. ``<name>_landmark_rmse_alone`` is that of the single run,
+    aligned separately.
     """
     out = Metrics()
     out.add("sessions", len(sessions))
@@ -68,7 +68,7 @@ def _score(
     true_ids: npt.NDArray[np.int64],
     true_points: Array,
 ) -> None:
-    """Errors against a truth in the frame of the first session's first base."""
+    """Errors against ground truth in the frame of the first session's first base."""
     rows = np.flatnonzero(keep)
     i, j = match_ids(solution.landmark_ids[rows], true_ids)
     if len(i) < 2:
@@ -87,7 +87,7 @@ def _score(
         truth, path = s.run.truth, s.run.truth_path
         if truth is None or path is None:
             continue
-        # the same surveyed landmarks, seen from two first bases, say how the two true frames lie
+        # landmarks known in the frames of two first bases give the transform between the two true frames
         try:
             frames = landmark_error(truth.landmark_ids, truth.landmarks, true_ids, true_points, gauge="rigid")
         except DataError:

@@ -1,4 +1,4 @@
-"""What a merge leaves on disk: one state, written and replaced as a whole."""
+"""Outputs of a merge: one state, written and replaced as a whole."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from graphslam.io.tum import write_tum
 from graphslam.plots.save import save_figure
 
 MOST_STATES = 6000
-"""Of a graph with more free scalars χ² is not told by class: that takes dense matrices where kernels are at work."""
+"""With more states, χ² by factor class is not computed: with robust kernels this needs dense matrices."""
 
 
 SAME_BYTES = (
     *("merge.json", "merged.npz", "landmarks.csv", "trajectory_*.tum", "events.jsonl", "metrics.json", "ledger.csv"),
     "figures/map.png",
 )
-"""Files of a merged folder that are the same bytes whenever the same runs are merged."""
+"""Files of a merged folder that have the same bytes whenever the same runs are merged."""
 
 
 @contextmanager
 def merged_folder(path: str | Path, *, anew: bool = False) -> Iterator[Path]:
-    """Make the folder of a merge, or take one that is empty; no other process writes into it until the block ends.
+    """Make the folder of a merge, or use an empty one; it is locked until the block ends.
 
     Parameters
     ----------
     anew : bool
-        One that holds a merge already is taken too.
+        A folder with an earlier merge is accepted, too.
     """
     folder = make_folder(path)
 
@@ -48,7 +48,7 @@ def merged_folder(path: str | Path, *, anew: bool = False) -> Iterator[Path]:
         if not (anew and (current_outputs(folder) / "merge.json").is_file()) and not is_empty(folder):
             raise RunFolderError(f"{folder}: not empty; choose another --out")
 
-    check()  # before a lock is put into somebody's folder
+    check()  # before a lock file is created in another person's folder
     with lock_folder(folder):
         check()
         yield folder
@@ -59,7 +59,7 @@ def write_merged(
 ) -> None:
     """Write a merge, by landmarks or of dense submaps, as a new state of its folder.
 
-    ``merged.npz``, ``landmarks.csv`` of one by landmarks, one ``trajectory_<session>.tum`` each, metrics, events, a
+    ``merged.npz``, ``landmarks.csv`` (of landmark maps), one ``trajectory_<session>.tum`` each, metrics, events, a
     picture, ``merge.json``; and the files of the surface of all sessions, if it was made.
     """
     with new_generation(path) as new:
@@ -116,7 +116,7 @@ def _write_dense(folder: FolderTransaction, merged: MergedSubmaps) -> None:
 
 
 def _finish(folder: FolderTransaction, merged: MergedMap | MergedSubmaps) -> None:
-    """What both kinds of merged maps have."""
+    """Write the files of both kinds of merged maps."""
     folder.write_lines("events.jsonl", merged.graph.events)
     folder.write_json("metrics.json", merged.metrics.to_dict("records"))
     save_figure(merged.plot(), folder.figures / "map.png")

@@ -1,4 +1,4 @@
-"""The surface of several sessions in one frame: each one's scans along its path in the merged graph."""
+"""The surface of several sessions in one frame, from the scans of each along its path in the merged graph."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def surface_of_sessions(
     Parameters
     ----------
     merged : MergedMap or MergedSubmaps
-        Of runs in space.
-    logs : sequence of card name, folder, or SensorLog; optional
-        Where the logs of the runs are by now, in the order of the sessions; default where they were.
+        Of 3-D runs.
+    logs : sequence of data set name, folder, or SensorLog; optional
+        Where the logs of the runs are now, in the order of the sessions; default: their original locations.
     """
     if not isinstance(merged, MergedSubmaps):
         raise ConfigError("a surface of runs that are merged by landmarks; wanted runs of dense submaps in space")

@@ -1,4 +1,4 @@
-"""Several runs in one map, merged by the landmarks they share: what a merge gives."""
+"""Result of a merge of several runs by common landmarks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Session:
     first_node : int
         Node of its first base.
     alignment : Alignment or None
-        Start value from the landmarks; None for the session whose first base is fixed.
+        Initial alignment by landmarks; None for the session whose first base is fixed.
     map : GlobalMap
         Its path in the common frame, with all landmarks of the merged map.
     """
@@ -53,7 +53,7 @@ class MergedMap:
     ----------
     landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
     landmark_sessions : (n,) int64
-        How many sessions saw it.
+        Number of sessions that observed it.
     solution : Solution
         One least-squares problem over all chains.
     """
@@ -73,7 +73,7 @@ class MergedMap:
         return metric_value(self.metrics, key)
 
     def plot(self, ax: Any = None) -> Any:
-        """Landmarks and the path of every session; the ellipses say how well the *shape* of the map is known."""
+        """Landmarks and the path of every session; the ellipses show the uncertainty of the *shape* of the map."""
         from graphslam.plots.merged import plot_merged
 
         columns = self.solution.covariance.layout.columns_of([f"l{i}" for i in self.landmark_ids.tolist()])
