@@ -1,8 +1,8 @@
 """Joint covariances of any variables of a graph, from its own Gauss-Newton matrix.
 
-GTSAM's joint marginals cost too much for dozens of keys at once. Up to about a thousand columns the inverse Cholesky
-factor is dense and cheap, and every block of the covariance is then one small product; above, sparse solves on the
-columns that are asked for (Algorithm 1 of Combined SLAM) never form the whole inverse.
+GTSAM's joint marginals are too slow for dozens of keys at once. With few columns the inverse Cholesky factor is dense,
+and every block of the covariance is then one small product; otherwise sparse solves on the requested columns
+(Algorithm 1 of Combined SLAM) never form the whole inverse.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graphslam.linear.symmetric_factor import SymmetricFactor
 
 
 class JointCovariance:
-    """Covariance ``A⁻¹`` of all variables, by blocks; those of poses in the right tangent (in space rotation first).
+    """Covariance ``A⁻¹`` of all variables, by blocks; of poses in the right tangent (3-D: rotation first).
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class JointCovariance:
         if sp.issparse(A):
             self._sparse = SymmetricFactor(A)  # type: ignore[arg-type]
             return
-        # Columns scaled to a unit diagonal: metres, radians and tight or loose factors then share one scale.
+        # Columns scaled to a unit diagonal: metres, radians and tight or loose factors then have one scale.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
         M = A * scale[:, None]
         M *= scale
@@ -74,7 +74,7 @@ class JointCovariance:
         return np.zeros((d, d)) if name == "x0" else self.joint([name])
 
     def pose_and_points(self, pose: npt.ArrayLike, first: npt.ArrayLike) -> tuple[Array, Array, Array]:
-        """Blocks of one pose and of each of many points, never of two points together.
+        """Blocks of one pose and of each of many points, without blocks between points.
 
         Parameters
         ----------
@@ -125,7 +125,7 @@ class JointCovariance:
         d = self.layout.pose_dof
         out = np.zeros((len(i), d, d))
         free = np.flatnonzero((i > 0) & (j > 0))
-        step = 60 // d  # pairs whose columns are solved together
+        step = 60 // d  # number of pairs whose columns are solved together
         for c in range(0, len(free), step):
             k = free[c : c + step]
             nodes, at = np.unique(np.concatenate([i[k], j[k]]), return_inverse=True)

@@ -1,4 +1,4 @@
-"""Which variables a graph does not constrain, and what would fix them."""
+"""Find variables that a graph does not constrain, and suggest remedies."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from graphslam.core.geometry import Array
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
 
-# Eigenvalues of the unit-diagonal matrix below this are rounding, not information: double precision keeps 1e-16 of the
-# largest, and a chain of a thousand honest submaps stays above 1e-9 (measured).
+# Eigenvalues of the unit-diagonal matrix below this are rounding errors: double precision keeps 1e-16 of the largest,
+# and a well-constrained chain of a thousand submaps stays above 1e-9 (measured).
 _RANK_TOLERANCE = 1e-13
-# Share of a null direction that a variable must carry to be named.
+# A variable is named if its share of a null direction is above this.
 _SHARE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What :func:`diagnose` found.
+    """Result of :func:`diagnose`.
 
     Parameters
     ----------
     unconstrained : tuple of str
         Names of variables that can move without changing the objective; empty if the graph determines everything.
     remedies : tuple of str
-        One sentence each: what would fix them.
+        One sentence per remedy.
     """
 
     unconstrained: tuple[str, ...] = ()
@@ -39,7 +39,7 @@ class Diagnosis:
 
     @property
     def ok(self) -> bool:
-        """Nothing is unconstrained."""
+        """Is every variable constrained?"""
         return not self.unconstrained
 
     def raise_if_bad(self) -> None:
@@ -53,13 +53,13 @@ class Diagnosis:
 
 
 def unconnected_variables(flat: FactorArrays) -> tuple[list[str], int]:
-    """Variables that no chain of factors ties to a held pose (cheap, no numbers), and in how many parts they are."""
+    """Variables that no chain of factors connects to a fixed pose (structure only), and the number of their parts."""
     lay, (factor, variable) = flat.layout, flat.links
     ground = lay.size
     prior = np.concatenate([np.zeros(0, dtype=bool), *(np.full(len(f), f.prior) for f in flat.batches)])
     at = np.where(variable < 0, ground, variable)
     at, factor, tied = at[variable != -2], factor[variable != -2], prior
-    # every factor is a node behind the columns; a prior ties its variable to a known value
+    # every factor is a node after the columns; a prior connects its variable to a known value
     rows = np.concatenate([at, np.full(int(tied.sum()), ground)])
     factors = ground + 1 + np.concatenate([factor, np.flatnonzero(tied)])
     size = ground + 1 + len(flat)
@@ -72,14 +72,14 @@ def unconnected_variables(flat: FactorArrays) -> tuple[list[str], int]:
 
 
 def diagnose(flat: FactorArrays, values: Values, *, waiting_fixes: int = 0) -> Diagnosis:
-    """Find unconstrained variables by structure and by number.
+    """Find unconstrained variables by structure, then numerically.
 
     Parameters
     ----------
     values : Values
-        Where to linearise.
+        Linearisation point.
     waiting_fixes : int
-        GPS fixes without a datum yet (for the remedy's wording).
+        GPS fixes without a datum yet (for the text of the remedy).
     """
     lay = flat.layout
     lost, _ = unconnected_variables(flat)

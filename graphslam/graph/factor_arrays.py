@@ -1,7 +1,7 @@
 """A graph's factors as flat arrays, and their Gauss-Newton system at given values.
 
-This is the vectorised path that batch solving, covariances, diagnosis and the linearisation-gap report use. It is
-independent of GTSAM, so that each can check the other.
+Batch solving, covariances, diagnosis and the linearisation gap use these vectorised arrays. They are independent of
+GTSAM, so that each can check the other.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class LinearSystem:
     g : (n,)
         ``Σ w Jᵀ Λ r``: half the gradient of the objective.
     chi2 : (f,)
-        ``rᵀ Λ r`` per factor (``2 ρ`` where a kernel acts), in the order of the records.
+        ``rᵀ Λ r`` per factor (``2 ρ`` with a robust kernel), in the order of the records.
     """
 
     A: Array | sp.csc_matrix
@@ -49,7 +49,7 @@ class LinearSystem:
 
 @dataclass(frozen=True)
 class FactorBlocks:
-    """Every factor by itself, linearised at one point, robust kernels left aside.
+    """Every factor separately, linearised at one point, without robust kernels.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class FactorBlocks:
     d2 : (f,)
         ``rᵀ Λ r``.
     weight : (f,)
-        Weight that the factor's kernel gives it in :attr:`LinearSystem.A`; 1 without one.
+        Weight of the factor by its kernel in :attr:`LinearSystem.A`; 1 without a kernel.
     """
 
     records: tuple[FactorRecord, ...]
@@ -73,14 +73,14 @@ class FactorBlocks:
 
 
 class FactorArrays:
-    """The least-squares problem: factor batches over the columns of a layout. Every solver takes it.
+    """The least-squares problem: factor batches over the columns of a layout. Input of every solver.
 
     Parameters
     ----------
     records : sequence of FactorRecord
-        One batch is made for each kind.
+        One batch is made per kind.
     batches : sequence of FactorBatch, optional
-        Factors that came as arrays; they count behind the records.
+        Factors given as arrays; they are numbered after the records.
     """
 
     def __init__(
@@ -115,40 +115,40 @@ class FactorArrays:
 
     @cached_property
     def _columns(self) -> Index:
-        """Column of every local scalar of the factors, one factor after the other; -1 where there is none."""
+        """Column of every local scalar of the factors, one factor after the other; -1 if it has none."""
         return np.concatenate([np.zeros(0, dtype=np.int64), *(f.columns for f in self.batches)])
 
     @property
     def has_kernels(self) -> bool:
-        """Does any factor carry a robust kernel?"""
+        """Does any factor have a robust kernel?"""
         return any(bool(np.any(f.code != 0)) for f in self.batches)
 
     def classes(self) -> Iterator[tuple[str, Index, Index]]:
-        """Classes of factors, the numbers of their factors in the order of the records, and the rows of each."""
+        """Name of each class of factors, indices of its factors in the order of the records, and their rows."""
         for f, first in zip(self.batches, self._first):
             for name, members in f.classes():
                 yield name, self._position[first + members], f.rows[members]
 
     @property
     def measurements(self) -> int:
-        """Scalars measured."""
+        """Number of measured scalars."""
         return int(sum(int(f.rows.sum()) for f in self.batches))
 
     @cached_property
     def links(self) -> tuple[Index, Index]:
-        """Factor and variable (its first column; -1 held, -2 left out) of every place of every factor."""
+        """Factor and variable (its first column; -1 fixed, -2 absent) for every place of every factor."""
         return np.repeat(np.arange(len(self._arity)), self._arity), self._variable
 
     @cached_property
     def _pattern(self) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """Where every entry of the factors' blocks lands in a CSC matrix (slot, row indices, indptr).
+        """Position of every entry of the factors' blocks in a CSC matrix (slot, row indices, indptr).
 
-        Worked out by pairs of variables; what belongs to no column lands in a slot behind the last.
+        Computed by pairs of variables; entries without a column get a slot after the last one.
         """
         n = self.layout.size
         of, places = self._pairs()
         var, width = self._variable[places], self._width[places]
-        # one block for every two variables that meet, ordered by the column, then by the row
+        # one block for every two variables with a common factor, ordered by the column, then by the row
         _, at, block = np.unique(var[1] * (n + 1) + var[0], return_index=True, return_inverse=True)
         rows, columns, height, span = var[0][at], var[1][at], width[0][at], width[1][at]
         head = np.flatnonzero(np.diff(columns, prepend=-1))  # first block of every column of blocks
@@ -176,7 +176,7 @@ class FactorArrays:
         return slot, indices, indptr
 
     def _pairs(self) -> tuple[Index, Index]:
-        """Factor ``(p,)`` and places ``(2, p)`` of every two free variables of every factor."""
+        """Factor ``(p,)`` and places ``(2, p)`` for every two free variables of every factor."""
         begin = block_offsets(self._arity)
         factors, places = [np.zeros(0, dtype=np.int64)], [np.zeros((2, 0), dtype=np.int64)]
         for a in np.unique(self._arity).tolist():
@@ -193,7 +193,7 @@ class FactorArrays:
         H = np.zeros(self._H_offset[-1] if hessian else 0)
         g = np.zeros(self._g_offset[-1] if hessian else 0)
         chi2 = np.zeros(len(self))
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows shows as inf or nan and is refused by name
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow gives inf or nan, which is refused by name
             for f, a, b in zip(self.batches, self._first, self._first[1:]):
                 chi2[a:b] = f.blocks(values, hessian, H, self._H_offset[a : b + 1], g, self._g_offset[a : b + 1])
         if weights is not None:
@@ -205,7 +205,7 @@ class FactorArrays:
         return H, g, chi2
 
     def squared(self, values: Values) -> Array:
-        """``rᵀ Λ r`` ``(f,)`` of every factor in the order of the records, kernels left aside."""
+        """``rᵀ Λ r`` ``(f,)`` of every factor in the order of the records, without robust kernels."""
         out = np.zeros(len(self))
         with np.errstate(over="ignore", invalid="ignore"):
             out[self._position] = np.concatenate([np.zeros(0), *(f.squared(values) for f in self.batches)])
@@ -225,7 +225,7 @@ class FactorArrays:
         hessian : bool
             False for the objective alone (``A`` and ``g`` are then empty).
         dense : bool, optional
-            Dense ``A``; by default where that is faster.
+            Dense ``A``; default: dense if that is faster.
         weights : (f,), optional
             Factor on the information of each factor, in the order of the records.
         """
@@ -248,7 +248,7 @@ class FactorArrays:
         return LinearSystem(sp.csc_matrix((data, indices, indptr), shape=(n, n)), gradient, out)
 
     def factor_blocks(self, values: Values) -> FactorBlocks:
-        """Every factor by itself at ``values``: what leverages and class-wise dof are made of."""
+        """Every factor separately at ``values``, for leverages and dof by class."""
         H, _, _ = self._blocks(values, True)
         d2 = self.squared(values)[self._position]
         weight = np.concatenate(
@@ -268,5 +268,5 @@ class FactorArrays:
         )
 
 
-# Above this many columns a sparse factorisation wins over a dense inverse factor (measured).
+# Above this number of columns a sparse factorisation is faster than a dense inverse factor (measured).
 DENSE_LIMIT = 1600

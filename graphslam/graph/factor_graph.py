@@ -1,18 +1,18 @@
-"""The graph: nodes, landmarks, datum, and its own record of every factor.
+"""The factor graph: functions that add submaps, sensors and other factors.
 
 Node ``x_k`` is the base of submap k, ``x_0`` is fixed at the origin, the last node is the end of the last submap. The
-graph knows no solver: it holds records, values and the ledger; solvers read them and write values back.
+graph has records, values and the ledger, but no solver; solvers read them and write values back.
 
 Examples
 --------
-The path of a pipeline, once per finished submap, and the end of a run::
+One call per finished submap, and the end of a run::
 
     graph = FactorGraph()
-    solver = make_solver("isam2", graph)                     # graphslam.solve.registry; "batch" has the same verbs
+    solver = make_solver("isam2", graph)                     # graphslam.solve.registry; "batch" has the same methods
     config = AssociationConfig(covariance_scale=5.0)         # graphslam.association.landmarks
-    graph.add_sensor(log["gps"], config=GpsConfig(robust=Robust("cauchy", 2.385)))  # fixes wait for their submap
+    graph.add_sensor(log["gps"], config=GpsConfig(robust=RobustKernel("cauchy", 2.385)))  # fixes wait for their submap
     for submap in submaps:
-        ids = associate(graph, submap, config)               # -1 = new
+        ids = associate_landmarks(graph, submap, config)     # -1 = new
         graph.add_submap(submap, landmark_ids=ids, covariance_scale=5.0)
         solver.update()
     graph.finish_sensors()
@@ -57,7 +57,7 @@ __all__ = ["FactorGraph", "SubmapNode"]
 
 
 class FactorGraph(FactorGraphState):
-    """A graph of submaps, landmarks and GPS, in the plane or in space: the functions that add factors.
+    """A 2-D or 3-D graph of submaps, landmarks and sensors: the functions that add factors.
 
     The first base is fixed at the origin. Queries of the graph are in
     :class:`~graphslam.graph.factor_graph_state.FactorGraphState`.
@@ -86,12 +86,12 @@ class FactorGraph(FactorGraphState):
         *,
         covariance_scale: float = 1.0,
     ) -> FactorGraph:
-        """A graph of submaps from anywhere, landmark submaps and dense ones in one chain, with all their matches.
+        """A graph of a chain of submaps, with landmarks or dense, and all their matches.
 
         Parameters
         ----------
         submaps : iterable of Submap
-            Each begins where the one before it ends. Landmarks are identified by the submaps' own ids, -1 = new.
+            Each starts at the end of the previous one. Landmarks are identified by the submaps' own ids, -1 = new.
         covariance_scale : float
             As for :meth:`add_submap`.
         """
@@ -126,31 +126,31 @@ class FactorGraph(FactorGraphState):
         Parameters
         ----------
         submap : Submap
-            Starts where the last one ended, or where :meth:`start_session` put its base. Without landmarks it becomes
+            Starts at the end of the last one, or at the base set by :meth:`start_session`. Without landmarks it becomes
             a between-factor, or a chain of them.
         landmark_ids : (n,) int, optional
-            Graph landmark of every entry, -1 = new; by default the submap's own ids. An id may be repeated.
+            Graph landmark of every entry, -1 = new; default: the submap's own ids. An id may be repeated.
         covariance_scale : float
             Factor on the covariance.
         spacing : float, optional
-            A submap without landmarks gets an inner node about every so many metres of its path
-            (:mod:`graphslam.graph.inner_nodes`), so that loops can bend it; the chain composes to its exit.
+            Approximate distance between inner nodes along the path of a submap without landmarks [m], so that loops can
+            deform it (:mod:`graphslam.graph.inner_nodes`); the chain composes to its end pose.
         level_sigma : float, optional
-            In space: base and exit of this submap were levelled, each by itself, with this standard deviation [rad].
-            An exit that says so as a *relative* roll and pitch says it wrongly: errors of relative poses add up along
-            a chain, those of levelling do not. So the exit gives up its relative roll and pitch, and the exit's node
-            is levelled instead (and the first base, once). That gravity was in the exit's covariance already;
-            it is no double count because the exit has given up what it knew of it (ledger kind ``levelled``).
+            3-D: σ of roll and pitch with which base and end of this submap were levelled independently [rad].
+            *Relative* roll and pitch in the end pose would be a wrong model: errors of relative poses accumulate along
+            a chain, levelling errors do not. So relative roll and pitch are removed from the last increment, and an
+            attitude factor on the end node is used instead (and one on the first base). Gravity is not used twice,
+            because it was removed from the end-pose covariance (ledger kind ``levelled``).
 
         Returns
         -------
         int
-            Factor id: the first one of a chain, whose factors come and go together.
+            Factor id: for a chain the first one, whose factors are removed together.
 
         Raises
         ------
         EvidenceReusedError
-            Its streams were already used over an overlapping interval (nothing is changed then).
+            Its streams were already used in an overlapping interval (the graph is unchanged then).
         CovarianceError, GeometryError, DataError
         """
         if submap.dim != self.dim:
@@ -190,7 +190,7 @@ class FactorGraph(FactorGraphState):
         node, fid = self.structure.count("x") - 1, self._next_factor
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         self.ledger.spend(fid, f"submap {submap.key}", submap.assisting_streams, submap.interval, "aid")
-        # from here on nothing fails
+        # from here on nothing can fail
         fresh = np.flatnonzero(ids < 0)
         top = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         ids[fresh] = top + np.arange(len(fresh))
@@ -219,9 +219,9 @@ class FactorGraph(FactorGraphState):
         return fid
 
     def _tell_lasting(self, lasting: SensorBiases, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
-        """What the last submap's own measurements say of the constant errors: it comes and goes with the submap.
+        """Add the information on constant errors from the last submap; it is removed together with the submap.
 
-        All submaps of the same streams share them; the first one brings what is known of them beforehand.
+        All submaps of the same streams share these errors; the first one adds their prior.
         """
         s = self.submaps[-1]
         if robot == self.structure.count("wheels"):
@@ -241,7 +241,7 @@ class FactorGraph(FactorGraphState):
         self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid), lasting=lasting, robot=robot)
 
     def as_known(self, submap: Submap) -> Submap:
-        """A submap as it is with what the graph knows of the constant errors of its robot, for gates and checks."""
+        """A submap corrected with the graph's estimate of its robot's constant errors, for gates and checks."""
         if submap.landmarks is None or submap.landmarks.lasting is None:
             return submap
         robot = self._robots.get(submap.uses)
@@ -252,7 +252,7 @@ class FactorGraph(FactorGraphState):
     def lasting_errors(self, robot: int = 0) -> tuple[Array, Array]:
         """Constant errors of a robot's wheels and sensor ``(4,)`` at the graph's values, and their covariance.
 
-        In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; their prior is in it.
+        In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; includes their prior.
         """
         if not 0 <= robot < self.values.count("wheels"):
             raise DataError(
@@ -266,7 +266,7 @@ class FactorGraph(FactorGraphState):
         cut = cut_submap(submap, spacing)
         stated = covariance_scale * cut.covariances
         if level_sigma is not None:
-            cut.covariances[-1] = without_tilt(cut.covariances[-1])  # the path inside stands by its own attitude
+            cut.covariances[-1] = without_tilt(cut.covariances[-1])  # the inner nodes keep their own attitude
         d, node, fid = self.structure.group.dof, self.structure.count("x") - 1, self._next_factor
         records = [
             BetweenRecord(
@@ -281,7 +281,7 @@ class FactorGraph(FactorGraphState):
         ]
         self.ledger.spend(fid, f"submap {submap.key}", submap.uses, submap.interval)
         self.ledger.spend(fid, f"submap {submap.key}", submap.assisting_streams, submap.interval, "aid")
-        # from here on nothing fails
+        # from here on nothing can fail
         self._append(submap, records, cut.times, cut.T_base_node, covariance_scale * cut.covariances, stated)
         if level_sigma is not None:
             self._level_ends(level_sigma)
@@ -293,22 +293,22 @@ class FactorGraph(FactorGraphState):
         return fid
 
     def _level_ends(self, sigma: float) -> None:
-        """The last submap's exit is level, and so is its base if nothing has said so yet."""
+        """Attitude factor on the end node of the last submap, and on its base if that has none."""
         s = self.submaps[-1]
         if not self._attitude_of.get(s.node):
             self._level(s.node, sigma, s.interval[0])
         fid = self._level(s.exit_node, sigma, s.interval[1])
-        self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # comes and goes with its submap
+        self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid))  # removed together with its submap
 
     def _level(self, node: int, sigma: float, time: float) -> int:
-        """A base that was levelled: a declared exception of the ledger, see :meth:`FactorGraph.add_submap`."""
+        """Attitude factor of a levelled base: declared in the ledger, see :meth:`FactorGraph.add_submap`."""
         used = EvidenceUse(["gravity"], (time, time), LEVELLED)
         return self.add_attitude(node, DOWN, sigma, evidence=used, group=LEVELLED)
 
     def _append(
         self, submap: Submap, records: Sequence[FactorRecord], times: Array, T_base_node: Array, *covariances: Array
     ) -> None:
-        """New nodes after the last one, the submap's entry, and its factors."""
+        """Add new nodes after the last one, the submap's entry, and its factors."""
         node, group, base = (
             self.structure.count("x") - 1,
             self.structure.group,
@@ -337,33 +337,33 @@ class FactorGraph(FactorGraphState):
             self.insert(record)
 
     def add_sensor(self, readings: Stream, *, stream: str | None = None, config: Any = None) -> list[int]:
-        """Give the graph readings of a sensor that no front end used; each finds its own submap.
+        """Add readings of a sensor that no front end used; each is assigned to its submap.
 
         Parameters
         ----------
         readings : Stream
             Of a kind in :func:`graphslam.graph.sensors.sensor_kinds`: :class:`~graphslam.core.records.Gps` fixes, an
-            :class:`~graphslam.core.imu.Imu`, ... What becomes of them the class of the kind says.
+            :class:`~graphslam.core.imu.Imu`, ... The class of the kind makes factors of them.
         stream : str, optional
-            Its name in the ledger; by default that of the kind.
+            Name in the ledger; default: that of the kind.
         config : optional
             Options of the kind.
 
         Returns
         -------
         list of int
-            Ids of the factors that they are or will be.
+            Ids of the factors; those of waiting readings are reserved.
 
         Raises
         ------
         EvidenceReusedError
-            A submap or another factor used them already. Nothing is changed then.
+            A submap or another factor used them already. The graph is unchanged then.
         DataError, GeometryError, ConfigError
         """
         return kind_of(readings).of(self).add(readings, stream=stream, config=config)
 
     def finish_sensors(self) -> None:
-        """No more submaps will come: readings that still wait are dropped, and counted."""
+        """No more submaps follow: drop and count readings that still wait for a submap."""
         for sensor in self.sensors.values():
             sensor.finish()
 
@@ -377,23 +377,23 @@ class FactorGraph(FactorGraphState):
         robust: RobustKernel = NO_KERNEL,
         group: str = "attitude",
     ) -> int:
-        """Where gravity points, seen from a node: roll and pitch, and nothing of the heading.
+        """Direction of gravity in the frame of a node: constrains roll and pitch, not heading.
 
-        The first one brings in the variable ``tilt``, where up is in the frame of the first base
-        (:mod:`graphslam.graph.factors.attitude`); what the first base itself saw of gravity goes to node 0.
+        The first call adds the variable ``tilt``, the up direction in the frame of the first base
+        (:mod:`graphslam.graph.factors.attitude`); gravity measured at the first base is added to node 0.
 
         Parameters
         ----------
         node : int
         direction : (3,)
-            Of gravity (down) in the node's frame; any length but zero. ``(0, 0, -1)`` if the node is level.
+            Of gravity (down) in the node's frame; any non-zero length. ``(0, 0, -1)`` if the node is level.
         sigma : float
             Standard deviation of roll and of pitch [rad].
         evidence : EvidenceUse or str
-            What it uses of the log, or a kind declared in the ledger.
+            Streams and interval used, or a kind declared in the ledger.
         robust : RobustKernel
         group : str
-            Class under which :meth:`objective` reports it.
+            Class of the factor in :meth:`objective`.
 
         Returns
         -------
@@ -403,7 +403,7 @@ class FactorGraph(FactorGraphState):
         Raises
         ------
         GeometryError
-            In the plane, or a direction without length.
+            A planar graph, or a direction of zero length.
         ConfigError, DataError, EvidenceReusedError
         """
         if self.dim != 3:
@@ -436,7 +436,7 @@ class FactorGraph(FactorGraphState):
         arm_j: ArrayLike | None = None,
         evidence: EvidenceUse | str = EXCLUSIVE,
     ) -> int:
-        """A distance between two nodes, antennas ``(dim,)`` in their frames [m]; ``evidence`` as in `add_between`."""
+        """A distance between antennas at two nodes, lever arms ``(dim,)`` [m]; ``evidence`` as in `add_between`."""
         last = self.structure.count("x") - 1
         if i == j or not (0 <= i <= last and 0 <= j <= last):
             raise DataError("a distance joins nodes that are not there", got=(i, j), wanted=f"two of x0 … x{last}")
@@ -450,20 +450,20 @@ class FactorGraph(FactorGraphState):
         return record.factor_id
 
     def start_session(self, T_world_base: ArrayLike) -> int:
-        """Begin another chain of submaps whose first base is free: another robot, or another day.
+        """Start another chain of submaps with a free first base: another robot, or another day.
 
-        Nothing but landmarks that both chains see ties it to what is there, so it needs at least two of them, or a
+        Only landmarks observed in both chains connect it to the graph, so it needs at least two of them, or a
         between-factor.
 
         Parameters
         ----------
         T_world_base : (3,) or (7,)
-            Where the chain is thought to begin; only a start value.
+            Initial value of the first base.
 
         Returns
         -------
         int
-            Node of the new first base; the next submap begins there.
+            Node of the new first base; the next submap starts there.
         """
         T = self._pose(T_world_base, "start of a session")
         if not self.submaps:
@@ -489,10 +489,10 @@ class FactorGraph(FactorGraphState):
         Parameters
         ----------
         evidence : EvidenceUse or str
-            What it uses of the log, or a kind declared in the ledger (``"shared-scan"``).
+            Streams and interval used, or a kind declared in the ledger (``"shared-scan"``).
         robust : RobustKernel
         group : str
-            Class under which :meth:`objective` reports it.
+            Class of the factor in :meth:`objective`.
         """
         last = self.structure.count("x") - 1
         if i == j or not (0 <= i <= last and 0 <= j <= last):
@@ -515,7 +515,7 @@ class FactorGraph(FactorGraphState):
         evidence: EvidenceUse | str = EXCLUSIVE,
         group: str = "between",
     ) -> range:
-        """Many relative poses in one call, without an object for each: a million of them in seconds.
+        """Many relative poses in one call, stored as arrays: a million of them in seconds.
 
         Parameters
         ----------
@@ -523,11 +523,11 @@ class FactorGraph(FactorGraphState):
             Nodes i and j.
         T_ij : (m, 3|7)
         covariance : (m, d, d) or (d, d)
-            In the right tangent; one for each, or one that all share.
+            In the right tangent; one per factor, or one for all.
         poses : (k, 3|7), optional
-            ``T_world_node`` of new nodes behind those that are there.
+            ``T_world_node`` of new nodes, numbered after the existing ones.
         evidence, group
-            Of all of them together (:meth:`add_between`).
+            For all of them together (:meth:`add_between`).
 
         Returns
         -------
@@ -537,7 +537,7 @@ class FactorGraph(FactorGraphState):
         Raises
         ------
         DataError, GeometryError, CovarianceError, ConfigError, EvidenceReusedError
-            Nothing is changed then.
+            The graph is unchanged then.
         """
         e = np.asarray(ends, dtype=np.int64).reshape(-1, 2)
         T = self._poses(T_ij, "relative pose")
@@ -555,7 +555,7 @@ class FactorGraph(FactorGraphState):
         W = covariance_whiteners(covariance, len(e), self.structure.group.dof, what="between-factor")
         first, label = self._next_factor, f"{len(e)} × {group}"
         kind = self.ledger.enter(first, label, evidence)
-        # from here on nothing fails
+        # from here on nothing can fail
         self.structure.append("x", new)
         self.records.add_block(BetweenBlock(first, e.copy(), T, W, group, np.ones(len(e), dtype=np.bool_)))
         self._next_factor += len(e)
@@ -564,7 +564,7 @@ class FactorGraph(FactorGraphState):
         return range(first, first + len(e))
 
     def _poses(self, T: ArrayLike, what: str) -> Array:
-        """Poses ``(m, 3|7)`` of the graph's dimension, their quaternions of length one."""
+        """Poses ``(m, 3|7)`` of the graph's dimension, with unit quaternions."""
         rows, group = np.array(T, dtype=np.float64), self.structure.group
         bad = [0] if rows.ndim != 2 or rows.shape[1] != group.size else np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if len(bad):
@@ -576,10 +576,9 @@ class FactorGraph(FactorGraphState):
     def add_match(self, submap_key: int, match: Match, *, robust: RobustKernel = NO_KERNEL) -> int:
         """A front end's re-entry into an earlier submap, as declared ``shared-scan`` evidence.
 
-        A scan matches what the map shows around it, and that was laid down by the nearest stretch of the target's
-        path. So where the target has inner nodes the match is attached to the one nearest to where the match puts this
-        submap's base: by the fixed pose of that node in the target, and with the covariance that the path has lost
-        between the node and its nearest pose added.
+        The matched scan overlaps the map that was built along the nearest part of the target's path. So if the target
+        has inner nodes, the match is attached to the nearest one, with the fixed pose of that node in the target; the
+        covariance of the path between the node and its nearest pose is added.
 
         Parameters
         ----------
@@ -601,7 +600,7 @@ class FactorGraph(FactorGraphState):
         return fid
 
     def _into(self, s: SubmapNode, T_base_here: Array, P: Array) -> tuple[int, Array, Array]:
-        """A pose seen from a submap's base, seen from the nearest of its nodes: (node, pose, covariance)."""
+        """Re-express a pose in a submap's base frame in its nearest node: (node, pose, covariance)."""
         path, group = s.trajectory, self.structure.group
         if not s.inner or path is None:
             return s.node, T_base_here, P
@@ -613,14 +612,14 @@ class FactorGraph(FactorGraphState):
         k = int(at[0])
         T = group.between(s.T_base_node[k], T_base_here)
         T_node_body, E = s.local(inside, at)
-        if E is None or k == 0:  # the base itself: what the match states is of it
+        if E is None or k == 0:  # the base itself: the match is already relative to it
             return s.nodes[k], T, P
-        A = group.adjoint(group.between(T, T_node_body[0]))  # an error of the body, seen where the match ends
+        A = group.adjoint(group.between(T, T_node_body[0]))  # maps an error of the body to the end of the match
         extra = A @ E[0] @ A.T
         return s.nodes[k], T, P + 0.5 * (extra + extra.T)
 
     def _pose(self, T: ArrayLike, what: str) -> Array:
-        """A pose of the graph's dimension, its quaternion of length one."""
+        """A pose of the graph's dimension, with a unit quaternion."""
         pose, group = np.asarray(T, dtype=np.float64), self.structure.group
         if pose.shape != (group.size,) or not np.all(np.isfinite(pose)):
             wanted = {3: "three", 7: "seven"}[group.size]
@@ -631,5 +630,5 @@ class FactorGraph(FactorGraphState):
 
 
 def _some(keys: Sequence[int]) -> str:
-    """A few keys and how many there are."""
+    """A few of the keys, and their number."""
     return ", ".join(map(str, keys)) if len(keys) <= 4 else f"{keys[0]}, {keys[1]} … {keys[-1]} ({len(keys)})"

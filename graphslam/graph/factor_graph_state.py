@@ -1,4 +1,4 @@
-"""What a graph holds: factor records, values, landmark table, ledger, events; and every question one can ask of it."""
+"""State of a graph: factor records, values, landmark table, ledger, events; with all queries."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from graphslam.graph.submap_node import SubmapNode
 from graphslam.graph.variables import Values, VariableLayout
 
 LANDMARK_SUBMAPS = (SubmapRecord, SpaceSubmapRecord)
-"""Records of submaps with landmarks, in the plane and in space."""
+"""Records of submaps with landmarks, 2-D and 3-D."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BetweenBlock:
-    """Relative poses that entered together, as arrays, under consecutive numbers.
+    """Relative poses that were added together, as arrays, with consecutive ids.
 
     Parameters
     ----------
     ends, T_ij, whiteners : (m, 2), (m, 3|7), (m, d, d)
     kept : (m,) bool
-        Those that were not removed since.
+        False for removed ones.
     """
 
     first_id: int
@@ -49,7 +49,7 @@ class BetweenBlock:
     kept: npt.NDArray[np.bool_]
 
     def batch(self, layout: VariableLayout) -> BetweenBatch:
-        """What is kept, as a batch."""
+        """The remaining factors as a batch."""
         k = np.flatnonzero(self.kept)
         rows = slice(None) if len(k) == len(self.kept) else k
         return BetweenBatch.of_arrays(
@@ -57,17 +57,16 @@ class BetweenBlock:
         )
 
     def record(self, factor_id: int) -> BetweenRecord:
-        """One of them."""
+        """Record of one factor."""
         k = factor_id - self.first_id
         i, j = self.ends[k].tolist()
         return BetweenRecord(factor_id, i, j, self.T_ij[k], self.whiteners[k], group=self.group)
 
 
 class FactorTable(MutableMapping[int, "FactorRecord"]):
-    """Factors by number, with a journal of every change, so that a solver sees what is new without looking at the rest.
+    """Factors by id, with a journal of all changes, so that a solver finds new factors without a search.
 
-    Factors that came as arrays stay arrays; a record of one is made when somebody asks for it. A record of a kind that
-    nobody registered is refused here.
+    Factors added as arrays stay arrays; a record of one is made on request. Records of unregistered kinds are refused.
     """
 
     def __init__(self) -> None:
@@ -76,19 +75,19 @@ class FactorTable(MutableMapping[int, "FactorRecord"]):
         self.journal: list[int] = []
 
     def block_of(self, factor_id: int) -> BetweenBlock | None:
-        """The arrays that hold a factor."""
+        """The array block of a factor."""
         for b in self.blocks:
             if 0 <= factor_id - b.first_id < len(b.kept) and b.kept[factor_id - b.first_id]:
                 return b
         return None
 
     def add_block(self, block: BetweenBlock) -> None:
-        """Take factors as arrays."""
+        """Add factors as arrays."""
         self.blocks.append(block)
         self.journal.extend(range(block.first_id, block.first_id + len(block.kept)))
 
     def flat(self, layout: VariableLayout) -> FactorArrays:
-        """All of them as a problem."""
+        """All factors as a least-squares problem."""
         return FactorArrays(list(self.single.values()), layout, [b.batch(layout) for b in self.blocks])
 
     def __getitem__(self, factor_id: int) -> FactorRecord:
@@ -125,27 +124,27 @@ class FactorTable(MutableMapping[int, "FactorRecord"]):
         return len(self.single) + sum(int(b.kept.sum()) for b in self.blocks)
 
     def values(self) -> ValuesView[FactorRecord]:
-        """Records; those of arrays are made on the way."""
+        """Records; those of arrays are created during the iteration."""
         return super().values() if self.blocks else self.single.values()
 
     def items(self) -> ItemsView[int, FactorRecord]:
-        """Numbers and records; those of arrays are made on the way."""
+        """Ids and records; those of arrays are created during the iteration."""
         return super().items() if self.blocks else self.single.items()
 
 
 class ValueSource(Protocol):
-    """An incremental solver that holds newer values than the graph."""
+    """An incremental solver whose values are newer than the graph's."""
 
     def holds(self, name: str) -> bool:
-        """Does it hold that variable?"""
+        """Does it have this variable?"""
         ...
 
     def value(self, name: str) -> Array:
-        """Its present value."""
+        """Its current value."""
         ...
 
     def pull(self, structure: Values) -> Values:
-        """All values; those that it does not hold as they are in ``structure``."""
+        """All values; variables that it does not have are copied from ``structure``."""
         ...
 
 
@@ -160,14 +159,14 @@ class FactorGraphState:
     Attributes
     ----------
     structure : Values
-        Variables with values that may be old: for what depends on which variables there are, and not on where.
+        Variables with possibly outdated values, for uses that need only the set of variables.
     records : dict of int to FactorRecord
         Every factor by id.
     ledger : Ledger
     events : list of dict
-        What happened, in order; JSON-serialisable.
+        Changes and decisions in order; JSON-serialisable.
     revision : int
-        Grows with every change of factors or variables.
+        Increases with every change of factors or variables.
     """
 
     def __init__(self, dim: int = 2) -> None:
@@ -182,15 +181,15 @@ class FactorGraphState:
         self.events: list[dict[str, Any]] = []
         self.revision = 0
         self.submaps: list[SubmapNode] = []
-        self._place: dict[int, int] = {}  # submap key -> place in submaps
+        self._place: dict[int, int] = {}  # submap key -> index in submaps
         self.sensors: dict[str, SensorFactors] = {}
-        """By the name of their kind, those that were ever asked for."""
+        """By the name of their kind; created at first use."""
         self.gps_origin: Array | None = None
         self._row: dict[int, int] = {}
         self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
-        self._attitude_of: dict[int, int] = {}  # node -> attitudes that it has
-        self._robots: dict[frozenset[str], int] = {}  # constant errors that submaps of the same streams share
-        self._retired: set[int] = set()  # ids merged away or removed: never used again
+        self._attitude_of: dict[int, int] = {}  # node -> number of its attitude factors
+        self._robots: dict[frozenset[str], int] = {}  # streams -> robot, whose submaps share constant errors
+        self._retired: set[int] = set()  # ids of merged or removed landmarks, never reused
         self._next_factor = 0
         self._next_landmark = 0
         self._flat: tuple[int, FactorArrays] | None = None
@@ -198,7 +197,7 @@ class FactorGraphState:
 
     @classmethod
     def with_values(cls, values: Values) -> Self:
-        """A graph without factors that has variables already: factors can be inserted one by one."""
+        """A graph with variables and without factors: factors can be inserted one by one."""
         new = cls(values.dim)
         new.structure, new.origin = values, values.poses[0].copy()
         new._row = {int(i): k for k, i in enumerate(values.landmark_ids)}
@@ -209,7 +208,7 @@ class FactorGraphState:
 
     @property
     def values(self) -> Values:
-        """Best known values. Where an incremental solver knows better it is asked for all of them now."""
+        """Current values; if an incremental solver has newer ones, all are read from it first."""
         if self._source is not None:
             source, self._source = self._source, None
             self.structure = source.pull(self.structure)
@@ -220,11 +219,11 @@ class FactorGraphState:
         self._source, self.structure = None, values
 
     def expect(self, source: ValueSource | None) -> None:
-        """From now on ``source`` knows the values; it is asked when they are needed (None: nobody does)."""
+        """Set the source of newer values, which is read at the next use (None: no source)."""
         self._source = source
 
     def pose(self, node: int) -> Array:
-        """Best known pose ``(3|7,)`` of one node."""
+        """Current pose ``(3|7,)`` of one node."""
         name = f"x{node}"
         if self._source is not None and node and self._source.holds(name):
             return self._source.value(name)
@@ -238,10 +237,10 @@ class FactorGraphState:
     # ---------------------------------------------------------------- changing
 
     def remove(self, factor_id: int, *, reason: str = "asked for") -> None:
-        """Take a factor out and give its evidence back; variables that nothing holds any more go with it.
+        """Remove a factor and release its evidence; variables without a factor are removed too.
 
-        Removing a submap also removes what hangs on its path, GPS fixes, readings and what IMUs said inside it, and, if
-        it is the last one, its nodes. The factors of a chain are one submap: with one of them all go.
+        Removing a submap also removes the GPS, IMU and other sensor factors attached to its path and, if it is the last
+        submap, its nodes. The factors of a chain are removed together.
         """
         if factor_id not in self.records:
             raise DataError(f"factor {factor_id} is not in the graph", wanted="the id of a factor")
@@ -265,12 +264,12 @@ class FactorGraphState:
             self.revision += 1
 
     def take_out(self, factor_id: int, reason: str) -> None:
-        """Take out one factor, its evidence, and landmarks that nothing sees any more."""
+        """Remove one factor, its evidence, and landmarks that have no factor left."""
         block = self.records.block_of(factor_id)
         record = self.records.pop(factor_id)
         if isinstance(record, AttitudeRecord):
             self._attitude_of[record.node] -= 1
-        if block is None or not block.kept.any():  # factors that came together spent their evidence together
+        if block is None or not block.kept.any():  # the factors of a block have one ledger entry
             self.ledger.release(factor_id if block is None else block.first_id)
         self.revision += 1
         if isinstance(record, LANDMARK_SUBMAPS):
@@ -280,7 +279,7 @@ class FactorGraphState:
         self._event("removed", factor_id=factor_id, factor=record.label(), reason=reason)
 
     def merge_landmarks(self, keep: int, drop: int) -> None:
-        """Two landmarks turned out to be one: factors on ``drop`` become factors on ``keep``."""
+        """Merge two landmarks: factors on ``drop`` become factors on ``keep``."""
         if keep == drop or keep not in self._row or drop not in self._row:
             raise DataError("landmarks to merge are not two of the graph", got=(keep, drop), wanted="two known ids")
         distance = float(np.linalg.norm(self.landmark(keep) - self.landmark(drop)))
@@ -288,7 +287,7 @@ class FactorGraphState:
             record = self.records[fid]
             assert isinstance(record, LANDMARK_SUBMAPS)
             ids = np.where(record.landmark_ids == drop, keep, record.landmark_ids)
-            self.records[fid] = replace(record, landmark_ids=ids)  # a new object: solvers see that it changed
+            self.records[fid] = replace(record, landmark_ids=ids)  # a new object, so that solvers detect the change
             self._seen_in[keep].add(fid)
             self._path_follows(record.submap_key, ids)
         for fid, r in list(self.records.single.items()) if "control" in self.sensors else ():
@@ -303,12 +302,12 @@ class FactorGraphState:
         self._event("merged", keep=keep, drop=drop, distance=distance)
 
     def split_landmark(self, factor_id: int, entry: int) -> int:
-        """One sighting was of another landmark: entry ``entry`` of a submap factor gets a new landmark of its own.
+        """Undo a false association: entry ``entry`` of a submap factor gets a new landmark.
 
         Returns
         -------
         int
-            Id of the new landmark, which stands where the submap saw it.
+            Id of the new landmark, initialised at the observed position.
         """
         record = self.records.get(factor_id)
         if not isinstance(record, LANDMARK_SUBMAPS) or not 0 <= entry < len(record.landmark_ids):
@@ -325,13 +324,13 @@ class FactorGraphState:
         self.start_landmarks(ids[entry : entry + 1], seen[None])
         if old not in ids:
             self._seen_in[old].discard(factor_id)
-        self.insert(replace(record, landmark_ids=ids))  # a new object: solvers see that it changed
+        self.insert(replace(record, landmark_ids=ids))  # a new object, so that solvers detect the change
         self._path_follows(record.submap_key, ids)
         self._event("split", factor_id=factor_id, submap=record.submap_key, landmark=old, new=new)
         return new
 
     def _path_follows(self, submap_key: int, ids: npt.NDArray[np.int64]) -> None:
-        """The points of a submap's path hang on the landmarks that the submap sees now."""
+        """Update the landmark ids of the path factor of a submap."""
         inner = self.submap(submap_key).inner_points
         if inner is not None and inner.factor_id is not None:
             path = self.records[inner.factor_id]
@@ -339,7 +338,7 @@ class FactorGraphState:
             self.records[inner.factor_id] = replace(path, landmark_ids=ids)
 
     def set_values(self, values: Values) -> None:
-        """Take a solver's values (same variables)."""
+        """Use a solver's values (same variables)."""
         if not values.is_finite():
             raise DataError("values of the graph are not finite", wanted="finite numbers")
         if values.layout() != self.structure.layout():
@@ -347,7 +346,7 @@ class FactorGraphState:
         self.values = values
 
     def log_event(self, kind: str, **facts: Any) -> None:
-        """Enter something that was decided about this graph in :attr:`events`; facts must be JSON-serialisable."""
+        """Add a decision on this graph to :attr:`events`; facts must be JSON-serialisable."""
         self._event(kind, **facts)
 
     # ---------------------------------------------------------------- asking
@@ -357,7 +356,7 @@ class FactorGraphState:
         return self.submap(submap_key).node
 
     def submap(self, submap_key: int) -> SubmapNode:
-        """A submap's nodes, by its key."""
+        """Nodes of a submap, by its key."""
         if submap_key in self._place:
             return self.submaps[self._place[submap_key]]
         raise DataError(f"submap {submap_key} is not in the graph", wanted="the key of a submap")
@@ -367,22 +366,22 @@ class FactorGraphState:
         return self.values.landmarks[self._row[landmark_id]]
 
     def sightings(self, landmark_id: int) -> frozenset[int]:
-        """Factors that see a landmark."""
+        """Ids of the factors that observe a landmark."""
         return frozenset(self._seen_in[landmark_id])
 
     def landmark_ids_of(self, submap_key: int) -> npt.NDArray[np.int64]:
-        """Graph landmark of every entry of a submap, as it stands now."""
+        """Current graph landmark of every entry of a submap."""
         record = self.records.get(self.submap(submap_key).factor_id) if submap_key in self._place else None
         return record.landmark_ids.copy() if isinstance(record, LANDMARK_SUBMAPS) else np.zeros(0, dtype=np.int64)
 
     def flat(self) -> FactorArrays:
-        """Flat arrays of the factors, made once per revision."""
+        """Flat arrays of the factors, computed once per revision."""
         if self._flat is None or self._flat[0] != self.revision:
             self._flat = (self.revision, self.records.flat(self.structure.layout()))
         return self._flat[1]
 
     def covariance(self) -> JointCovariance:
-        """Joint covariance at the current values, made once per revision and values."""
+        """Joint covariance at the current values, computed once per revision and values."""
         c = self._covariance
         if c is None or c[0] != self.revision or c[1] is not self.values:
             system = self.flat().evaluate(self.values)
@@ -395,12 +394,12 @@ class FactorGraphState:
         return c[2]
 
     def objective(self, values: Values | None = None) -> GraphScore:
-        """χ² and dof per class of factor at ``values`` (default: the graph's)."""
+        """χ² and dof per factor class at ``values`` (default: the graph's)."""
         flat = self.flat()
         return score_graph(flat, flat.evaluate(values or self.values, hessian=False).chi2)
 
     def diagnose(self, values: Values | None = None) -> Diagnosis:
-        """Unconstrained variables and what would fix them; ``.raise_if_bad()`` makes it an error."""
+        """Unconstrained variables and remedies; ``.raise_if_bad()`` raises an error."""
         waiting = sum(sensor.waiting_readings() for sensor in self.sensors.values())
         return diagnose(self.flat(), values or self.values, waiting_fixes=waiting)
 
@@ -411,7 +410,7 @@ class FactorGraphState:
     # ---------------------------------------------------------------- inside
 
     def insert(self, record: FactorRecord) -> None:
-        """Take a factor whose evidence is in the ledger already; one with the same id is replaced."""
+        """Add a factor whose evidence is already in the ledger; one with the same id is replaced."""
         self.records[record.factor_id] = record
         self._next_factor = max(self._next_factor, record.factor_id + 1)
         self.revision += 1
@@ -422,7 +421,7 @@ class FactorGraphState:
                 self._seen_in[i].add(record.factor_id)
 
     def next_factor(self) -> int:
-        """A factor id that nobody has."""
+        """An unused factor id."""
         self._next_factor += 1
         return self._next_factor - 1
 
@@ -430,12 +429,12 @@ class FactorGraphState:
         self.events.append({"event": kind, **facts})
 
     def append_node(self, pose: Array) -> int:
-        """A node ``(3|7,)`` that no factor holds yet; returns its number."""
+        """Append a node ``(3|7,)`` without factors; returns its number."""
         self.revision += 1
         return self.structure.append("x", pose)
 
     def start_landmarks(self, ids: npt.NDArray[np.int64], world: Array) -> None:
-        """Landmarks ``(k,)`` that are new, at ``(k, dim)``; those that the graph has stay where they are."""
+        """Add new landmarks ``(k,)`` at ``(k, dim)``; existing ones are unchanged."""
         new: dict[int, Array] = {}
         for i, p in zip(ids.tolist(), world):
             if i not in self._row and i not in new:
@@ -448,7 +447,7 @@ class FactorGraphState:
         )
 
     def drop_landmarks(self, ids: Sequence[int]) -> None:
-        """Remove landmarks that no factor holds; their ids are not used again."""
+        """Remove landmarks without factors; their ids are not used again."""
         if not ids:
             return
         keep = ~np.isin(self.values.landmark_ids, np.asarray(ids))
@@ -460,10 +459,10 @@ class FactorGraphState:
             self._retired.add(i)
 
     def start_tilt(self) -> None:
-        """Bring in the variable ``tilt``; factors that took the z axis of the first base for up are turned by it."""
+        """Add the variable ``tilt``; factors that assumed the z axis of the first base as up are then rotated by it."""
         if not self.structure.count("tilt"):
             self.structure.append("tilt", np.zeros(2))
             for fid, r in self.records.items():
                 if getattr(r, "tilt", None) is False and self.dim == 3:
-                    self.records[fid] = replace(cast(Any, r), tilt=True)  # a new object: solvers see that it changed
+                    self.records[fid] = replace(cast(Any, r), tilt=True)  # a new object, so that solvers detect it
             self.revision += 1

@@ -1,4 +1,4 @@
-"""Values of a graph ↔ GTSAM's values."""
+"""Conversion between values of a graph and GTSAM's values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphslam.graph.variables import KINDS, Values, gtsam_key, key_name, split_
 
 
 def value_of(values: Values, name: str, row_of: Mapping[int, int]) -> Array:
-    """Value ``(size,)`` of one variable; ``row_of`` says where landmarks stand."""
+    """Value ``(size,)`` of one variable; ``row_of``: row of each landmark id."""
     kind, k = split_name(name)
     return values[kind.word][row_of[k] if kind.word == "l" else k]
 
@@ -27,7 +27,7 @@ def insert_values(out: gtsam.Values, names: Iterable[str], values: Values, row_o
 
 
 def from_gtsam(estimate: gtsam.Values, like: Values, row_of: Mapping[int, int] | None = None) -> Values:
-    """GTSAM values → ours; variables that GTSAM does not hold keep their value in ``like``."""
+    """GTSAM values → ours; variables that are not in GTSAM keep their value in ``like``."""
     out = like.copy()
     row_of = like.layout().row_of if row_of is None else row_of
     keys = np.array(list(estimate.keys()), dtype=np.uint64)
@@ -36,7 +36,7 @@ def from_gtsam(estimate: gtsam.Values, like: Values, row_of: Mapping[int, int] |
     nodes = letter == ord("x")
     _poses_from_gtsam(estimate, out, letter, index)
     done = nodes
-    if like.dim == 2:  # bulk extraction comes in the order of the keys; in space it leaves rows of other sizes unset
+    if like.dim == 2:  # bulk extraction is in the order of the keys; in 3-D it leaves rows of other sizes unset
         points = np.isin(letter, [ord(k.letter) for k in KINDS.values() if k.dof(2) == 2])
         p = np.asarray(gtsam.utilities.extractPoint2(estimate)).reshape(-1, 2)
         if len(p) == points.sum():

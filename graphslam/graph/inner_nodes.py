@@ -1,17 +1,17 @@
-"""A dense submap cut into a chain of nodes about every so many metres, by its contract alone.
+"""Cut a dense submap into a chain of nodes with an approximately constant spacing.
 
-The submap says where its body was, ``T_base_body(t)`` with marginal covariances ``P_k``, and where it ends, with the
-covariance ``P`` of the exit. Its chain are nodes at some of those poses, with independent increments between them::
+Input are its path ``T_base_body(t)`` with marginal covariances ``P_k``, and its end pose with covariance ``P``. The
+chain has nodes at some of the path's poses, with independent increments between them::
 
     P_{k+1} = Ad(T_{k,k+1}⁻¹) P_k Ad(T_{k,k+1}⁻¹)ᵀ + Q_k          (right tangents)
 
-which says ``Q_k``. Marginals of a path need not be those of a chain of independent steps: roll and pitch of a levelled
-path do not grow at all, and a filter's spread may shrink. So the increments are carried to the exit and measured in
-units of its covariance, ``Y_k = L⁻¹ A_k Q_k A_kᵀ L⁻ᵀ`` with ``P = L Lᵀ``; there they are projected to be positive
-definite with a floor of a small share of the exit's covariance, and then corrected so that their sum is the identity,
-``Y_k ← S^{-1/2} Y_k S^{-1/2}``, ``S = Σ Y_k``: the least correction that does so (the symmetric one is the optimal
-transport between the two Gaussians). To first order the composition of the increments then has exactly the covariance
-of the exit: cutting a submap neither makes information nor loses any.
+which is solved for ``Q_k``. Marginals of a path need not be those of a chain of independent steps: roll and pitch of a
+levelled path do not grow, and the spread of a filter may shrink. So the increments are transformed to the end and
+expressed in units of its covariance, ``Y_k = L⁻¹ A_k Q_k A_kᵀ L⁻ᵀ`` with ``P = L Lᵀ``. There they are projected to
+positive definite with a floor (a small share of the end-pose covariance), and corrected so that their sum is the
+identity, ``Y_k ← S^{-1/2} Y_k S^{-1/2}``, ``S = Σ Y_k``: the smallest such correction (the symmetric one is the optimal
+transport between the two Gaussians). To first order the composition of the increments then has exactly the end-pose
+covariance, so cutting a submap neither adds nor loses information.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 
 FLOOR = 0.02
-"""Least share of the exit's covariance that the increments have together, each by its share of the way."""
+"""Minimum share of the end-pose covariance for all increments together, divided by their path lengths."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubmapChain:
-    """A submap as a chain.
+    """A submap as a chain of nodes.
 
     Parameters
     ----------
     times : (k + 2,)
-        Base, inner nodes, exit [s].
+        Base, inner nodes, end [s].
     T_base_node : (k + 2, 3|7)
     increments : (k + 1, 3|7)
         ``T_{node, next node}``.
@@ -52,7 +52,7 @@ class SubmapChain:
 
 
 def inner_rows(path: Trajectory, spacing: float) -> npt.NDArray[np.intp]:
-    """Rows of a path about every ``spacing`` metres of the way, without its ends."""
+    """Rows of a path about every ``spacing`` metres of path length, without its ends."""
     if len(path) < 3:
         return np.zeros(0, dtype=np.intp)
     way = arc_length(path.positions)
@@ -65,16 +65,16 @@ def inner_rows(path: Trajectory, spacing: float) -> npt.NDArray[np.intp]:
 
 
 def cut_submap(submap: Submap, spacing: float | None) -> SubmapChain:
-    """The chain of a dense submap; of one increment without a path, without ``spacing``, or where it is short.
+    """The chain of a dense submap; one increment if it has no path, is short, or without ``spacing``.
 
     Parameters
     ----------
     spacing : float or None
-        Metres of the way between nodes; None: no inner nodes.
+        Path length between nodes [m]; None: no inner nodes.
     """
     group, path = group_of(submap.exit_pose), submap.trajectory
     rows = inner_rows(path, spacing) if spacing is not None and path is not None else np.zeros(0, dtype=np.intp)
-    if path is not None and len(rows):  # a path may begin or end a little beyond its submap
+    if path is not None and len(rows):  # a path may extend slightly beyond its submap
         inside = (path.times[rows] > submap.interval[0]) & (path.times[rows] < submap.interval[1])
         rows = rows[inside]
     inner = path.poses[rows] if path is not None and len(rows) else np.zeros((0, group.size))
@@ -96,7 +96,7 @@ def cut_submap(submap: Submap, spacing: float | None) -> SubmapChain:
 
 
 def reconcile_increments(group: Group, T_base_node: Array, Q: Array, P_exit: Array, share: Array) -> Array:
-    """Increment covariances ``(k, d, d)`` that compose to ``P_exit``, from what the marginals leave.
+    """Increment covariances ``(k, d, d)`` that compose to ``P_exit``, from the differences of the marginals.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def reconcile_increments(group: Group, T_base_node: Array, Q: Array, P_exit: Arr
         Symmetric, not necessarily positive; right tangents at nodes 1 … k.
     P_exit : (d, d)
     share : (k,)
-        Of the way, for the floor; sums to one.
+        Share of the path length, for the floor; sums to one.
     """
     L = np.linalg.cholesky(P_exit)
     to_exit = group.adjoint(group.between(T_base_node[-1], T_base_node[1:]))  # ξ_exit = Ad(T_exit⁻¹ T_node) ξ_node

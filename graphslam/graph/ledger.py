@@ -1,9 +1,9 @@
-"""The ledger: which measurement went into which factor. Nothing is spent twice.
+"""The evidence ledger: which measurements each factor uses. No measurement is used twice.
 
-Every factor names the stream(s) and the interval it spends. Two entries of one stream whose intervals overlap are a
-double count and are refused, unless one of them is of a *declared* kind: a deliberate exception that says why, such
-as a laser scan that made a submap and also matches it to another. Intervals are half open, ``[t_start, t_end)``; an
-instant (``t_start == t_end``) belongs to the interval that starts there.
+Every factor has an entry for each stream and interval that it uses. Two entries of one stream with overlapping
+intervals would be double counting and are refused, unless one of them is of a *declared* kind: an exception with a
+reason, such as a laser scan that is part of a submap and also matches it to another one. Intervals are half open,
+``[t_start, t_end)``; an instant (``t_start == t_end``) belongs to the interval that starts there.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ DECLARED = {
 
 @dataclass(frozen=True, slots=True)
 class EvidenceUse:
-    """What a factor uses of the log.
+    """Measurements used by a factor.
 
     Parameters
     ----------
     streams : sequence of str
         Names of streams.
     interval : (float, float)
-        Of time, ``[t_start, t_end)`` [s].
+        Time interval ``[t_start, t_end)`` [s].
     kind : str
-        ``"measurement"``, which nothing else may use, or a kind declared in the ledger (``"shared-scan"``).
+        ``"measurement"``: no other factor may use it; or a kind declared in the ledger (``"shared-scan"``).
 
     Examples
     --------
@@ -58,7 +58,7 @@ class EvidenceUse:
 
 @dataclass(frozen=True, slots=True, order=True)
 class LedgerEntry:
-    """One spending: ``stream`` over ``[t_start, t_end)`` by a factor."""
+    """Use of ``stream`` over ``[t_start, t_end)`` by a factor."""
 
     t_start: float
     t_end: float
@@ -70,7 +70,7 @@ class LedgerEntry:
 
 
 class Ledger:
-    """Spent evidence of one graph.
+    """Measurements used by the factors of one graph.
 
     Examples
     --------
@@ -85,11 +85,11 @@ second time: submap 0 spent it over [0.000, 10.000) s
 
     def __init__(self) -> None:
         self._kinds = dict(DECLARED)
-        self._exclusive: dict[str, list[LedgerEntry]] = {}  # stream -> entries in order of start; they never overlap
+        self._exclusive: dict[str, list[LedgerEntry]] = {}  # stream -> entries sorted by start; they never overlap
         self._by_factor: dict[int, list[LedgerEntry]] = {}
 
     def declare(self, kind: str, reason: str) -> None:
-        """Declare a kind of factor that may share evidence, and why."""
+        """Declare a kind of factor that may share measurements, with the reason."""
         if kind == EXCLUSIVE or not reason.strip():
             raise ConfigError(f"ledger kind {kind!r} needs a name of its own and a reason")
         self._kinds[kind] = reason
@@ -100,7 +100,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
         return dict(self._kinds)
 
     def conflict(self, stream: str, interval: tuple[float, float]) -> LedgerEntry | None:
-        """The entry that already spent ``stream`` over an overlapping interval, or None."""
+        """The entry that already uses ``stream`` over an overlapping interval, or None."""
         t0, t1 = interval
         entries = self._exclusive.get(stream, [])
         i = bisect_right(entries, t0, key=lambda e: e.t_start)
@@ -111,7 +111,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
         return None
 
     def check(self, factor: str, streams: Iterable[str], interval: tuple[float, float], kind: str = EXCLUSIVE) -> None:
-        """Raise if :meth:`spend` would."""
+        """Raise the errors of :meth:`spend` without an entry."""
         t0, t1 = interval
         if not (np.isfinite(t0) and np.isfinite(t1) and t0 <= t1):
             raise DataError(f"interval of {factor} cannot be entered in the ledger", got=interval, wanted="t0 <= t1")
@@ -135,7 +135,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
         interval: tuple[float, float],
         kind: str = EXCLUSIVE,
     ) -> None:
-        """Enter one factor; all streams or none (see :meth:`check` for the errors)."""
+        """Add the entries of one factor; all streams or none (see :meth:`check` for the errors)."""
         names = sorted(set(streams))
         self.check(factor, names, interval, kind)
         note = self._kinds[kind] if kind != EXCLUSIVE else ""
@@ -146,7 +146,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
             self._by_factor.setdefault(factor_id, []).append(e)
 
     def enter(self, factor_id: int, factor: str, evidence: EvidenceUse | str) -> str:
-        """Enter what one factor uses, or a declared kind without streams; returns the kind."""
+        """Add the use of one factor, or a declared kind without streams; returns the kind."""
         use = EvidenceUse((), (0.0, 0.0), evidence) if isinstance(evidence, str) else evidence
         if use.kind == EXCLUSIVE and not use.streams:
             raise ConfigError(f"{factor} must name the streams and the interval that it uses")
@@ -154,28 +154,28 @@ second time: submap 0 spent it over [0.000, 10.000) s
         return use.kind
 
     def release(self, factor_id: int) -> None:
-        """Take a factor's spendings back (the factor was removed)."""
+        """Remove the entries of a removed factor."""
         for e in self._by_factor.pop(factor_id, []):
             if e.kind == EXCLUSIVE:
                 entries = self._exclusive[e.stream]
                 del entries[bisect_left(entries, e)]
 
     def as_start(self) -> Ledger:
-        """The same entries as those of the start of a refinement, which spends their streams anew."""
+        """The same entries with kind ``start``, so that a refinement can use their streams again."""
         out = Ledger()
         for e in self.entries():
             out.spend(e.factor_id, e.factor, [e.stream], (e.t_start, e.t_end), "start")
         return out
 
     def entries(self) -> list[LedgerEntry]:
-        """All entries in order of time."""
+        """All entries sorted by time."""
         return sorted(e for es in self._by_factor.values() for e in es)
 
     def __len__(self) -> int:
         return sum(len(es) for es in self._by_factor.values())
 
     def table(self) -> pd.DataFrame:
-        """The ledger as a table: one row a factor and stream."""
+        """The ledger as a table: one row per factor and stream."""
         import pandas as pd
 
         rows = [(e.factor_id, e.factor, e.stream, e.t_start, e.t_end, e.kind, e.note) for e in self.entries()]
@@ -186,7 +186,7 @@ second time: submap 0 spent it over [0.000, 10.000) s
 
 
 def _overlap(a0: float, a1: float, b0: float, b1: float) -> bool:
-    """Do two half-open intervals share an instant? An empty one counts as the instant where it stands."""
+    """Do two half-open intervals overlap? An empty one counts as an instant."""
     if a0 == a1 and b0 == b1:
         return a0 == b0
     if a0 == a1:

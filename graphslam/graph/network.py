@@ -1,4 +1,4 @@
-"""Pose networks (what a file says) and the least-squares problem: there and back."""
+"""Conversion between pose networks (file contents) and graphs or least-squares problems."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ def network_values(network: PoseNetwork, poses: Array, landmarks: Array | None =
 
 
 def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordered: bool = True) -> FactorArrays:
-    """The measurements of a network as a least-squares problem, with no object for each.
+    """The measurements of a network as a least-squares problem, stored as arrays.
 
-    Factors count through the edges, then the observations. Fixed vertices (the first, if there are none) are held.
+    Factors are numbered through the edges, then the observations. Fixed vertices (or the first one) are held.
 
     Parameters
     ----------
     used : (m + k,) bool, optional
-        Edges and observations that enter; all of them if not given.
+        Edges and observations to use; default: all.
     ordered : bool
-        Columns come in a minimum-degree order of elimination: quicker than to order their scalars. Else in their own.
+        Columns in a minimum-degree elimination order, faster than ordering the scalars; otherwise in their own order.
     """
     n, l, m = len(network), len(network.landmark_ids), len(network.edges)
     e = slice(None) if used is None else np.flatnonzero(used[:m])
@@ -67,7 +67,7 @@ def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordere
 
 
 def network_of(flat: FactorArrays, values: Values) -> PoseNetwork:
-    """A problem of relative poses as a network: for what knows nothing else (chordal starts, the certificate)."""
+    """A problem of relative poses as a network, for methods that accept nothing else (chordal start, certificate)."""
     others = sorted({name for f in flat.batches if not isinstance(f, BetweenBatch) for name, _ in f.classes()})
     if others or flat.has_kernels:
         what = f"factors of other kinds ({', '.join(others)})" if others else "robust kernels"
@@ -89,17 +89,17 @@ def network_of(flat: FactorArrays, values: Values) -> PoseNetwork:
 
 
 def to_network(graph: FactorGraph) -> PoseNetwork:
-    """Nodes, landmarks, and everything that a network can hold.
+    """Nodes, landmarks, and all measurements that a network can have.
 
     A landmark submap becomes one edge between its nodes and one observation per entry, each with its own marginal
-    information: the correlations between them have no place in such a file, so its optimum is near the graph's but
-    not the same. GPS factors, attitudes, robust kernels and landmarks in space have no place either.
+    information. The file format has no correlations between them, so its optimum is near the graph's but not the same.
+    GPS factors, attitudes, robust kernels and 3-D landmarks are omitted.
 
     Returns
     -------
     PoseNetwork
         Nodes are vertices 0 … m, with vertex 0 fixed; landmark i of the graph is vertex ``m + 1 + row``, because a
-        file knows one space of vertex numbers only.
+        file has one numbering for all vertices.
     """
     v = graph.values
     d = v.group.dof

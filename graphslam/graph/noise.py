@@ -1,7 +1,7 @@
-"""Noise of factors: covariances checked before GTSAM sees them, whiteners, and robust kernels.
+"""Noise of factors: checks of covariances before GTSAM uses them, whiteners, and robust kernels.
 
-GTSAM takes a covariance that is not positive definite, not finite or not symmetric in silence and answers with
-``nan`` or with one triangle of the matrix; everything that enters a graph therefore passes here first.
+GTSAM accepts a covariance that is not positive definite, not finite or not symmetric without a message, and returns
+``nan`` or uses one triangle of the matrix. So all covariances of a graph are checked here first.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ def whitener(cov: ArrayLike, *, what: str = "covariance", dim: int | None = None
     what : str
         Name for the message.
     dim : int, optional
-        Wanted d.
+        Expected d.
     scale : float
-        Factor on the covariance (> 0): 5 says that the front end is overconfident by a factor of 5 in variance.
+        Factor on the covariance (> 0).
     """
     if not (np.isfinite(scale) and scale > 0):
         raise CovarianceError(f"scale of the {what} is not usable", got=scale, wanted="> 0")
@@ -53,16 +53,16 @@ def whiteners(information: Array) -> Array:
     except np.linalg.LinAlgError:
         w, V = np.linalg.eigh(information)
         R = np.linalg.qr(np.sqrt(np.maximum(w, 0.0))[:, :, None] * np.swapaxes(V, 1, 2), mode="r")
-        # GTSAM takes a diagonal one for standard deviations, and refuses negative ones
+        # GTSAM reads a diagonal one as standard deviations, and refuses negative ones
         return np.asarray(np.where(np.diagonal(R, axis1=1, axis2=2) < 0.0, -1.0, 1.0)[:, :, None] * R)
 
 
-# So many matrices are turned into whiteners at a time.
+# Number of matrices that are converted at a time.
 _PART = 1 << 15
 
 
 def covariance_whiteners(covariances: ArrayLike, count: int, dim: int, *, what: str = "factor") -> Array:
-    """:func:`whitener` of many covariances, or of one that all share.
+    """:func:`whitener` of many covariances, or of one that is common to all.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def covariance_whiteners(covariances: ArrayLike, count: int, dim: int, *, what: 
     Returns
     -------
     (count, dim, dim)
-        A view of one matrix where all share it.
+        A view of one matrix if it is common to all.
     """
     P = np.asarray(covariances, dtype=np.float64)
     if P.shape == (dim, dim):
@@ -102,13 +102,13 @@ def covariance_whiteners(covariances: ArrayLike, count: int, dim: int, *, what: 
 
 @dataclass(frozen=True, slots=True)
 class RobustKernel:
-    """A robust kernel on the whitened norm ``d`` of one residual, with GTSAM's formulae.
+    """A robust kernel on the whitened norm ``d`` of one residual, with GTSAM's formulas.
 
     Parameters
     ----------
     kind : {"none", "huber", "cauchy"}
     k : float
-        Width in standard deviations; customary are 1.345 for Huber, 2.385 for Cauchy.
+        Width in standard deviations; usual values are 1.345 for Huber, 2.385 for Cauchy.
     """
 
     kind: Literal["none", "huber", "cauchy"] = "none"

@@ -24,10 +24,10 @@ def inverse_left_jacobian_kernel(d: float) -> tuple[float, float, float]:
 
 
 class SubmapFactorArrays(NamedTuple):
-    """Landmark submaps one after the other."""
+    """Landmark submaps in flat arrays."""
 
     start: Index
-    """(S,): node of each."""
+    """(S,): start node of each."""
     entry_offset: Index
     """(S + 1,)"""
     entry_row: Index
@@ -35,19 +35,19 @@ class SubmapFactorArrays(NamedTuple):
     z: Array
     """Measurements, flat …"""
     z_offset: Index
-    """… and where they begin."""
+    """… with their offsets."""
     info: Array
     """Information matrices, flat and row-major …"""
     info_offset: Index
-    """… and where they begin."""
+    """… with their offsets."""
     group: npt.NDArray[np.bool_]
-    """(S,): the residual is taken in the group chart."""
+    """(S,): the residual is in the group parametrisation."""
     constant: int
-    """Rows of the points from this one on are pairs of constants: they have no frame, and no chart."""
+    """From this row on, points are pairs of constants, without a frame and parametrisation."""
 
 
 class SubmapBlocks(NamedTuple):
-    """What is computed of them: out."""
+    """Output arrays of :func:`submap_blocks`."""
 
     H: Array
     """Blocks ``(6 + 2n)²``, flat."""
@@ -60,14 +60,14 @@ class SubmapBlocks(NamedTuple):
 
 
 class SubmapTerms(NamedTuple):
-    """What residual and Jacobian of a submap with n entries are made of."""
+    """Terms of residual and Jacobian of a submap with n entries."""
 
     q: Array
     """(n + 1, 2): the end and all points in the frame of the start."""
     h: Array
-    """(n + 1, 2): what their residuals change by with the end's heading, in the chart."""
+    """(n + 1, 2): derivative of their residuals by the end's heading, due to the parametrisation."""
     r: Array
-    """(3 + 2n,): ``H(X) - z`` (eq. 15) in its chart."""
+    """(3 + 2n,): ``H(X) - z`` (eq. 15) in its parametrisation."""
 
 
 @njit
@@ -76,8 +76,8 @@ def submap_terms(
 ) -> tuple[float, float, float, float, float, float]:
     """Residual of a submap; returns ``a, b`` of V⁻¹ and cosine and sine of the start's heading and of the turn.
 
-    ``rows`` are those of the entries among the points; from ``places`` on they are pairs of constants, which have no
-    frame, and no chart.
+    ``rows`` are those of the entries among the points; from ``places`` on they are pairs of constants, without a frame
+    and parametrisation.
     """
     start, end = ends
     q, h, r = out
@@ -112,7 +112,7 @@ def times_submap_jacobian(
 ) -> None:
     """``M = L J`` ``(k, 6 + 2n)`` for any L ``(k, 3 + 2n)``, right tangents of ``[start (3), end (3), entries…]``.
 
-    ``turns`` are those of :func:`submap_terms`.
+    ``turns`` is the return value of :func:`submap_terms`.
     """
     q, h, _ = terms
     va, vb, ca, sa, ce, se = turns
@@ -156,14 +156,14 @@ def whiten_submap(
 def submap_blocks(poses: Array, points: Array, submaps: SubmapFactorArrays, hessian: bool, out: SubmapBlocks) -> None:
     """Objective, gradient block and Gauss-Newton block of every submap (eq. 15–16, right tangents).
 
-    Local variables of submap s are ``[x_start (3), x_{start+1} (3), entry_1 (2), …]``; an entry that stands twice is
-    two local variables here and is added up by the assembly.
+    Local variables of submap s are ``[x_start (3), x_{start+1} (3), entry_1 (2), …]``; a repeated entry is two local
+    variables here, which the assembly adds.
 
     Parameters
     ----------
     poses : (m + 1, 3); points : (n, 2)
     hessian : bool
-        Fill H as well.
+        Compute H too.
     """
     start, entry_offset, entry_row, z, z_offset, info, info_offset, group, constant = submaps
     H, H_offset, g, g_offset, chi2 = out
@@ -172,7 +172,7 @@ def submap_blocks(poses: Array, points: Array, submaps: SubmapFactorArrays, hess
         n = len(rows)
         m, d = 3 + 2 * n, 6 + 2 * n
         L = info[info_offset[s] : info_offset[s] + m * m].reshape(m, m)
-        places = n  # constants stand last
+        places = n  # constants are last
         while places > 0 and rows[places - 1] >= constant:
             places -= 1
         terms = SubmapTerms(np.empty((n + 1, 2)), np.empty((n + 1, 2)), np.empty(m))

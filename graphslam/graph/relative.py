@@ -19,7 +19,7 @@ def relative_poses(T_i: Array, T_j: Array, P_ii: Array, P_ij: Array, P_jj: Array
     ----------
     T_i, T_j : (k, 7) or (k, 3)
     P_ii, P_ij, P_jj : (k, d, d)
-        Of the right tangents; zeros of a node that is held.
+        Of the right tangents; zeros for a fixed node.
 
     Returns
     -------

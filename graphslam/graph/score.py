@@ -1,4 +1,4 @@
-"""The objective of a graph, per class of factor: the figures that say whether the noise is believed too much."""
+"""The objective of a graph per factor class, with χ²/dof, which shows whether the assumed noise is too small."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from graphslam.graph.variables import KINDS
 
 @dataclass(frozen=True, slots=True)
 class ClassScore:
-    """``χ²`` of one class of factors.
+    """``χ²`` of one factor class.
 
     Parameters
     ----------
     chi2 : float
         ``Σ rᵀ P⁻¹ r`` (``Σ 2 ρ`` under a robust kernel).
     factors, rows : int
-        Factors, and scalars they measure.
+        Number of factors, and of scalars they measure.
     dof : int
         ``rows`` less the unknowns that this class alone brings in: poses and landmarks for submaps, the datum for GPS,
         biases for their priors, the tilt for attitudes, velocities and biases of an IMU for its ways. Summed over the
