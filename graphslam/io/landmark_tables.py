@@ -28,6 +28,7 @@ from graphslam.core.records import LandmarkObservations, Odometry, VelocityContr
 from graphslam.io.clock import usable_records
 from graphslam.io.odometry_noise import OdometryNoise
 from graphslam.io.source_probe import ReaderMatch, SourceProbe
+from graphslam.io.text_records import is_number
 
 NAMES = {
     "t": ("t", "time", "stamp", "timestamp", "secs", "seconds"),
@@ -258,13 +259,25 @@ def _read(path: Path, stream: str, counter: DropCounter) -> tuple[dict[str, Arra
         )
     out = {}
     for name, (k, factor) in header.columns.items():
-        out[name] = np.array([_number(r[k]) for r in rows]) * factor
+        words = [r[k].strip('"') for r in rows]
+        odd = [w for w in words if w and not is_number(w)]
+        if 2 * len(odd) > len(words) and name == "id":  # names, which are numbered
+            out[name] = np.unique(words, return_inverse=True)[1].astype(np.float64)
+            continue
+        if 2 * len(odd) > len(words):
+            raise FormatError(
+                f"{len(odd)} of {len(words)} values in the column of {name} are no numbers",
+                where=str(path),
+                got=repr(odd[0][:40]),
+                wanted="numbers with a decimal point; times in seconds",
+            )
+        out[name] = np.array([_number(w) for w in words]) * factor
     return out, header
 
 
 def _number(word: str) -> float:
     try:
-        value = float(word.strip('"'))
+        value = float(word)
     except ValueError:
         return float("nan")
     return value if abs(value) <= 1e30 else float("nan")

@@ -76,13 +76,14 @@ def read_table(
     try:
         values = np.array(rows, dtype=np.float64).reshape(-1, columns)
     except ValueError:
-        k, word = next((k, w) for k, words in enumerate(rows) for w in words if not _is_number(w))
+        k, word = next((k, w) for k, words in enumerate(rows) for w in words if not is_number(w))
         raise FormatError("not a number", where=f"{path}, line {lines[k]}", got=repr(word[:40])) from None
     values[np.abs(values) > LARGEST] = np.inf  # as useless, and dropped or refused as such
     return values, np.array(lines, dtype=np.int64)
 
 
-def _is_number(word: str) -> bool:
+def is_number(word: str) -> bool:
+    """Whether Python reads it as a number."""
     try:
         float(word)
     except ValueError:

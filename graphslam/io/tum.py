@@ -72,21 +72,30 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
+        if len(fields) == 9 and fields[8].isdigit():
+            fields.pop()  # RTAB-Map: the number of the pose
         if len(fields) != 8:
             raise FormatError(
-                "wrong number of columns", where=f"{where}:{number}", got=len(fields), wanted="t x y z qx qy qz qw"
+                "wrong number of columns",
+                where=f"{where}:{number}",
+                got=f"{len(fields)}: {line.strip()[:60]!r}",
+                wanted="8: t x y z qx qy qz qw (matrices are read beside clouds only)",
             )
         try:
             rows.append([float(f) for f in fields])
         except ValueError as error:
-            raise FormatError(f"not a number ({error})", where=f"{where}:{number}") from None
+            wanted = "numbers with a decimal point; time in seconds"
+            raise FormatError(f"not a number ({error})", where=f"{where}:{number}", wanted=wanted) from None
         lines.append(number)
     data = np.array(rows).reshape(-1, 8)
     _refuse(~np.all(finite_mask(data), axis=1), "not finite", where, lines, rows)
     norm = np.linalg.norm(data[:, 4:], axis=1)
     _refuse(np.abs(norm - 1.0) > _NORM_TOLERANCE, "rotation is no unit quaternion", where, lines, norm)
     data, lines = _without_repeats(data, lines, where)
-    _refuse(np.r_[False, np.diff(data[:, 0]) <= 0][: len(data)], "stamps do not increase", where, lines, data[:, 0])
+    if len(back := np.flatnonzero(np.diff(data[:, 0]) <= 0)):
+        k = int(back[0]) + 1
+        got, wanted = f"{data[k, 0]} after {data[k - 1, 0]}", "rows in the order of time: sort the file"
+        raise FormatError("stamps do not increase", where=f"{where}:{lines[k]}", got=got, wanted=wanted)
     off_plane = np.any(data[:, 3:6] != 0.0, axis=1)
     if dim is None:
         dim = 3 if np.any(off_plane) or not len(data) else 2

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphslam.core.errors import ConfigError, DataError, MissingDataError
+from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.io.catalog import load_recording
 from graphslam.io.readers import recognise
 from tests.io import small_sources as small
@@ -127,3 +127,34 @@ def test_a_named_reader_is_taken_before_what_is_recognised(tmp_path: Path) -> No
     assert load_recording(folder).meta["reader"]["also"] == ["tum: a TUM trajectory, poses.txt"]
     log = load_recording(folder, reader="tum")
     assert set(log.streams) == {"odometry"} or "clouds" not in log
+
+
+def test_names_of_landmarks_are_numbered(tmp_path: Path) -> None:
+    folder = small.tables(tmp_path / "robot")
+    plain = load_recording(folder)["landmarks"].ids
+    rows = (folder / "sightings.csv").read_text().splitlines()
+    k = rows[0].replace(" ", "").lstrip("#").split(",").index("id")
+    named = [r.split(",") for r in rows]
+    for words in named[1:]:
+        words[k] = f"tag_{float(words[k]):04.0f}"
+    (folder / "sightings.csv").write_text("\n".join(",".join(w) for w in named) + "\n")
+    ids = load_recording(folder)["landmarks"].ids
+    np.testing.assert_array_equal(ids, np.unique(plain, return_inverse=True)[1])
+
+
+@pytest.mark.parametrize("stamp", ["2026-01-01T00:00:{:06.3f}Z", "{:.3f}"])
+def test_dates_and_decimal_commas_are_refused_with_the_column_and_what_is_wanted(tmp_path: Path, stamp: str) -> None:
+    t, _, _, pose = small.drive(8.0)
+    rows = [";".join([stamp.format(a).replace(".", ","), *(f"{v:.3f}" for v in p)]) for a, p in zip(t, pose)]
+    (tmp_path / "odometry.csv").write_text("t;x;y;theta\n" + "\n".join(rows) + "\n")
+    (tmp_path / "sightings.csv").write_text("t,id,range,bearing\n0.1,1,2.0,0.1\n")
+    with pytest.raises(
+        FormatError, match=r"values in the column of t are no numbers; got '.*,.*'; wanted numbers with a"
+    ):
+        load_recording(tmp_path)
+
+
+def test_a_file_that_no_reader_knows_is_described(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1,2,3\n4,5,6\n")
+    with pytest.raises(FormatError, match=r"no reader knows this file; .* first line '1,2,3'"):
+        load_recording(tmp_path / "a.csv")

@@ -66,7 +66,7 @@ def test_comments_blank_lines_and_rounded_quaternions(tmp_path: Path) -> None:
     ("line", "what"),
     [
         ("2.0 0 0 0 0 0 0", "wrong number of columns; got 7"),
-        ("2.0 0 0 0 0 0 0 1 5", "wrong number of columns; got 9"),
+        ("2.0 0 0 0 0 0 0 1 0.5", "wrong number of columns; got 9"),
         ("2.0 0 zero 0 0 0 0 1", "not a number"),
         ("2.0 0 nan 0 0 0 0 1", "not finite"),
         ("inf 0 0 0 0 0 0 1", "not finite"),
@@ -102,3 +102,15 @@ def test_a_repeated_stamp_costs_one_pose(tmp_path: Path, caplog: pytest.LogCaptu
     read = read_tum(path)
     assert read.poses[:, 0].tolist() == list(range(40))
     assert "a.tum:22: 1 poses that repeat" in caplog.text
+
+
+def test_the_number_of_a_pose_behind_it_is_left_out(tmp_path: Path) -> None:
+    """As RTAB-Map writes it."""
+    (tmp_path / "a.txt").write_text("#timestamp x y z qx qy qz qw id\n" + GOOD + " 1\n2.0 1 0 0 0 0 0 1 2\n")
+    assert read_tum(tmp_path / "a.txt").poses.tolist() == [[0, 0, 0], [1, 0, 0]]
+
+
+def test_stamps_out_of_order_are_told_with_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "a.tum").write_text(GOOD + "\n0.5 0 0 0 0 0 0 1\n")
+    with pytest.raises(FormatError, match=r"a\.tum:2: stamps do not increase; got 0\.5 after 1\.0; .*sort the file"):
+        read_tum(tmp_path / "a.tum")
