@@ -1,1 +1,1 @@
-"""SegSLAM: particles over segments of the path, each with a submap of its own, that may be entered again."""
+"""SegSLAM: a particle filter over path segments, each with its own submap, which may be re-entered."""

@@ -1,6 +1,6 @@
-"""Which earlier segments a particle may have come back to (A10): long enough ago, and near enough in a map sample.
+"""Candidate selection for loop closure (A10): earlier segments, old enough and near enough in a map sample.
 
-Matching costs far more than looking: out of some tens of segments one to three are left here.
+Matching is far more expensive than this selection: one to three of some tens of segments remain.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentCandidates:
-    """Segments worth matching, nearest first (in σ), each ``(c, …)``.
+    """Candidate segments for matching, nearest first (in σ), each ``(c, …)``.
 
     Parameters
     ----------
     segments : (c,) int64
     T_map_body : (c, 7) or (c, 3)
-        Where the sample puts the body in the frame of the segment's map: where the search begins.
+        Predicted body pose in the frame of the segment's map: the start of the search.
     distance : (c,)
-        From the body to the segment's path, horizontally [m].
+        Horizontal distance from the body to the segment's path [m].
     travelled : (c,)
-        Way from now to the nearest point of that path, through the sample [m]: what may have drifted.
+        Path length from now to the nearest point of that path, through the sample [m], which determines the drift.
     sigma : (c,)
-        σ of the path-length model over that way [m].
+        σ of the path-length model over that length [m].
     known : (c,) int64
-        Voxels near the body that the map knows.
+        Number of known voxels near the body.
     """
 
     segments: Ints
@@ -52,7 +52,7 @@ class SegmentCandidates:
 
 @dataclass(slots=True)
 class CandidateSelection:
-    """How many segments fell at which sieve."""
+    """Number of segments rejected by each criterion."""
 
     recent: int = 0
     far: int = 0
@@ -62,7 +62,7 @@ class CandidateSelection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Places:
-    """Segments of a sample that ended long enough ago, and the poses of their paths one after another.
+    """Segments of a sample that ended long enough ago, with the concatenated poses of their paths.
 
     Parameters
     ----------
@@ -73,11 +73,11 @@ class _Places:
     positions : (m, dim)
         Of all paths, in the frames of their segments.
     owner : (m,) int64
-        Which of the c segments each belongs to.
+        Index of the segment of each position, 0 … c - 1.
     first : (c,) int64
-        Where each segment's poses begin.
+        Index of the first position of each segment.
     way : (m,)
-        From the root's anchor, through the sample [m].
+        Path length from the root's anchor, through the sample [m].
     sigma : (m,)
         Of the path-length model [m].
     """
@@ -94,7 +94,7 @@ class _Places:
 def _places(
     segmap: SegMap, sample: MapSample, step: int, config: SegmentCandidateConfig, exclude: frozenset[int] | set[int]
 ) -> tuple[_Places | None, int]:
-    """What does not depend on the particle, and how many segments ended too recently."""
+    """The part that does not depend on the particle, and the number of segments that ended too recently."""
     t = segmap.table
     place = np.array([k for k, i in enumerate(sample.segments.tolist()) if i != OPEN and i not in exclude], np.int64)
     if len(place) and sample.segments[0] != OPEN:
@@ -130,15 +130,15 @@ def select_candidates(
     Parameters
     ----------
     sample : MapSample
-        Its root is the segment the particles are in.
+        Its root is the current segment of the particles.
     T_root_body : (n, 7) or (n, 3)
         Their poses.
     step : int
-        The step of now.
+        The current step.
     exclude : set of int
-        Segments that are not asked for, such as the one whose map the particles work in already.
+        Segments to leave out, such as the one whose map the particles already use.
     tally : CandidateSelection, optional
-        Counts are added.
+        Counts are added to it.
     """
     T = np.asarray(T_root_body, dtype=np.float64)
     tally = CandidateSelection() if tally is None else tally
@@ -179,7 +179,7 @@ def _known(
     config: SegmentCandidateConfig,
     tally: CandidateSelection,
 ) -> SegmentCandidates:
-    """3. does the map know the place? Of one particle, nearest first, until there are enough."""
+    """Criterion 3, known voxels at the place, for one particle: nearest first, until there are enough."""
     g = segmap.group
     near = np.isfinite(measure)
     tally.far += int(np.sum(~near))

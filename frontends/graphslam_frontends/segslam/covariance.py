@@ -1,8 +1,8 @@
-"""How sure a segment is of its exit: the spread of the particles, and what particles cannot know.
+"""Covariance of the end pose of a segment: spread of the particles plus drift model.
 
-The spread alone, which is what moment matching hands over, is overconfident a hundredfold: resampling leaves the
-particles a recent common ancestor, and the error that all of them share (a bias of the heading) is in none of them.
-So the default adds a drift model, the covariance of dead reckoning over the length of the segment.
+The spread alone (moment matching) is overconfident by a factor of 100: after resampling the particles have a recent
+common ancestor, and an error common to all of them (a heading bias) is not in the spread. So the default adds a drift
+model, the covariance of dead reckoning over the length of the segment.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from graphslam.core.poses import group_of, pose_mean, pose_scatter
 
 @dataclass(frozen=True, slots=True)
 class ExitCovariance:
-    """Covariances of a segment's exit, all in the right tangent of :attr:`pose`.
+    """Covariances of the end pose of a segment, all in the right tangent of :attr:`pose`.
 
     Parameters
     ----------
     pose : (7,) or (3,)
     total : (d, d)
-        Particles plus drift model: what a graph gets.
+        Particles plus drift model: used in the graph.
     particles : (d, d)
         Second moment of the particles about ``pose``.
     matched : (d, d)
-        The paper's: moments of the particles about their own mean, with a floor that makes it invertible.
+        As in the paper: moments of the particles about their own mean, with a floor that makes it invertible.
     drift : (d, d)
     effective : float
-        ``1 / Σ w²`` of the particles that gave the spread.
+        ``1 / Σ w²`` of the particles.
     """
 
     pose: Array
@@ -53,14 +53,14 @@ def exit_covariance(
     floor_position: float = 0.01,
     floor_angle: float = 1e-3,
 ) -> ExitCovariance:
-    """Covariance of the pose at the end of a segment, seen from its start.
+    """Covariance of the pose at the end of a segment, relative to its start.
 
     Parameters
     ----------
     exits : (n, 7) or (n, 3)
-        Of all particles of the interval, each in the frame of the body's own start.
+        Of all particles of the interval, each relative to its own start pose.
     about : (7,) or (3,)
-        The exit that is handed over; need not be the mean, and how far it lies off is added.
+        The end pose used; if it is not the mean, the squared offset is included.
     drift : (d, d)
         Covariance of dead reckoning over the segment, right tangent.
     weights : (n,), optional

@@ -1,4 +1,4 @@
-"""The front end ``segslam``: a log of beams and motion as submaps with evidence grids and matches."""
+"""The front end ``segslam``: submaps with evidence grids and matches from a log of beams and motion."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class SegSlamFrontEndConfig:
     """The front end ``segslam``."""
 
     steps: StepConfig = field(default_factory=StepConfig)
-    """How the log becomes steps."""
+    """Conversion of the log to steps."""
     filter: GridFilterConfig = field(default_factory=GridFilterConfig)
     """Particles, motion, weights."""
     segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
-    """Segmentation, matching, what is handed over."""
+    """Segmentation, matching, and output."""
     drift: FilterDrift = field(default_factory=FilterDrift)
-    """Errors that all particles share, where the filter carries them."""
+    """Errors common to all particles, if the filter samples the motion."""
     window: ScanWindowConfig = field(default_factory=ScanWindowConfig)
     """Scan-to-window odometry inside the segments (``segslam.inside = "scan-window"``)."""
 
@@ -47,9 +47,9 @@ class SegSlamFrontEndConfig:
 class SegSlam(StepwiseFrontEnd):
     """The front end ``segslam``.
 
-    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. Particles decide late
-    which segment was the right one, so the filter runs over the whole log first, also when a run is resumed; the same
-    seed gives the same submaps.
+    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion. The best particle is
+    known only at the end, so the filter processes the whole log first, also in a resumed run; the same seed gives the
+    same submaps.
     """
 
     config: SegSlamFrontEndConfig = field(default_factory=SegSlamFrontEndConfig)
@@ -76,10 +76,10 @@ class SegSlam(StepwiseFrontEnd):
     def result(
         self, log: SensorLog, *, seed: SeedTree, drops: DropCounter | None = None, watch: Watch | None = None
     ) -> SegSlamResult:
-        """The SegMap with all particles, of which :meth:`submaps` hands over the best one's chain."""
+        """The SegMap with all particles; :meth:`submaps` outputs the chain of the best one."""
         c, steps, filter = self.config, self.steps(log, drops=drops), self.config.filter
         if c.segslam.inside == "scan-window":
-            # one path for all: what it leaves to sample is less than a map can tell apart
+            # one path for all: its uncertainty is too small for maps to resolve
             steps, filter = odometry_from_scans(steps, c.window), replace(filter, walk_scale=0.0, motion_scale=0.0)
         return run_segslam(steps, filter, c.segslam, seed.child(0), watch=watch)
 
@@ -90,7 +90,7 @@ def submaps_of_best_particle(result: SegSlamResult, drift: FilterDrift, config: 
     Parameters
     ----------
     drift : FilterDrift
-        Errors that all particles share.
+        Errors common to all particles.
     """
     segmap, steps = result.segmap, result.steps
     chain = common_ancestor_chain(segmap, int(result.closed[result.best]))

@@ -1,7 +1,7 @@
-"""Trying a place with a throw-away particle filter: how sharply does the scan fit, and how well? (SegSLAM eq. 19)
+"""Localisation in a map by a temporary particle filter: quality and precision of a match (SegSLAM eq. 19).
 
-Unlike a registration it needs no surface normals and no correspondences, and it says in one answer how good the place
-is (the range error) and how well it is determined (the spread that is left).
+Unlike registration it needs no surface normals and no correspondences. It gives the quality (range error) and the
+precision (remaining spread).
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from graphslam.evidence.queries import cast_grids
 from graphslam_frontends.grid.particles import effective_sample_size, normalise_log_weights, systematic_resample
 from graphslam_frontends.segslam.segmentation import LookAheadWindow
 
-_SHRINK = 0.95  # of the cloud about its mean before it is blurred to its old size (Liu & West 2001)
+_SHRINK = 0.95  # shrinkage about the mean before the cloud is blurred to its old covariance (Liu & West 2001)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalisationConfig:
-    """The throw-away particle filter that tries a match (eq. 19)."""
+    """The temporary particle filter that checks a match (eq. 19)."""
 
     particles: int = 100
-    """Poses drawn around the start."""
+    """Number of poses, sampled around the start."""
     rounds: int = 4
-    """Times they are weighed and resampled; the likelihood is spent in equal parts."""
+    """Number of rounds of weighting and resampling, each with an equal part of the likelihood."""
     position: float = 0.4
-    """σ of the draw in position [m]."""
+    """σ of the samples in position [m]."""
     angle: float = 0.05
-    """σ of the draw in heading [rad]; roll and pitch stay where gravity put them."""
+    """σ of the samples in heading [rad]; roll and pitch are those of the start."""
     effective_beams: float = 60.0
-    """Beams of the window count for so many independent ones."""
+    """Effective number of independent beams of the window."""
     cast_sigma: float = 0.2
-    """σ of the ranges in the error [m]."""
+    """σ of the ranges in the range error [m]: the unit of ``clip``."""
     clip: float = 3.0
-    """Range errors are no larger than this many σ."""
+    """Range errors are limited to this many σ."""
 
 
 LOCALISATION = LocalisationConfig()
-"""Tries the matches of SegSLAM."""
+"""Default for the matches of SegSLAM."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanLocalisation:
-    """Where a scan lies in a map.
+    """Pose of a scan in a map.
 
     Parameters
     ----------
     pose : (7,) or (3,)
         ``T_map_body``, mean of the cloud.
     covariance : (d, d)
-        Of the cloud, right tangent. Roll and pitch were not searched and have none.
+        Of the cloud, right tangent. Roll and pitch were not searched and have zero variance.
     error : float
-        err_X: mean squared difference of measured and expected ranges at ``pose``, each clipped [m²].
+        err_X: mean squared difference of measured and expected ranges at ``pose``, each limited [m²].
     spread : float
         ``|Σ_X|`` of the position as a length: the 2·dim-th root of its determinant [m].
     effective : float
@@ -83,21 +83,21 @@ def localise_in_map(
     *,
     threads: int = 1,
 ) -> ScanLocalisation:
-    """Draw poses around a start, weigh and resample them a few times, and say what is left.
+    """Sample poses around a start, and weight and resample them in several rounds.
 
-    The likelihood is spent in equal parts, one a round, so that all rounds together count the scan once; between them
-    the cloud is blurred so that its mean and covariance stay (Liu & West 2001).
+    Each round uses an equal part of the likelihood, so that all rounds together count the scan once; between them the
+    cloud is blurred such that its mean and covariance stay (Liu & West 2001).
 
     Parameters
     ----------
     grid : EvidenceGrid
-        The map; not written to.
+        The map; read-only.
     T_start : (7,) or (3,)
-        ``T_map_body``. Roll and pitch stay as they are there.
+        ``T_map_body``. Roll and pitch are not changed.
     max_range : float
         [m]
     threads : int
-        The result is the same for any number.
+        The result does not depend on it.
     """
     if not len(window):
         raise DataError("nothing to localise by", got="a window without beams that met something", wanted="some")
@@ -107,8 +107,8 @@ def localise_in_map(
     sigma[g.position], sigma[g.heading] = config.position, config.angle
     free = np.flatnonzero(sigma)
     likelihood = EndpointLikelihood(exponent=config.effective_beams / (len(window) * config.rounds))
-    # offsets about the start, in its axes; roll and pitch stay zero, as a turn about the vertical through the body does
-    # not change them where the start is level
+    # offsets about the start, in map axes; roll and pitch stay zero, because a rotation about the vertical through the
+    # body does not change them if the start is level
     x = sigma * rng.standard_normal((n, g.dof))
     w, effective = np.full(n, 1.0 / n), 1.0
     for round in range(config.rounds):
@@ -134,9 +134,9 @@ def localise_in_map(
 
 
 def range_error(grid: EvidenceGrid, pose: Array, window: LookAheadWindow, max_range: float, *, clip: float) -> float:
-    """Mean squared difference of measured and expected ranges [m²], each at most ``clip`` [m]; eq. 19's err_X.
+    """Mean squared difference of measured and expected ranges [m²], each limited to ``clip`` [m]; err_X of eq. 19.
 
-    Where the map expects nothing, the difference is ``clip``. NaN without any beam.
+    If the map has no surface on the beam, the difference is ``clip``. NaN without any beam.
     """
     if not len(window):
         return math.nan

@@ -1,8 +1,8 @@
-"""Which match is believed (A9): gates, weights, and a draw that always holds the null match.
+"""Acceptance of matches (A9): gates, weights, and a draw that always includes "no match".
 
-A false match does more harm than ten right ones do good, and nothing on top repairs it; so the gates are strict. What
-passes them is still drawn, not decided: particles hold several topologies at once, and those that chose wrongly lose
-their weight later.
+A false match is far more harmful than a missed one, and later stages cannot repair it, so the gates are strict. Matches
+that pass are drawn at random: particles represent several topologies, and those with a wrong one lose their weight
+later.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from graphslam_frontends.segslam.localisation import ScanLocalisation
 from graphslam_frontends.segslam.segmap import MATCH, SegmentEntry
 
 NULL = -1
-"""The draw's answer for no match."""
+"""Result of a draw without a match."""
 MODE_DISTANCE = 1.5
-"""Modes of a match farther apart than this are two [m]."""
+"""Poses farther apart than this are two modes of a match [m]."""
 FITNESS_SIGMA = 0.15
 """Weight of the fitness of a match: ``exp(-½ ((1 - fitness) / this)²)``."""
 ERROR_SIGMA = 0.4
@@ -39,7 +39,7 @@ SPREAD_SIGMA = 0.3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """One registration of what a particle sees into an older map.
+    """One registration of the look-ahead window of a particle to an older map.
 
     Parameters
     ----------
@@ -48,13 +48,13 @@ class Proposal:
     registration : Registration
         ``T_map_body`` with its quality.
     T_prior : (7,) or (3,)
-        Where the map sample puts the body in that map.
+        Predicted pose of the body in that map, from the map sample.
     sigma : float
-        σ of the path-length model at that place [m].
+        σ of the path-length model for that place [m].
     rise : float
-        What heights may have drifted by over the way from there to the body [m].
+        Allowed height drift over the path from there to the body [m].
     localisation : ScanLocalisation or None
-        What the throw-away particle filter says of it.
+        Result of the temporary particle filter.
     """
 
     segment: int
@@ -66,7 +66,7 @@ class Proposal:
 
     @property
     def T(self) -> Array:
-        """The match, ``T_map_body``; of the localisation where there is one."""
+        """The match, ``T_map_body``; that of the localisation if there is one."""
         return self.registration.T_target_source if self.localisation is None else self.localisation.pose
 
     @property
@@ -76,35 +76,35 @@ class Proposal:
 
     @property
     def shift(self) -> float:
-        """From the prediction to the match, horizontally [m]."""
+        """Horizontal distance from the prediction to the match [m]."""
         return shift_between(self.T, self.T_prior)
 
     @property
     def height(self) -> float:
-        """From the prediction to the match, vertically [m]; 0 in two dimensions."""
+        """Vertical distance from the prediction to the match [m]; 0 in 2-D."""
         return height_between(self.T, self.T_prior)
 
     @property
     def tilt(self) -> float:
-        """Between the vertical of the match and that of the prediction [rad]; 0 in two dimensions."""
+        """Angle between the verticals of match and prediction [rad]; 0 in 2-D."""
         return tilt_between(self.T, self.T_prior)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchPosterior:
-    """What became of the proposals of one particle.
+    """Gates and weights of the proposals of one particle.
 
     Parameters
     ----------
     proposals : tuple of m Proposal
     why : tuple of m str
-        The gates each fails, in words; empty for those that may be drawn.
+        The gates each fails, as text; empty for those that may be drawn.
     weights : (m,)
         Unnormalised (eq. 18, 19); 0 of those that fail.
     margins : (m,)
-        Fitness less that of the best other place in the same map; 1 where there is none.
+        Fitness minus that of the best other mode in the same map; 1 if there is none.
     null : float
-        Weight of no match.
+        Weight of "no match".
     """
 
     proposals: tuple[Proposal, ...]
@@ -115,28 +115,28 @@ class MatchPosterior:
 
     @property
     def accepted(self) -> npt.NDArray[np.int64]:
-        """Those that may be drawn."""
+        """Indices of those that may be drawn."""
         return np.flatnonzero(self.weights > 0).astype(np.int64)
 
     @property
     def probabilities(self) -> Array:
-        """Of the proposals, and last of no match ``(m + 1,)``."""
+        """Of the proposals, and last of "no match" ``(m + 1,)``."""
         p = np.append(self.weights, self.null)
         return np.asarray(p / p.sum())
 
     def counts(self) -> dict[str, int]:
-        """How many proposals failed each gate (one may fail several), and how many were accepted."""
+        """Number of proposals that failed each gate (one may fail several), and number accepted."""
         names = Counter(t.split()[0].rstrip(":") for text in self.why for t in text.split("; ") if t)
         return {**dict(sorted(names.items())), "accepted": len(self.accepted)}
 
     def draw(self, uniform: float) -> int:
-        """The proposal that a uniform number in [0, 1) chooses, or `NULL`."""
+        """The proposal for a uniform number in [0, 1), or `NULL`."""
         k = int(np.searchsorted(np.cumsum(self.probabilities), uniform, side="right"))
-        # rounding of the sum must not choose one without weight
+        # rounding of the sum must not choose a proposal of zero weight
         return k if k < len(self.proposals) and self.weights[k] > 0 else NULL
 
     def entry(self, k: int, config: ChoiceConfig) -> SegmentEntry:
-        """How a particle that drew proposal ``k`` enters the older segment."""
+        """Entry into the older segment for proposal ``k``."""
         p = self.proposals[k]
         return SegmentEntry(
             T_entry=p.T,
@@ -150,17 +150,17 @@ class MatchPosterior:
 def match_posterior(
     proposals: Sequence[Proposal], config: ChoiceConfig, registration: RegistrationConfig | None = None
 ) -> MatchPosterior:
-    """Gate and weigh the proposals of one particle at one time (A9).
+    """Gate and weight the proposals of one particle at one time (A9).
 
-    Gates: those of the registration (fitness, degeneracy, tilt), a finite result, height and shift against the
-    prediction, and a margin to the second place in the same map, whether that passes its own gates or not.
-    Weights: ``exp(-½ ((1 - fitness)/σ_f)²) exp(-½ (shift/σ)²)``, σ of the path-length model (eq. 18); with a
-    localisation ``exp(-½ err_X/σ_e²) exp(-½ |Σ_X|/σ_s²)`` in place of, or beside, the fitness (eq. 19).
+    Gates: those of the registration (fitness, degeneracy, tilt), a finite result, height and shift relative to the
+    prediction, and a margin to the second mode in the same map, whether that passes its own gates or not. Weights:
+    ``exp(-½ ((1 - fitness)/σ_f)²) exp(-½ (shift/σ)²)``, σ of the path-length model (eq. 18); with a localisation
+    ``exp(-½ err_X/σ_e²) exp(-½ |Σ_X|/σ_s²)`` instead of, or in addition to, the fitness (eq. 19).
 
     Parameters
     ----------
     registration : RegistrationConfig, optional
-        Whose gates are asked; default the standard ones.
+        Its gates are used; default the standard ones.
     """
     rules = RegistrationConfig() if registration is None else registration
     margins = proposal_margins(proposals, MODE_DISTANCE)
@@ -176,13 +176,13 @@ def match_posterior(
 
 
 def proposal_margins(proposals: Sequence[Proposal], apart: float) -> Array:
-    """Fitness of each proposal less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``; see
+    """Fitness of each proposal minus that of the best one in the same map ``apart`` [m] or more away ``(m,)``; see
     :func:`graphslam.registration.gates.match_margins`."""
     return gates.match_margins([p.registration for p in proposals], [p.segment for p in proposals], apart)
 
 
 def match_covariance(p: Proposal, config: ChoiceConfig) -> Array:
-    """Covariance of ``T_map_body`` of a match ``(d, d)``, right tangent: its own, and what no registration knows."""
+    """Covariance of ``T_map_body`` of a match ``(d, d)``, right tangent: its own plus configured floors."""
     g = group_of(p.T)
     floor = np.full(g.dof, config.angle_sigma**2)
     floor[g.position] = config.position_sigma**2

@@ -1,8 +1,8 @@
-"""Has a particle come back to an older segment? Candidates, search, registration, and the draw (A2, A9, A10).
+"""Loop detection: candidates, search, registration, and the draw (A2, A9, A10).
 
-Drift at a closure is far beyond what registration can capture, so a correlative search over what the path length allows
-comes first, and all of its modes are tried: the true place must be among them, or an alias wins. Particles that ask for
-the same map share the results; those whose map is another one share them as starts.
+Drift at a loop closure is far beyond the convergence range of registration, so a correlative search over the range
+allowed by the path length comes first, and all of its modes are registered: if the true place is missing, a similar one
+is accepted. Particles with the same map share the results; particles with another map of the same place share starts.
 """
 
 from __future__ import annotations
@@ -36,30 +36,30 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 KEPT_BYTES = 200_000_000
-"""What is kept of search fields, and of clouds that others are registered to, takes so much memory each [bytes]."""
+"""Memory limit of the cache of search fields, and of that of registration targets [bytes]."""
 POINT_BYTES = 1250
-"""Of one point of such a cloud, with its covariance and its places in two trees."""
+"""Memory of one point of a registration target, with covariance and search trees [bytes]."""
 LEAST_SCORE = 0.7
-"""A place that explains less of the points than this in the search is not registered: what registration accepted later
-scored 0.85 to 0.97, and places that the robot had not been at 0.54 to 0.63, with a few to 0.84 …"""
+"""Modes with a lower search score are not registered. Matches accepted later had scores of 0.85 to 0.97, unvisited
+places 0.54 to 0.63, with a few up to 0.84 …"""
 SCORE_MARGIN = 0.15
-"""… and none that scores so much less than the best."""
+"""… nor those worse than the best by more than this."""
 CLOUD_LEVEL = 1
-"""The occupied voxels of a map are gathered for matching in cells of 2**level voxels."""
+"""The occupied voxels of a map are averaged for matching in cells of 2**level voxels."""
 SAME_START = 1.0
-"""Particles that ask for the same map from places closer than about this share one search [m]."""
+"""Particles with the same map and predictions closer than about this share one search [m]."""
 RIVALS = 0.15
-"""In the maps that other particles made of the same steps only modes are tried that in the first were worse by no more
-than this share of the points. Less than ``choice.margin`` would hide second modes: then the margin counts."""
+"""In the maps of other particles of the same steps only those modes are tried that in the first map were worse by at
+most this share of the points, or by ``choice.margin`` if that is larger, so that second modes are not missed."""
 
 
 class RecentCache(dict[K, V]):
-    """What was made, by what it was made of; what was asked for longest ago goes first, and is made again.
+    """Least-recently-used cache with a memory limit.
 
     Parameters
     ----------
     size : callable
-        Bytes of one.
+        Bytes of a value.
     """
 
     def __init__(self, size: Callable[[V], int]) -> None:
@@ -67,7 +67,7 @@ class RecentCache(dict[K, V]):
         self._size = size
 
     def of(self, key: K, make: Callable[[], V]) -> V:
-        """That of a key, made where it is not there."""
+        """The value of a key, made if it is missing."""
         value = self[key] = self.pop(key) if key in self else make()
         size = sum(map(self._size, self.values()))
         for oldest in list(self)[:-1]:
@@ -77,29 +77,29 @@ class RecentCache(dict[K, V]):
         return value
 
     def keep(self, alive: Callable[[K], bool]) -> None:
-        """Drop all others."""
+        """Delete all other values."""
         for key in [k for k in self if not alive(k)]:
             del self[key]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchAttempt:
-    """What one attempt at one step came to.
+    """Result of one attempt at one step.
 
     Parameters
     ----------
     entries : tuple of N (SegmentEntry or None)
-        How each particle enters an older map; None: not at all.
+        Entry of each particle into an older map; None: no match.
     candidates : tuple of int
-        Segments that were asked for, by any particle.
+        Candidate segments of any particle.
     searches, registrations : int
-        Made.
+        Their numbers.
     accepted : int
-        Particles that had something to draw besides no match.
+        Number of particles with at least one accepted proposal.
     fitness : float
         Of the best registration; NaN without any.
     why : mapping of str to int
-        Gates that proposals failed.
+        Counts of gates that proposals failed.
     """
 
     step: int
@@ -113,7 +113,7 @@ class MatchAttempt:
 
     @property
     def matched(self) -> int:
-        """Particles that enter an older map."""
+        """Number of particles that enter an older map."""
         return sum(e is not None for e in self.entries)
 
     def describe(self) -> dict[str, Any]:
@@ -131,7 +131,7 @@ class MatchAttempt:
 
 
 class Matcher:
-    """Looks for re-entries.
+    """Finds and registers re-entries into older maps.
 
     Parameters
     ----------
@@ -143,9 +143,9 @@ class Matcher:
         self.segmap, self.config, self.max_range, self.threads = segmap, config, max_range, threads
         self.winnowed = CandidateSelection()
         self.seconds = 0.0
-        # what a closed map is matched by: made when it is first asked for
+        # registration targets of closed maps, made at first use
         self._targets: RecentCache[int, Target | None] = RecentCache(lambda t: 0 if t is None else POINT_BYTES * len(t))
-        # fine and coarse, of one of all particles' maps of the same steps
+        # fine and coarse, of one map of all particles' maps of the same steps
         self._fields: RecentCache[tuple[int, int], tuple[SearchField, SearchField]] = RecentCache(
             lambda pair: pair[0].nbytes + pair[1].nbytes
         )
@@ -158,7 +158,7 @@ class Matcher:
         poses : (N, 7) or (N, 3)
             ``T_segment_body``.
         ahead : LookAheadScan
-            The window of this step; with one that is not full, nothing is matched.
+            The window of this step; an incomplete window gives no matches.
         seed : SeedTree
             Of this attempt alone.
         """
@@ -206,7 +206,7 @@ class Matcher:
     # --- candidates ------------------------------------------------------------------------------------------
 
     def _candidates(self, step: int, poses: Array, seed: SeedTree) -> list[SegmentCandidates]:
-        """What each particle asks for. Particles that came the same way share a map sample."""
+        """Candidates of each particle. Particles with the same history share a map sample."""
         segmap, config = self.segmap, self.config
         groups: dict[tuple[int, int, int], list[int]] = {}
         for i, entry in enumerate(segmap.entries):
@@ -227,7 +227,7 @@ class Matcher:
         return [out[i] for i in range(len(poses))]
 
     def _held(self, source: int) -> frozenset[int]:
-        """Segments of whose scans every one is in the map of ``source`` already."""
+        """Segments with all their scans already in the map of ``source``."""
         if source < 0:
             return frozenset()
         t, scans = self.segmap.table, self.segmap.maps.scans
@@ -239,9 +239,9 @@ class Matcher:
     def _register(
         self, source: Array, asked: list[SegmentCandidates]
     ) -> tuple[dict[int, list[Registration]], int, int]:
-        """Results by map, and how many searches and registrations they took."""
+        """Results by map, and the numbers of searches and registrations."""
         s, gates = self.config.search, self.config.registration.gates
-        # the body may be tilted: what tilts against the prediction is refused later
+        # the body may be tilted: tilt relative to the prediction is checked later
         rules = replace(self.config.registration, gates=replace(gates, tilt=math.pi))
         planar = self.segmap.group.dim == 2
         cloud: Target | None = None
@@ -261,7 +261,7 @@ class Matcher:
                 done.add(key)
                 cloud = Target(source, neighbours=target.neighbours) if cloud is None else cloud
                 radius = min(s.max_radius, 2.5 * float(sigma))
-                # particles' maps that begin at one step begin at one place: where the first was found the others are
+                # maps that begin at one step share a start pose: the modes of the first are starts in the others
                 alike = modes.setdefault(self._begin(segment), [])
                 starts = next((f for at, r, f in alike if np.linalg.norm((T - at)[:2]) <= 0.25 * min(r, radius)), None)
                 first = starts is None
@@ -283,14 +283,14 @@ class Matcher:
         return results, searches, registrations
 
     def _begin(self, segment: int) -> int:
-        """Step at which the map that a segment works in was begun."""
+        """First step of the map that a segment uses."""
         t = self.segmap.table
         while t.source[segment] >= 0:
             segment = int(t.source[segment])
         return int(t.start[segment])
 
     def _target(self, m: int, segment: int) -> Target | None:
-        """The map's cloud, None if there is too little of it."""
+        """Registration target of the map; None if it has too few points."""
 
         def made() -> Target | None:
             points = self.segmap.map_of(segment)[0].binned_cloud(CLOUD_LEVEL).points
@@ -299,7 +299,7 @@ class Matcher:
         return self._targets.of(m, made)
 
     def _search(self, source: Array, segment: int, T: Array, half: list[float]) -> list[Array]:
-        """Starts of registrations: the distinct best places, if any is good enough to be the true one."""
+        """Starts for registration: the best distinct modes, if any score is high enough."""
         s = self.config.search
         known = (self._begin(segment), int(self.segmap.table.end[segment]))
 
@@ -317,7 +317,7 @@ class Matcher:
         return [p.T for p in found if p.score >= max(LEAST_SCORE, best - SCORE_MARGIN)]
 
     def forget(self) -> None:
-        """Drop what belongs to maps that are gone."""
+        """Delete the cached data of maps that are gone."""
         segmap = self.segmap
         self._targets.keep(lambda m: segmap.maps.grids[m] is not None)
         ends = set(segmap.table.end[segmap.alive].tolist())
@@ -350,7 +350,7 @@ class Matcher:
         return out
 
     def _spread(self, entries: list[SegmentEntry | None], seed: SeedTree) -> list[SegmentEntry | None]:
-        """Particles that drew one match stand where its covariance may have them, not all at one place."""
+        """Sample the entry poses of particles from the covariance of their match."""
         group, n = self.segmap.group, len(entries)
         if n == 1:
             return entries

@@ -1,4 +1,4 @@
-"""Paths of map samples: put together of their segments' (A6), and where they do not meet."""
+"""Paths of map samples, concatenated from their segments (A6)."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Ints = npt.NDArray[np.int64]
 def concatenate_segments(segmap: SegMap, sample: MapSample, open_path: Array | None = None) -> Trajectory:
     """The path of a sample in the frame of its root (A6, eq. 11–12).
 
-    A boundary stands in two segments; its pose is that of the exit. Where two fronts of the growth met there is a
-    seam, over which the path jumps by what the loops do not close; see :func:`find_seams`.
+    A boundary belongs to two segments; its pose is the end pose of the first. Where two branches of the sample meet,
+    the path has a jump by the loop closure error.
 
     Parameters
     ----------
     open_path : (n, 7) or (n, 3), optional
-        ``T_segment_body`` of an open root, from its start to the step of now; without it the path ends where that
-        begins.
+        ``T_segment_body`` of an open root, from its start to the current step; without it the path ends where the open
+        segment begins.
     """
     g = segmap.group
     steps: list[Ints] = []

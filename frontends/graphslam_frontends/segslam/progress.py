@@ -1,4 +1,4 @@
-"""How far a run of SegSLAM is: for whoever waits for it."""
+"""Progress of a SegSLAM run."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from graphslam_frontends.segslam.submaps import common_ancestor_chain, segment_b
 
 @dataclass(frozen=True, slots=True)
 class SegSlamProgress:
-    """A look at a run. Of use until the next step only: the SegMap goes on.
+    """State of a run. Valid until the next step only, because the SegMap changes.
 
     Parameters
     ----------
     step, steps : int
-        Steps done, of how many.
+        Steps done, and their total number.
     length : float
         Driven so far, by the odometry [m].
     last : int
-        The segment that the best particle closed last; -1 before the first.
+        The last closed segment of the best particle; -1 before the first.
     """
 
     step: int
@@ -33,13 +33,13 @@ class SegSlamProgress:
 
     @property
     def segments(self) -> int:
-        """Segments of the best particle's chain that are closed."""
+        """Number of closed segments in the chain of the best particle."""
         return 0 if self.last < 0 else len(common_ancestor_chain(self.segmap, self.last))
 
     def paths(self) -> list[Array]:
         """Paths ``(n, 7|3)`` of the closed segments of the best particle's chain, in the frame of the first base.
 
-        Along the exits, as the segments are handed over: no loop is closed.
+        Composed along the end poses, without loop closures.
         """
         if self.last < 0:
             return []

@@ -1,4 +1,4 @@
-"""What a run of SegSLAM came to, and the questions one asks of it."""
+"""Result of a SegSLAM run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ScoreLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Boundary:
-    """Where segments ended, why, of how many particles, and how many different ones."""
+    """A boundary: where segments ended, the reason, the number of particles, and of distinct segments."""
 
     step: int
     why: str
@@ -55,19 +55,19 @@ class SegSlamResult:
         The last segment of each particle.
     weights : (N,)
     best : int
-        The heaviest particle.
+        Index of the particle with the largest weight.
     effective, resampled : (n,)
         N_eff of each step before resampling; whether it was resampled.
     ancestry : Ancestry
-        Poses in the frames of the segments; tags number these.
+        Poses in the frames of the segments; tags are the numbers of the segments.
     scores, attempts, boundaries : tuples
-        In the order of time; attempts are those that had candidates.
+        In the order of time; only attempts with candidates.
     seconds : mapping of str to float
-        Wall time by part.
+        Wall time by part [s].
     step_seconds : (n,)
-        Wall time of each step, of all parts together.
+        Wall time of each step, all parts together [s].
     used_bytes : int
-        Memory of all maps at the end.
+        Memory of all maps at the end [bytes].
     """
 
     steps: Steps
@@ -99,7 +99,7 @@ class SegSlamResult:
         Parameters
         ----------
         number : int
-            Samples with different numbers are drawn independently; the same number is the same sample.
+            Samples with different numbers are independent; the same number gives the same sample.
         """
         at = int(self.closed[self.best if particle is None else particle])
         rng = self.seed.child("map-sample", number).generator()
@@ -115,15 +115,14 @@ class SegSlamResult:
 
     @property
     def final_pose(self) -> Array:
-        """Pose of the best particle at the end in the frame of the first segment, by the shortest way of entries and
-        exits between the two."""
+        """End pose of the best particle in the frame of the first segment, by the map sample."""
         s = self.sample()
         group = self.segmap.group
         exit = self.segmap.table.exit[int(self.closed[self.best])]
         return np.asarray(group.between(s.poses[int(s.in_time[0])], exit))
 
     def report(self) -> dict[str, Any]:
-        """The run in figures, ready for JSON."""
+        """Metrics of the run, ready for JSON."""
         n = len(self.weights)
         quantiles = np.quantile(self.effective / n, [0.05, 0.5])
         t = self.segmap.table

@@ -1,11 +1,10 @@
 """Map samples: one path through the SegMap, with the pose of every submap on it (SegSLAM section 3.3).
 
-A sample begins at one segment and grows along two kinds of links: to segments that end where one begins (or begin where
-it ends), any of which will do (A6), and between a segment that entered an older map and the one it entered. These two
-share a frame, in which the later was localised in what the earlier saw: nothing drifts between them. So such links are
-taken at once, before those in time, which are taken breadth-first, among links of equal depth in random order. After a
-loop closure submaps stand where the closure says, not where the long way round would put them; and a place that was
-driven through twice is one place, whichever of its two segments was reached first.
+A sample begins at one segment and grows along two kinds of links: in time, to any segment that ends where one begins or
+begins where it ends (A6); and in space, between a segment that entered an older map and the one it entered. Linked in
+space, two segments share a frame, in which the later one was localised, so there is no drift between them. So links in
+space are followed at once, links in time breadth-first, in random order at equal depth. After a loop closure submaps
+are where the closure puts them, not where the long path would, whichever of two segments of a place was reached first.
 """
 
 from __future__ import annotations
@@ -26,29 +25,30 @@ from graphslam_frontends.segslam.segmap import NEW, SegMap, SegmentEntry
 Ints = npt.NDArray[np.int64]
 
 OPEN = -1
-"""Stands for the segment a particle is in now, which has no index yet."""
+"""Index of the open segment of a particle."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSample:
-    """Segments that follow each other, and where their frames are.
+    """Consecutive segments and the poses of their frames.
 
     Parameters
     ----------
     segments : (m,) int64
-        In the order they were reached; the first is the root, `OPEN` if it is the one a particle is in now.
+        In the order in which they were reached; the first is the root, `OPEN` if it is the current segment of a
+        particle.
     poses : (m, 7) or (m, 3)
-        ``T_root_segment``: frames of the segments in that of the root.
+        ``T_root_segment``: frames of the segments in the frame of the root.
     via : (m,) int64
-        Place in this sample of the segment each was reached from; -1 of the root.
+        Index in this sample of the segment from which each was reached; -1 for the root.
     depth : (m,) int64
-        Links from the root, of both kinds.
+        Number of links from the root, of both kinds.
     intervals : (m, 2) int64
-        Steps of the boundaries; of an open root its start and the step of now.
+        Steps of the boundaries; for an open root its start and the current step.
     anchor : (m,) int64
-        Step at which the way from the root comes into the segment …
+        Step at which the path from the root enters the segment …
     travelled : (m,) float64
-        … and the length of that way up to there [m]: how far poses have drifted apart depends on it.
+        … and the length of that path up to there [m], which determines the drift.
     """
 
     segments: Ints
@@ -64,13 +64,13 @@ class MapSample:
 
     @property
     def in_time(self) -> Ints:
-        """Places in this sample in the order of the path."""
-        return np.argsort(self.intervals[:, 0], kind="stable").astype(np.int64)  # they do not overlap
+        """Indices of this sample in the order of time."""
+        return np.argsort(self.intervals[:, 0], kind="stable").astype(np.int64)  # intervals do not overlap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleRoot:
-    """Where a sample begins: use :func:`root_of_particle` or :func:`root_of_segment`."""
+    """Root of a sample: use :func:`root_of_particle` or :func:`root_of_segment`."""
 
     segment: int
     start: int
@@ -83,7 +83,7 @@ class SampleRoot:
 
 
 def root_of_particle(segmap: SegMap, particle: int, step: int) -> SampleRoot:
-    """The segment a particle is in, at the step of now."""
+    """The current segment of a particle, at the current step."""
     if not 0 <= particle < segmap.particles or segmap.entries[particle] is None:
         raise DataError(f"particle {particle} is in no segment", wanted="one that entered a segment and did not leave")
     e = cast(SegmentEntry, segmap.entries[particle])
@@ -97,7 +97,7 @@ def root_of_particle(segmap: SegMap, particle: int, step: int) -> SampleRoot:
 
 
 def root_of_segment(segmap: SegMap, index: int) -> SampleRoot:
-    """A closed segment, seen from its end."""
+    """A closed segment, at its end."""
     s = segmap[index]
     return SampleRoot(
         segment=s.index, start=s.interval[0], end=s.interval[1], anchor=s.interval[1], entry=s.T_entry, exit=s.T_exit,
@@ -116,18 +116,18 @@ def grow_sample(
 ) -> MapSample:
     """Draw a map sample.
 
-    Level by level, the links in time of all segments of a level are taken in random order; each leads to any segment
-    that fits there and does not overlap in time with what the sample holds. As soon as a segment is reached, those that
-    share its frame follow, on the same level: the one whose map it entered, unless its place is taken, and of each
-    interval with segments that entered its own map the one that is drawn of that interval, if it is one of these. Of
-    each interval one segment is drawn, once.
+    Level by level, the links in time of all segments of a level are followed in random order; each leads to a segment
+    that fits there and does not overlap in time with the sample. When a segment is reached, those that share its frame
+    follow on the same level: the one whose map it entered, unless that overlaps; and of each interval with segments
+    that entered its own map the segment drawn for that interval, if it is one of these. One segment is drawn per
+    interval, once.
 
     Parameters
     ----------
     weights : (len(segmap),), optional
-        Of the segments, for the draw among those that fit; default equal. Where all that fit weigh nothing, equal.
+        Of the segments, for the draw among those that fit; default equal. If all that fit have zero weight, equal.
     local_length : float
-        Local sample: do not grow on from segments that the way from the root enters beyond this length [m]; 0 = full.
+        Local sample: no growth from segments that the path from the root enters beyond this length [m]; 0 = full.
     local_depth : int
         … nor from those this many links away; 0 = full.
     """
@@ -145,15 +145,15 @@ def grow_sample(
 def draw_weights(segmap: SegMap) -> Array:
     """Weights of all segments ``(len(segmap),)`` for the draw among those of an interval.
 
-    A segment's own weight is what its particles had when it was closed, of what was known by then. Where later segments
-    entered maps of an interval, more is known: those maps were found again, by particles that are still there, and what
-    came after was localised in them. So of such an interval the segments that were entered share the weight of those
-    that entered them, and the others, beside whose maps a second one of the same place would stand, have none.
+    The own weight of a segment is that of its particles when it was closed. If later segments entered maps of an
+    interval, more is known: surviving particles recognised those maps and were localised in them. Then the entered
+    segments share the weight of those that entered them, and the others of that interval have zero weight, because
+    their maps would duplicate the place.
     """
     t, n = segmap.table, len(segmap)
     out = np.where(t.alive[:n], t.weight[:n], 0.0)
     received = np.zeros(n)
-    # the latest first: a segment is entered only by later ones
+    # the latest first: a segment is only entered by later ones
     for begin, end in segmap.intervals()[::-1].tolist():
         rows = segmap.in_interval((begin, end))
         if received[rows].any():
@@ -164,7 +164,7 @@ def draw_weights(segmap: SegMap) -> Array:
 
 
 def segment_probabilities(fits: Ints, weights: Array | None) -> Array:
-    """Of the segments that fit ``(k,)``; equal without weights, and where all weigh nothing."""
+    """Of the segments that fit ``(k,)``; equal without weights, and if all are zero."""
     w = np.ones(len(fits)) if weights is None else np.asarray(weights, dtype=np.float64)[fits]
     return np.asarray(w / w.sum()) if w.sum() > 0 else np.full(len(fits), 1.0 / len(fits))
 
@@ -175,7 +175,7 @@ def _draw(fits: Ints, weights: Array | None, rng: np.random.Generator) -> int:
     if weights is None:
         return int(rng.integers(len(fits)))
     p = segment_probabilities(fits, weights)
-    # rounding must not choose one without weight
+    # rounding must not choose a segment of zero weight
     return int(min(np.searchsorted(np.cumsum(p), rng.random(), side="right"), np.flatnonzero(p)[-1]))
 
 
@@ -188,14 +188,14 @@ def grow_sample_by(
     local_length: float = 0.0,
     local_depth: int = 0,
 ) -> MapSample:
-    """As :func:`grow_sample`, with the two kinds of choice given.
+    """As :func:`grow_sample`, with given functions for the two kinds of choice.
 
     Parameters
     ----------
     order : callable
-        Number of links of a level → the order in which they are taken.
+        Number of links of a level → the order in which they are followed.
     choose : callable
-        Segments ``(k,)`` that fit → which of them, 0 … k - 1.
+        Segments ``(k,)`` that fit → index of the chosen one, 0 … k - 1.
     """
     growing = _GrowingSample(segmap, root, choose, local_length, local_depth)
     level = growing.settle(0)
@@ -210,18 +210,18 @@ _BEFORE, _AFTER = 0, 1
 
 
 class _Free:
-    """Frames of a sample as whole poses: where gravity is not known."""
+    """Frames of a sample as full poses, without gravity."""
 
     def __init__(self, segmap: SegMap, root: SampleRoot) -> None:
         self.g, self.t, self.root = segmap.group, segmap.table, root
         self.at = [self.g.identity]
 
     def linked(self, k: int, T: Array) -> None:
-        """A frame more, at ``T`` in that of place k."""
+        """Add a frame at ``T`` relative to frame k."""
         self.at.append(self.g.compose(self.at[k], T))
 
     def joined(self, k: int, here: int, there: int, direction: int) -> None:
-        """A frame more, of segment ``there`` that comes before or after ``here`` in place k: both know the body at the
+        """Add the frame of segment ``there`` before or after ``here`` (frame k): both have the body pose at the
         boundary (A6)."""
         entry, exit = (self.root.entry, self.root.exit) if k == 0 else (self.t.entry[here], self.t.exit[here])
         if direction == _BEFORE:
@@ -236,7 +236,7 @@ class _Free:
 
 
 class _Upright:
-    """Frames of a sample by position and heading: those between level frames, ten times as fast as whole poses."""
+    """Frames of a sample by position and heading, for levelled frames; ten times as fast as full poses."""
 
     def __init__(self, segmap: SegMap, root: SampleRoot) -> None:
         self.t, self.dim, self.root = segmap.table, segmap.group.dim, root
@@ -262,7 +262,7 @@ class _Upright:
         self._put(k, a, heading, b, float(self.t.headings[there, 1 - leaving]))
 
     def _put(self, k: int, a: Array, heading_a: float, b: Array, heading_b: float) -> None:
-        """The body is at ``a`` in the frame of place k, and at ``b`` in the new one."""
+        """The body is at ``a`` in frame k, and at ``b`` in the new one."""
         x, y, z, yaw = self.at[k]
         c, s = math.cos(yaw), math.sin(yaw)
         ax, ay, bx, by = float(a[0]), float(a[1]), float(b[0]), float(b[1])
@@ -280,7 +280,7 @@ class _Upright:
 
 
 class _GrowingSample:
-    """A sample while it grows: places in the order in which they were added, each with the one that it hangs on."""
+    """A growing sample: segments in the order in which they were added, each with its predecessor."""
 
     def __init__(
         self,
@@ -298,11 +298,11 @@ class _GrowingSample:
         self.drawn: dict[tuple[int, int], int] = {}
 
     def free(self, begin: int, end: int) -> bool:
-        """Does an interval overlap in time with nothing that is there?"""
+        """Is an interval without overlap with the sample?"""
         return not any(begin < e and s < end for s, e in self.intervals)
 
     def fits(self, found: Ints) -> Ints:
-        """Those that do not overlap in time with what is there."""
+        """Those without overlap in time with the sample."""
         if not len(found):
             return found
         ends, begins = self.t.end[found], self.t.start[found]
@@ -311,7 +311,7 @@ class _GrowingSample:
         return found[[self.free(b, e) for b, e in zip(begins.tolist(), ends.tolist())]]
 
     def add(self, index: int, at: int, step_there: int, step_here: int) -> int:
-        """A place more; its number."""
+        """Add a segment; returns its index in the sample."""
         L = self.segmap.path_length
         self.segments.append(index)
         self.via.append(at)
@@ -322,7 +322,7 @@ class _GrowingSample:
         return len(self.segments) - 1
 
     def draw(self, found: Ints) -> int:
-        """One of those that fit; the same again of an interval that was asked for before."""
+        """Draw one of those that fit; the same one again for an interval that was drawn before."""
         begins, ends = self.t.start[found], self.t.end[found]
         if (begins != begins[0]).any() or (ends != ends[0]).any():
             return int(found[self.choose(found)])
@@ -332,14 +332,14 @@ class _GrowingSample:
         return self.drawn[key]
 
     def grows(self, k: int) -> bool:
-        """Is place k near enough to the root to be gone on from?"""
+        """Is segment k of the sample near enough to the root to grow from?"""
         far = self.local_length and self.travelled[k] > self.local_length
         return not (far or (self.local_depth and self.depth[k] >= self.local_depth))
 
     def settle(self, k: int) -> list[int]:
-        """Places of what shares a frame with place k, and with those in turn; place k first."""
+        """Add all segments that share a frame with segment k, recursively; returns their indices, k first."""
         found, g, t, segmap = [k], self.segmap.group, self.t, self.segmap
-        for k in found:  # grows as it goes
+        for k in found:  # the list grows in the loop
             if not self.grows(k):
                 continue
             i, begin = self.segments[k], self.intervals[k][0]
@@ -348,7 +348,7 @@ class _GrowingSample:
                 source, T, entry = int(t.source[i]), t.link[i], t.entry[i]
             if source >= 0 and t.alive[source] and self.free(int(t.start[source]), int(t.end[source])):
                 T = cast(Array, T)
-                # the way goes on from where the body stood in the entered map
+                # the path continues from the position of the body in the entered map
                 found.append(self.add(source, k, nearest_step(segmap, source, g.compose(g.inverse(T), entry)), begin))
                 self.frames.linked(k, T)
             entering = segmap.entering(i)
@@ -358,14 +358,14 @@ class _GrowingSample:
                 rivals = segmap.beginning_at(begin)
                 chosen = self.draw(rivals[t.end[rivals] == end])
                 if t.source[chosen] != i:
-                    continue  # particles of that time that went another way
+                    continue  # particles of that time did not enter this map
                 T = g.inverse(t.link[chosen])
                 found.append(self.add(chosen, k, begin, nearest_step(segmap, i, g.compose(T, t.entry[chosen]))))
                 self.frames.linked(k, T)
         return found
 
     def links(self, level: list[int]) -> list[tuple[int, int]]:
-        """Where places of a level go on: place and direction in time."""
+        """Links in time from the segments of a level: index and direction."""
         out = []
         for k in level:
             if self.grows(k):
@@ -375,7 +375,7 @@ class _GrowingSample:
         return out
 
     def join(self, k: int, direction: int) -> list[int]:
-        """Add what comes before or after place k, if anything fits; the new places."""
+        """Add a segment before or after segment k, if one fits; returns the new indices."""
         begin, end = self.intervals[k]
         at = begin if direction == _BEFORE else end
         there = self.fits(self.segmap.ending_at(at) if direction == _BEFORE else self.segmap.beginning_at(at))
@@ -387,7 +387,7 @@ class _GrowingSample:
         return self.settle(place)
 
     def sample(self) -> MapSample:
-        """What has grown."""
+        """The finished sample."""
         return MapSample(
             segments=np.array(self.segments, np.int64),
             poses=self.frames.poses(),
@@ -400,7 +400,7 @@ class _GrowingSample:
 
 
 def nearest_step(segmap: SegMap, index: int, T_segment_body: Array) -> int:
-    """Step of a segment at which its body stood nearest to a pose in its frame."""
+    """Step of a segment with the body position nearest to a pose in its frame."""
     path = cast(Array, segmap.table.paths[index])
     d = path[:, : segmap.group.dim] - np.asarray(T_segment_body)[: segmap.group.dim]
     return int(segmap.table.start[index]) + int(np.argmin(np.einsum("ni,ni->n", d, d)))

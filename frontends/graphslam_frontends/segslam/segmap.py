@@ -1,11 +1,11 @@
 """The SegMap Θ: all segments of the path, their submaps, and which of them fit together in time (SegSLAM section 3).
 
 A segment covers the steps of an *interval*, from the boundary where a particle entered a submap to the one where it
-left. Particles that are alive at a boundary leave one segment each, so an interval has many, and those of one interval
-are interchangeable: any of them may be followed by any that begins where it ends (A6).
+left. Each particle at a boundary leaves one segment, so an interval has many. Segments of one interval are
+interchangeable: any of them may be followed by any that begins where it ends (A6).
 
-Frames. The frame of a new segment is the body at its entry, levelled and lowered by `lift` where gravity is known. A
-segment that entered an older map works in the frame of that map, on a copy of it. Poses are ``T_segment_body``.
+Frames. The frame of a new segment is the body at its entry, levelled and lowered by `lift` if gravity is known. A
+segment that entered an older map uses the frame of that map, and a copy of it. Poses are ``T_segment_body``.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ class SegMap:
     times : (n,)
         Of the steps [s].
     path_length : (n,)
-        Way by odometry up to each step [m].
+        Path length by odometry up to each step [m].
     dim : {3, 2}
     gravity : bool
-        Frames are aligned with gravity: only headings lie between them.
+        Frames are aligned with gravity: their relative rotation is a heading.
     lift : float
-        Height of the body over the frame of a new segment at its entry [m].
+        Height of the body above the frame of a new segment at its entry [m].
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class SegMap:
         self.particles = int(particles)
         self.table = SegmentTable(self.group.size)
         self.maps = SegmentMaps(self.group)
-        # the open segment of each particle: how it was entered, since which boundary, after which closed segment
+        # the open segment of each particle: its entry, its first boundary, and the closed segment before it
         self.entries: list[SegmentEntry | None] = [None] * self.particles
         self.links: list[Array] = [self.group.identity] * self.particles
         self.start: Ints = np.zeros(self.particles, np.int64)
@@ -73,7 +73,7 @@ class SegMap:
         self.pruned = 0
 
     def __len__(self) -> int:
-        """Number of segments ever closed; their indices are 0 … len - 1, also of those pruned since."""
+        """Number of all segments ever closed; their indices are 0 … len - 1, including pruned ones."""
         return self.table.count
 
     def __getitem__(self, index: int) -> Segment:
@@ -100,7 +100,7 @@ class SegMap:
 
     @property
     def alive(self) -> Ints:
-        """Indices of the segments that are viable, ascending."""
+        """Indices of the viable segments, ascending."""
         return np.flatnonzero(self.table.alive).astype(np.int64)
 
     # --- life of the current segments ------------------------------------------------------------------------
@@ -113,15 +113,15 @@ class SegMap:
         Parameters
         ----------
         entries : sequence of SegmentEntry
-            One for each particle, in its order.
+            One per particle, in the order of ``which``.
         which : iterable of int, optional
             The particles; default all.
 
         Returns
         -------
         list of EvidenceGrid or None
-            The map to go on with: a copy of the one that is entered, locked if that is; None of a new segment, whose
-            map the filter makes.
+            The map to continue with: a copy of the one entered, locked if that is; None for a new segment, whose map
+            the filter creates.
         """
         chosen = self._which(which, len(entries), "entries")
         if not 0 <= step < len(self.times):
@@ -151,7 +151,7 @@ class SegMap:
         return grids
 
     def resample(self, ancestors: npt.ArrayLike) -> None:
-        """Particle i becomes a copy of particle ``ancestors[i]``; closed segments stay, whoever made them (A6)."""
+        """Particle i becomes a copy of particle ``ancestors[i]``; closed segments of all particles are kept (A6)."""
         a = np.asarray(ancestors, dtype=np.int64)
         if a.shape != (self.particles,) or a.min() < 0 or a.max() >= self.particles:
             raise DataError("impossible ancestors", got=a, wanted=f"{self.particles} of 0 … {self.particles - 1}")
@@ -167,12 +167,12 @@ class SegMap:
         weights: npt.ArrayLike | None = None,
         which: Iterable[int] | None = None,
     ) -> Ints:
-        """Particles leave their segments at a boundary; what they hold is kept.
+        """Particles leave their segments at a boundary; the closed segments are stored.
 
         Parameters
         ----------
         grids : sequence of EvidenceGrid
-            Their maps, in the frames they work in. Only handles are kept: the filter may go on writing to its own.
+            Their maps, in their frames. Copies are stored: the filter may continue to write to its own.
         paths : sequence of (step - start + 1, 7 or 3)
             ``T_segment_body`` at every step since the boundary, both boundaries included, **in the frame of this
             segment**: the first pose is that of the entry.
@@ -208,15 +208,15 @@ class SegMap:
     # --- what fits together ----------------------------------------------------------------------------------
 
     def ending_at(self, step: int) -> Ints:
-        """Viable segments that end at a boundary, ascending: those that may come before what begins there."""
+        """Viable segments that end at a boundary, ascending: possible predecessors of those that begin there."""
         return self.table.fitting[1].get(int(step), _NOBODY)
 
     def beginning_at(self, step: int) -> Ints:
-        """Viable segments that begin at a boundary, ascending: those that may follow what ends there."""
+        """Viable segments that begin at a boundary, ascending: possible successors of those that end there."""
         return self.table.fitting[0].get(int(step), _NOBODY)
 
     def entering(self, index: int) -> Ints:
-        """Viable segments that entered the map of a segment, or went on in it, ascending: they share its frame."""
+        """Viable segments that entered or continued the map of a segment, ascending: they share its frame."""
         return self.table.fitting[2].get(int(index), _NOBODY)
 
     def intervals(self) -> Ints:
@@ -230,24 +230,24 @@ class SegMap:
         return np.flatnonzero(t.alive & (t.start == interval[0]) & (t.end == interval[1])).astype(np.int64)
 
     def chain(self, index: int) -> Ints:
-        """Segments from the first to ``index`` as one particle lived them, as far as they are viable."""
+        """Segments of one particle from the first to ``index``, back to the first one pruned."""
         found = [self._alive(index)]
         while (p := int(self.table.previous[found[-1]])) >= 0 and self.table.alive[p]:
             found.append(p)
         return np.array(found[::-1], np.int64)
 
     def map_of(self, index: int) -> tuple[EvidenceGrid, Array]:
-        """Map of a segment, and ``T_map_segment``: the identity, except where maps were merged. Not to be written."""
+        """Map of a segment, and ``T_map_segment``: the identity, unless maps were merged. Read-only."""
         m = int(self.table.map[self._alive(index)])
         return cast(EvidenceGrid, self.maps.grids[m]), self.table.T_map[index]
 
     # --- care ------------------------------------------------------------------------------------------------
 
     def prune(self) -> int:
-        """Drop the segments that are not viable any more, and give their maps back; returns how many.
+        """Drop the segments that are not viable any more, and free their maps; returns their number.
 
-        A segment is viable while a chain of segments, each beginning where the one before ends, leads from it to
-        where a particle is now (A12).
+        A segment is viable while a chain of segments, each beginning where the previous one ends, leads from it to the
+        start of a current segment (A12).
         """
         t = self.table
         here = set(self.start.tolist())
@@ -259,18 +259,18 @@ class SegMap:
         return self._release(dead)
 
     def lock(self, index: int) -> None:
-        """A segment's map is localised in from now on, not updated: also its copies that are entered later (A12)."""
+        """Use the map of a segment for localisation only, without updates; also for copies entered later (A12)."""
         self.maps.lock(int(self.table.map[self._alive(index)]))
 
     def entered(self, index: int) -> int:
-        """How often particles entered the map of a segment by a match."""
+        """Number of times that particles entered the map of a segment by a match."""
         return self.maps.entered[int(self.table.map[self._alive(index)])]
 
     def merge(self, keep: int, other: int, T_keep_other: npt.ArrayLike | None = None) -> EvidenceGrid:
-        """Make one map of two by adding their log-odds (A12); both segments, and all that use the two maps, have it.
+        """Merge two maps by adding their log-odds (A12); all segments of the two maps then use the merged one.
 
-        Each scan counts once: where one map holds all scans of the other (it was entered, and went on), it takes its
-        place and nothing is added.
+        Each scan counts once: if one map contains all scans of the other (it was entered and continued), it replaces
+        the other and nothing is added.
 
         Parameters
         ----------
@@ -302,13 +302,13 @@ class SegMap:
     def _append(self, p: int, step: int, e: SegmentEntry, grid: EvidenceGrid, path: Array) -> int:
         interval = (int(self.start[p]), step)
         scans = {interval}
-        if e.kind != NEW:  # a copy: what its source held is in it, also if that was pruned since
+        if e.kind != NEW:  # a copy: it contains the scans of its source, even if that was pruned since
             scans |= self._scans_of(e.source)
         m = self.maps.add(grid.copy(), frozenset(scans), grid.locked)
         return self.table.append(interval, e, int(self.previous[p]), path, m, self.links[p], self.group.identity)
 
     def _scans_of(self, source: int) -> frozenset[tuple[int, int]]:
-        """Intervals whose scans the map of a segment holds."""
+        """Intervals with scans in the map of a segment."""
         return self.maps.scans[int(self.table.map[source])]
 
     def _release(self, dead: Ints) -> int:
@@ -333,7 +333,7 @@ class SegMap:
         return chosen
 
     def _check_entry(self, p: int, e: SegmentEntry) -> Array:
-        """Raise if a particle cannot enter so; ``T_segment_source`` between the frames."""
+        """Raise if an entry is invalid; returns ``T_segment_source`` between the frames."""
         T = np.asarray(e.T_entry, dtype=np.float64)
         if T.shape != (self.group.size,) or not np.all(np.isfinite(T)):
             raise GeometryError(f"entry of particle {p} is no pose", got=T, wanted=f"({self.group.size},) finite")
@@ -344,7 +344,7 @@ class SegMap:
         if e.kind == NEW:
             return self.group.identity
         self._alive(e.source)
-        if e.kind == MATCH:  # it becomes a factor some day, and none goes without
+        if e.kind == MATCH:  # it may become a factor, which needs a covariance
             if e.covariance is None:
                 raise CovarianceError(f"particle {p} enters segment {e.source} by a match without a covariance")
             check_covariance(e.covariance, what=f"covariance of a match into segment {e.source}", dim=self.group.dof)

@@ -1,4 +1,4 @@
-"""Segments as values: how a particle enters one, and what is known of one that is closed."""
+"""Segments: how a particle enters one, and the data of a closed one."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
 
 NEW, MATCH, SAME = 0, 1, 2
-"""How a segment was entered (A2): an empty map; an older one, by registration; the one it comes from, which goes on."""
+"""Kind of entry (A2): an empty map; an older one, by registration; or the map of the previous segment, continued."""
 KINDS = ("new", "match", "same")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentEntry:
-    """How one particle enters a segment.
+    """Entry of a particle into a segment.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class SegmentEntry:
         ``T_segment_body`` at the boundary.
     kind : {NEW, MATCH, SAME}
     source : int
-        The older segment whose map is entered; -1 of a new one.
+        The older segment whose map is entered; -1 for a new map.
     covariance : (d, d) or None
         Of ``T_entry`` of a match, right tangent.
     fitness : float
@@ -42,7 +42,7 @@ class SegmentEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Segment:
-    """What is known of one closed segment; arrays are views and must not be written to.
+    """Data of a closed segment; arrays are read-only views.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Segment:
     kind : str
         "new", "match" or "same".
     source, previous : int
-        The segment whose map it entered (its parent), and the one its particle came from; -1 = none.
+        The segment whose map it entered (its parent), and the previous segment of its particle; -1 = none.
     T_entry, T_exit : (7,) or (3,)
         ``T_segment_body`` at the boundaries.
     path : (end - start + 1, 7 or 3)
@@ -61,10 +61,10 @@ class Segment:
     length : float
         Path length by odometry [m].
     weight : float
-        Share of the particles' weight when it was closed.
+        Sum of the weights of its particles when it was closed.
     match_covariance : (d, d) or None
     locked : bool
-        Its map is localised in, not updated.
+        Its map is used for localisation only, without updates.
     """
 
     index: int
@@ -85,7 +85,7 @@ class Segment:
 
 
 def check_path(path: Any, entry: SegmentEntry | None, particle: int, interval: tuple[int, int], last: int) -> Array:
-    """The path of a particle through a segment that it leaves ``(n, 7)`` or ``(n, 3)``, in the frame of that segment.
+    """Check the path ``(n, 7)`` or ``(n, 3)`` of a particle through a segment that it leaves, in the segment's frame.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def check_path(path: Any, entry: SegmentEntry | None, particle: int, interval: t
     interval : (start, end)
         Steps.
     last : int
-        The last step there is.
+        The last step of the log.
     """
     start, step = interval
     if entry is None:

@@ -1,8 +1,8 @@
-"""When a segment ends: motion error (A7), predictive score (A8), period; between a minimum and a maximum size.
+"""End of segments: motion error (A7), predictive score (A8), period; within a minimum and a maximum size.
 
-The predictive score asks how well the particles' maps foretell what the robot sees in the next seconds. It is a
-property of the place far more than of the particle (it falls at doors, corners, ramps), so one decision for the whole
-filter is the default; and it is low in a fresh map, so the first seconds of a segment do not count.
+The predictive score is the quality of the maps' prediction of the beams of the next seconds. It depends on the place
+far more than on the particle (it falls at doors, corners, ramps), so the default is one decision for the whole filter.
+It is low in a new map, so the first seconds of a segment are not used.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from graphslam_frontends.segslam.config import SegmentationConfig
 Scan = tuple[Array, Array, npt.NDArray[np.bool_]]
 """Points, origins and returns of one step, in the base frame at its stamp."""
 SCORE_SIGMA, SCORE_CLIP = 0.3, 3.0
-"""σ of the ranges in the log-likelihood of the predictive score [m], and where residuals are clipped [σ]."""
+"""σ of the ranges in the log-likelihood of the predictive score [m], and the limit of residuals [σ]."""
 KNOWN_SCORE = 0.8
-"""Predictive score from which ground is known that the path of the map itself passed: it does not count for the longest
-length of a segment, since a map that ended there would be drawn a second time beside the first. In a simulated building
-three quarters of the scores on new ground are below 0.78, and of those on the way back above 0.84."""
+"""Predictive score above which revisited ground counts as known: it does not add to the length of a segment, because a
+new segment there would map it a second time. In a simulated building 75 % of the scores on new ground are below 0.78,
+and 75 % of those on the way back above 0.84."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LookAheadWindow:
-    """Beams of the look-ahead window in the frame of the body before it, carried there by dead reckoning (A8).
+    """Beams of the look-ahead window, transformed by dead reckoning to the body frame before it (A8).
 
     Parameters
     ----------
     points, origins : (n, dim)
-        Of beams that met something within range [m].
+        Of returns within range [m].
     beams : int
-        Beams of the window, those that met nothing included.
+        Number of beams of the window, including those without a return.
     """
 
     points: Array
@@ -52,7 +52,7 @@ class LookAheadWindow:
         return len(self.points)
 
     def thinned(self, most: int) -> LookAheadWindow:
-        """At most so many of its points, evenly spread."""
+        """At most ``most`` of its points, evenly spaced."""
         if len(self) <= most:
             return self
         rows = np.linspace(0, len(self) - 1, most).astype(np.int64)
@@ -60,12 +60,12 @@ class LookAheadWindow:
 
 
 def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float) -> LookAheadWindow:
-    """Bring the scans of a window into one frame.
+    """Transform the scans of a window to one frame.
 
     Parameters
     ----------
     increments : (w, 7) or (w, 3)
-        Dead reckoning from each step of the window to the next, the first from the body's frame to the first step.
+        Dead reckoning from each step of the window to the next, the first from the body frame to the first step.
     scans : sequence of w scans
     max_range : float
         Beams longer than this are left out [m].
@@ -88,14 +88,14 @@ def gather_window(increments: ArrayLike, scans: Sequence[Scan], max_range: float
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowScore:
-    """How well maps foretell a window.
+    """Prediction of a window by maps.
 
     Parameters
     ----------
     shares : (P,)
-        Share of the beams that a particle's map predicts; NaN without any beam.
+        Share of the beams that the map of a particle predicts; NaN without any beam.
     log_likelihoods : (P,)
-        Mean log-likelihood a beam, 0 = perfect (eq. 15–17, clipped); NaN likewise.
+        Mean log-likelihood per beam, 0 = perfect (eq. 15–17, limited); NaN likewise.
     share, log_likelihood : float
         Weighted means over the particles.
     """
@@ -117,7 +117,7 @@ def predictive_score(
     tolerance: float = 0.6,
     threads: int = 1,
 ) -> WindowScore:
-    """Cast the beams of a look-ahead window in the particles' maps (A8).
+    """Ray-cast the beams of a look-ahead window in the particles' maps (A8).
 
     Parameters
     ----------
@@ -128,9 +128,9 @@ def predictive_score(
         [m]
     weights : (P,), optional
     tolerance : float
-        A beam is predicted if the map expects a range within this [m]; where it expects nothing, it is not.
+        A beam is predicted if the expected range is within this [m]; without an expected range it is not.
     threads : int
-        The result is the same for any number.
+        The result does not depend on it.
     """
     n = len(grids)
     w = normalise_weights(weights, n)
@@ -139,7 +139,7 @@ def predictive_score(
         return WindowScore(shares=nan, log_likelihoods=nan, share=math.nan, log_likelihood=math.nan, beams=0)
     rays = window.points - window.origins
     measured = np.linalg.norm(rays, axis=1)
-    # a wall somewhat beyond the beam must still count as met, or the tolerance would be one-sided at the limit
+    # a wall slightly beyond the beam must count, or the tolerance would be one-sided at the limit
     reach = max_range + tolerance
     c = cast_grids(grids, poses, window.origins, rays, reach, threads=threads)
     with np.errstate(invalid="ignore"):
@@ -157,9 +157,9 @@ def predictive_score(
 
 
 def representative_particles(weights: Array, most: int) -> tuple[npt.NDArray[np.int64], Array]:
-    """Which particles speak for all: at most so many, spread evenly over the weight, and the share of each.
+    """Indices of at most ``most`` representative particles, evenly spaced over the weight, and their shares.
 
-    The weighted mean of anything over them is that over all, but for the spread within one ``most``-th of the weight.
+    Their weighted mean approximates that of all, within the spread of one ``most``-th of the weight.
     """
     if len(weights) <= most:
         return np.arange(len(weights), dtype=np.int64), weights
@@ -170,14 +170,14 @@ def representative_particles(weights: Array, most: int) -> tuple[npt.NDArray[np.
 
 
 def motion_error(lengths: ArrayLike, turns: ArrayLike, translation: ArrayLike, rotation: ArrayLike) -> Array:
-    """Motion error that has gathered since a segment began, after each step ``(n,)`` (A7, eq. 13).
+    """Accumulated motion error of a segment after each step ``(n,)`` (A7, eq. 13).
 
     Parameters
     ----------
     lengths, turns : (n,)
-        Metres driven and radians turned in each step, the segment's own.
+        Metres driven and radians rotated in each step of the segment.
     translation, rotation : float or (n,)
-        α1 [1/m] and α2 [1/rad]; arrays of them make the error depend on the state (eq. 14).
+        α1 [1/m] and α2 [1/rad]; with arrays the error depends on the state (eq. 14).
     """
     d, a = np.abs(np.asarray(lengths, dtype=np.float64)), np.abs(np.asarray(turns, dtype=np.float64))
     per_metre, per_radian = np.asarray(translation, dtype=np.float64), np.asarray(rotation, dtype=np.float64)
@@ -186,19 +186,19 @@ def motion_error(lengths: ArrayLike, turns: ArrayLike, translation: ArrayLike, r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentDecision:
-    """Whether a segment ends here.
+    """Decision whether a segment ends here.
 
     Parameters
     ----------
     why : str
-        "score", "relative-score", "motion-error", "period", "max-length", "max-seconds"; else what keeps it: "young",
-        "short", "" if nothing asks for an end.
+        "score", "relative-score", "motion-error", "period", "max-length", "max-seconds"; if it does not end: "young" or
+        "short" (a criterion is met too early), or "".
     score, best_score : float
-        The score, NaN if there is none, and its maximum since the segment began, NaN before the first that counts.
+        The score, NaN if there is none, and its maximum in the segment, NaN before the first that counts.
     seconds, length : float
-        Age and way of the segment [s], [m].
+        Duration and path length of the segment [s], [m].
     new_ground : float
-        Way that its map did not foretell [m].
+        Path length over ground that its map did not predict [m].
     error : float
         Motion error.
     """
@@ -215,16 +215,16 @@ class SegmentDecision:
 
 @dataclass(slots=True)
 class Segmenter:
-    """Decides for one filter (or one particle) when its segment ends.
+    """Decides when the segment of a filter (or of a particle) ends.
 
     Parameters
     ----------
     time : float
-        When the segment began [s].
+        Start of the segment [s].
     length : float
-        Way by odometry up to there [m].
+        Path length by odometry up to there [m].
     turned : float
-        Radians turned up to there, all turns counted positive.
+        Sum of absolute rotations up to there [rad].
     """
 
     config: SegmentationConfig
@@ -240,27 +240,27 @@ class Segmenter:
         self.seen = self.length
 
     def begin(self, time: float, length: float, turned: float = 0.0) -> None:
-        """A new segment begins here."""
+        """Start a new segment."""
         self.time, self.length, self.turned = time, length, turned
         self.best, self.last = math.nan, -math.inf
         self.new_ground, self.seen = 0.0, length
 
     def copy(self) -> Segmenter:
-        """An equal one, for a resampled particle."""
+        """A copy, for a resampled particle."""
         twin = Segmenter(self.config, self.time, self.length, self.turned)
         twin.follow(self)
         return twin
 
     def follow(self, other: Segmenter) -> None:
-        """Know of the segment what another one knows that has decided."""
+        """Copy the state of another one that has decided."""
         self.best, self.last, self.new_ground, self.seen = other.best, other.last, other.new_ground, other.seen
 
     def due(self, time: float) -> bool:
-        """Is it time for a decision? Half a step's rounding of the clock does not put it off."""
+        """Is it time for a decision? Rounding of the clock does not delay it."""
         return time - max(self.last, self.time) >= self.config.every - 1e-6
 
     def wants_score(self, time: float) -> bool:
-        """Would a score say anything now? Else it need not be cast."""
+        """Would a score be used now? Otherwise ray casting is skipped."""
         c = self.config
         return not c.period and bool(c.score or c.relative_score) and time - self.time >= c.excluded - 1e-6
 
@@ -272,11 +272,11 @@ class Segmenter:
         Parameters
         ----------
         time, length, turned : float
-            Now, on the same scales as those of the beginning.
+            Current values, on the same scales as at the start.
         score : float
             Predictive score of the window ahead; NaN: there is none.
         again : bool
-            The body is where the path of its map passed before; only then may the ground be known.
+            The path of its map was here before; only then may the ground be known.
         """
         c = self.config
         seconds, way = time - self.time, length - self.length
@@ -287,11 +287,11 @@ class Segmenter:
         counts = not math.isnan(score) and seconds >= c.excluded - 1e-6
         known = counts and again and score >= KNOWN_SCORE
         if counts:
-            # The maximum that a drop is measured against includes the score of now, but not how well a map foretells
-            # what it has seen before: leaving that for new ground is no drop.
+            # The running maximum includes the current score, but not the high scores of revisited ground: going from
+            # there to new ground is no drop.
             usual = KNOWN_SCORE if known else score
             self.best = usual if math.isnan(self.best) else max(self.best, usual)
-        if not known:  # since the last decision; without a score nobody knows, and it counts
+        if not known:  # since the last decision; without a score the ground counts as new
             self.new_ground += length - self.seen
         self.seen = length
         why = self._why(seconds, way, error, score if counts else math.nan)

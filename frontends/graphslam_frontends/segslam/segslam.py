@@ -1,11 +1,11 @@
-"""SegSLAM: a particle filter on evidence grids that ends submaps, begins new ones, and enters old ones again.
+"""SegSLAM: a particle filter on evidence grids that ends submaps, begins new ones, and re-enters old ones.
 
-The state of a particle is its pose *in a submap* (A1–A6). While its map predicts what comes it goes on; when the map
-stops predicting, the segment ends for all particles, and each draws what comes next: an older map that explains the
-window ahead, or a new one. An older map can also be entered while the segment would have gone on; particles that do not
-draw it then carry on with the map they have.
+The state of a particle is its pose *in a submap* (A1–A6). While its map predicts the next beams the segment continues;
+otherwise the segment ends for all particles, and each draws its next map: an older one that explains the look-ahead
+window, or a new one. An older map can also be entered while the segment would continue; particles that do not draw it
+then keep their map.
 
-The filter stands at step k and looks at the seconds after it: it runs that far behind the sensors.
+The filter at step k uses the seconds after it, so it lags behind the sensors by that time.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from graphslam_frontends.segslam.window import LookAheadScan, gather_look_ahead
 
 Ints = npt.NDArray[np.int64]
 SCORE_BEAMS = 600
-"""Beams of a look-ahead window that are cast for the predictive score, at most (evenly thinned)."""
+"""Most beams of a look-ahead window that are ray-cast for the predictive score (evenly subsampled)."""
 SCORE_PARTICLES = 8
-"""Particles in whose maps they are cast, at most, by weight: where the whole filter decides, its mean score counts, and
-particles differ by less than 0.03 in it."""
+"""Most particles for the predictive score, selected by weight, if the filter decides as a whole: its mean score is
+used, and particles differ by less than 0.03 in it."""
 KNOWN_RADIUS = 2.0
-"""A place is known where the path of the map itself passed this near [m] …"""
+"""A place is known if the path of the map itself was within this distance [m] …"""
 KNOWN_GAP = 20.0
-"""… at least so long ago [s]."""
+"""… at least this long ago [s]."""
 
 
 def run_segslam(
@@ -74,7 +74,7 @@ def run_segslam(
     prune_every : int
         See :class:`~graphslam_frontends.grid.ancestry.Ancestry`.
     watch : callable, optional
-        Called with a :class:`~graphslam_frontends.segslam.progress.SegSlamProgress` after every step; changes nothing.
+        Called with a :class:`~graphslam_frontends.segslam.progress.SegSlamProgress` after every step.
     """
     if len(steps) < 2:
         raise DataError("too few steps for a segment", where=steps.name, got=len(steps), wanted="at least 2")
@@ -89,12 +89,12 @@ def run_segslam(
 
 
 def near_pose(path: Array, T: Array, radius: float) -> npt.NDArray[np.bool_]:
-    """Which poses of a path ``(n, 7)`` or ``(n, 3)`` are as near to a pose [m], in height too."""
+    """Which poses of a path ``(n, 7)`` or ``(n, 3)`` are within ``radius`` [m] of a pose, in 3-D."""
     return np.asarray(np.linalg.norm((path - T)[:, : group_of(T).dim], axis=1) <= radius)
 
 
 class _Run:
-    """A run, step by step."""
+    """State of a run, step by step."""
 
     def __init__(
         self, steps: Steps, filter: GridFilterConfig, config: SegSlamConfig, seed: SeedTree, prune_every: int
@@ -104,7 +104,7 @@ class _Run:
         n = filter.particles
         self.group = group_of(self.filter.particles.poses)
         self.path_length = steps.path_length
-        # how far the body turned, all turns counted
+        # accumulated absolute rotation
         tangents = self.group.log(steps.odometry.increments)
         turns = tangents[:, [2]] if steps.dim == 2 else tangents[:, :3]
         self.turned = np.cumsum(np.linalg.norm(turns, axis=1))
@@ -114,7 +114,7 @@ class _Run:
         self.matcher = Matcher(self.segmap, config, steps.max_range, threads=filter.threads)
         self.segmenters = [self._segmenter(0) for _ in range(n)]
         self.segmap.open(0, [SegmentEntry(T_entry=p, kind=NEW) for p in self.filter.particles.poses])
-        self.ids = np.zeros(n, dtype=np.int64)  # of the open segments, counted as they are begun: tags of the ancestry
+        self.ids = np.zeros(n, dtype=np.int64)  # of the open segments, in order of start: tags of the ancestry
         self.begun = 1
         self.last_attempt = float(steps.times[0])
         self.effective = np.empty(len(steps))
@@ -124,7 +124,7 @@ class _Run:
         self.attempts: list[MatchAttempt] = []
         self.boundaries: list[Boundary] = []
         self.closed: Ints = np.full(n, -1, dtype=np.int64)
-        self.seconds = {"score": 0.0, "match": 0.0, "segments": 0.0}  # wall time of what the filter does not count
+        self.seconds = {"score": 0.0, "match": 0.0, "segments": 0.0}  # wall time of parts not counted by the filter
         self.ahead: LookAheadScan | None = None
 
     # --- one step --------------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ class _Run:
         self.seconds["segments"] += time.perf_counter() - begin
 
     def _look(self, k: int) -> LookAheadScan:
-        """The window ahead, gathered once a step for scores and matches."""
+        """The look-ahead window, gathered once per step for scores and matches."""
         if self.ahead is None or self.ahead.step != k:
             self.ahead = gather_look_ahead(self.steps, k, self.config.segmentation.window)
         return self.ahead
@@ -180,7 +180,7 @@ class _Run:
     # --- when a segment ends ---------------------------------------------------------------------------------
 
     def _ending(self, k: int, now: float) -> tuple[npt.NDArray[np.bool_], str]:
-        """Which particles' segments end here, and why those of the first do (A7, A8)."""
+        """Which particles' segments end here, and the reason of the first of them (A7, A8)."""
         f, c = self.filter, self.config.segmentation
         n = len(f)
         ends = np.zeros(n, dtype=np.bool_)
@@ -193,7 +193,7 @@ class _Run:
         if wants:
             begin = time.perf_counter()
             ahead, p = self._look(k), f.particles
-            # half a window at the end of the log would be scored against maxima of whole ones
+            # a partial window at the end of the log is not comparable with full ones
             if ahead.full:
                 rows, weights = representative_particles(p.weights, SCORE_PARTICLES if together else n)
                 score = predictive_score(
@@ -226,7 +226,7 @@ class _Run:
         return self.segmenters[i].decide(now, length, turned, score, again=again)
 
     def _been_here(self, k: int, particle: int) -> bool:
-        """Did the path of the map that a particle works in pass here, long enough ago?"""
+        """Was the path of the map of a particle here, long enough ago?"""
         f, segmap = self.filter, self.segmap
         entry, start, T = segmap.entries[particle], int(segmap.start[particle]), f.particles.poses[particle]
         assert entry is not None
@@ -234,7 +234,7 @@ class _Run:
         own = f.ancestry.recent(k - start)[: max(old - start, 0), particle] if old > start else T[None][:0]
         paths, frames = [own], [T]
         source, link = (-1 if entry.kind == NEW else entry.source), segmap.links[particle]
-        while source >= 0:  # on through the older segments that drew this map, each in its own frame
+        while source >= 0:  # continue through the older segments of this map, each in its own frame
             T = self.group.compose(self.group.inverse(link), T)
             path, link = segmap.table.paths[source], segmap.table.link[source]
             source = int(segmap.table.source[source])
@@ -244,12 +244,12 @@ class _Run:
         return any(bool(near_pose(path, at, KNOWN_RADIUS).any()) for path, at in zip(paths, frames))
 
     def _match(self, k: int, now: float, ends: npt.NDArray[np.bool_]) -> MatchAttempt | None:
-        """Try to enter older maps: every so often, and wherever a segment ends."""
+        """Try to enter older maps: at intervals, and whenever a segment ends."""
         c = self.config
         if not ends.any() and now - self.last_attempt < c.choice.every - 1e-6:
             return None
         if now - max(s.time for s in self.segmenters) < c.choice.every - 1e-6:
-            return None  # a segment of nothing
+            return None  # the segment would be almost empty
         begin = time.perf_counter()
         ahead = self._look(k)
         attempt = None
@@ -277,7 +277,7 @@ class _Run:
         return closed
 
     def _goes_on(self, p: int, segment: int, ended: bool) -> SegmentEntry:
-        """Into a new map where the old one has ended; else with the map it has."""
+        """Entry into a new map if the old one has ended; else with the current map."""
         pose = self.filter.particles.poses[p]
         if not ended:
             return SegmentEntry(T_entry=pose, kind=SAME, source=segment)
@@ -313,7 +313,7 @@ class _Run:
         )
 
     def progress(self, k: int) -> SegSlamProgress:
-        """After step k."""
+        """Progress after step k."""
         best = self.filter.particles.best
         last = int(self.closed[best]) if k == len(self.steps) - 1 else int(self.segmap.previous[best])
         return SegSlamProgress(k + 1, len(self.steps), float(self.path_length[k]), self.segmap, last)
@@ -321,7 +321,7 @@ class _Run:
     # --- the end ---------------------------------------------------------------------------------------------
 
     def result(self) -> SegSlamResult:
-        """What it came to; all segments are closed."""
+        """Result of the run; all segments are closed."""
         f = self.filter
         return SegSlamResult(
             steps=self.steps,

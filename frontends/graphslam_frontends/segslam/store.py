@@ -1,4 +1,4 @@
-"""Storage behind a SegMap: a table of segments in growing arrays, and the maps that segments may share."""
+"""Storage of a SegMap: a table of segments in growing arrays, and the maps that segments share."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Scans = frozenset[tuple[int, int]]
 
 
 class SegmentTable:
-    """Segments as columns; rows beyond :attr:`count` are not used, and are not alive.
+    """Segments as columns; rows beyond :attr:`count` are unused, and not alive.
 
     Parameters
     ----------
     size : int
-        Numbers of a pose.
+        Number of elements of a pose.
     """
 
     _COLUMNS = ("start", "end", "kind", "source", "previous", "map", "weight", "fitness", "alive", "entry", "exit",
@@ -44,7 +44,7 @@ class SegmentTable:
         self.entry: Array = np.zeros((n, size))
         self.exit: Array = np.zeros((n, size))
         self.headings: Array = np.zeros((n, 2))  # at entry and exit [rad]
-        self.link: Array = np.zeros((n, size))  # T_segment_source: between the frames, of those with a source
+        self.link: Array = np.zeros((n, size))  # T_segment_source between the frames, for segments with a source
         self.T_map: Array = np.zeros((n, size))  # T_map_segment
         self.paths: list[Array | None] = []
         self.covariances: list[Array | None] = []
@@ -60,7 +60,7 @@ class SegmentTable:
         link: Array,
         T_map: Array,
     ) -> int:
-        """A segment more, without weight; its index."""
+        """Append a segment with zero weight; returns its index."""
         i = self.count
         if i == len(self.alive):
             for name in self._COLUMNS:
@@ -78,15 +78,15 @@ class SegmentTable:
         return i
 
     def kill(self, i: int) -> None:
-        """The segment is not viable any more."""
+        """Mark a segment as not viable."""
         self.alive[i] = False
         self.paths[i] = None
         self._fitting = None
 
     @property
     def fitting(self) -> tuple[dict[int, Ints], dict[int, Ints], dict[int, Ints]]:
-        """Viable segments by the step they begin at, by the step they end at, and by the segment whose map they
-        entered, each ascending."""
+        """Viable segments by their first step, by their last step, and by the segment whose map they entered, each
+        ascending."""
         if self._fitting is None:
             alive = np.flatnonzero(self.alive).astype(np.int64)
             entered = alive[self.source[alive] >= 0]
@@ -96,7 +96,7 @@ class SegmentTable:
         return self._fitting
 
     def row(self, i: int, times: Array) -> dict[str, Any]:
-        """A segment in words and numbers, ready for JSON; ``times (n,)`` of the steps [s]."""
+        """Data of a segment, ready for JSON; ``times (n,)`` of the steps [s]."""
         return {
             "index": i,
             "interval": [int(self.start[i]), int(self.end[i])],
@@ -114,13 +114,13 @@ class SegmentTable:
 
 def _by_value(column: Ints, rows: Ints) -> dict[int, Ints]:
     order = rows[np.argsort(column[rows], kind="stable")]
-    order.flags.writeable = False  # it is handed out
+    order.flags.writeable = False  # callers get this array
     values, first = np.unique(column[order], return_index=True)
     return dict(zip(values.tolist(), np.split(order, first[1:])))
 
 
 class SegmentMaps:
-    """Evidence grids that segments use, each until its last user is gone."""
+    """Evidence grids of segments, reference-counted."""
 
     def __init__(self, group: Group) -> None:
         self.group = group
@@ -131,7 +131,7 @@ class SegmentMaps:
         self.scans: list[Scans] = []
 
     def add(self, grid: EvidenceGrid, scans: Scans, locked: bool) -> int:
-        """A map more, with one user; its number. The grid is kept as it is: it must be a handle of our own."""
+        """Add a map with one user; returns its number. The grid is not copied: the caller must not keep it."""
         if locked:
             grid.lock()
         self.grids.append(grid)
@@ -142,22 +142,22 @@ class SegmentMaps:
         return len(self.grids) - 1
 
     def drop(self, m: int, users: int = 1) -> None:
-        """Users less; the grid goes with the last."""
+        """Remove users; the grid is released with the last one."""
         self.users[m] -= users
         if self.users[m] == 0:
             cast(EvidenceGrid, self.grids[m]).release()
             self.grids[m] = None
 
     def lock(self, m: int) -> None:
-        """Localise only."""
+        """Use the map for localisation only."""
         cast(EvidenceGrid, self.grids[m]).lock()
         self.locked[m] = True
 
     def merge(self, table: SegmentTable, a: int, b: int, T_a_b: Array) -> int:
-        """One map of two; every user of the one that goes is moved to the other. See `SegMap.merge`."""
+        """Merge two maps; all users of one are moved to the other. See `SegMap.merge`."""
         if a == b:
             return a
-        if self.scans[a] < self.scans[b]:  # b went on from a: it is in there already
+        if self.scans[a] < self.scans[b]:  # b continued a: its map already contains a
             return self._move(table, a, b, self.group.inverse(T_a_b))
         if not self.scans[b] <= self.scans[a]:
             for s, e in sorted(self.scans[a]):

@@ -1,8 +1,8 @@
-"""From settled segments to submaps: what SegSLAM hands to the graph.
+"""Conversion of finished segments to submaps for the graph.
 
-The base of a submap is the body at its entry, where gravity is known level and lowered to the lattice of its map, also
-where the segment worked in the frame of an older map; so the exit of each is the base of the next. Matches go along as
-hypotheses with their support: also those that the particles of the chain itself did not take.
+The base of a submap is the body at its entry, if gravity is known levelled and lowered to the voxel grid of its map,
+also if the segment used the frame of an older map; so the end pose of each submap is the base of the next. Matches are
+output as hypotheses with their support, including those of particles outside the chain.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from graphslam_frontends.segslam.segmap import KINDS, MATCH, SegMap, Segment
 Ints = npt.NDArray[np.int64]
 
 KNOTS = 9
-"""Places along a segment at which the drift model is asked; between them its covariance is interpolated."""
+"""Places along a segment where the drift model is evaluated; its covariance is interpolated between them."""
 MINIMUM_SUPPORT = 0.05
-"""Matches that a smaller share of the weight of the particles holds are not handed over."""
+"""Matches with a smaller share of the particle weights are not output."""
 
 
 class Drift(Protocol):
     """Covariance ``(d, d)`` of dead reckoning from step ``start`` to step ``end``, right tangent.
 
-    The frame at the start is level where frames are; that at the end if ``level_end``.
+    The frame at the start is levelled if frames are; that at the end if ``level_end``.
     """
 
     def __call__(self, start: int, end: int, *, level_end: bool) -> Array: ...
@@ -53,17 +53,17 @@ class _Errors(Protocol):
 
 
 def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrift, steps: Steps | None = None) -> Drift:
-    """What a filter of so many particles leaves of the errors along the paths of the segments of a chain.
+    """Drift model along the paths of the segments of a chain, for the number of particles of the filter.
 
-    With the steps also the share that the filter passes on of what dead reckoning states of its own errors
-    (:class:`~graphslam_frontends.grid.filter_error_model.ErrorPassThrough`), and all of it where no scan corrects it
-    (:mod:`graphslam_frontends.odometry.scan_use`). Steps that scan-to-window odometry followed state their own.
+    With ``steps`` it includes the share of the dead-reckoning errors that the filter does not correct
+    (:class:`~graphslam_frontends.grid.filter_error_model.ErrorPassThrough`), and all of it without scan corrections
+    (:mod:`graphslam_frontends.odometry.scan_use`). Steps from scan-to-window odometry have their own covariance.
     """
     if steps is not None and isinstance(steps.errors, ScanOdometryErrors):
         steps.errors.prepare(segmap[int(i)].interval[0] for i in chain)
         return drift_by_errors(steps.errors, gravity=segmap.gravity)
     paths = {(s := segmap[int(i)]).interval[0]: s.path for i in chain}
-    # a single particle corrects nothing anywhere
+    # a single particle corrects nothing
     stretches = [] if steps is None or segmap.particles == 1 else unobserved_stretches(steps)
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
@@ -79,7 +79,7 @@ def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrif
 
 
 def drift_by_errors(errors: _Errors, *, gravity: bool) -> Drift:
-    """The drift that the source of the motion states over any interval (`PathErrors`)."""
+    """The drift covariance that the source of the motion gives for any interval (`PathErrors`)."""
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
         return errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]
@@ -88,9 +88,9 @@ def drift_by_errors(errors: _Errors, *, gravity: bool) -> Drift:
 
 
 def common_ancestor_chain(segmap: SegMap, last: int) -> Ints:
-    """Segments from the first to ``last``, each beginning where the one before ends.
+    """Segments from the first to ``last``, each beginning where the previous one ends.
 
-    The particle's own history as far as it is there, else the heaviest segment that fits (A6).
+    The history of the particle as far as it exists, then the segment of largest weight that fits (A6).
     """
     t = segmap.table
     chain = [segmap[last].index]
@@ -106,7 +106,7 @@ def common_ancestor_chain(segmap: SegMap, last: int) -> Ints:
 
 
 def sampled_chain(segmap: SegMap, sample: MapSample) -> Ints:
-    """Segments of a full map sample as they follow each other, of whichever particles."""
+    """Segments of a full map sample in the order of time, of any particles."""
     if (sample.segments < 0).any():
         raise DataError(
             "a map sample with an open segment is no chain", wanted="a sample from a segment that is closed"
@@ -130,15 +130,15 @@ def submaps_of_segments(
     Parameters
     ----------
     chain : sequence of int
-        Each begins where the one before ends.
+        Each begins where the previous one ends.
     uses : frozenset of str
-        Streams of the log that are inside.
+        Streams of the log that were used.
     reasons : mapping of step to str, optional
-        Why the interval that ends there did.
+        Reason for the end of the interval that ends there.
     first_key : int
         Key of the first submap; the others follow.
     with_grids : bool
-        Hand over the maps, in the frames of the submaps' bases.
+        Include the maps, in the frames of the submaps' bases.
     """
     config = HandoverConfig() if config is None else config
     segments = [segmap[int(i)] for i in chain]
@@ -197,8 +197,8 @@ def submaps_of_segments(
 def segment_base(segmap: SegMap, body: Array) -> Array:
     """``T_segment_base`` of a body at its entry, or at its exit, where the next base is.
 
-    The body itself, or where gravity is known level and on the lattice that maps are begun on: they need not be
-    resampled to be handed over.
+    The body itself or, with gravity, levelled and on the voxel grid on which maps begin, so that no resampling is
+    needed.
     """
     if not segmap.gravity:
         return np.array(body)
@@ -208,7 +208,7 @@ def segment_base(segmap: SegMap, body: Array) -> Array:
 
 
 def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array, Array]:
-    """Exits ``(n, 7|3)`` of all segments of an interval in the frames of their bases, and weights ``(n,)``."""
+    """End poses ``(n, 7|3)`` of all segments of an interval relative to their bases, and weights ``(n,)``."""
     g, t = segmap.group, segmap.table
     i = segmap.in_interval(interval)
     entry, exit = t.entry[i], t.exit[i]
@@ -218,12 +218,12 @@ def exits_of_interval(segmap: SegMap, interval: tuple[int, int]) -> tuple[Array,
 
 
 def _shares(weights: Array) -> Array:
-    """Weights that sum to one; equal where what is left of an interval weighs nothing."""
+    """Weights that sum to one; equal if all are zero."""
     return normalise_weights(weights if weights.sum() > 0 else None, len(weights))
 
 
 def _payload(segmap: SegMap, index: int, base: Array) -> EvidenceGrid:
-    """The map in the frame of the base; the very map where it is in that frame already."""
+    """The map in the frame of the base; unchanged if it is already in that frame."""
     g = segmap.group
     grid, T_map = segmap.map_of(index)
     T_base_map = g.inverse(g.compose(T_map, base))
@@ -235,7 +235,7 @@ def _payload(segmap: SegMap, index: int, base: Array) -> EvidenceGrid:
 
 
 def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, scale: float) -> Array:
-    """Covariances ``(n, d, d)`` along a path, right tangents: particles at every step, drift at knots."""
+    """Covariances ``(n, d, d)`` along a path, right tangents: particles at every step, drift interpolated."""
     g, t = segmap.group, segmap.table
     start, end = s.interval
     n = end - start + 1
@@ -256,7 +256,7 @@ def _path_covariances(segmap: SegMap, s: Segment, poses: Array, drift: Drift, sc
 def _matches(
     segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mapping[int, int]
 ) -> tuple[tuple[Match, ...], dict[str, Any]]:
-    """Re-entries of all particles of an interval, one for each submap that was entered, heaviest first."""
+    """Re-entries of all particles of an interval, one per entered submap, by descending support."""
     t = segmap.table
     members = segmap.in_interval(s.interval)
     share = np.zeros(t.count)
@@ -276,7 +276,7 @@ def _matches(
         support = min(float(weight.sum()), 1.0)
         if support < MINIMUM_SUPPORT:
             continue
-        # the chain's own match speaks for its group, else the heaviest
+        # the match of the chain represents its group, else that of the largest weight
         lead = int(np.argmax(index == s.index)) if s.index in index else int(np.argmax(weight))
         T = np.stack([T for _, T in entries])
         scatter = pose_scatter(T, T[lead], _shares(weight)) if len(T) > 1 else 0.0
@@ -297,7 +297,7 @@ def _matches(
 
 
 def _holds(segmap: SegMap, s: Segment, segments: Sequence[Segment], keys: Mapping[int, int]) -> list[int]:
-    """Keys of the submaps whose scans are in the map of a segment: its own, and those of maps that it went on in."""
+    """Keys of the submaps with scans in the map of a segment: its own, and those of maps that it continued."""
     scans = segmap.maps.scans[int(segmap.table.map[s.index])]
     return [keys[c.index] for c in segments if any(a < c.interval[1] and c.interval[0] < b for a, b in scans)]
 
@@ -310,7 +310,7 @@ def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Se
         return None
     T_source_body = g.compose(g.inverse(t.link[index]), t.entry[index])
     step = nearest_step(segmap, source, T_source_body)
-    # a chain may have another particle's segment there: the two agree where the body was when it passed
+    # the chain may have another particle's segment there: the body pose at that step relates the two
     same = [c for c in segments if c.index == source]
     at = same or [c for c in segments if c.interval[0] <= step <= c.interval[1]]
     if not at:
@@ -325,7 +325,7 @@ def _target(segmap: SegMap, index: int, segments: Sequence[Segment]) -> tuple[Se
 
 
 def _levelled(segmap: SegMap, entry: Array, covariance: Array) -> Array:
-    """Covariance at the body → at the levelled base in the same place."""
+    """Covariance in the body frame → in the levelled base frame at the same place."""
     g = group_of(entry)
     A = g.adjoint(g.between(segment_base(segmap, entry), entry))
     C = A @ covariance @ A.T

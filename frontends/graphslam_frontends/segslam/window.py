@@ -1,8 +1,8 @@
-"""The look-ahead window: beams of the next seconds, seen from where the body stands now (SegSLAM section 3.2).
+"""The look-ahead window: beams of the next seconds in the current body frame (SegSLAM section 3.2).
 
-The filter runs a few seconds behind the sensors. What lies between is placed by dead reckoning, which is good enough
-for so short a time, and serves twice: a map that predicts it badly has ended (A8), and an older map that explains it
-may be the same place (A9).
+The filter lags behind the sensors by a few seconds. Over so short a time dead reckoning is accurate. The window is used
+twice: if the current map predicts it badly, the segment ends (A8); if an older map explains it, that may be the same
+place (A9).
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from graphslam_frontends.segslam.segmentation import LookAheadWindow, gather_win
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LookAheadScan:
-    """What lies ahead of a step.
+    """Look-ahead window of a step.
 
     Parameters
     ----------
     step : int
-        The step of now.
+        The current step.
     last : int
-        The last step whose beams are in the window; ``step`` where there is none.
+        The last step with beams in the window; ``step`` if there is none.
     full : bool
-        The log reaches to the end of the window. A match of less is not to be believed: with half of its surroundings
-        a place looks like others.
+        The log extends to the end of the window. Matches of a partial window are not used: with half of its
+        surroundings a place looks like others.
     """
 
     step: int
@@ -38,21 +38,21 @@ class LookAheadScan:
     window: LookAheadWindow
 
     def source(self, most: int, radius: float) -> Array:
-        """Points ``(k, dim)`` that beams met within a radius of the body, at most so many, evenly spread."""
+        """Points ``(k, dim)`` of the returns within a radius of the body, at most ``most``, evenly spaced."""
         p = self.window.points
         rows = np.flatnonzero(np.linalg.norm(p, axis=1) <= radius)
         return p[rows[evenly_spaced_indices(len(rows), most)]]
 
 
 def gather_look_ahead(steps: Steps, step: int, seconds: float) -> LookAheadScan:
-    """The window ahead of a step: what beams met in the steps after it, up to so many seconds later.
+    """The look-ahead window of a step: the returns of the steps after it, up to ``seconds`` later.
 
     Parameters
     ----------
     seconds : float
         W.
     """
-    slack = 1e-6  # half a step's rounding of the clock takes no step off
+    slack = 1e-6  # rounding of the clock must not drop a step
     until = float(steps.times[step]) + seconds
     last = int(np.searchsorted(steps.times, until + slack, side="right")) - 1
     rows = range(step + 1, last + 1)
