@@ -1,4 +1,4 @@
-"""What every front end is: sensor data in, submaps out, one at a time, resumable at submap granularity."""
+"""Interface of all front ends: sensor data in, submaps out, one at a time, resumable after any submap."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graphslam.core.submap import Submap
 from graphslam_frontends.odometry.steps import Steps
 
 Watch: TypeAlias = Callable[[Any], None]
-"""Takes the progress of a front end, of its own kind (``segslam``:
+"""Callback for the progress of a front end, of its own type (``segslam``:
 `graphslam_frontends.segslam.progress.SegSlamProgress`)."""
 
 
@@ -21,19 +21,19 @@ Watch: TypeAlias = Callable[[Any], None]
 class FrontEnd(Protocol):
     """A front end registered under the entry point ``graphslam.frontends``.
 
-    Classes inherit from it. A front end is built from its configuration alone. Everything it draws comes from
-    ``seed.child(key of the submap)`` and a submap depends on nothing but the log and the end of the one before, so that
-    a run resumed after submap k is the run that was never stopped.
+    Classes inherit from it. A front end is built from its configuration alone. All its random numbers are from
+    ``seed.child(key of the submap)``, and a submap depends only on the log and the end of the previous one, so that a
+    run resumed after submap k gives the same result as an uninterrupted one.
 
-    It has one of two methods, and the other follows from it: :meth:`follow`, where submaps can be made while records
-    come, or :meth:`submaps`, where only the whole log says what they are.
+    It implements one of two methods, from which the other follows: :meth:`follow`, if submaps can be made while records
+    arrive, or :meth:`submaps`, if the whole log is needed.
     """
 
     name: ClassVar[str]
     draws: ClassVar[bool] = False
-    """Are its submaps drawn, so that another branch of the seed tree gives others?"""
+    """Do its submaps depend on random numbers, that is on the seed?"""
     calibrates: ClassVar[str] = ""
-    """What calibration uses beside the motion: ``sightings`` of landmarks, ``scans``, or nothing (no calibration)."""
+    """Data for the calibration besides the motion: ``sightings`` of landmarks, ``scans``, or none (no calibration)."""
     config: Any
 
     def submaps(
@@ -45,16 +45,16 @@ class FrontEnd(Protocol):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """Yield the submaps of a log that is whole, in order.
+        """Yield the submaps of a complete log, in order.
 
         Parameters
         ----------
         after : Submap or None
-            The last submap that is already there; the next one starts at its end.
+            The last existing submap; the next one starts at its end.
         drops : DropCounter or None
-            Where records that are not used are counted.
+            Counts unused records.
         watch : callable or None
-            Called with the front end's own progress after every step that it can show; changes nothing.
+            Called with the progress of the front end after every step; does not change the result.
         """
         found = self.follow(RecordSource(log), seed=seed, after=after, drops=drops, watch=watch)
         return (submap for submap in found if submap is not None)
@@ -68,9 +68,9 @@ class FrontEnd(Protocol):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap | None]:
-        """Yield submaps as soon as the records that have come make them; None: all of these are used, more are wanted.
+        """Yield submaps as soon as enough records have arrived; None: more records are needed.
 
-        The submaps are the same in whatever portions the records come, and those of :meth:`submaps`.
+        The submaps do not depend on the portions in which records arrive, and are those of :meth:`submaps`.
 
         Parameters
         ----------
@@ -83,7 +83,7 @@ class FrontEnd(Protocol):
 
     @classmethod
     def incremental(cls) -> bool:
-        """Does it make submaps while records come?"""
+        """Does it output submaps while records arrive?"""
         return cls.follow is not FrontEnd.follow
 
     def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
@@ -92,25 +92,25 @@ class FrontEnd(Protocol):
         Parameters
         ----------
         asked : mapping
-            Options of this front end that the user set: they stay.
+            Options of this front end that the user set: they are not changed.
         corrected : bool
-            Systematic errors were estimated and removed, and nothing contradicts the estimates.
+            Systematic errors were estimated and removed, and no check contradicts the estimates.
         drift : bool
-            The errors of the odometry by the metre were estimated from scans.
+            The odometry errors per metre were estimated from scans.
         """
         return self
 
     def steps(self, log: SensorLog) -> Steps | None:
-        """The steps that it made of the log, for a refinement by scans; None where it works on no scans."""
+        """The steps of the log, for a refinement by scans; None if it uses no scans."""
         return None
 
     def forget(self) -> None:
-        """Free the memory of what it keeps of the last log; it is made again where it is asked for."""
+        """Free the memory of the last log; its data are computed again when needed."""
         return
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations] | None:
-        """Name of the stream of landmarks that it reads, and the observations in it; None where it tells none.
+        """Name of its stream of landmarks, and the observations in it; None if it uses none.
 
-        They are what ``sightings`` of its submaps are counted in, so that their identities can be audited.
+        ``sightings`` of its submaps are indices of these, so that data associations can be checked.
         """
         return None

@@ -1,7 +1,7 @@
-"""Two front ends on one log: one maps where landmarks are seen, the other one where they are not.
+"""Two front ends on one log: one maps intervals with landmarks, the other one the rest.
 
-Both need the motion, so the log is cut into intervals, and each interval is mapped by one of them. A submap of the next
-interval begins where the last one ended, and every record is used once.
+Both need the motion, so the log is cut into intervals, each mapped by one of them. A submap of the next interval begins
+where the last one ended, and every record is used once.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from graphslam_frontends.odometry.make_steps import scanner_names
 from graphslam_frontends.stepwise import StepwiseFrontEnd
 
 WINDOW = 5.0
-"""Interval over which it is decided whether landmarks are seen often enough [s]."""
+"""Window length for the decision whether there are enough landmarks [s]."""
 SHORTEST = 20.0
-"""Shorter intervals of one front end are joined with those around them [s]."""
+"""Shorter intervals of one front end are merged with their neighbours [s]."""
 SEEN = 2
-"""Landmarks in a scan that fix the pose in the plane."""
+"""Least number of landmarks in a scan that determine a planar pose."""
 SHARE = 0.5
-"""Share of the scans of a window that must see so many landmarks."""
+"""Least share of the scans of a window with that many landmarks."""
 SAME_TIME = 1e-6
-"""Stamps that differ by less are one [s]."""
+"""Stamps that differ by less are equal [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +44,9 @@ class Interval:
     Parameters
     ----------
     begin, end : float
-        The base of the first submap and the end of the last one [s]; ``-inf`` and ``inf`` at the ends of the log.
+        Base of the first submap and end of the last one [s]; ``-inf`` and ``inf`` at the ends of the log.
     first, last : float
-        Scans from ``first`` to ``last`` are used [s], both included for beams, both excluded for landmarks.
+        Interval of the scans used [s]; its ends are included for beams, excluded for landmarks.
     """
 
     landmarks: bool
@@ -58,11 +58,11 @@ class Interval:
 
 @dataclass(frozen=True, slots=True)
 class MixedFrontEnd(FrontEnd):
-    """A front end of landmarks and one of planar scans, each in the intervals of the log that suit it.
+    """A front end for landmarks and one for planar scans, each in suitable intervals of the log.
 
-    The front end of landmarks maps windows of :data:`WINDOW` seconds in which :data:`SHARE` of the scans see
-    :data:`SEEN` landmarks or more; the other one maps the rest. Intervals shorter than :data:`SHORTEST` are joined with
-    those around them.
+    The front end for landmarks maps windows of :data:`WINDOW` seconds in which :data:`SHARE` of the scans have
+    :data:`SEEN` landmarks or more; the other one maps the rest. Intervals shorter than :data:`SHORTEST` are merged with
+    their neighbours.
 
     Parameters
     ----------
@@ -81,17 +81,17 @@ class MixedFrontEnd(FrontEnd):
 
     @property
     def calibrated_part(self) -> FrontEnd:
-        """The front end whose data are calibrated: the motion is that of both, and landmarks show its errors better."""
+        """The front end for the calibration: the motion is common to both, and landmarks show its errors better."""
         return min(self.parts, key=lambda p: p.calibrates != "sightings")
 
     def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
-        """See :class:`~graphslam_frontends.base.FrontEnd`: of each front end."""
+        """See :class:`~graphslam_frontends.base.FrontEnd`; for each front end."""
         return MixedFrontEnd(
             tuple(p.with_calibration(log, asked.get(p.name, {}), corrected=corrected, drift=drift) for p in self.parts)
         )
 
     def split(self, log: SensorLog) -> tuple[FrontEnd, StepwiseFrontEnd]:
-        """The front end of landmarks and that of scans."""
+        """The front ends for landmarks and for scans."""
         scans = [p for p in self.parts if isinstance(p, StepwiseFrontEnd)]
         seen = [p for p in self.parts if not isinstance(p, StepwiseFrontEnd) and p.observations(log) is not None]
         names = ", ".join(p.name for p in self.parts)
@@ -109,13 +109,13 @@ class MixedFrontEnd(FrontEnd):
         return seen[0], scans[0]
 
     def intervals(self, log: SensorLog) -> list[Interval]:
-        """Who maps which interval of a log, in order of time."""
+        """Intervals of a log and their front ends, in order of time."""
         seen, scans = self.split(log)
         observed = seen.observations(log)
         assert observed is not None
         stamps = log[_scanner(log, scans)].times
         runs = _runs(observed[1], stamps)
-        wait = scans.config.steps.period or 0.0  # the first step ends so long after its first scan
+        wait = scans.config.steps.period or 0.0  # the end of the first step is this much later than its first scan
         out: list[Interval] = []
         begin = first = -np.inf
         for (_, landmarks), later in zip(runs, [*runs[1:], None]):
@@ -140,7 +140,7 @@ class MixedFrontEnd(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`~graphslam_frontends.base.FrontEnd`. Keys rise over all intervals; matches stay inside one."""
+        """See :class:`~graphslam_frontends.base.FrontEnd`. Keys increase over all intervals; matches are within one."""
         seen, scans = self.split(log)
         intervals, count = self.intervals(log), drops if drops is not None else DropCounter()
         _count_left_out(log, seen, scans, intervals, count)
@@ -160,7 +160,7 @@ class MixedFrontEnd(FrontEnd):
             start = None
             if resumed and before is not None:
                 start = replace(before, key=before.key - first)
-            elif part.landmarks and np.isfinite(part.begin):  # only its end counts
+            elif part.landmarks and np.isfinite(part.begin):  # only its end is used
                 span = part.begin - 1.0, part.begin
                 start = Submap(key=-1, interval=span, exit_pose=np.zeros(3), exit_covariance=np.eye(3))
             for made in front.submaps(cut, seed=seed.child("interval", k), after=start, drops=count, watch=watch):
@@ -187,13 +187,13 @@ class MixedFrontEnd(FrontEnd):
 
 
 def _scanner(log: SensorLog, front: StepwiseFrontEnd) -> str:
-    """Name of the stream of beams that a front end works on."""
+    """Name of the stream of beams that a front end uses."""
     named: tuple[str, ...] = front.config.steps.scanners or scanner_names(log)
     return named[0]
 
 
 def _runs(seen: LandmarkObservations, stamps: Array) -> list[tuple[float, bool]]:
-    """Where each interval begins [s], and whether landmarks are mapped in it."""
+    """Start of each interval [s], and whether landmarks are mapped in it."""
     begin = float(min(stamps[0], seen.times[0] if len(seen.times) else np.inf))
     end = float(max(stamps[-1], seen.times[-1] if len(seen.times) else -np.inf))
     n = max(int(np.ceil((end - begin) / WINDOW)), 1)
@@ -205,7 +205,7 @@ def _runs(seen: LandmarkObservations, stamps: Array) -> list[tuple[float, bool]]
 
 
 def _long_runs(flags: npt.NDArray[np.bool_], shortest: int) -> list[tuple[int, bool]]:
-    """Runs ``(first, value)`` of equal flags, of which the shortest joins its neighbours until none is too short."""
+    """Runs ``(first, value)`` of equal flags; the shortest is merged with its neighbours until none is too short."""
     flags = flags.copy()
     while True:
         edges = [0, *(np.flatnonzero(np.diff(flags)) + 1).tolist(), len(flags)]
@@ -217,7 +217,7 @@ def _long_runs(flags: npt.NDArray[np.bool_], shortest: int) -> list[tuple[int, b
 
 
 def _motion_around(log: SensorLog, part: Interval) -> dict[str, Any]:
-    """Streams of a log, those of the motion cut to an interval and one record on either side."""
+    """Streams of a log, with the motion cut to an interval plus one record on either side."""
     streams: dict[str, Any] = dict(log.streams)
     for name, s in log.streams.items():
         if isinstance(s, (Odometry, SteeringControls, VelocityControls)):
@@ -240,7 +240,7 @@ def _scan_log(log: SensorLog, front: FrontEnd, part: Interval) -> tuple[SensorLo
 def _landmark_log(log: SensorLog, front: FrontEnd, part: Interval) -> tuple[SensorLog, int]:
     """The log for a front end of landmarks in an interval, and the number of observations before it.
 
-    Scans without observations stand at its begin and end, so that the motion is that of the whole interval.
+    Empty scans are added at its begin and end, so that the motion is that of the whole interval.
     """
     found = front.observations(log)
     assert found is not None
@@ -258,7 +258,7 @@ def _landmark_log(log: SensorLog, front: FrontEnd, part: Interval) -> tuple[Sens
 
 
 def _between(times: Array, first: float, last: float, *, both: bool) -> tuple[int, int]:
-    """Rows from ``first`` to ``last``, with or without records at these very times."""
+    """Rows from ``first`` to ``last``, with (``both``) or without records at exactly these times."""
     sides = ("left", "right") if both else ("right", "left")
     i, j = np.searchsorted(times, first, side=sides[0]), np.searchsorted(times, last, side=sides[1])  # type: ignore[call-overload]
     return int(i), max(int(i), int(j))
@@ -267,7 +267,7 @@ def _between(times: Array, first: float, last: float, *, both: bool) -> tuple[in
 def _count_left_out(
     log: SensorLog, seen: FrontEnd, scans: StepwiseFrontEnd, intervals: list[Interval], drops: DropCounter
 ) -> None:
-    """Records that lie in an interval of the other front end are counted."""
+    """Count the records in intervals of the other front end."""
     found = seen.observations(log)
     assert found is not None
     beams = _scanner(log, scans)
@@ -284,7 +284,7 @@ def _count_left_out(
 
 
 def _idle(intervals: list[Interval], seen: FrontEnd, scans: FrontEnd) -> list[dict[str, Any]]:
-    """A finding where one of the front ends maps no interval."""
+    """A finding if one of the front ends maps no interval."""
     kinds = {part.landmarks for part in intervals}
     if len(kinds) == 2:
         return []
@@ -297,7 +297,7 @@ def _idle(intervals: list[Interval], seen: FrontEnd, scans: FrontEnd) -> list[di
 
 
 def _renumbered(submap: Submap, first: int, offset: int) -> Submap:
-    """A submap with its key in the whole run, and its sightings in the whole log."""
+    """A submap with its key in the whole run, and its observation indices in the whole log."""
     landmarks = submap.landmarks
     if landmarks is not None and landmarks.sightings is not None:
         landmarks = replace(landmarks, sightings=landmarks.sightings + np.array([offset, 0]))

@@ -1,4 +1,4 @@
-"""What front ends share that work on scans and motion, put into steps."""
+"""Common part of the front ends that use scans and motion as steps."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from graphslam_frontends.odometry.steps import Steps
 
 @dataclass(frozen=True, slots=True)
 class StepwiseFrontEnd(FrontEnd):
-    """A front end whose configuration holds ``steps``, a `StepConfig`."""
+    """A front end with ``steps``, a `StepConfig`, in its configuration."""
 
     calibrates: ClassVar[str] = "scans"
     _made: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def steps(self, log: SensorLog, *, drops: DropCounter | None = None) -> Steps:
-        """The steps of a log; those of the last one are kept."""
+        """The steps of a log; those of the last log are cached."""
         if not (self._made and self._made[0] is log):
             self._made[:] = [log, check_steps(log, self.config.steps, drops)]
         made: Steps = self._made[1]
@@ -29,8 +29,8 @@ class StepwiseFrontEnd(FrontEnd):
     def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
         """See :class:`~graphslam_frontends.base.FrontEnd`.
 
-        The random walks of a grid filter represent errors of poor odometry that last. In space they would shake
-        odometry by LiDAR and IMU, which is better than they are; where scans gave its drift, they are switched off.
+        The random walks of a grid filter model systematic errors of poor odometry. They are too large for 3-D odometry
+        by LiDAR and IMU, so they are switched off if its drift was estimated from scans.
         """
         walks = getattr(self.config, "filter", None)
         if not drift or walks is None or "walk_scale" in asked.get("filter", {}):
@@ -38,5 +38,5 @@ class StepwiseFrontEnd(FrontEnd):
         return type(self)(config=replace(self.config, filter=replace(walks, walk_scale=0.0)))  # type: ignore[call-arg]
 
     def forget(self) -> None:
-        """Let go of the steps of the last log."""
+        """Free the steps of the last log."""
         self._made.clear()

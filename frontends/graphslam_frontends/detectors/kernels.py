@@ -1,4 +1,4 @@
-"""Kernels of the tree detector: plain arrays in, plain arrays out. Twin: ``tests/reference/trees.py``."""
+"""Kernels of the tree detector: plain arrays in, plain arrays out. Reference: ``tests/reference/trees.py``."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ COLUMNS = 8
 (P_MAX_RANGE, P_BREAK, P_MISSING, P_WIDTH, P_DEPTH, P_ISOLATION, P_OCCLUSION, P_MIN_BEAMS, P_FIT_BEAMS, P_SIGMA) = (
     range(10)
 )
-# Beams farther out than this share of the half width graze the trunk, where the range has no finite slope.
+# Beams beyond this fraction of the half width graze the trunk; their range has an unbounded slope and is not used.
 _INTERIOR = 0.7
-# A circle is believed up to this chi-square per beam; above it the cluster is no cylinder.
+# Largest chi-square per beam of an accepted circle; above it the cluster is no cylinder.
 _FIT_GATE = 9.0
 _MAX_ITERATIONS = 20
 
@@ -44,7 +44,7 @@ def _clusters(r, angles, max_range, jump, missing, first, last, ends):  # type: 
 
 @njit
 def _isolated(c, count, ends, distance):  # type: ignore[no-untyped-def]
-    """Is every other cluster farther than ``distance``: its last point from my first, its first from my last?"""
+    """Are all other clusters farther than ``distance`` (their last point to this first one, and vice versa)?"""
     d2 = distance * distance
     for k in range(count):
         if k == c:
@@ -60,7 +60,7 @@ def _isolated(c, count, ends, distance):  # type: ignore[no-untyped-def]
 
 @njit
 def _middle_range(r, a, b, max_range):  # type: ignore[no-untyped-def]
-    """Mean range of the one or two returns nearest to the middle of beams a..b, and how many they are."""
+    """Mean range of the one or two returns nearest to the middle of beams a..b, and their number."""
     best, total, used = 2 * (b - a) + 2, 0.0, 0
     for k in range(a, b + 1):
         if not (r[k] > 0.0 and r[k] < max_range):
@@ -78,7 +78,7 @@ def _middle_range(r, a, b, max_range):  # type: ignore[no-untyped-def]
 def _fit_circle(beams_of, a, b, rho, bearing, radius, out):  # type: ignore[no-untyped-def]
     """Weighted least squares of (rho, bearing, radius) on both edge angles and the ranges of the inner beams.
 
-    Fills ``out`` with rho, bearing, radius, var(rho), var(bearing); True if it converged on a believable circle.
+    Fills ``out`` with rho, bearing, radius, var(rho), var(bearing); True if it converged and passed the χ² gate.
     """
     r, angles, step, max_range, sigma = beams_of
     edge_variance = step * step / 12.0
@@ -202,7 +202,7 @@ def detect_kernel(ranges, angles, step, parameters, mean_g, var_g):  # type: ign
                     nearest, farthest = min(nearest, r[k]), max(farthest, r[k])
             if farthest - nearest >= parameters[P_DEPTH]:
                 continue
-            # a nearer thing beside it hides part of the trunk
+            # a nearer object next to it hides part of the trunk
             if (r[a - 1] > 0.0 and r[a - 1] < r[a] - parameters[P_OCCLUSION]) or (
                 r[b + 1] > 0.0 and r[b + 1] < r[b] - parameters[P_OCCLUSION]
             ):

@@ -41,33 +41,33 @@ from graphslam_frontends.detectors import kernels
 
 Ints = npt.NDArray[np.int64]
 BREAK_DISTANCE = 1.5
-"""Neighbouring returns that differ more in range belong to different things [m]."""
+"""Neighbouring returns with a larger range difference are of different objects [m]."""
 MAX_MISSING = 5
-"""More missing beams than this break a cluster."""
+"""A cluster is split at a gap of more missing beams than this."""
 MAX_DEPTH = 0.5
-"""Spread of the ranges within a trunk is below this [m]."""
+"""Largest range difference within a trunk [m]."""
 ISOLATION = 3.0
-"""Least distance from a trunk's first and last return to those of any other cluster [m]."""
+"""Least distance from the first and last return of a trunk to those of any other cluster [m]."""
 OCCLUSION = 0.3
 """A neighbouring beam nearer by more than this hides part of the trunk: rejected [m]."""
 MIN_BEAMS = 1
-"""Fewer beams than this are no trunk. One is right for a park: requiring two loses 40 % of the trees."""
+"""Least number of beams of a trunk. One is right for a park: two would lose 40 % of the trees."""
 FIT_BEAMS = 5
-"""From this many beams on a circle is fitted."""
+"""Least number of beams for a circle fit."""
 BEAM_SIGMA = 0.03
-"""σ of one beam's range on bark [m], for the noise of the geometry."""
+"""σ of the range of one beam on bark [m], for the noise model of the geometry."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TreeDetectorConfig:
-    """Rules and noise of the tree detector."""
+    """Rules and noise model of the tree detector."""
 
     max_range: float = 75.0
-    """Returns at or beyond are ignored [m]."""
+    """Returns at or beyond this range are ignored [m]."""
     max_width: float = 1.0
-    """The least width that the beams allow, (n - 1) δ r, must be below [m]."""
+    """Upper bound of the least width that the beams allow, (n - 1) δ r [m]."""
     noise: Literal["fixed", "fit"] = "fixed"
-    """Whether the sigmas are the parameters below or those of the geometry."""
+    """Sigmas of observations: fixed (the parameters below), or from the geometry and the circle fit."""
     range_sigma: float = 0.08
     """Fixed noise: constant part of σ_range [m]."""
     range_slope: float = 0.001
@@ -87,7 +87,7 @@ class TreeDetectorConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trunks:
-    """What the detector found, with what the geometry says of it.
+    """Detected trunks, with sigmas from the geometry.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class Trunks:
     beams : (q,) int64
         Beams from the first to the last return.
     fitted : (q,) bool
-        Whether the circle fit was taken.
+        Whether the values are from the circle fit.
     """
 
     scan: Ints
@@ -118,7 +118,7 @@ class Trunks:
 def half_chord_moments(beams: int) -> tuple[Array, Array]:
     """Mean and variance of g for trunks of 0 … ``beams`` beams, in units of the beam spacing; ``(beams + 1,)`` each.
 
-    An odd trunk is judged by its middle beam, an even one by the mean of the two in the middle. With the left edge
+    For an odd number the middle beam is used, for an even number the mean of the two in the middle. With the left edge
     k + U and the right edge k' + U' away from a beam, U, U' uniform in [0, 1]: E g = E√(k + U) E√(k' + U').
     """
     x, w = np.polynomial.legendre.leggauss(64)
@@ -126,13 +126,13 @@ def half_chord_moments(beams: int) -> tuple[Array, Array]:
     x, w = x**2, w * 2.0 * x  # √x has no derivative at 0: substitute
     mean, variance = np.zeros(beams + 1), np.zeros(beams + 1)
     for n in range(1, beams + 1):
-        far = n // 2  # whole spacings to the farther edge; the nearer one is the same (odd) or one less (even)
+        far = n // 2  # whole spacings to the farther edge; the nearer one has the same number (odd) or one less (even)
         near = far if n % 2 else far - 1
         root_far, root_near = w @ np.sqrt(far + x), w @ np.sqrt(near + x)
         mean[n] = root_far * root_near
         second = (far + 0.5) * (near + 0.5)
         if n % 2 == 0:
-            both = float(w @ np.sqrt((far + x) * (near + x)))  # the two beams see the same edges
+            both = float(w @ np.sqrt((far + x) * (near + x)))  # the two beams have the same edges
             second = 0.5 * second + 0.5 * both**2
         variance[n] = second - mean[n] ** 2
     mean.setflags(write=False)
@@ -182,9 +182,9 @@ def find_trunks(scans: LaserScans, config: TreeDetectorConfig | None = None) -> 
 
 
 def detect_trees(scans: LaserScans, config: TreeDetectorConfig | None = None) -> LandmarkObservations:
-    """Tree trunks as landmark observations, one entry a scan (a scan may be empty).
+    """Tree trunks as landmark observations, one entry per scan (a scan may be empty).
 
-    The sigmas are ``config.noise``'s; see the module for both formulas.
+    The sigmas are those of ``config.noise``; see the module docstring for both formulas.
     """
     c = config or TreeDetectorConfig()
     found = find_trunks(scans, c)

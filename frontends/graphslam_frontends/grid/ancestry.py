@@ -1,8 +1,8 @@
-"""Which particle descends from which: paths back in time, and how soon they meet.
+"""Ancestry of particles: their past paths, and common ancestors.
 
-A step's poses are written once, as rows, and each row remembers the row of the step before that it went on from. What
-nobody descends from any more is thrown away now and then, so that a long run holds one row a step for what all
-particles share, and as many as there are lineages for the recent past (SegSLAM Fig. 2–3).
+The poses of a step are stored once, as rows with the row of their parent in the previous step. Rows without descendants
+are pruned at intervals, so a long run has one row per step for the common past and one per lineage for the recent past
+(SegSLAM Fig. 2–3).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Ints = npt.NDArray[np.int64]
 
 
 class Ancestry:
-    """The family tree of a particle filter.
+    """Ancestry tree of a particle filter.
 
-    Each step: :meth:`record` the particles as they stand, then :meth:`branch` if they are resampled.
+    Each step: :meth:`record` the particles, then :meth:`branch` if they are resampled.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Ancestry:
     width : int
         Length of a pose, 3 or 7.
     prune_every : int
-        Steps between two looks for lineages that died out; 0 = keep them, for pictures of short runs.
+        Steps between prunings of extinct lineages; 0 = no pruning, for plots of short runs.
     """
 
     def __init__(self, particles: int, width: int, *, prune_every: int = 32) -> None:
@@ -42,10 +42,10 @@ class Ancestry:
         self._n, self._width = particles, width
         self._poses: list[Array] = []  # by step: (rows, width)
         self._tags: list[Ints] = []  # (rows,)
-        self._number: list[Ints] = []  # (rows,) which particle a row was
-        self._parent: list[Ints] = []  # (rows,) row of the step before; -1 in the first step
-        self._current = np.full(particles, -1, dtype=np.int64)  # row of the last step each particle stands on
-        self._tight = 0  # rows of steps before this one all had descendants at the last look
+        self._number: list[Ints] = []  # (rows,) particle number of a row
+        self._parent: list[Ints] = []  # (rows,) row of the previous step; -1 in the first step
+        self._current = np.full(particles, -1, dtype=np.int64)  # row of the last step of each particle
+        self._tight = 0  # all rows of earlier steps had descendants at the last pruning
         self._looked = 0
 
     def __len__(self) -> int:
@@ -58,17 +58,17 @@ class Ancestry:
 
     @property
     def rows(self) -> int:
-        """Rows held, of all steps."""
+        """Number of stored rows, of all steps."""
         return sum(map(len, self._parent))
 
     def record(self, poses: Array, tags: npt.ArrayLike | None = None) -> None:
-        """Write down where the particles stand in this step.
+        """Store the poses of the particles in this step.
 
         Parameters
         ----------
         poses : (N, 3) or (N, 7)
         tags : (N,) int, optional
-            Whatever belongs to a pose, as the segment whose frame it is in; default 0.
+            Any number per pose, such as the segment of its frame; default 0.
         """
         p = np.array(poses, dtype=np.float64)
         if p.shape != (self._n, self._width):
@@ -82,11 +82,11 @@ class Ancestry:
             self.prune()
 
     def branch(self, ancestors: Ints) -> None:
-        """Particle i goes on from what particle ``ancestors[i]`` was ``(N,)``."""
+        """Particle i continues from particle ``ancestors[i]`` ``(N,)``."""
         self._current = self._current[ancestors]
 
     def prune(self) -> None:
-        """Throw away rows that no particle descends from."""
+        """Delete rows without descendants."""
         self._looked = len(self)
         alive = self._current
         for k in range(len(self) - 1, -1, -1):
@@ -95,10 +95,10 @@ class Ancestry:
             keep[alive] = True
             if keep.all():
                 if k <= self._tight:
-                    break  # everything before has descendants here
+                    break  # all earlier rows have descendants here
                 alive = self._parent[k]
                 continue
-            new = np.cumsum(keep) - 1  # row numbers after the others are gone
+            new = np.cumsum(keep) - 1  # row numbers after the deletion
             if k + 1 < len(self):
                 self._parent[k + 1] = new[self._parent[k + 1]]
             else:
@@ -110,14 +110,14 @@ class Ancestry:
         self._tight = max(len(self) - 1, 0)
 
     def _backwards(self) -> Iterator[tuple[int, Ints]]:
-        """Step by step towards the beginning: step, row each of today's particles had then."""
+        """Iterate backwards: step, and the row of each current particle's ancestor in it."""
         row = self._current
         for k in range(len(self) - 1, -1, -1):
             yield k, row
             row = self._parent[k][row]
 
     def paths(self) -> Array:
-        """Poses of every particle's own past ``(steps, N, width)``."""
+        """Past poses of every particle ``(steps, N, width)``."""
         out = np.empty((len(self), self._n, self._width))
         for k, row in self._backwards():
             out[k] = self._poses[k][row]
@@ -134,7 +134,7 @@ class Ancestry:
         return out
 
     def path(self, particle: int) -> Array:
-        """Poses of one particle's past ``(steps, width)``."""
+        """Past poses of one particle ``(steps, width)``."""
         out = np.empty((len(self), self._width))
         row = int(self._current[particle])
         for k in range(len(self) - 1, -1, -1):
@@ -143,42 +143,42 @@ class Ancestry:
         return out
 
     def tags(self) -> Ints:
-        """Tags of every particle's own past ``(steps, N)``."""
+        """Past tags of every particle ``(steps, N)``."""
         out = np.empty((len(self), self._n), dtype=np.int64)
         for k, row in self._backwards():
             out[k] = self._tags[k][row]
         return out
 
     def numbers(self) -> Ints:
-        """Which particle each of today's particles was in every step ``(steps, N)``."""
+        """Particle number of the ancestor of each current particle in every step ``(steps, N)``."""
         out = np.empty((len(self), self._n), dtype=np.int64)
         for k, row in self._backwards():
             out[k] = self._number[k][row]
         return out
 
     def survivors(self) -> Ints:
-        """Number of different ancestors that today's particles had in each step ``(steps,)``."""
+        """Number of distinct ancestors of the current particles in each step ``(steps,)``."""
         out = np.empty(len(self), dtype=np.int64)
         for k, row in self._backwards():
             out[k] = len(np.unique(row))
         return out
 
     def coalescence(self) -> int:
-        """The last step in which all of today's particles were one; -1 if they never were."""
+        """The last step with a single common ancestor of all current particles; -1 if there is none."""
         for k, row in self._backwards():
             if np.all(row == row[0]):
                 return k
         return -1
 
     def links(self) -> tuple[Ints, npt.NDArray[np.bool_]]:
-        """What is left of the tree, edge by edge.
+        """Edges of the stored tree.
 
         Returns
         -------
         edges : (e, 3)
-            Step; number of the particle there; number of the one it went on from, in the step before.
+            Step; number of the particle there; number of its parent in the previous step.
         alive : (e,)
-            Whether some particle of today descends from it.
+            Whether a current particle descends from it.
         """
         edges, alive = [], []
         row = self._current

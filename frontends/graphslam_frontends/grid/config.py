@@ -1,5 +1,5 @@
 """Configuration of the particle filter on evidence grids. The defaults are for a robot at walking pace with steps of
-0.4 s; what they rest on stands beside them."""
+0.4 s; the reasons are in the docstrings."""
 
 from __future__ import annotations
 
@@ -12,75 +12,74 @@ from graphslam.evidence.beams import BeamModel
 from graphslam.evidence.likelihood import CastLikelihood, EndpointLikelihood
 
 CAST_EFFECTIVE_BEAMS = 4.0
-"""Independent beams that a step counts as, weighed by casting, which is far sharper than end points: a few."""
+"""Effective number of independent beams per step with ray casting, which is far more peaked than end points."""
 GREATEST_EXPONENT = 1.0
-"""A beam counts as no more than this many, however few there are."""
+"""Upper bound of the exponent: a beam never counts more than once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridFilterConfig:
-    """What a particle filter needs whose particles each carry a pose and an evidence grid."""
+    """Configuration of a particle filter with a pose and an evidence grid per particle."""
 
     particles: int = 40
-    """Number of particles N. A single one moves without noise: there is nobody to choose from, so that noise would only
-    take it off the dead reckoning."""
+    """Number of particles N. A single one moves without noise, because without a choice noise would only add errors."""
     ess_fraction: float = 0.5
     """Systematic resampling when N_eff < ess_fraction · N (SegSLAM eq. 7)."""
 
     voxel_size: float = 0.2
-    """Edge of a voxel [m]: smaller ones cost time with the cube, larger ones blur what end points are weighed by."""
+    """Edge of a voxel [m]: computing time grows with the inverse cube; larger ones blur the end-point likelihood."""
     lift: float = 0.25
-    """Height of the body over the lattice of a new map, in voxels, where gravity is measured. A floor between two
-    layers of voxels sinks into the lower one, and the body with it: half a voxel in every new map. In simulated garages
-    heights drifted half as much with 0.25 (and with 0.5) as with 0."""
+    """Height of the body above the voxel boundary of a new map, in voxels, if gravity is measured. A floor at the
+    boundary of two voxel layers falls into the lower one, which lowers the body by half a voxel in every new map. In
+    simulated garages the height drift with 0.25 (and with 0.5) was half of that with 0."""
     hit: float = 0.7
-    """Probability that a voxel is occupied, given that a beam ended in it (OctoMap's). With a larger one floors outlast
-    the beams that graze them, so that heights drift less; walls get thicker, and the way across them is told less
-    well."""
+    """Probability that a voxel is occupied, given that a beam ended in it (OctoMap's). With a larger one floors are not
+    erased by grazing beams, so heights drift less; but walls get thicker, and positions across them less precise."""
     map_beams: int = 0
-    """Beams of a step that go into the maps, spread over it; 0 = all there are."""
+    """Most beams of a step inserted into the maps, evenly spaced; 0 = all."""
 
     likelihood: Literal["endpoint", "cast", "upright"] = "endpoint"
-    """How beams are weighed. End points are flat, so that of particles all a little off the nearest still wins. Casting
-    is sharp, and asks for more particles or less motion noise. ``upright``: end points of upright surfaces alone, which
-    say where the body is in the plan, and some casts, which say how high it is; end points of floors pull the
-    body down. Where no gravity is measured that is ``endpoint``."""
+    """Likelihood of beams. End points are a wide likelihood: the nearest of several slightly wrong particles wins. Ray
+    casting is peaked and needs more particles or less motion noise. ``upright``: end points on vertical surfaces only,
+    for the horizontal position, and some ray casts, for the height; end points on floors pull the body down. Without
+    gravity it is ``endpoint``."""
     weight_beams: int = 180
-    """Beams of a step that are weighed, spread over it. Neighbours repeat each other, so fewer than go into the map."""
+    """Most beams of a step used for the weights, evenly spaced; fewer than for the map, because neighbours are
+    redundant."""
     endpoint_effective_beams: float = 60.0
-    """Independent beams that a step counts as, weighed by end points: the exponent of its likelihood is this over the
-    number weighed. Some tens leave about half of the particles effective; fewer teach the filter little, and many more
-    have it resample at nearly every step."""
+    """Effective number of independent beams per step for end points: the exponent of the likelihood is this over the
+    number used. With some tens about half of the particles stay effective; with fewer the filter learns little, with
+    many more it resamples at nearly every step."""
     floor: float = 0.05
-    """End points: probability that a beam has nothing to do with the map."""
+    """End points: probability that a beam is an outlier."""
     unknown: float = 0.3
-    """End points: probability of occupancy where the map knows nothing. Below one half, so that a particle which finds
-    the surfaces it knows again beats one that puts them where nothing was seen; far above, new ground is a reward."""
+    """End points: probability of occupancy in unknown space. Below 0.5, so that a particle that re-observes known
+    surfaces is better than one that puts them into unknown space; larger values reward new ground."""
     young: int = 12
-    """A map of fewer scans than this says little yet, and what it says is not to be held against maps that know more:
-    its particle takes the mean evidence of the older ones. 12 are 5 s, after which a spun scanner has seen all round
-    once and a walking robot's scans overlap."""
+    """A map with fewer scans is not used for weights: its particle gets the mean evidence of the particles with older
+    maps. 12 scans take 5 s, after which a spinning scanner has seen all directions and the scans of a walking robot
+    overlap."""
 
     walk_scale: float = 1.0
-    """Factor on the walks below. A filter over a whole way needs them whole, to undo what the gyro's bias has done;
-    inside the segments of SegSLAM about half is better: most of what is left at the end of one is this noise."""
+    """Factor on the random walks below. A filter over a whole path needs them fully, to compensate the gyro bias;
+    within the segments of SegSLAM about half is better: most of the end-pose error is this noise."""
     motion_scale: float = 1.0
     """Factor on the σ of the odometry."""
     position_walk: float = 0.025
-    """σ along and across, added after one metre, growing with the root of the path [m/√m]."""
+    """σ along and across after one metre, growing with the root of the path [m/√m]."""
     height_walk: float = 0.01
     """σ of the height, likewise [m/√m]."""
     heading_walk: float = 0.013
-    """σ of the heading, likewise [rad/√m]: 7 mrad per 0.3 m. Noise is white and a gyro's bias is not, so it must be ten
-    to twenty times what a bias turns in a step: else no particle is ever where the bias has to be undone."""
+    """σ of the heading, likewise [rad/√m]: 7 mrad per 0.3 m. This noise is white and a gyro bias is not, so it must be
+    10 to 20 times the rotation by a bias in a step; otherwise no particle compensates the bias."""
     heading_turn: float = 0.05
-    """σ of the heading, added after a turn of one radian, growing with the root of the angle [rad/√rad]: turning on the
-    spot."""
+    """σ of the heading after a rotation of one radian, growing with the root of the angle [rad/√rad]; for turning on
+    the spot."""
     tilt_walk: float = 0.003
-    """σ of roll and pitch, growing with the root of the path, where no gravity tells them [rad/√m]."""
+    """σ of roll and pitch, growing with the root of the path, without gravity [rad/√m]."""
 
     threads: int = 1
-    """Threads that weigh and update maps; the result is the same for any number."""
+    """Number of threads for weights and map updates; results do not depend on it."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -110,11 +109,11 @@ class GridFilterConfig:
         self.by_casting(self.weight_beams)
 
     def beam_model(self) -> BeamModel:
-        """What a beam says of a voxel."""
+        """Sensor model of a beam for the evidence grid."""
         return BeamModel(hit=self.hit)
 
     def by_end_points(self, beams: int) -> EndpointLikelihood:
-        """The likelihood of a step of which the end points of so many beams are weighed."""
+        """The likelihood of a step with this many end points."""
         return EndpointLikelihood(
             exponent=self._exponent(self.endpoint_effective_beams, beams),
             floor=self.floor,
@@ -122,7 +121,7 @@ class GridFilterConfig:
         )
 
     def by_casting(self, beams: int) -> CastLikelihood:
-        """The likelihood of a step of which so many beams are cast."""
+        """The likelihood of a step with this many ray casts."""
         exponent = self._exponent(CAST_EFFECTIVE_BEAMS, beams)
         return CastLikelihood(exponent=exponent)
 

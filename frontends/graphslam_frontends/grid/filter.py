@@ -1,9 +1,9 @@
-"""The particle core: particles with a pose and an evidence grid each, moved, weighed, resampled, written to.
+"""Particle filter core: particles with a pose and an evidence grid each; motion, weights, resampling, map updates.
 
-A filter does nothing by itself; whoever owns it calls the parts of a step in order: :meth:`GridFilter.predict`,
-:meth:`~GridFilter.weigh`, :meth:`~GridFilter.record`, :meth:`~GridFilter.resample_if_needed`,
-:meth:`~GridFilter.update` (or all of them by :meth:`~GridFilter.step`), and may change poses, maps and ages in between.
-Everything drawn hangs from ``seed.child(purpose, step)``: the same seed gives the same bytes for any number of threads.
+The caller calls the parts of a step in order: :meth:`GridFilter.predict`, :meth:`~GridFilter.weigh`,
+:meth:`~GridFilter.record`, :meth:`~GridFilter.resample_if_needed`, :meth:`~GridFilter.update` (or all of them by
+:meth:`~GridFilter.step`), and may change poses, maps and ages in between. All random numbers are from
+``seed.child(purpose, step)``: the same seed gives identical results for any number of threads.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Ints = npt.NDArray[np.int64]
 
 PARTS = ("predict", "weigh", "record", "resample", "update")
 CAST_BEAMS = 60
-"""Beams of a step that are cast beside the end points of upright surfaces, spread over it."""
+"""Most ray-cast beams of a step in addition to the end points on vertical surfaces, evenly spaced."""
 
 
 @dataclass(slots=True)
@@ -56,17 +56,17 @@ class GridParticles:
     Parameters
     ----------
     poses : (N, 7) or (N, 3)
-        ``T_map_body`` of each, in the frame of its own map.
+        ``T_map_body`` of each particle, in the frame of its own map.
     tilt_errors : (N, 2) or None
-        By how much each thinks that gravity's roll and pitch are too large [rad]; None where no gravity is measured.
+        Error of roll and pitch by gravity for each particle [rad]; None without gravity.
     grids : list of N EvidenceGrid
-        Of one pool.
+        All from one pool.
     log_weights : (N,)
         Normalised: their exponentials sum to one.
     ages : (N,) int64
-        Scans in each map.
+        Number of scans in each map.
     scores : (N,)
-        Log-likelihood of each particle's whole past, tempered as the weights are.
+        Accumulated log-likelihood of each particle's history, tempered as the weights are.
     """
 
     poses: Array
@@ -86,7 +86,7 @@ class GridParticles:
 
     @property
     def best(self) -> int:
-        """The heaviest particle; of equally heavy ones (after resampling all are) that of the likeliest past."""
+        """Index of the largest weight; if equal, as after resampling, that of the largest score."""
         return int(np.lexsort((-np.arange(len(self)), self.scores, self.log_weights))[-1])
 
     def gain(self, log_likelihoods: Array) -> None:
@@ -97,7 +97,7 @@ class GridParticles:
             self.log_weights = np.log(normalise_log_weights(total))
 
     def take(self, ancestors: Ints) -> None:
-        """Particle i becomes what ``ancestors[i]`` was, all of equal weight; maps are copied in constant time."""
+        """Particle i becomes a copy of ``ancestors[i]``, with equal weights; maps are copied in constant time."""
         n = len(self)
         kept: set[int] = set()
         grids = []
@@ -115,16 +115,16 @@ class GridParticles:
 
 @dataclass(slots=True)
 class FilterCounts:
-    """What happened so far.
+    """Counts of a filter.
 
     Parameters
     ----------
     seconds : mapping of part to float
-        Wall time.
+        Wall time [s].
     without_beams, without_returns : int
-        Steps updated without a beam, and with beams none of which met anything.
+        Steps updated without a beam, and with beams but without returns.
     rays, dropped_rays : int
-        Beams inserted into maps, and beams that could not be, summed over the maps that were written.
+        Beams inserted into maps, and beams that could not be inserted, summed over the maps.
     """
 
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
@@ -141,12 +141,12 @@ class GridFilter:
     Parameters
     ----------
     seed : SeedTree
-        Of this filter alone.
+        Of this filter only.
     first : int
-        Step at which the particles stand at the start pose; nothing before it is read.
+        First step, with the particles at the start pose; earlier steps are not used.
     start : (7,), (3,), or (N, …), optional
-        ``T_map_body`` at that step; default the origin, in space with gravity `lift` above it. Where gravity is
-        measured, roll and pitch are taken from it.
+        ``T_map_body`` at that step; default the origin, in 3-D with gravity `lift` above it. With gravity, roll and
+        pitch are replaced by those measured.
     pool : GridPool, optional
         Storage of the maps; default one of its own.
     prune_every : int
@@ -203,7 +203,7 @@ class GridFilter:
 
     @property
     def lift(self) -> float:
-        """How far above the lattice of a new map the body stands [m]; 0 where nobody knows what is up."""
+        """Height of the body above the voxel boundary of a new map [m]; 0 without gravity."""
         return self.config.lift * self.config.voxel_size if self.steps.tilt is not None else 0.0
 
     @property
@@ -219,7 +219,7 @@ class GridFilter:
     # --- the parts of a step ---------------------------------------------------------------------------------
 
     def predict(self, k: int) -> None:
-        """Move to step k from the one before (A1); at the first step everybody stands where it starts."""
+        """Move to step k from the previous one (A1); no motion at the first step."""
         if k == self.first:
             return
         with self._timed("predict"):
@@ -238,9 +238,9 @@ class GridFilter:
             self._level(k)
 
     def weigh(self, k: int) -> Array:
-        """Multiply the likelihood of step k's scan into the weights (A3); its logarithms ``(N,)``.
+        """Multiply the likelihood of step k's scan into the weights (A3); returns its logarithms ``(N,)``.
 
-        Particles whose map is young have the mean of the others; a scan that says nothing leaves all as they are.
+        Particles with a young map get the mean likelihood of the others; a scan without beams changes nothing.
         """
         with self._timed("weigh"):
             p, config = self.particles, self.config
@@ -266,12 +266,12 @@ class GridFilter:
             return gains
 
     def record(self, tags: npt.ArrayLike | None = None) -> None:
-        """Write poses, with tags ``(N,)``, into the ancestry: once a step, in the frames they are in now."""
+        """Store poses, with tags ``(N,)``, in the ancestry: once per step, in their current frames."""
         with self._timed("record"):
             self.ancestry.record(self.particles.poses, tags)
 
     def resample_if_needed(self, k: int) -> Ints | None:
-        """Draw the survivors if too few particles are effective (A4): whom each comes from ``(N,)``, or None."""
+        """Resample if too few particles are effective (A4); returns the ancestor of each ``(N,)``, or None."""
         with self._timed("resample"):
             p = self.particles
             w = p.weights
@@ -286,7 +286,7 @@ class GridFilter:
     def update(self, k: int) -> UpdateReport:
         """Insert step k's scan into all maps that are not locked.
 
-        Particles of the same map at the same pose, as copies are right after resampling, get one update and share it.
+        Particles with the same map and pose, such as copies after resampling, share one update.
         """
         with self._timed("update"):
             p = self.particles
@@ -299,7 +299,7 @@ class GridFilter:
             leads: dict[tuple[int, bytes, int], int] = {}
             first_of = np.empty(len(p), dtype=np.int64)
             for i, grid in enumerate(p.grids):
-                # a locked map is left alone, and counted once for each handle
+                # a locked map is not written, and counted once per handle
                 key = (grid.root, p.poses[i].tobytes(), i if grid.locked else -1)
                 first_of[i] = leads.setdefault(key, i)
             rows = sorted(leads.values())
@@ -320,7 +320,7 @@ class GridFilter:
             return report
 
     def step(self, k: int) -> tuple[float, Ints | None]:
-        """All parts of step k; N_eff before resampling, and the survivors if there was one."""
+        """All parts of step k; returns N_eff before resampling, and the ancestors if resampled."""
         self.predict(k)
         self.weigh(k)
         self.record()
@@ -332,9 +332,9 @@ class GridFilter:
     # --- what they are made of -------------------------------------------------------------------------------
 
     def weighed_beams(self, k: int) -> list[tuple[Ints, EndpointLikelihood | CastLikelihood]]:
-        """Beams of step k by which particles are weighed, and how; nothing of a step without any.
+        """Beams of step k for the weights, with their likelihood; only non-empty sets.
 
-        End points are those of beams that met something; casting also compares beams that met nothing.
+        End points use returns only; ray casting also uses beams without a return.
         """
         c, returns = self.config, self.steps.scan(k)[2]
         out: list[tuple[Ints, EndpointLikelihood | CastLikelihood]] = []
@@ -349,14 +349,14 @@ class GridFilter:
         return [(rows, likelihood) for rows, likelihood in out if len(rows)]
 
     def _level(self, k: int) -> None:
-        """Roll and pitch of all particles from gravity at step k, each with its error taken off."""
+        """Set roll and pitch of all particles from gravity at step k, minus each particle's error."""
         p = self.particles
         if p.tilt_errors is not None:
             assert self.steps.tilt is not None
             p.poses = with_roll_pitch(p.poses, self.steps.tilt[k] - p.tilt_errors)
 
     def _normal(self, purpose: str, k: int, d: int) -> Array:
-        """Standard normal ``(N, d)`` of one purpose in one step."""
+        """Standard normal ``(N, d)`` for one purpose in one step."""
         return self.seed.child(purpose, k).generator().standard_normal((self.config.particles, d))
 
     @contextmanager
@@ -369,5 +369,5 @@ class GridFilter:
 
 
 def _some(rows: Ints, most: int) -> Ints:
-    """At most so many of some rows, evenly spread."""
+    """At most ``most`` of the rows, evenly spaced."""
     return rows[evenly_spaced_indices(len(rows), most)]

@@ -1,14 +1,13 @@
-"""What a particle filter leaves of the errors of dead reckoning: a covariance that knows the shape of the path.
+"""Error model of a particle filter: covariance of its remaining error, depending on the shape of the path.
 
-Particles share their ancestors, and with them most of what is wrong with all of them; their spread is a small part of
-how far off they are. What is left is, above all, a heading that walks: its errors turn everything that comes after, so
-the end of a segment is off across its path, the more the longer the way from where the heading erred. A model that only
-knows the length cannot say so, and is overconfident in position where it is right in heading.
+Particles share ancestors, and thus most of their errors; their spread is only a small part of the error. The remaining
+error is mainly a random walk of the heading: it rotates everything after it, so the error of the end pose is mainly
+across the path and grows with the distance from the heading error. A model by path length alone cannot describe that:
+with a correct heading σ it is overconfident in position.
 
-What a filter leaves has two sources. One is its own (noise of its particles, voxels, a flat likelihood): it is there
-with the best of odometry, and is what `FilterDrift` was fitted to. The other are errors of the motion that reach the
-map before they are seen: `Passed`, a share of what dead reckoning states of itself. A robot whose odometry is worse
-has exits that say so.
+There are two sources. One is the filter itself (particle noise, voxels, wide likelihood), present even with perfect
+odometry: `FilterDrift` was fitted to it. The other is motion errors that enter the map before they are observed:
+`ErrorPassThrough`, a fraction of the dead-reckoning covariance. So worse odometry gives larger end-pose covariances.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from graphslam.core.geometry import Array, rotation2
 from graphslam.core.poses import group_of, remove_roll_pitch
 
 _NODES = 64
-"""Places along a path at which the heading may err; more change nothing that a Monte Carlo could see."""
+"""Number of points of a path for the integration of heading errors; more do not change the result."""
 HEADING_START = 0.002
-"""σ of the heading at the end of a path of no length [rad]."""
+"""σ of the heading at the end of a path of zero length [rad]."""
 POSITION_START = 0.01
 """σ along x and y there [m]."""
 HEIGHT_START = 0.025
@@ -37,21 +36,21 @@ HEIGHT_SCALE = 0.002
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorPassThrough:
-    """How much of the errors of dead reckoning a filter passes on.
+    """Fraction of the dead-reckoning errors that a filter does not correct.
 
-    A scan holds a pose to the map of the last metres, and that map was drawn along the same path: errors leak into it.
-    The shares were fitted to exits of drawn robots (motion, laser and speed over a factor of 4 to 16, each robot in
-    another garage), and are the same, within 0.02 and 0.06, in either half of these robots.
+    Scans constrain a pose to the map of the last metres, and that map has the errors of the same path. The fractions
+    were fitted to end poses of simulated random robots (noise of motion, laser and speed over a factor of 4 to 16, each
+    robot in another garage); either half of the robots gives the same values within 0.02 and 0.06.
     """
 
     heading: float = 0.6
-    """Of the error of the heading, and without gravity of roll and pitch."""
+    """Of the heading error, and without gravity of roll and pitch."""
     position: float = 0.75
     """Along x and y, and without gravity along z."""
     height_tilt: float = 110.0
-    """Slope of the height by the square of the σ of roll and pitch that gravity tells [1/rad²]. Scans that are tilted
-    by it thicken the floor, and the floor pulls the body along. Errors of the heights of dead reckoning are beside that
-    small: a filter is worse than these where gravity is told poorly."""
+    """Height error per metre over the square of the σ of roll and pitch by gravity [1/rad²]. Tilted scans thicken the
+    floor, which pulls the body along. Height errors of dead reckoning are small compared with that: with poor gravity a
+    filter is worse than dead reckoning."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -62,7 +61,7 @@ class ErrorPassThrough:
             raise ConfigError("errors passed on: wanted shares ≤ 1 of heading and position")
 
     def covariance(self, reckoned: Array, length: float, particles: int, *, tilt: float | None = None) -> Array:
-        """What is added at the end of a path, right tangent, of the size of ``reckoned``.
+        """Covariance to add at the end of a path, right tangent, of the size of ``reckoned``.
 
         Parameters
         ----------
@@ -71,9 +70,9 @@ class ErrorPassThrough:
         length : float
             [m]
         particles : int
-            One corrects nothing, and passes everything on.
+            A single one corrects nothing: the fraction is 1.
         tilt : float, optional
-            σ of roll and pitch where gravity tells them [rad].
+            σ of roll and pitch by gravity, if measured [rad].
         """
         C = np.asarray(reckoned, dtype=np.float64)
         if particles == 1:
@@ -91,16 +90,16 @@ class ErrorPassThrough:
 
 
 PASSED = ErrorPassThrough()
-"""Comes on top of what a filter leaves, where it is known how far off dead reckoning is."""
+"""Default, added to the error of the filter itself if the dead-reckoning covariance is known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterDrift:
-    """Covariance at the end of a path that a filter of N particles drove.
+    """Covariance at the end of a path of a filter with N particles.
 
-    Walks are variances per metre. The defaults were fitted to the exits of 550 segments of 10 to 65 m in simulated
-    garages, with 5, 20 and 40 particles that walk half (``walk_scale``); with the whole noise heading and position walk
-    nearly twice as much.
+    Walks are variances per metre. The defaults were fitted to the end poses of 550 segments of 10 to 65 m in simulated
+    garages, with 5, 20 and 40 particles and half the random walk (``walk_scale``); with the full walk, heading and
+    position walks are nearly twice as large.
     """
 
     heading_walk: float = 0.0042
@@ -108,15 +107,15 @@ class FilterDrift:
     position_walk: float = 0.0118
     """Along x and y [m/√m]."""
     position_scale: float = 0.0045
-    """Wheels are off by a factor that lasts: σ of it. It moves the end along the line from the start."""
+    """σ of a constant scale error of the wheels; it moves the end along the line from the start."""
     few: float = 3.0
-    """The variances of these walks are larger by this over the number of particles."""
+    """The variances of these walks are increased by this over the number of particles."""
     alone_walk: float = 0.015
-    """Walk of the heading of a single particle, which corrects nothing [rad/√m]."""
+    """Heading walk of a single particle, which corrects nothing [rad/√m]."""
     height_walk: float = 0.021
     """[m/√m]"""
     tilt: float = 0.006
-    """σ of roll and pitch, whatever the length [rad]."""
+    """σ of roll and pitch, independent of the length [rad]."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -142,12 +141,12 @@ class FilterDrift:
         path : (n, 7) or (n, 3)
             Poses from the start to the end, in any frame whose z axis is up.
         gravity : bool
-            The frame at the end stands level, as that of a submap does.
+            The frame at the end is levelled, as that of a submap is.
         reckoned : (d, d), optional
-            Covariance of dead reckoning over the path, of which a share is passed on; without it a single particle's
-            heading walks by ``alone_walk``, and nothing comes on top of what the filter itself leaves.
+            Covariance of dead reckoning over the path, a fraction of which is added; without it a single particle has
+            the heading walk ``alone_walk``, and nothing is added to the error of the filter itself.
         told_tilt : float, optional
-            σ of roll and pitch where gravity tells them [rad].
+            σ of roll and pitch by gravity, if measured [rad].
         """
         poses = np.asarray(path, dtype=np.float64)
         if poses.ndim != 2 or len(poses) == 0 or particles < 1:
@@ -158,7 +157,7 @@ class FilterDrift:
         s = np.cumsum(steps)
         k = np.unique(np.linspace(0, len(s) - 1, min(_NODES, len(s))).round().astype(np.int64))
         length = float(s[-1])
-        # where the body was, as seen from the end: an error of the heading there turns all that comes after about it
+        # positions in the end frame: a heading error there rotates the rest of the path about it
         there = group.between(np.broadcast_to(end, poses[k].shape), poses[k])[:, : group.dim]
         effect = np.zeros((len(k), group.dof))
         effect[:, group.heading] = 1.0
@@ -183,23 +182,23 @@ class FilterDrift:
 
 
 def interpolate_covariances(knots: npt.NDArray[np.int64], covariances: Array, poses: Array, along: Array) -> Array:
-    """Covariances ``(n, d, d)`` at all poses of a path from those at some, linear in the way, right tangents.
+    """Covariances ``(n, d, d)`` at all poses of a path from those at some, linear in path length, right tangents.
 
-    In the axes of the base, where neighbours differ by drift alone and not by the turn of the body.
+    Interpolated in the axes of the base frame, where neighbours do not differ by the rotation of the body.
 
     Parameters
     ----------
     knots : (k,) int
-        Rising, from 0 to n - 1.
+        Increasing, from 0 to n - 1.
     covariances : (k, d, d)
     poses : (n, 7) or (n, 3)
     along : (n,)
-        Metres driven, not falling.
+        Metres driven, not decreasing.
     """
     n = len(poses)
     R = _axes(poses)
     D = R[knots] @ covariances @ np.swapaxes(R[knots], 1, 2)
-    way = along + 1e-9 * np.arange(n)  # a robot that stands still: by steps
+    way = along + 1e-9 * np.arange(n)  # stationary robot: by steps
     j = np.clip(np.searchsorted(knots, np.arange(n), side="right") - 1, 0, len(knots) - 2)
     a, b = way[knots[j]], way[knots[j + 1]]
     u = ((way - a) / (b - a))[:, None, None]

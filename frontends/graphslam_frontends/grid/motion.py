@@ -1,7 +1,7 @@
-"""How particles move: the odometry with its noise (SegSLAM eq. 1–2), and roll and pitch from gravity.
+"""Motion model of the particles: odometry with its noise (SegSLAM eq. 1–2), and roll and pitch from gravity.
 
-Gravity tells roll and pitch without drift, but not exactly: an accelerometer's attitude is off by a fraction of a
-degree for seconds on end. Each particle carries such an error of its own, an Ornstein–Uhlenbeck process.
+Roll and pitch by gravity do not drift, but have time-correlated errors of a fraction of a degree over seconds. Each
+particle has its own sample of this error, an Ornstein–Uhlenbeck process.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from graphslam_frontends.grid.config import GridFilterConfig
 
 
 def motion_covariance(increment: Array, covariance: Array, config: GridFilterConfig) -> Array:
-    """Covariance a step's motion is sampled from: the odometry's own, and what errors that last need on top of it.
+    """Covariance for sampling the motion of a step: that of the odometry plus walks that cover its systematic errors.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def motion_covariance(increment: Array, covariance: Array, config: GridFilterCon
 
 
 def square_root(covariance: Array) -> Array:
-    """``L`` with ``L Lᵀ`` = a positive semi-definite ``(d, d)``; Cholesky's fails where one direction has no noise."""
+    """``L`` with ``L Lᵀ`` = a positive semi-definite ``(d, d)``; Cholesky fails if a direction has no noise."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -64,7 +64,7 @@ def roll_pitch_of(poses: Array) -> Array:
 
 
 def with_roll_pitch(poses: Array, tilt: Array) -> Array:
-    """Poses ``(n, 7)`` with roll and pitch ``(n, 2)`` [rad] in place of their own; headings and positions stay."""
+    """Poses ``(n, 7)`` with roll and pitch replaced by ``(n, 2)`` [rad]; headings and positions stay."""
     half = 0.5 * np.column_stack([tilt, heading_of(poses)])
     (sr, sp, sy), (cr, cp, cy) = np.sin(half).T, np.cos(half).T
     q = [
@@ -83,9 +83,9 @@ def walk_tilt_errors(errors: Array, seconds: float, sigma: float, time: float, n
     ----------
     errors : (n, 2)
     sigma : float
-        σ in the long run [rad].
+        Stationary σ [rad].
     time : float
-        In which the memory falls to 1/e [s]; 0: none.
+        Correlation time (1/e) [s]; 0: white.
     normal : (n, 2)
         Standard normal.
     """

@@ -1,4 +1,4 @@
-"""Particle weights, resampling and ancestry, shared by every particle filter of the project."""
+"""Particle weights and resampling, used by all particle filters of the project."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Index = npt.NDArray[np.int64]
 
 
 def normalise_log_weights(log_weights: Array) -> Array:
-    """Weights ``(n,)`` summing to one from log-weights; a set without any finite weight becomes uniform."""
+    """Weights ``(n,)`` summing to one from log-weights; uniform if none is finite."""
     m = np.max(log_weights)
     if not np.isfinite(m):
         return np.full(len(log_weights), 1.0 / len(log_weights))
@@ -32,5 +32,5 @@ def systematic_resample(weights: Array, uniform: float) -> Index:
     n = len(weights)
     positions = (np.arange(n) + uniform) / n
     chosen = np.searchsorted(np.cumsum(weights), positions, side="right")
-    # rounding must not push the last pointer off the end, nor onto a particle without weight
+    # rounding must not move the last pointer past the end, nor to a particle of zero weight
     return np.minimum(chosen, np.flatnonzero(weights > 0)[-1]).astype(np.int64)

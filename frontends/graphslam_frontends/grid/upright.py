@@ -1,4 +1,4 @@
-"""Which beams met a surface that lies: a floor, a ramp, a ceiling, a roof of a car."""
+"""Selection of the beams that did not hit a horizontal surface (floor, ramp, ceiling, roof of a car)."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
 Flags = npt.NDArray[np.bool_]
 
 NEIGHBOURS = 8
-"""Points of the same step by which a surface is told, the beam's own among them."""
+"""Number of points of the same step to fit a surface, the beam's own included."""
 SURE = 0.1
-"""Greatest σ of a normal that is known [rad]: of a plane through n points whose spread across it is λ₀ and along its
-shorter axis λ₁, ``sqrt(λ₀ / (n λ₁))``. Of points on a line, and of points that lie anyhow, it is 0.3."""
+"""Largest σ of a known normal [rad]; σ of a plane through n points with variance λ₀ across and λ₁ along its shorter
+axis is ``sqrt(λ₀ / (n λ₁))``. For points on a line or in random positions it is 0.3."""
 STEEP = float(np.sqrt(0.5))
-"""A surface lies whose normal is less than 45° off the vertical; ramps that can be driven are far below."""
+"""A surface is horizontal if its normal is less than 45° from the vertical; drivable ramps are far below that."""
 _APART = 1e4
-"""By which steps are moved apart [m], so that neighbours are looked for in the same step."""
+"""Distance between the steps in the search tree [m], so that neighbours are from the same step."""
 
 
 def upright_beams(steps: Steps) -> Flags:
-    """Beams ``(q,)`` of all steps that met something, and nothing of which it is known that it lies.
+    """Beams ``(q,)`` of all steps with a return that is not known to be on a horizontal surface.
 
-    What is met by too few beams to tell, as a pole or the edge of a wall, tells a place in the plan as well; floors too
-    far off to be told from it are few.
+    Objects with too few beams for a normal, such as a pole or the edge of a wall, also constrain the horizontal
+    position; floors too far away for a normal are rare.
 
     Parameters
     ----------
     steps : Steps
-        In space, with roll and pitch by gravity.
+        3-D, with roll and pitch by gravity.
     """
     assert steps.tilt is not None
     out = np.array(steps.returns)
@@ -58,6 +58,6 @@ def upright_beams(steps: Steps) -> Flags:
 
 
 def up_directions(tilt: Array) -> Array:
-    """What is up ``(n, 3)``, seen from bodies with roll and pitch ``(n, 2)`` [rad]."""
+    """Up vectors ``(n, 3)`` in the frames of bodies with roll and pitch ``(n, 2)`` [rad]."""
     (sr, sp), (cr, cp) = np.sin(tilt).T, np.cos(tilt).T
     return np.column_stack([-sp, sr * cp, cr * cp])

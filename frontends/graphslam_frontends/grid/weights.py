@@ -1,4 +1,4 @@
-"""What of a step is weighed, and how maps that know little are weighed beside others that know more."""
+"""Selection of beams for the weights, and likelihoods of particles with young maps."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ Flags = npt.NDArray[np.bool_]
 
 
 def evenly_spaced_indices(n: int, most: int) -> Ints:
-    """At most ``most`` (0: all) of ``n`` indices, ascending and evenly spread: the same ones every time."""
+    """At most ``most`` (0: all) of ``n`` indices, ascending and evenly spaced; deterministic."""
     if most <= 0 or n <= most:
         return np.arange(n, dtype=np.int64)
     return (np.arange(most, dtype=np.int64) * n) // most
 
 
 def maps_with_enough_scans(ages: Ints, young: int) -> Flags:
-    """Which maps ``(n,)`` may be weighed by what they say: of at least ``young`` scans, or, where none is, the oldest.
+    """Which maps ``(n,)`` are used for weights: those of at least ``young`` scans or, without any, the oldest.
 
-    Maps without any scan say nothing.
+    Maps without any scan are never used.
     """
     oldest = int(ages.max(initial=0))
     return np.asarray((ages >= min(young, oldest)) & (ages > 0))
 
 
 def fill_with_mean_likelihood(gains: Array, log_weights: Array, told: Flags) -> Array:
-    """Log-likelihoods ``(n,)`` in which particles that were not ``told`` have the mean likelihood of those that were.
+    """Log-likelihoods ``(n,)`` in which particles not ``told`` get the mean likelihood of the others.
 
-    The mean is weighted by what the particles weighed before, which makes it the evidence ``p(z)`` of those told: the
-    share of the weight that the others have together stays what it was. Nobody told: zeros.
+    The mean is weighted by the prior weights, so it is the evidence ``p(z)`` of the ``told`` ones: the total weight of
+    the others does not change. If none is ``told``: zeros.
 
     Parameters
     ----------
     gains : (n,)
-        Log-likelihoods; only those of particles told are read.
+        Log-likelihoods; only those of ``told`` particles are read.
     log_weights : (n,)
         Before this step.
     told : (n,) bool

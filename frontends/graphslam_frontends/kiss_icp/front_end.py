@@ -1,20 +1,20 @@
-"""The front end ``kiss-icp``: the odometry of the package ``kiss_icp``, with our submaps and covariances.
+"""The front end ``kiss-icp``: odometry of the package ``kiss_icp``, with the submaps and covariances of this project.
 
-KISS-ICP (Vizzo et al. 2023) registers each scan to its own point map and gives a pose, but no covariance. Submaps, the
-cloud and the evidence grid in them, reports and refinement are those of
+KISS-ICP (Vizzo et al. 2023) registers each scan to its own point map and gives a pose, but no covariance. Submaps,
+their clouds and evidence grids, reports and refinement are those of
 :mod:`graphslam_frontends.lidar_odometry.front_end`. The covariance is that of a registration to Gaussian cells, at the
-pose that KISS-ICP found:
+pose of KISS-ICP:
 
-- information by pose of the window, and the noise of the gradient, as in ``lidar-odometry``;
-- the optimum of the cells, found from the pose of KISS-ICP, is a second estimate from the same scan. The difference of
-  the two is followed through the window as one error, and its outer product is added;
-- along directions that no surface holds, the scan may have moved by nothing or as predicted: the whole predicted motion
-  is added as σ.
+- information by window pose, and noise of the gradient, as in ``lidar-odometry``;
+- the optimum of the cells, started at the pose of KISS-ICP, is a second estimate from the same scan. The difference of
+the two is propagated through the window as one error, and its outer product is added;
+- along unobservable directions the motion may be anything from zero to the predicted one: the whole predicted motion is
+added as σ.
 
-The map of the cells lies where KISS-ICP puts the scans. Where its map and the cells slip together (few points, most of
-them in rings on a level floor), the covariance does not show it.
+The map of the cells uses the poses of KISS-ICP. If both maps drift together (few points, mostly in rings on a level
+floor), the covariance does not include it.
 
-Scans are deskewed at constant velocity by us, because the package ends the process on stamps that are all equal.
+Scans are deskewed here at constant velocity, because the package aborts the process if all point stamps are equal.
 """
 
 from __future__ import annotations
@@ -49,23 +49,23 @@ from graphslam_frontends.lidar_odometry.odometry import (
 )
 
 CELL = 0.5
-"""Edge of the Gaussian cells of which the covariance is computed [m]."""
+"""Edge of the Gaussian cells for the covariance [m]."""
 NO_STAMPS = np.zeros(0)
-"""The package does not deskew without stamps."""
+"""Without stamps the package does not deskew."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KissIcpConfig:
-    """Parameters of the package; the defaults are its own."""
+    """Parameters of the package, with its defaults."""
 
     max_range: float = 100.0
-    """Points farther away are left out [m]."""
+    """Points farther away are ignored [m]."""
     min_range: float = 0.0
-    """Points nearer are left out [m]."""
+    """Nearer points are ignored [m]."""
     voxel_size: float | None = None
-    """Edge of the voxels of its map [m]; None: a hundredth of ``max_range``."""
+    """Edge of the voxels of its map [m]; None: ``max_range`` / 100."""
     deskew: bool = True
-    """Move points of a scan to its stamp, where they have stamps of their own."""
+    """Deskew points to the stamp of the scan, if they have times of their own."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.min_range < self.max_range < np.inf:
@@ -74,7 +74,7 @@ class KissIcpConfig:
             raise ConfigError(f"kiss-icp: voxel_size = {self.voxel_size}; wanted > 0, or none")
 
     def registration(self) -> Any:
-        """The package's odometry at its start, on one thread, so that a run can be repeated."""
+        """The odometry of the package in its initial state, with one thread, so that runs are reproducible."""
         package = import_extra("kiss_icp.kiss_icp", "front end 'kiss-icp'")
         config = import_extra("kiss_icp.config", "front end 'kiss-icp'").KISSConfig()
         config.data.max_range, config.data.min_range, config.data.deskew = self.max_range, self.min_range, False
@@ -90,15 +90,15 @@ class KissIcpFrontEndConfig:
     stream: str | None = None
     """Stream of point clouds; None: the first of the log."""
     odometry: KissIcpConfig = field(default_factory=KissIcpConfig)
-    """How scans are registered."""
+    """Registration of scans."""
     submap: LidarSubmapConfig = field(default_factory=LidarSubmapConfig)
-    """How the path is cut, and what submaps carry."""
+    """Cutting of the path, and contents of the submaps."""
     imu: ClassVar[str] = "none"
-    """KISS-ICP reads scans alone."""
+    """KISS-ICP uses scans only."""
 
 
 class KissIcpOdometry(LidarOdometry):
-    """Poses by ``kiss_icp``, their covariance by Gaussian cells; see the module's text.
+    """Poses by ``kiss_icp``, with covariance by Gaussian cells; see the module docstring.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class KissIcpOdometry(LidarOdometry):
         return super().step(cloud, time, ages)
 
     def _register(self, points: Array) -> Array:
-        """Pose ``(7,)`` that the package gives a scan; the scan is in its map then."""
+        """Register a scan and add it to the map of the package; returns its pose ``(7,)``."""
         self.package.register_frame(np.ascontiguousarray(points, dtype=np.float64), NO_STAMPS)
         T = self.package.last_pose
         return np.concatenate([T[:3, 3], se3.matrix_to_quat(T[:3, :3])])
@@ -169,7 +169,7 @@ class KissIcpOdometry(LidarOdometry):
 
 @dataclass(frozen=True, slots=True)
 class KissIcpFrontEnd(LidarFrontEnd):
-    """The front end ``kiss-icp``: point clouds alone, no IMU and no wheels."""
+    """The front end ``kiss-icp``: point clouds only, without IMU and wheels."""
 
     config: KissIcpFrontEndConfig = field(default_factory=KissIcpFrontEndConfig)  # type: ignore[assignment]
     name: ClassVar[str] = "kiss-icp"
