@@ -1,17 +1,17 @@
-"""Systematic errors of wheels and sightings, estimated beside a submap: is one map enough, and what would mend it?
+"""Score test for systematic errors of wheels and landmark observations in a submap.
 
-Sightings are smoothed in short windows under the association that the front end decided on, every window from a base of
-its own. What is left there says two things that no figure of a solved graph says:
+Observations are smoothed in short windows under the association of the front end, each window from its own base. The
+residuals give two results:
 
-- χ² of all residuals over their degrees of freedom: do wheels and sightings fit one map at all?
-- for every way in which a robot may be miscalibrated (:data:`PARAMETERS`), the *score* ``g = Bᵀ W r`` and its
-  information ``S = Bᵀ W B - Bᵀ W A (Aᵀ W A)⁻¹ Aᵀ W B``: B how the error moves the residuals, A how the path and the
-  landmarks do. An honest robot has ``g ~ N(0, S)``; a wrong one gives the error itself, ``S⁻¹ g`` (one step of
-  Gauss-Newton over path, landmarks and calibration), and its σ.
+- χ² of all residuals over their degrees of freedom: are wheels and observations consistent with one map?
+- for every systematic error (:data:`PARAMETERS`), the *score* ``g = Bᵀ W r`` and its information
+``S = Bᵀ W B - Bᵀ W A (Aᵀ W A)⁻¹ Aᵀ W B``: B is the Jacobian of the residuals by the error, A that by path and
+landmarks. Without errors ``g ~ N(0, S)``; otherwise ``S⁻¹ g`` estimates the error (one step of Gauss-Newton over path,
+landmarks and calibration), with its σ.
 
-Windows are independent, so both are sums (:mod:`graphslam.evaluate.bias_test` reads them). Not seen, in principle: a
-common scale of ranges and distances, and bearings and turns mirrored together. They give a map that is similar to the
-true one, and nothing in these two sensors says which is the world.
+Windows are independent, so both are sums (:mod:`graphslam.evaluate.bias_test` reads them). Not observable in principle:
+a common scale of ranges and distances, and bearings and rotations mirrored together. They give a map similar to the
+true one, and these two sensors cannot distinguish them.
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ PARAMETERS = (
     "turn-scale",
     "turn-per-metre",
 )
-"""Errors that are tested for: factors (0 is right) of ranges, distances and turns; metres of ranges and of the sensor's
-place; radians of bearings, and of heading for every metre driven."""
+"""Errors that are tested for: factors (0 is correct) of ranges, distances and rotations; offsets of ranges and of the
+sensor position [m]; offset of bearings [rad], and heading error per metre driven [rad/m]."""
 WINDOW = 60
-"""Scans of a window. Long enough for a landmark to be seen from several places, short enough that wheels are nearly
-white in it, and that the normal equations stay small."""
+"""Scans per window: enough to observe a landmark from several places, few enough that wheel errors are nearly white and
+the normal equations small."""
 LEAST_SCANS = 5
 
 
 def bias_score_test(
     data: PreparedLog, first: int, last: int, rows: Ints, landmark: Ints, poses: Array, places: Array
 ) -> dict[str, Any]:
-    """Sums over the windows of a submap, as its report holds them.
+    """Sums over the windows of a submap, for its report.
 
     Parameters
     ----------
     first, last : int
         Scans of the submap: ``first … last - 1``.
     rows, landmark : (q,)
-        Observations that were used (rows of ``data.rows``), in order, and the landmark of each.
+        Observations used (rows of ``data.rows``), in order, and the landmark of each.
     poses : (last - first, 3)
-        Of the base at the scans, in any one frame.
+        Of the base at the scans, in any common frame.
     places : (L, 2)
         Of the landmarks, same frame.
 
@@ -75,7 +75,7 @@ def bias_score_test(
     dict
         ``windows``, ``chi2``, ``dof``, ``score`` and ``information`` as described in the module, and for the scatter of
         the windows ``score2``, ``score_information``, ``information2``: sums of gᵢ², gᵢ Sᵢᵢ and Sᵢᵢ². Empty without a
-        window that could be judged.
+        usable window.
     """
     scan = np.searchsorted(data.observations.offsets, rows, side="right") - 1
     p = len(PARAMETERS)
@@ -104,7 +104,7 @@ def bias_score_test(
 def _window(
     data: PreparedLog, a: int, b: int, rows: Ints, pose: Ints, landmark: Ints, poses: Array, places: Array
 ) -> tuple[float, int, Array, Array] | None:
-    """χ², dof, score and information of one window; None where nothing in it is redundant."""
+    """χ², dof, score and information of one window; None without redundancy."""
     names, index, seen = np.unique(landmark, return_inverse=True, return_counts=True)
     again = seen[index] > 1
     rows, pose = rows[again], pose[again]
@@ -115,7 +115,7 @@ def _window(
         first_seen.setdefault(name, len(first_seen))
     names = np.array(list(first_seen), dtype=np.int64)
     index = np.array([first_seen[n] for n in landmark[again].tolist()], dtype=np.int64)
-    # the window's own base is the pose that its first increment starts from
+    # the base of the window is the pose before its first increment
     u, Q = data.odometry.increments[a:b], data.odometry.covariances[a:b]
     base = se2_compose(poses[0], se2_inverse(u[0]))
     x = se2_between(np.broadcast_to(base, poses.shape), poses).copy()
@@ -152,16 +152,16 @@ def _score(
     for i in range(3):
         A_o[at[1:], :, 3 * (at[1:] - 1) + i] = past[1:, :, i]
     r_o = -e
-    # what the wheels would say more if they were wrong: a longer way, a larger turn, a turn for every metre
+    # Jacobian by the wheel errors: longer distances, larger rotations, a rotation per metre
     ahead = np.einsum("kji,kj->ki", rotation2(between[:, 2]), between[:, :2])
     B_o[:, :2, PARAMETERS.index("distance-scale")] = ahead
     B_o[:, 2, PARAMETERS.index("turn-scale")] = between[:, 2]
     B_o[:, 2, PARAMETERS.index("turn-per-metre")] = np.hypot(between[:, 0], between[:, 1])
-    # residuals are measured - predicted: A δ + B c + noise for a state that is δ from the true one
+    # residuals are measured - predicted: A δ + B c + noise for a state error δ
     A_o, B_o, r_o = root @ A_o, root @ B_o, np.einsum("kij,kj->ki", root, r_o)
-    # sightings
+    # observations
     R = rotation2(x[pose, 2])
-    d = np.einsum("kji,kj->ki", R, l[index] - x[pose, :2]) - sensor[:2]  # in the body, from the sensor
+    d = np.einsum("kji,kj->ki", R, l[index] - x[pose, :2]) - sensor[:2]  # body frame, from the sensor
     r = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-6)
     ex, ey = d[:, 0] / r, d[:, 1] / r
     A_z, B_z = np.zeros((q, 2, 3 * T + n)), np.zeros((q, 2, p))

@@ -1,8 +1,8 @@
-"""Which observation belongs to which landmark, given the joint Gaussian of pose and landmarks.
+"""Data association given the joint Gaussian of pose and landmarks.
 
-Nearest neighbour judges each pairing by itself; joint compatibility (Neira & Tardós 2001, IEEE Trans. Robotics and
-Automation 17(6)) judges the pairings of a scan together, so that a common error of the pose cannot pass as several
-good matches of the wrong landmarks.
+Nearest neighbour tests each pairing separately. Joint compatibility (Neira & Tardós 2001, IEEE Trans. Robotics and
+Automation 17(6)) tests all pairings of a scan together, so that a common pose error is not accepted as several good
+matches of the wrong landmarks.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def _gates(gate: float, rows: int) -> Array:
 
 
 def gates_by_dof(gate: float, rows: int) -> Array:
-    """χ² gates ``(rows + 1,)`` by degrees of freedom, all of the probability that ``gate`` has with two.
+    """χ² gates ``(rows + 1,)`` by degrees of freedom, with the probability of ``gate`` at 2 degrees of freedom.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class Pairing:
     landmark : (q,) int64
         Landmark of each observation, -1 = none.
     nearest : (q,)
-        Least Mahalanobis distance² of any landmark, as a share of the gate; inf without landmarks.
+        Least Mahalanobis distance² of any landmark, relative to the gate; inf without landmarks.
     polar : (L, 2)
         Predicted range [m] and bearing [rad] of every landmark.
     distance2 : float
@@ -67,7 +67,7 @@ class Pairing:
     nodes : int
         Hypotheses tested (joint compatibility only).
     capped : bool
-        The search was stopped by ``max_nodes``; the pairing is the best found, not proved the best.
+        The search was stopped by ``max_nodes``; the pairing is the best found, not proved optimal.
     """
 
     landmark: Ints
@@ -104,13 +104,13 @@ def pair_observations(
     gate : float
         χ² gate with two degrees of freedom (see :func:`gates_by_dof`).
     method : {"nearest", "jcbb"}
-        ``nearest``: the pair with the least Mahalanobis distance² first (in shares of its gate, so that observations
-        with and without bearing compare); ``jcbb``: the most pairings that are jointly compatible, and of those the
-        set with the least joint distance².
+        ``nearest``: greedy by Mahalanobis distance² (relative to the gate, so that observations with and without
+        bearing are comparable); ``jcbb``: the largest jointly compatible set of pairings, and of those the one with the
+        least joint distance².
     max_nodes : int
-        Bound of the search of ``jcbb``.
+        Most hypotheses of ``jcbb``.
     alive : (L,) bool, optional
-        Landmarks that take part; all of ``x`` by default.
+        Landmarks to use; all of ``x`` by default.
     """
     q = len(observations)
     if alive is None:

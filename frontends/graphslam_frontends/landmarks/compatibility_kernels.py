@@ -1,8 +1,7 @@
-"""Compiled data association of one scan against a joint Gaussian: candidates, nearest neighbour, joint compatibility.
+"""Compiled data association of one scan with a joint Gaussian: candidates, nearest neighbour, joint compatibility.
 
-All work on the active state of :mod:`graphslam_frontends.landmarks.ekf_kernels`. Gates come as an array over the
-degrees of
-freedom, so that an observation without bearing is judged with one. Twin: ``tests/reference/ekf_slam.py``.
+All use the active state of :mod:`graphslam_frontends.landmarks.ekf_kernels`. Gates are an array over the degrees of
+freedom, so that an observation without bearing has one. Reference: ``tests/reference/ekf_slam.py``.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class JointGaussian(NamedTuple):
 
 
 class PairingBuffer(NamedTuple):
-    """Room for pairings (q · nl,)."""
+    """Arrays for pairings (q · nl,)."""
 
     o: Any
     """Observation."""
@@ -37,7 +36,7 @@ class PairingBuffer(NamedTuple):
 
 
 class LandmarkCounts(NamedTuple):
-    """Of landmarks, by slot."""
+    """Counts of landmarks, by slot."""
 
     hits: Any
     misses: Any
@@ -89,7 +88,7 @@ def candidates_kernel(state, alive, obs, sensor, gates, polar, nearest, pairs):
             nearest[o] = min(nearest[o], d2 / gate)
             if d2 <= gate:
                 at = count
-                while at > begin and pair_d2[at - 1] > d2:  # insertion: few candidates
+                while at > begin and pair_d2[at - 1] > d2:  # insertion sort: few candidates
                     pair_o[at], pair_k[at], pair_d2[at] = pair_o[at - 1], pair_k[at - 1], pair_d2[at - 1]
                     at -= 1
                 pair_o[at], pair_k[at], pair_d2[at] = o, k, d2
@@ -99,7 +98,7 @@ def candidates_kernel(state, alive, obs, sensor, gates, polar, nearest, pairs):
 
 @njit
 def nearest_kernel(pairs, pair_o, pair_k, cost, match):
-    """Greedy gated nearest neighbour: the cheapest pair first, each observation and each landmark at most once."""
+    """Greedy gated nearest neighbour: the least cost first, each observation and each landmark at most once."""
     match[:] = -1
     used = np.zeros(pairs, np.bool_)
     while True:
@@ -117,7 +116,7 @@ def nearest_kernel(pairs, pair_o, pair_k, cost, match):
 
 @njit(error_model="numpy")
 def _levels(pair_o, count, observations):
-    """First pairing and end of each observation that has a candidate, and their number."""
+    """First and end index of the pairings of each observation with a candidate, and the number of such observations."""
     begin, end = np.empty(observations, np.int64), np.empty(observations, np.int64)
     levels = 0
     for i in range(count):
@@ -130,7 +129,7 @@ def _levels(pair_o, count, observations):
 
 @njit(error_model="numpy")
 def _linearise_pairings(x, obs, sensor, pair_o, pair_k, count):
-    """Jacobian, innovation and number of rows of each pairing, and the last landmark."""
+    """Jacobian, innovation and number of rows of each pairing, and the largest landmark index."""
     H, nu, rows = np.empty((count, 2, 5)), np.empty((count, 2)), np.empty(count, np.int64)
     h = np.empty(12)
     last = 0
@@ -144,10 +143,10 @@ def _linearise_pairings(x, obs, sensor, pair_o, pair_k, count):
 def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
     """Joint compatibility by branch and bound (Neira & Tardós 2001): most pairings, then least joint distance².
 
-    Observations are interpreted in the order given, candidates nearest first, then "none". Every hypothesis on the way
-    is jointly compatible: D² ≤ gates[rows]. D² grows by one forward substitution per pairing (incremental Cholesky of
-    the joint innovation covariance). A branch goes as soon as it cannot beat the best: fewer pairings even if all
-    remaining observations paired, or as many with a D² that is already no smaller (D² never decreases).
+    Observations are assigned in the given order, candidates nearest first, then "none". Every partial hypothesis is
+    jointly compatible: D² ≤ gates[rows]. D² grows by one forward substitution per pairing (incremental Cholesky of the
+    joint innovation covariance). A branch is cut if it cannot improve the best: fewer pairings even if all remaining
+    observations were paired, or the same number with a D² that is not smaller (D² never decreases).
 
     Returns (nodes tested, 1 if ``max_nodes`` stopped the search, else 0, D² of the result).
     """
@@ -173,7 +172,7 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
             best_match[:] = match
         if level == levels or hopeless or choice[level] > end[level]:
             level -= 1
-            if level >= 0 and taken[level] >= 0:  # undo the pairing that led here
+            if level >= 0 and taken[level] >= 0:  # undo the pairing of this branch
                 used[pair_k[taken[level]]] = False
                 match[pair_o[taken[level]]] = -1
                 taken[level] = -1
@@ -188,7 +187,7 @@ def joint_kernel(state, obs, sensor, gates, count, pairs, max_nodes, match):
             nodes += 1
             d2, d = D2[level], depth[level]
             ci = 3 + 2 * pair_k[i]
-            # rows of the joint covariance against every pairing already made, then against itself
+            # rows of the joint covariance with every earlier pairing, then with itself
             at = 0
             for v in range(level):
                 p = taken[v]
@@ -248,7 +247,7 @@ def _cross(P, a, ca, b, cb):
 
 @njit
 def misses_kernel(slots, scan, at, polar, counts, limits, dropped):
-    """Provisional landmarks that should have been seen and were not: counts misses, marks those that go.
+    """Provisional landmarks that were expected but not observed: counts misses, marks those to delete.
 
     slots (nl,) of the active landmarks; at (q,): active landmark of each observation or -1; limits: confirm hits,
     misses, scans, range, least and greatest bearing; dropped (nl,) bool out.

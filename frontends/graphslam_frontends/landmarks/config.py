@@ -15,10 +15,10 @@ from graphslam_frontends.odometry.motion import MotionNoise
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeBearingNoise:
-    """Errors of a range-bearing sensor: σ_r = range_sigma + range_slope · r, σ_β = bearing_sigma, and systematic ones.
+    """Noise of a range-bearing sensor: σ_r = range_sigma + range_slope · r, σ_β = bearing_sigma, and systematic errors.
 
-    Without it the log's own sigmas are used, and its ranges as they are. Scale and offset are those of the filter's
-    noise; a noise for the smoothing has no say in them.
+    Without it the sigmas of the log are used, and its ranges unchanged. Scale and offset are those of the filter's
+    noise, not of the smoothing's.
     """
 
     range_sigma: float
@@ -28,7 +28,7 @@ class RangeBearingNoise:
     bearing_sigma: float
     """σ of the bearing [rad]; inf: bearings are not used."""
     range_scale: float = 1.0
-    """A distance d is measured as range_scale · d + range_offset; both are taken out before anything else."""
+    """A distance d is measured as range_scale · d + range_offset; both are corrected before anything else."""
     range_offset: float = 0.0
     """[m]."""
 
@@ -44,31 +44,31 @@ class RangeBearingNoise:
         return np.stack([s**2, np.full_like(s, self.bearing_sigma**2)], -1)
 
     def distances(self, ranges: Array) -> Array:
-        """Distances ``(q,)`` [m] that measured ranges stand for."""
+        """Distances ``(q,)`` [m] from measured ranges."""
         return np.asarray((ranges - self.range_offset) / self.range_scale)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoppingConfig:
-    """When a submap ends (Combined SLAM B8). Each criterion names itself in the submap's report."""
+    """End of a submap (Combined SLAM B8). The report of the submap gives the criterion that applied."""
 
     num_features: int = 30
-    """(iii) the standard particle holds this many confirmed features."""
+    """(iii) number of confirmed features of the standard particle."""
     time_max: float = 8.0
     """(i) TIME_max [s]: a submap without any feature for TIME_max · min(1, ε/σ) ends."""
     min_ancestors: int = 0
-    """(ii) diversity: end when the particles descend from this many or fewer of the first ones; 0 = off."""
+    """(ii) diversity: end if the particles descend from this many or fewer initial ones; 0 = off."""
     max_resamplings: int = 0
     """(ii) diversity: end at this many resamplings; 0 = off."""
     max_distance: float = 40.0
-    """End after this many metres driven: local accuracy, and the smoother's linear cost."""
+    """End after this many metres driven: limits the errors of the local map and the cost of the smoother."""
     max_scans: int = 400
-    """End after this many scans (a vehicle that stands still gathers no distance)."""
+    """End after this many scans, because a stationary vehicle reaches no distance."""
     min_scans: int = 20
-    """No criterion counts before this many scans."""
+    """No criterion applies before this many scans."""
     scans: int = 0
-    """With a number: the submap ends after exactly this many scans and nothing else counts, so that every algorithm
-    of a study cuts the log at the same places; 0 = off."""
+    """If positive: the submap ends after exactly this many scans, without other criteria, so that all algorithms of a
+    study cut the log at the same places; 0 = off."""
 
     def __post_init__(self) -> None:
         if self.scans < 0:
@@ -77,16 +77,16 @@ class StoppingConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DelayedInitialisation:
-    """When the ranges to a beacon, kept until then, make a landmark. A single range says too little."""
+    """When stored ranges to a beacon initialise a landmark; a single range is not enough."""
 
     min_ranges: int = 5
-    """At least this many ranges, outliers not counted."""
+    """Least number of ranges, without outliers."""
     spread: float = 0.1
-    """The fit's largest σ is at most this part of the mean range: beyond it the circle is too curved for a Gaussian."""
+    """Largest σ of the fit, relative to the mean range; above it the posterior is too curved for a Gaussian."""
     margin: float = 16.0
-    """Every other minimum (the mirror image above all) fits worse by this much in χ²."""
+    """Least χ² difference to every other minimum, such as the mirror image."""
     support: float = 0.9
-    """Share of the particles' weight whose fits must satisfy both."""
+    """Least share of the particle weights with fits that meet both criteria."""
 
     def __post_init__(self) -> None:
         if self.min_ranges < 3:
@@ -96,40 +96,40 @@ class DelayedInitialisation:
 
 
 DELAYED = DelayedInitialisation()
-"""Of the particle filters."""
+"""Default of the particle filters."""
 
 GATE_NEW = 30.0
-"""An observation farther (χ², 2 dof) than this from every landmark founds a new one; between the gates it is unused."""
+"""An observation farther (χ², 2 dof) from all landmarks initialises a new one; between the gates it is unused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SightingConfig:
-    """What every filter over a map of landmarks needs."""
+    """Common options of all filters with a map of landmarks."""
 
     gate: float = 11.8
     """χ² gate of an association (2 dof: 99.7 %; the same tail for an observation of one channel)."""
     outlier_gate: float = 0.0
-    """With known association: an observation with d² above this (χ², 2 dof; the same tail where it has one channel) is
-    an outlier (to that particle) and not used; 0 = use all."""
+    """With known association: an observation with larger d² (χ², 2 dof; same tail probability with one channel) is an
+    outlier for that particle and is not used; 0 = use all."""
     confirm_hits: int = 3
-    """A feature is provisional until it has been seen this often."""
+    """A feature is provisional until it has been observed this often."""
     drop_misses: int = 5
-    """A provisional feature goes after this many scans in which it should have been seen and was not."""
+    """A provisional feature is deleted after this many scans in which it was expected but not observed."""
     drop_scans: int = 10
-    """A provisional feature goes if it is not confirmed this many scans after its birth."""
+    """A provisional feature is deleted if it is not confirmed this many scans after its first observation."""
     max_range: float = 45.0
-    """Observations beyond are not used [m]."""
+    """Observations beyond this range are not used [m]."""
     longest_gap: float = 60.0
-    """Longest time without a record of the motion that is bridged [s]
-    (:mod:`graphslam_frontends.odometry.motion_gaps`)."""
+    """Longest gap in the records of the motion that is bridged [s] (:mod:`graphslam_frontends.odometry.motion_gaps`).
+    """
     motion: MotionNoise = field(default_factory=MotionNoise)
     """Noise of the dead-reckoning increments."""
     noise: RangeBearingNoise | None = None
-    """Observation noise in the filter; None: the log's sigmas."""
+    """Observation noise in the filter; None: the sigmas of the log."""
     min_hits: int = 1
-    """Landmarks handed over were seen at least this often (under the winning association)."""
+    """Landmarks in the submap were observed at least this often (under the winning association)."""
     detector: TreeDetectorConfig = field(default_factory=TreeDetectorConfig)
-    """Tree detector, used when the log holds raw scans instead of landmark observations."""
+    """Tree detector, used if the log has raw scans instead of landmark observations."""
 
     def __post_init__(self) -> None:
         if not self.longest_gap >= 0:
@@ -142,16 +142,16 @@ class SightingConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterConfig(SightingConfig):
-    """What a particle filter over one map needs, whatever becomes of the map."""
+    """Options of a particle filter over one map."""
 
     particles: int = 40
     """Number of particles N."""
     proposal: Literal["2.0", "1.0"] = "2.0"
     """FastSLAM 2.0 (EKF proposal, measurement in the proposal) or 1.0 (motion prior)."""
     association: Literal["likelihood", "known"] = "likelihood"
-    """Per-particle maximum likelihood, or the identities in the log."""
+    """Maximum likelihood per particle, or the identities in the log."""
     ess_fraction: float = 0.5
-    """Systematic resampling when N_eff < ess_fraction · N. Never switch it off inside a submap."""
+    """Systematic resampling if N_eff < ess_fraction · N. Do not switch it off."""
 
     def __post_init__(self) -> None:
         SightingConfig.__post_init__(self)
@@ -167,25 +167,25 @@ class FilterConfig(SightingConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorBiasConfig:
-    """Constant errors that a graph estimates with the map: σ of what is known of each beforehand; 0: it is none.
+    """Constant errors that a graph estimates with the map: prior σ of each; 0: not estimated.
 
-    The defaults are what a robot's data sheet and a tape measure leave open.
+    The defaults are typical uncertainties of a data sheet and a tape measure.
     """
 
     yaw_bias: float = float(np.deg2rad(1.0))
     """Of the yaw rate while the robot moves [rad/s]."""
     turn_per_metre: float = 0.0
-    """Of the heading for every metre driven [rad/m], in the place of a bias of the yaw rate."""
+    """Of the heading per metre driven [rad/m]; instead of a yaw-rate bias."""
     distance_scale: float = 0.05
-    """Of the logarithm of the distances."""
+    """Of the logarithm of the scale of distances."""
     range_offset: float = 0.3
-    """Of the zero of the ranges [m]."""
+    """Of the offset of the ranges [m]."""
     sensor_yaw: float = float(np.deg2rad(5.0))
-    """Of the direction of the sensor [rad]."""
+    """Of the yaw of the sensor on the robot [rad]."""
     range_scale: float = 0.0
-    """Of the logarithm of the ranges, in the place of a direction: for ranges without bearings."""
+    """Of the logarithm of the scale of ranges, instead of ``sensor_yaw``; for ranges without bearings."""
     mount: float = 0.05
-    """Of where the sensor stands on the robot, ahead and to the left [m]."""
+    """Of the position of the sensor on the robot, ahead and to the left [m]."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -198,8 +198,8 @@ class SensorBiasConfig:
                 )
 
     def chosen(self) -> tuple[tuple[str, ...], Array]:
-        """Name and σ of each of :data:`~graphslam.core.sensor_biases.CONSTANTS`; what is none has no name, and a σ of
-        1."""
+        """Name and σ of each of :data:`~graphslam.core.sensor_biases.CONSTANTS`; those not estimated have no name and σ
+        = 1."""
         pairs = (("yaw_bias", "turn_per_metre"), ("distance_scale",), ("range_offset",), ("sensor_yaw", "range_scale"))
         names = tuple(next((n for n in some if getattr(self, n) > 0.0), "") for some in pairs)
         sigmas = [getattr(self, n) if n else 1.0 for n in names]
@@ -209,25 +209,25 @@ class SensorBiasConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RbpfEkfConfig(FilterConfig):
-    """FastSLAM local maps, summarised as one Gaussian each."""
+    """FastSLAM local maps, each summarised as one Gaussian."""
 
     smoothing_noise: RangeBearingNoise | None = None
     """Observation noise in the smoothing; None: as in the filter."""
     trim: float = 0.0
-    """After a Huber pass, observations with d² above this (2 dof; the same tail where there is one channel) are dropped
-    and counted; 0 = keep all."""
+    """After a robust (Huber) iteration, observations with larger d² (2 dof; same tail probability with one channel) are
+    dropped and counted; 0 = keep all."""
     handover: Literal["smoothed", "moments", "pooled"] = "smoothed"
     """``smoothed``: Gauss-Newton under the winning association, Laplace covariance; ``moments``: B3 (paper mode);
     ``pooled``: moments of ``pooled`` independent filters."""
     moment_inflation: bool = False
     """Paper mode only: multiply the between-particle part by 1 + 40/N."""
     pooled: int = 0
-    """Number K of independent filters over the same scans, the first of them the one that decides; their pooled moments
-    stand in the report as an alarm. Costs K times the filter's time; 0 = off."""
+    """Number K of independent filters over the same scans; the first one determines the association. The discrepancy of
+    their pooled moments is reported as a check. The filter takes K times as long; 0 = off."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
-    """When a submap ends."""
+    """Criteria for the end of a submap."""
     lasting: SensorBiasConfig | None = None
-    """Constant errors of wheels and sensor that the graph estimates with the map; None: there are none."""
+    """Constant errors of wheels and sensor that the graph estimates with the map; None: none."""
 
     def __post_init__(self) -> None:
         FilterConfig.__post_init__(self)

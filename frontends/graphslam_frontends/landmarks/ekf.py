@@ -37,7 +37,7 @@ Ints = npt.NDArray[np.int64]
 
 
 def require_bearings(data: PreparedLog, where: str) -> None:
-    """Refuse ranges alone."""
+    """Reject logs with ranges only."""
     if len(data.rows) and not np.any(np.isfinite(data.rows[:, 3])):
         raise MissingDataError(
             "an EKF cannot start a landmark from ranges alone", where=where, wanted="bearings in some observations"
@@ -45,7 +45,7 @@ def require_bearings(data: PreparedLog, where: str) -> None:
 
 
 class EkfRun:
-    """One EKF map growing from scan ``first`` on, with the path it took."""
+    """One growing EKF map from scan ``first`` on, with its path."""
 
     def __init__(self, data: PreparedLog, config: EkfFilterConfig, first: int, t_start: float) -> None:
         obs = data.observations
@@ -58,7 +58,7 @@ class EkfRun:
         self.covariances: list[Array] = []  # of the plain vectors
 
     def advance(self) -> None:
-        """Take in the next scan."""
+        """Process the next scan."""
         obs, k = self.data.observations, self.next
         rows = self.data.scan(k) if self.local else obs.scan(k)
         if self.config.association == "known":
@@ -72,13 +72,13 @@ class EkfRun:
         self.next += 1
 
     def identities(self, slots: Ints) -> Ints:
-        """The log's identity of the landmarks ``slots``; -1 where the filter found them by itself."""
+        """Identities in the log of the landmarks ``slots``; -1 if the filter created them without one."""
         identity = {key: i for i, key in self.slots.items()}
         by_founding = {founding: identity[key] for key, founding in self.map.keys.items()}
         return np.array([by_founding.get(int(f), -1) for f in self.map.founded[slots]], dtype=np.int64)
 
     def sightings(self, slots: Ints) -> tuple[Ints, Ints]:
-        """Observations (index in the prepared log) of the landmarks ``slots``, and the position of each in them."""
+        """Observations (index in the prepared log) of the landmarks ``slots``, and the index of each one's landmark."""
         a = self.map.association()
         rank = np.full(self.map.foundings + 1, -1, dtype=np.int64)
         rank[self.map.founded[slots]] = np.arange(len(slots))
@@ -87,7 +87,7 @@ class EkfRun:
         return used + int(self.data.observations.offsets[self.first]), landmark[used]
 
     def trajectory(self, poses: Array, covariances: Array) -> Trajectory:
-        """Path in the base frame; the base itself stands first, exactly known, unless the first scan is the base."""
+        """Path in the base frame; the base itself is first, with zero covariance, unless the first scan is the base."""
         times = self.data.observations.times[self.first : self.next]
         if self.t_start < times[0]:
             times = np.concatenate([[self.t_start], times])
@@ -96,7 +96,7 @@ class EkfRun:
         return Trajectory(times, poses, covariances)
 
     def report(self, used: int) -> dict[str, Any]:
-        """Counts and the filter's own figures of honesty."""
+        """Counts and the consistency statistics (NIS) of the filter."""
         m, c = self.map, self.config
         offsets = self.data.observations.offsets
         out: dict[str, Any] = {
@@ -133,7 +133,7 @@ class EkfRun:
         return problem.smooth(np.array(self.poses), places)
 
     def submap(self, key: int, report: dict[str, Any], feed: RecordSource | None = None) -> Submap:
-        """The filter's own Gaussian as a submap; points of its path at the fixes of a feed are smoothed beside it."""
+        """The Gaussian of the filter as a submap; points of its path at fixes are from a smoothing."""
         slots = self.map.landmarks(self.config.min_hits)
         mean, P = self.map.joint(slots)
         rows, landmark = self.sightings(slots)

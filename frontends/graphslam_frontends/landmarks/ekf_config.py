@@ -13,12 +13,12 @@ from graphslam_frontends.landmarks.config import RangeBearingNoise, SightingConf
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfFilterConfig(SightingConfig):
-    """What an EKF over one map needs, whatever becomes of the map."""
+    """Options of an EKF over one map."""
 
     association: Literal["known", "nearest", "jcbb"] = "nearest"
     """Identities in the log, gated nearest neighbour, or joint compatibility by branch and bound."""
     max_nodes: int = 20_000
-    """Joint compatibility: hypotheses tested per scan; the best one so far is used then, and the scan counted."""
+    """Joint compatibility: most hypotheses tested per scan; then the best one so far is used, and counted."""
 
     def __post_init__(self) -> None:
         SightingConfig.__post_init__(self)
@@ -38,13 +38,13 @@ class EkfConfig(EkfFilterConfig):
     smoothing_noise: RangeBearingNoise | None = None
     """Observation noise in the smoothing; None: as in the filter."""
     trim: float = 0.0
-    """Smoothed hand-over: after a Huber pass, observations with d² above this are dropped and counted; 0 = keep all."""
+    """Smoothed output: after robust (Huber) iterations, observations with larger d² are dropped, counted; 0: off."""
     handover: Literal["smoothed", "filter"] = "smoothed"
-    """``smoothed``: Gauss-Newton under the filter's association, Laplace covariance; ``filter``: the EKF's own
-    Gaussian, as the paper has it. Each sighting is linearised once there: where ranges are far surer than bearings
-    (5 cm, 3°), its covariances are too small by a factor of up to ten."""
+    """``smoothed``: Gauss-Newton under the filter's association, Laplace covariance; ``filter``: the Gaussian of the
+    EKF, as in the paper. That linearises each observation once: if ranges are far more precise than bearings (5 cm,
+    3°), its covariances are too small by a factor of up to 10."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
-    """When a submap ends."""
+    """Criteria for the end of a submap."""
 
     def __post_init__(self) -> None:
         EkfFilterConfig.__post_init__(self)

@@ -1,8 +1,8 @@
-"""EKF-SLAM over one map, compressed: the work of a scan is that of the landmarks nearby (Guivant & Nebot 2001).
+"""Compressed EKF-SLAM over one map: the cost of a scan depends on nearby landmarks only (Guivant & Nebot 2001).
 
-The filter is the textbook one: state ``[x, y, θ, l_1x, l_1y, …]`` in the frame of the first base, motion in the
-tangent of the pose, all observations of a scan in one stacked update, new landmarks with their exact cross covariances.
-Only *when* the far part of the covariance is written differs, not what is written.
+It is the standard filter: state ``[x, y, θ, l_1x, l_1y, …]`` in the frame of the first base, motion in the tangent of
+the pose, one stacked update by all observations of a scan, new landmarks with exact cross covariances. The far part of
+the covariance is written later, with the same result.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from graphslam_frontends.landmarks.ekf_kernels import (
 
 Ints = npt.NDArray[np.int64]
 IGNORED = -1
-# Up to this many landmarks nothing is passive: the bookkeeping would cost more than it saves.
+# Up to this many landmarks all are active: the bookkeeping would take longer than it saves.
 _SMALL = 48
-# When one landmark has to become active, so do those within this multiple of its gate.
+# If a landmark has to become active, all those within this multiple of its gate become active.
 _GENEROUS = 3.0
 _ROWS = 1024
 _ROOM = 96
 ACTIVE_MARGIN = 20.0
-"""The filter works on landmarks this far beyond the range of the sensor and leaves the rest for later [m]. It changes
-the time the filter takes, not its result."""
+"""Landmarks this far beyond the range of the sensor are active, the others are updated later [m]. It changes the
+computing time, not the result."""
 
 
 class EkfMap:
-    """The Gaussian over pose and landmarks, and the association that made it.
+    """The Gaussian over pose and landmarks, with its association.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class EkfMap:
     field_of_view : (2,)
         Bearings of the sensor [rad].
     max_range : float
-        The sensor's own [m]; may be infinite.
+        That of the sensor [m]; may be infinite.
     """
 
     resamplings = 0
@@ -68,7 +68,7 @@ class EkfMap:
             field_of_view,
         )
         self.reach = min(config.max_range, max_range)
-        # the whole map, as last folded in; P keeps its lower triangle
+        # the whole map at the last fold; P stores its lower triangle
         self._x, self._P = np.zeros(3), np.zeros((3, 3))
         self._slots = 0
         self.hits, self.misses, self.born, self.founded = (np.zeros(0, dtype=np.int64) for _ in range(4))
@@ -76,19 +76,19 @@ class EkfMap:
         self._slot_of_key: dict[int, int] = {}
         # the active part
         self._active = np.zeros(0, dtype=np.int64)
-        self._place = np.zeros(0, dtype=np.int64)  # place of a slot among the active ones, -1 = passive
+        self._place = np.zeros(0, dtype=np.int64)  # index of a slot in the active ones, -1 = passive
         self._ax, self._aP, self._aPhi = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 0))
         self._n0 = 0
         self._C, self._V, self._rows, self._theta = np.zeros((0, 3)), np.zeros((0, 0)), 0, np.zeros(0)
         self._passive, self._anchor = np.zeros(0, dtype=np.int64), np.zeros(2)
-        # association: every founding has a number; an observation refers to it
+        # association: every created landmark has a founding number, stored for each observation
         self._founding = np.full(256, IGNORED, dtype=np.int64)
         self.foundings = 0
         self.scans = self.observations = 0
         self.folds = 0
         self.nis, self.nis_dof = 0.0, 0
         self.capped, self.nodes, self.outliers, self.unfounded = 0, 0, 0, 0
-        margin = np.deg2rad(1.0)  # at the edge of the scan a trunk is cut off and not reported
+        margin = np.deg2rad(1.0)  # at the edge of a scan a trunk is cut off and not reported
         self._limits = np.array(
             [
                 config.confirm_hits,
@@ -103,7 +103,7 @@ class EkfMap:
     # ---- one scan
 
     def step(self, u: Array, Q: Array, observations: Array, known: Ints) -> None:
-        """One scan: motion, association, stacked update, new landmarks, spurious ones.
+        """Process one scan: motion, association, stacked update, new landmarks, deletion of spurious ones.
 
         Parameters
         ----------
@@ -172,7 +172,7 @@ class EkfMap:
         fresh, keys = [], set()
         for o in np.flatnonzero(slots < 0):
             if np.isinf(observations[o, 3]):
-                self.unfounded += 1  # one range does not say where
+                self.unfounded += 1  # one range gives no position
             elif int(known[o]) not in keys:
                 fresh.append(int(o))
                 keys.add(int(known[o]))
@@ -204,9 +204,9 @@ class EkfMap:
         return p.landmark, [int(o) for o in np.flatnonzero(far & ~flat)], p.polar
 
     def _distance(self, observations: Array, slots: Ints, cross: Array) -> Array:
-        """Least distance² of any observation to each passive landmark, at most; as a share of "surely new".
+        """Bound of the least distance² of any observation to each passive landmark, relative to the gate of new ones.
 
-        cross (4, N): covariance of the pose with the whole state, and how far that has moved since it was folded in.
+        cross (4, N): covariance of the pose with the whole state, and the change of that state since the last fold.
         """
         new = gates_by_dof(GATE_NEW, 2)
         weights = np.broadcast_to([1.0 / new[1], 1.0 / new[2]], (len(observations), 2))
@@ -216,15 +216,15 @@ class EkfMap:
         return out
 
     def _drop_spurious(self, at: Ints, polar: Array) -> None:
-        k = len(polar)  # landmarks founded in this very scan are not judged
+        k = len(polar)  # landmarks created in this scan are not tested
         dropped = np.zeros(k, dtype=np.bool_)
         slots = self._active[:k]
         counts = LandmarkCounts(self.hits, self.misses, self.born)
         if misses_kernel(slots, self.scans, at, polar, counts, self._limits, dropped):
-            self.hits[slots[dropped]] = 0  # marginalised out: the row stays until the active part is chosen anew
+            self.hits[slots[dropped]] = 0  # marginalised out: the row stays until the active part is chosen again
 
     def _remember(self, q: int) -> int:
-        """Room for the association of ``q`` more observations; index of the first."""
+        """Allocate space for the association of ``q`` more observations; returns the index of the first."""
         while self.observations + q > len(self._founding):
             self._founding = np.pad(self._founding, (0, len(self._founding)), constant_values=IGNORED)
         return self.observations
@@ -232,7 +232,7 @@ class EkfMap:
     # ---- landmarks and the active part
 
     def _found(self, row: Array) -> int:
-        """A new landmark at the end of the active part; returns its slot."""
+        """Add a landmark at the end of the active part; returns its slot."""
         if self._free:
             slot = self._free.pop()
         else:
@@ -264,7 +264,7 @@ class EkfMap:
         self._place = np.pad(self._place, (0, pad), constant_values=-1)
 
     def _compress(self, rows: int) -> None:
-        """Room for more rows of V: what counts of it is Vᵀ V, so its triangular factor does."""
+        """Allocate more rows of V; only Vᵀ V is needed, so V is replaced by its triangular factor."""
         if self._rows > self._n0:
             self._V[: self._n0] = qr(self._V[: self._rows], mode="r", check_finite=False)[0][: self._n0]
             self._rows = self._n0
@@ -272,7 +272,7 @@ class EkfMap:
             self._V = np.pad(self._V, ((0, self._rows + rows + _ROWS - len(self._V)), (0, 0)))
 
     def _fold(self) -> None:
-        """Write the active part, and what it means for the rest, into the whole map."""
+        """Write the active part, and its effect on the passive part, into the whole map."""
         n0 = self._n0
         alive = np.concatenate([[True, True, True], np.repeat(self.hits[self._active] > 0, 2)])
         mine = np.flatnonzero(alive)
@@ -283,7 +283,7 @@ class EkfMap:
                 V = self._V[: self._rows]
                 R = V if self._rows <= n0 else qr(V, mode="r", check_finite=False)[0][:n0]
                 W = R @ self._C
-                # P[B, B] -= (V C)ᵀ (V C); C has no columns but those of B. P.T is in Fortran order: nothing is copied
+                # P[B, B] -= (V C)ᵀ (V C); C has only the columns of B. P.T is in Fortran order, so nothing is copied
                 self._P = dsyrk(-1.0, W.T, beta=1.0, c=self._P.T, lower=0, overwrite_c=1).T
             cross = self._aPhi[mine, :n0] @ self._C[:, others]
             scatter_kernel(self._P, state, others, cross)
@@ -298,7 +298,7 @@ class EkfMap:
         self._active = self._passive = np.zeros(0, dtype=np.int64)
 
     def _choose(self, needed: Ints | None, observations: Array | None = None) -> None:
-        """Fold in, then make the landmarks around the vehicle active, and in any case ``needed`` and those observed."""
+        """Fold, then choose the active landmarks: those near the vehicle, ``needed``, and those near observations."""
         self._fold()
         slots = np.flatnonzero(self.hits[: self._slots] > 0)
         x, y, th = self._x[:3]
@@ -311,7 +311,7 @@ class EkfMap:
             bearing = np.abs((np.arctan2(dy, dx) - th - self.sensor[2] + np.pi) % (2 * np.pi) - np.pi)
             ahead = bearing < np.max(np.abs(self.field_of_view)) + np.deg2rad(20.0)
             active = (distance < self.reach + m) & (ahead | (distance < 0.3 * m))
-            if self.config.association != "known":  # the provisional ones are watched in every scan
+            if self.config.association != "known":  # provisional ones are checked in every scan
                 active |= self.hits[slots] < self.config.confirm_hits
             if needed is not None:
                 active |= np.isin(slots, needed)
@@ -356,28 +356,28 @@ class EkfMap:
 
     @property
     def confirmed(self) -> int:
-        """Features that are no longer provisional."""
+        """Number of features that are no longer provisional."""
         return int(np.count_nonzero(self.hits[: self._slots] >= self.config.confirm_hits))
 
     @property
     def keys(self) -> dict[int, int]:
-        """Founding number of each known landmark by the number it was given in :meth:`step`."""
+        """Founding number of each known landmark by the ``known`` number of :meth:`step`."""
         return {k: int(self.founded[s]) for k, s in self._slot_of_key.items()}
 
     def association(self) -> Ints:
-        """Founding number of the landmark of each observation so far ``(observations,)``; -1 = none, or dropped."""
-        live = np.zeros(self.foundings + 1, dtype=np.bool_)  # the last entry stands for "none"
+        """Founding number of the landmark of each observation so far ``(observations,)``; -1 = none, or deleted."""
+        live = np.zeros(self.foundings + 1, dtype=np.bool_)  # the last entry represents "none"
         live[self.founded[: self._slots][self.hits[: self._slots] > 0]] = True
         a = self._founding[: self.observations]
         return np.where(live[a], a, IGNORED)
 
     def landmarks(self, min_hits: int) -> Ints:
-        """Slots of the landmarks seen at least ``min_hits`` times, in order of founding."""
+        """Slots of the landmarks observed at least ``min_hits`` times, in order of founding."""
         slots = np.flatnonzero(self.hits[: self._slots] >= min_hits)
         return slots[np.argsort(self.founded[slots])]
 
     def joint(self, slots: Ints) -> tuple[Array, Array]:
-        """Mean and covariance over ``[pose, landmarks of slots]``; writes the whole map first."""
+        """Mean and covariance over ``[pose, landmarks of slots]``; folds first."""
         self._choose(None)
         ix = _columns(slots)
         P = np.empty((len(ix), len(ix)))
@@ -385,7 +385,7 @@ class EkfMap:
         return self._x[ix], P
 
     def marginals(self, slots: Ints) -> tuple[Array, Array]:
-        """Positions ``(L, 2)`` and covariances ``(L, 2, 2)`` of landmarks; writes the whole map first."""
+        """Positions ``(L, 2)`` and covariances ``(L, 2, 2)`` of landmarks; folds first."""
         self._choose(None)
         ix = (3 + 2 * slots)[:, None] + np.arange(2)
         i, j = np.maximum(ix[:, :, None], ix[:, None, :]), np.minimum(ix[:, :, None], ix[:, None, :])

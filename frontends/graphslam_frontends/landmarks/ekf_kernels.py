@@ -1,13 +1,13 @@
 """Compiled EKF-SLAM over the active part of a map: pose and nearby landmarks (compressed filter).
 
 State ``x = [x, y, θ, l_1x, l_1y, …]`` in the frame of the first base, its covariance P dense and symmetric, both in
-buffers of which the leading n entries count. The rest of the map (passive landmarks, index B) is not touched: with
-A₀ the active state when it was chosen and C = P[A₀, B] then, every later cross covariance is P[A, B] = Φ C, and
-P[B, B] has lost Σ (V C)ᵀ (V C). The kernels carry Φ (n, n₀), the rows of V and θ = Σ Vᵀ y along; folding them in is
-exact, so a compressed run equals a plain one (Guivant & Nebot 2001). Twin: ``tests/reference/ekf_slam.py``.
+buffers with n entries in use. The rest of the map (passive landmarks, index B) is not changed: with A₀ the active state
+when it was chosen and C = P[A₀, B] at that time, every later cross covariance is P[A, B] = Φ C, and P[B, B] is reduced
+by Σ (V C)ᵀ (V C). The kernels update Φ (n, n₀), the rows of V and θ = Σ Vᵀ y; folding them into the map is exact, so
+the result equals that of the plain filter (Guivant & Nebot 2001). Reference: ``tests/reference/ekf_slam.py``.
 
 An observation is a row (range, bearing, variance, variance). An infinite bearing variance means that there is no
-bearing, and the observation counts as one equation instead of two.
+bearing, and the observation is one equation instead of two.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, 
 
 
 class ActiveState(NamedTuple):
-    """What an update works on: the active state, and what passive landmarks will be told."""
+    """Data of an update: the active state, and accumulated updates of the passive landmarks."""
 
     x: Any
     P: Any
@@ -32,7 +32,7 @@ class ActiveState(NamedTuple):
 
 
 class PoseState(NamedTuple):
-    """The pose as it is, beside landmarks that are not up to date."""
+    """The current pose, with landmarks that are not up to date."""
 
     pose: Any
     """(3,)"""
@@ -41,7 +41,7 @@ class PoseState(NamedTuple):
     cross: Any
     """(3, N): P[pose, B]."""
     shift: Any
-    """(N,): what B has moved since it was folded in."""
+    """(N,): change of B since the last fold."""
 
 
 @njit(error_model="numpy")
@@ -182,7 +182,7 @@ def augment_kernel(x, P, n, Phi, n0, row, sensor):
     th = x[2] + sensor[2] + row[1]
     ct, st, r = math.cos(th), math.sin(th), row[0]
     x[n], x[n + 1] = x[0] + ax + r * ct, x[1] + ay + r * st
-    # l = p + R(θ) a + r (cos, sin): ∂l/∂θ is the arm turned by 90°
+    # l = p + R(θ) a + r (cos, sin): ∂l/∂θ is the lever arm rotated by 90°
     gx, gy = -(ay + r * st), ax + r * ct
     for j in range(n):
         P[n, j] = P[0, j] + gx * P[2, j]
@@ -201,11 +201,11 @@ def augment_kernel(x, P, n, Phi, n0, row, sensor):
 
 @njit(error_model="numpy")
 def passive_distance_kernel(now, slots, x, P, obs, sensor, out):
-    """Lower bound of the Mahalanobis distance² of every observation to each passive landmark, as a share of its gate.
+    """Lower bound of the Mahalanobis distance² of every observation to each passive landmark, relative to its gate.
 
-    x (N,), P (N, N; lower triangle): as last folded in. P[l, l] has only shrunk since, so the innovation covariance
-    formed with it bounds the true one from above, and the distance from below. obs (q, 6): range, bearing, variances,
-    weight of one and of two equations. out (len(slots),): least weighted distance².
+    x (N,), P (N, N; lower triangle): at the last fold. P[l, l] only decreases after that, so the innovation covariance
+    from it is an upper bound, and the distance a lower one. obs (q, 6): range, bearing, variances, weight with one and
+    with two equations. out (len(slots),): least weighted distance².
     """
     pose, Pvv, cross, shift = now
     h = np.empty(12)
@@ -242,7 +242,7 @@ def passive_distance_kernel(now, slots, x, P, obs, sensor, out):
 
 @njit
 def gather_kernel(P, rows, cols, out):
-    """``out[i, j] = P[rows[i], cols[j]]`` of a symmetric matrix of which the lower triangle is kept."""
+    """``out[i, j] = P[rows[i], cols[j]]`` of a symmetric matrix stored as its lower triangle."""
     for i in range(len(rows)):
         a = rows[i]
         for j in range(len(cols)):
@@ -252,7 +252,7 @@ def gather_kernel(P, rows, cols, out):
 
 @njit
 def scatter_kernel(P, rows, cols, block):
-    """``P[rows[i], cols[j]] = block[i, j]``, kept in the lower triangle."""
+    """``P[rows[i], cols[j]] = block[i, j]``, stored in the lower triangle."""
     for i in range(len(rows)):
         a = rows[i]
         for j in range(len(cols)):
@@ -265,7 +265,7 @@ def scatter_kernel(P, rows, cols, block):
 
 @njit(error_model="numpy")
 def innovation_kernel(x, P, obs, at, sensor):
-    """Mahalanobis distance² (q,) of every observation to its active landmark ``at``; 0 where there is none."""
+    """Mahalanobis distance² (q,) of every observation to its active landmark ``at``; 0 if there is none."""
     out = np.zeros(len(obs))
     H, nu, h = np.empty((2, 5)), np.empty(2), np.empty(12)
     ix = np.array([0, 1, 2, 0, 0])

@@ -32,9 +32,9 @@ class ParticleSet:
     field_of_view : (2,)
         Bearings of the sensor [rad].
     miss_range : float
-        A provisional feature nearer than this and inside the field of view should be seen [m].
+        A provisional feature nearer than this and in the field of view is expected to be observed [m].
     rng : numpy Generator
-        This submap's branch of the seed tree.
+        Random numbers of this submap's branch of the seed tree.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class ParticleSet:
         self.min_ess = float(n)
         outlier = config.outlier_gate or np.inf
         self.waiting = WaitingRanges(n, DELAYED, equal_tail_gate(outlier, 2, 1))
-        margin = np.deg2rad(1.0)  # at the edge of the scan a trunk is cut off and not reported
+        margin = np.deg2rad(1.0)  # at the edge of a scan a trunk is cut off and not reported
         self._cfg = np.zeros(CFG_LENGTH)
         self._cfg[:] = (
             1.0 if config.proposal == "2.0" else 0.0,
@@ -81,7 +81,7 @@ class ParticleSet:
         )
 
     def _grow_slots(self, new_slots: int) -> None:
-        """Make the arrays hold ``new_slots`` more landmarks before the kernel runs out of them."""
+        """Allocate space for ``new_slots`` more landmarks before the kernel needs it."""
         while self.count.max() + new_slots > self.mean.shape[1]:
             grow = ((0, 0), (0, self.mean.shape[1]))
             self.mean = np.pad(self.mean, (*grow, (0, 0)))
@@ -89,22 +89,22 @@ class ParticleSet:
             self.hits, self.misses, self.born = (np.pad(a, grow) for a in (self.hits, self.misses, self.born))
 
     def _grow_history(self, n_obs: int) -> None:
-        """Make the history hold another scan with ``n_obs`` observations."""
+        """Allocate history for another scan with ``n_obs`` observations."""
         while self.observations + n_obs > self.assoc.shape[1]:
             self.assoc = np.pad(self.assoc, ((0, 0), (0, self.assoc.shape[1])), constant_values=IGNORED)
         if self.scans >= self.path.shape[1]:
             self.path = np.pad(self.path, ((0, 0), (0, self.path.shape[1]), (0, 0)))
 
     def _column(self) -> int:
-        """Column of ``assoc`` where this scan's observations begin."""
+        """First column of ``assoc`` for the observations of this scan."""
         return self.observations
 
     def _record(self, n_obs: int) -> None:
-        """Note what the scan that was just taken in adds to the history."""
+        """Store the history of the scan just processed."""
         self.path[:, self.scans] = self.pose
 
     def step(self, u: Array, Q: Array, observations: Array, known: Ints) -> None:
-        """One scan: motion, association, weights, maps; then resampling if the effective size is low.
+        """Process one scan: motion, association, weights, maps; then resampling if the effective size is low.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class ParticleSet:
         self.weights = normalise_log_weights(self.log_weight)
         ess = effective_sample_size(self.weights)
         self.min_ess = min(self.min_ess, ess)
-        uniform = self.rng.random()  # drawn every scan, so a branch that resamples less sees the same stream
+        uniform = self.rng.random()  # drawn every scan, so that random numbers do not depend on resampling
         if ess < self.config.ess_fraction * len(self.pose):
             self._resample(systematic_resample(self.weights, uniform))
 
@@ -151,43 +151,43 @@ class ParticleSet:
         self.resamplings += 1
 
     def _wait_or_start(self, observations: Array, known: Ints) -> None:
-        """Keep the ranges of this scan to beacons that are no landmarks yet, and start those that now can be."""
+        """Store the ranges of this scan to beacons without a landmark, and initialise those that have enough."""
         started = (self.hits[:, np.maximum(known, 0)] > 0).any(axis=0)
         new = np.flatnonzero(np.isinf(observations[:, 3]) & (known >= 0) & ~started)
         here = se2_transform(self.pose, self.sensor[:2])
         self.waiting.add(known[new], self.observations + new, observations[new, 0], observations[new, 2], here)
         for slot in np.unique(known[(known >= 0) & started]):
-            self.waiting.forget(int(slot))  # founded with a bearing: earlier ranges stay unspent
+            self.waiting.forget(int(slot))  # initialised with a bearing: earlier ranges stay unused
         for start in self.waiting.ready(np.unique(known[new]), normalise_log_weights(self.log_weight)):
             j, ok = start.slot, start.solved
             self.mean[ok, j], self.cov[ok, j] = start.mean[ok], start.covariance[ok]
             self.hits[ok, j], self.misses[ok, j], self.born[ok, j] = start.used[ok].sum(axis=1), 0, self.scans
             self.count[ok] = np.maximum(self.count[ok], j + 1)
-            # the ranges that made the landmark also weigh the paths: their likelihood with the landmark integrated out
+            # the ranges of the new landmark also weight the paths: likelihood with the landmark integrated out
             self.log_weight += np.where(ok, start.log_likelihood, -np.inf)
             self._note_past(start)
 
     def _note_past(self, start: BeaconInitialisation) -> None:
-        """Note in the history which observations have become sightings of a landmark."""
+        """Store in the history which observations belong to the new landmark."""
         self.assoc[:, start.observations] = np.where(start.used & start.solved[:, None], start.slot, IGNORED)
 
     def _copy_waiting(self, source: Ints) -> None:
-        """Let row k of what waits to become a landmark go on from row ``source[k]``."""
+        """Row k of the stored ranges continues from row ``source[k]``."""
         self.waiting.resample(source)
 
     @property
     def best(self) -> int:
-        """Index of the standard particle, the one of highest weight (B4); the first of equals."""
+        """Index of the standard particle, the one of largest weight (B4); the first of equals."""
         return int(np.argmax(self.weights))
 
     @property
     def ancestors(self) -> int:
-        """Number of distinct particles of the submap's start that still have descendants."""
+        """Number of distinct initial particles of the submap with descendants."""
         return len(np.unique(self.ancestor))
 
     @property
     def effective_ancestors(self) -> float:
-        """Effective number of lines of descent ``1 / Σ f²``, f being the share of the weight of each."""
+        """Effective number of lineages ``1 / Σ f²``, f being the sum of the weights of each."""
         share = np.bincount(self.ancestor, weights=self.weights)
         return float(1.0 / np.sum(share**2))
 

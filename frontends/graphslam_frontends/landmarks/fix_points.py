@@ -1,4 +1,4 @@
-"""Where the antenna was on the smoothed path of a submap whenever a fix was taken, jointly with exit and landmarks."""
+"""Antenna positions on the smoothed path of a submap at the times of fixes, jointly with exit pose and landmarks."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from graphslam_frontends.landmarks.smoothing_kernels import path_covariances
 from graphslam_frontends.landmarks.summarise import SmoothingResult
 
 STEP = 1e-5
-"""Of the central differences [m, rad]."""
+"""Step of the central differences [m, rad]."""
 FLOOR = 1e-4
-"""σ that a point has by itself at least [m]."""
+"""Least σ of a point [m]."""
 
 
 def expects_fixes(feed: RecordSource, until: float) -> bool:
-    """May fixes of a log that grows still come that are older than ``until`` [s]?
+    """May fixes older than ``until`` [s] still arrive in a growing log?
 
-    What a front end makes must not depend on the portions in which a log comes.
+    The result of a front end must not depend on the portions in which a log arrives.
     """
     name = feed.of_type(Gps)
     return not feed.ended and name is not None and feed.until(name) < until
@@ -52,7 +52,7 @@ def measured_times(feed: RecordSource) -> tuple[Array, Array] | None:
 
 
 def has_fixes(feed: RecordSource, t_start: float, times: Array) -> bool:
-    """Was the path measured between the ends of a submap?"""
+    """Are there fixes between the ends of a submap?"""
     found = measured_times(feed)
     if found is None:
         return False
@@ -60,9 +60,9 @@ def has_fixes(feed: RecordSource, t_start: float, times: Array) -> bool:
 
 
 def transfer_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, joint: Array) -> PathPoints | None:
-    """Points beside another Gaussian over exit and landmarks than the smoothed one that they were made with.
+    """Points with another Gaussian over exit pose and landmarks than the smoothed one that they were made with.
 
-    What exit and landmarks tell of the points stays as it is; what they are themselves, the other Gaussian says.
+    The conditional distribution of the points given exit pose and landmarks is unchanged; their marginal is replaced.
     """
     if points is None:
         return None
@@ -79,7 +79,7 @@ def transfer_points(points: PathPoints | None, smoothed: Gaussian, mean: Array, 
 
 @dataclass(frozen=True, slots=True)
 class FixPlacement:
-    """Where fixes were taken on a smoothed path: on the arc from pose ``at`` to the next (-1: from the base).
+    """Positions of fixes on a smoothed path: on the arc from pose ``at`` to the next (-1: from the base).
 
     Parameters
     ----------
@@ -87,11 +87,11 @@ class FixPlacement:
     lever : (2,)
     at : (q,)
     share : (q,)
-        Of the arc.
+        Fraction of the arc.
     positions : (q, 2)
         Of the antenna.
     by_first, by_second : (q, 2, 3)
-        Their change with the right tangents of both poses.
+        Jacobians by the right tangents of both poses.
     """
 
     times: Array
@@ -104,7 +104,7 @@ class FixPlacement:
 
 
 def place_fixes(feed: RecordSource, smoothed: SmoothingResult, t_start: float, times: Array) -> FixPlacement | None:
-    """Where the fixes inside a submap were taken; None where none was taken, or none has come yet.
+    """Positions of the fixes inside a submap; None if there are none.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def place_fixes(feed: RecordSource, smoothed: SmoothingResult, t_start: float, t
                 ends[end] = se2_compose(ends[end], se2_exp(np.tile(sign * step, (len(k), 1))))
                 moved.append(antenna(*ends))
             G[end, :, :, c] = (moved[0] - moved[1]) / (2.0 * STEP)
-    G[0, k == 0] = 0.0  # the base is held
+    G[0, k == 0] = 0.0  # the base is fixed
     at = (k - 1).astype(np.int64)
     return FixPlacement(at_fixes, lever, at, share[:, 0], antenna(poses[k], poses[k + 1]), G[0], G[1])
 
@@ -148,8 +148,8 @@ def place_fixes(feed: RecordSource, smoothed: SmoothingResult, t_start: float, t
 def fix_points(smoothed: SmoothingResult, way: FixPlacement) -> PathPoints:
     """Points of a submap's path at the fixes inside it.
 
-    Between two scans the path is the arc from one pose to the next, and what it does besides has the variance of a
-    bridge, ``a (1 - a) Q`` at the share a of a step whose odometry has the covariance Q.
+    Between two scans the path is the arc from one pose to the next; the deviation from it has the variance of a
+    Brownian bridge, ``a (1 - a) Q`` at the fraction a of a step whose odometry has the covariance Q.
     """
     cross, own = path_covariances(
         smoothed.poses, smoothed.landmarks, smoothed.evidence, way.at, way.by_first, way.by_second

@@ -1,13 +1,13 @@
 """Compiled FastSLAM step (1.0 and 2.0) over all particles of one scan.
 
-Every particle owns its landmarks (2×2 EKFs) and its own data association (Combined SLAM B1–B4). One call handles one
-scan for all particles; all randomness comes in as ``normals``, so results do not depend on the order of particles.
+Every particle has its own landmarks (2×2 EKFs) and data association (Combined SLAM B1–B4). One call processes one scan
+for all particles; all random numbers are in ``normals``, so results do not depend on the order of particles.
 
-Cost per scan is particles × (landmarks + observations × landmarks *near each observation*): predicted bearings are
-bucketed, and an observation looks only into the buckets inside its gate.
+Cost per scan is particles × (landmarks + observations × landmarks *near each observation*): predicted bearings are in
+buckets, and only the buckets in the gate of an observation are searched.
 
-An observation with an infinite bearing variance is a range alone: one channel in innovation, likelihood and gate. It
-updates a landmark but cannot found one; what waits for that is in :mod:`graphslam_frontends.landmarks.range_only`.
+An observation with an infinite bearing variance is a range only: one channel in innovation, likelihood and gate. It
+updates a landmark but cannot initialise one; see :mod:`graphslam_frontends.landmarks.range_only`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from graphslam_frontends.landmarks.measurement_kernels import (
     wrap_angle_kernel,
 )
 
-# Association outcome of one observation, as stored in ``assoc`` (slots are ≥ 0)
+# Association result of one observation, as stored in ``assoc`` (slots are ≥ 0)
 IGNORED = -1
-# of known identity, but too far from where it should be
+# known identity, but outside the outlier gate
 REJECTED = -2
 BUCKETS = 64
 
@@ -50,7 +50,7 @@ def _of_channels(vb, two, one):
 
 
 class ParticleArrays(NamedTuple):
-    """Of n particles with up to M landmarks each; hits 0 = free slot."""
+    """Arrays of n particles with up to M landmarks each; hits 0 = free slot."""
 
     pose: Any
     """(n, 3)"""
@@ -74,13 +74,13 @@ class ScanArrays(NamedTuple):
     """One scan."""
 
     number: Any
-    """In the submap."""
+    """Number of the scan in the submap."""
     first: Any
     """Unique index (B4) of its first observation."""
     obs: Any
     """(q, 4): range, bearing, variance of each."""
     known: Any
-    """(q,) int64: slot per observation, or -1: decide by likelihood."""
+    """(q,) int64: slot per observation, or -1: association by likelihood."""
 
 
 class MotionArrays(NamedTuple):
@@ -95,7 +95,7 @@ class MotionArrays(NamedTuple):
 
 
 class _Landmarks(NamedTuple):
-    """Of one particle."""
+    """Landmarks of one particle."""
 
     mean: Any
     cov: Any
@@ -104,7 +104,7 @@ class _Landmarks(NamedTuple):
 
 
 class _Pairing(NamedTuple):
-    """Answers of an association, and room for it."""
+    """Results of an association, and work arrays."""
 
     match: Any
     nearest: Any
@@ -119,7 +119,7 @@ class _Pairing(NamedTuple):
 
 @njit(error_model="numpy")
 def _choose(n_pairs, pair_o, pair_s, pair_c, match):
-    """Greedy by likelihood, each observation and each landmark at most once; uses ``pair_o`` up."""
+    """Greedy by likelihood, each observation and each landmark at most once; overwrites ``pair_o``."""
     while True:
         best, k = np.inf, -1
         for i in range(n_pairs):
@@ -138,8 +138,8 @@ def _choose(n_pairs, pair_o, pair_s, pair_c, match):
 def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
     """Maximum-likelihood association of one particle, exclusive (B4, step 2): fills match[o] with a slot or -1.
 
-    nearest[o] is the least Mahalanobis distance² of any landmark to observation o (inf if none is near).
-    polar[j] = predicted (range, bearing) of slot j, range < 0 where it is out of view.
+    nearest[o] is the least Mahalanobis distance² of any landmark to observation o (inf if none is near). polar[j] =
+    predicted (range, bearing) of slot j, range < 0 if it is too far away.
     """
     mean, cov, hits, count = landmarks
     match, nearest, polar, head, link, pair_o, pair_s, pair_d, pair_c = pairing
@@ -156,7 +156,7 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
                 worst = v
     slm = math.sqrt(worst)
     lever = math.sqrt(sensor[0] ** 2 + sensor[1] ** 2)
-    # a landmark farther than this (with a margin for rounding) can neither be in a gate nor be missed
+    # a landmark farther than this (with a margin for rounding) cannot be in a gate, nor missed
     far = cfg[CFG_MISS_RANGE]
     for o in range(n_obs):
         reach = math.sqrt(_of_channels(obs[o, 3], cfg[CFG_GATE_NEW], cfg[CFG_GATE_NEW_1]))
@@ -216,12 +216,12 @@ def _associate(m, P, landmarks, obs, sensor, cfg, pairing):
 def fastslam_step(particles, scan, motion, sensor, cfg):
     """Advance every particle by one scan.
 
-    In known-association mode ``known[o] >= 0`` for all o and an empty slot is filled, unless by a range alone.
+    In known-association mode ``known[o] >= 0`` for all o, and an empty slot is initialised, unless by a range only.
 
     Parameters
     ----------
     particles : ParticleArrays
-        Changed in place.
+        Updated in place.
     scan : ScanArrays
     motion : MotionArrays
     sensor : (3,)
@@ -264,14 +264,14 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
                 polar[j, 0] = -1.0
         else:
             _associate(m, P, _Landmarks(mean[i], cov[i], hits[i], count[i]), obs, sensor, cfg, pairing)
-        # proposal and weight: sequential over features; the product of the innovations' likelihoods is exact
-        # for the linearised model
+        # proposal and weight: sequential over features; the product of the innovation likelihoods is exact for the
+        # linearised model
         for o in range(n_obs):
             vr, vb = obs[o, 2], obs[o, 3]
             j = match[o]
             log_2pi = log_2pi_channels(vb)
             if j < 0:
-                # a new or ignored observation weighs as much as one that just fails the gate
+                # a new or ignored observation has the weight of one at the gate
                 if not by_identity:
                     gate = _of_channels(vb, cfg[CFG_GATE], cfg[CFG_GATE_1])
                     log_weight[i] -= 0.5 * gate + log_2pi + 0.5 * math.log(_of_channels(vb, vr * vb, vr))
@@ -284,7 +284,7 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
             n0, n1 = obs[o, 0] - h[0], wrap_angle_kernel(obs[o, 1] - h[1])
             d2 = i00 * n0 * n0 + 2.0 * i01 * n0 * n1 + i11 * n1 * n1
             limit = _of_channels(vb, cfg[CFG_OUTLIER], cfg[CFG_OUTLIER_1])
-            if by_identity and d2 > limit:  # the likelihood is cut off at the gate, so an outlier decides nothing
+            if by_identity and d2 > limit:  # the likelihood is limited at the gate, so that an outlier has no influence
                 match[o] = REJECTED
                 log_weight[i] -= 0.5 * limit + log_2pi + 0.5 * math.log(det)
                 continue
@@ -294,7 +294,7 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
         if cfg[CFG_PROPOSAL_2] > 0.5:
             sample_pose(m, P, normals[i], L)
         pose[i] = m
-        # map: each feature an EKF given the sampled path (B1)
+        # map: each feature is an EKF given the sampled path (B1)
         for o in range(n_obs):
             vr, vb = obs[o, 2], obs[o, 3]
             j = match[o]
@@ -347,7 +347,7 @@ def fastslam_step(particles, scan, motion, sensor, cfg):
                 assoc[i, first_obs + o] = IGNORED
         if by_identity:
             continue
-        # spurious features: provisional ones that should have been seen again and were not
+        # spurious features: provisional ones that were expected but not observed
         for j in range(count[i]):
             if hits[i, j] > 0 and hits[i, j] < cfg[CFG_CONFIRM] and born[i, j] < number:
                 in_view = (

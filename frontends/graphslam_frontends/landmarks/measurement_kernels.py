@@ -1,8 +1,7 @@
-"""Compiled measurement model of a point landmark, and the small matrix steps of a filter that uses it.
+"""Compiled measurement model of a point landmark, and small matrix operations of the filters.
 
-An observation has the channels range and bearing; one with an infinite bearing variance has the range alone
-(:func:`inverse_innovation` drops the channel), so range-bearing and range-only are two measurement
-models of one filter.
+An observation has the channels range and bearing; with an infinite bearing variance it has the range only
+(:func:`inverse_innovation` drops the channel), so one filter covers range-bearing and range-only.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ LOG_2PI = math.log(TWO_PI)
 
 @njit(inline="always")
 def wrap_angle_kernel(a):
-    """Angle to (-π, π]."""
+    """Wrap an angle to (-π, π]."""
     return math.pi - (math.pi - a) % TWO_PI
 
 
 @njit(error_model="numpy")
 def observe_landmark(x, y, th, sensor, lx, ly, out):
-    """Range, bearing and their Jacobians for a landmark (lx, ly) seen from pose (x, y, th) with ``sensor (3,)``.
+    """Range, bearing and their Jacobians for a landmark (lx, ly) from pose (x, y, th) with ``sensor (3,)``.
 
     out[0:2] range, bearing; out[2:8] rows of ∂/∂ξ (right tangent of the pose); out[8:12] rows of ∂/∂l.
     """
@@ -82,7 +81,7 @@ def pose_update(m, P, h, nu0, nu1, i00, i01, i11):
     for r in range(3):
         for q in range(3):
             P[r, q] -= K[r, 0] * G[q, 0] + K[r, 1] * G[q, 1]
-    for r in range(3):  # keep it symmetric: rounding must not accumulate over many features
+    for r in range(3):  # symmetrise: rounding must not accumulate over many features
         for q in range(r):
             P[r, q] = P[q, r] = 0.5 * (P[r, q] + P[q, r])
     retract_pose(m, K[0, 0] * nu0 + K[0, 1] * nu1, K[1, 0] * nu0 + K[1, 1] * nu1, K[2, 0] * nu0 + K[2, 1] * nu1)
@@ -121,7 +120,7 @@ def sample_pose(m, P, z, L):
 
 @njit(inline="always")
 def inverse_innovation(s00, s01, s11):
-    """Inverse (00, 01, 11) and determinant of an innovation covariance; of its range alone where s11 is infinite."""
+    """Inverse (00, 01, 11) and determinant of an innovation covariance; of its range only if s11 is infinite."""
     if math.isinf(s11):
         return 1.0 / s00, 0.0, 0.0, s00
     det = s00 * s11 - s01 * s01
@@ -130,5 +129,5 @@ def inverse_innovation(s00, s01, s11):
 
 @njit(inline="always")
 def log_2pi_channels(vb):
-    """``k/2 · log 2π`` of an observation with k channels: 2, or 1 where its bearing variance ``vb`` is infinite."""
+    """``k/2 · log 2π`` of an observation with k channels: 2, or 1 if its bearing variance ``vb`` is infinite."""
     return 0.5 * LOG_2PI if math.isinf(vb) else LOG_2PI

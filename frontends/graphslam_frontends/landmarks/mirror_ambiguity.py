@@ -1,10 +1,10 @@
-"""Range-only landmarks have mirror images: the smoothed submap decides between them, or leaves the landmark out.
+"""Mirror images of range-only landmarks: resolved by smoothing the submap; ambiguous landmarks are removed.
 
-A filter starts a beacon where the ranges fit best *given a particle's path*. A path that drifted a little may fit the
-mirror image better, and particles that resampled on it have nothing else left. The smoother is free to move the path,
-so after it every other place that would explain a landmark's ranges is tried: the whole submap is smoothed again from
-there. The better one stays; where both are nearly as good, the landmark is not known and goes, and so does one that the
-free path leaves too uncertain to be a Gaussian.
+A filter initialises a beacon by the best fit *given the path of a particle*. A path with some drift may fit the mirror
+image better, and after resampling no other particles may be left. The smoother can change the path. So after it, every
+other position that explains the ranges of a landmark is tried: the whole submap is smoothed again from there, and the
+better one is kept. If both fit similarly well, the landmark is ambiguous and removed, as is one that is too uncertain
+for a Gaussian.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from graphslam_frontends.landmarks.range_only_kernels import FIT_LENGTH, circle_
 from graphslam_frontends.landmarks.summarise import SmoothingProblem, SmoothingResult
 
 Bools = npt.NDArray[np.bool_]
-_ROUNDS = 3  # a swap moves the path, so the others are looked at again
-_APART = 1.0  # a rival this near [m] is the landmark itself
+_ROUNDS = 3  # a swap changes the path, so the others are tried again
+_APART = 1.0  # an alternative this near [m] is the landmark itself
 
 
 @dataclass(frozen=True, slots=True)
 class ResolvedMirrors:
-    """A submap without rivals.
+    """A submap without mirror ambiguities.
 
     Parameters
     ----------
     smoothed : SmoothingResult
-        Over the problem's own observations and landmarks.
+        Over the observations and landmarks of the problem.
     swapped : int
-        Landmarks that were better explained by their mirror image.
+        Number of landmarks replaced by their mirror image.
     ambiguous : int
-        Landmarks left out because both are nearly as good.
+        Number of landmarks removed because both fit similarly well.
     vague : int
-        Landmarks left out because the free path leaves them too uncertain for a Gaussian.
+        Number of landmarks removed because they are too uncertain for a Gaussian.
     """
 
     smoothed: SmoothingResult
@@ -50,14 +50,14 @@ class ResolvedMirrors:
 def resolve_mirror_ambiguity(
     problem: SmoothingProblem, first: SmoothingResult, config: DelayedInitialisation
 ) -> ResolvedMirrors:
-    """Try every rival of every landmark that was seen without bearings.
+    """Try every alternative position of every landmark without bearings.
 
     Parameters
     ----------
     first : SmoothingResult
-        Its smoothing from the filter's start.
+        Smoothing from the start of the filter.
     config : DelayedInitialisation
-        A landmark must beat its rivals by its ``margin``, and be known to its ``spread``.
+        A landmark must be better than its alternatives by ``margin``, with a σ within ``spread``.
     """
     blind = np.ones(len(first.landmark_kept), dtype=np.bool_)
     np.logical_and.at(blind, problem.ob_landmark, np.isinf(problem.observations[:, 3]))
@@ -82,10 +82,10 @@ def resolve_mirror_ambiguity(
 
 
 def _vague(problem: SmoothingProblem, current: SmoothingResult, blind: Bools, spread: float) -> Bools:
-    """Landmarks whose largest σ exceeds ``spread`` of their mean range, seen both from the base and from the exit.
+    """Landmarks with largest σ above ``spread`` of their mean range, relative to both base and exit.
 
-    The two views share no drift: a landmark that was seen at the beginning is sharp from the base, one at the end from
-    the exit.
+    The drift of the two is different: a landmark observed at the beginning is precise relative to the base, one at the
+    end relative to the exit.
     """
     out = np.zeros(len(blind), dtype=np.bool_)
     P, exit_pose = current.gaussian.covariance, current.gaussian.mean[:3]
@@ -111,7 +111,7 @@ def _positions(smoothed: SmoothingResult) -> Array:
 def _round(
     problem: SmoothingProblem, current: SmoothingResult, blind: Bools, margin: float
 ) -> tuple[SmoothingResult, Bools, int]:
-    """One look at all landmarks: the smoothing with the better ones, which ones are ambiguous, number of swaps."""
+    """One iteration over all landmarks: the best smoothing, which ones are ambiguous, number of swaps."""
     inner = problem.restricted(current.kept, current.landmark_kept)
     poses, landmarks, chi2 = current.poses, _positions(current), current.chi2
     where = np.flatnonzero(current.landmark_kept)
@@ -125,7 +125,7 @@ def _round(
             other = inner.smooth(poses, start)
             moved = _positions(other)
             if not other.converged or np.hypot(*(moved[j] - landmarks[j])) < _APART:
-                continue  # it came back: no minimum of its own
+                continue  # it converged to the same minimum
             gain = chi2 - other.chi2
             closest = min(closest, abs(gain))
             if gain > 0.0:
@@ -134,7 +134,7 @@ def _round(
         ambiguous[where[j]] = closest < margin
     if not swaps:
         return current, ambiguous, 0
-    # what was trimmed under the mirror image may be good: from the whole problem again
+    # observations trimmed with the mirror image may be good: start from the whole problem
     again = problem.restricted(np.ones(len(problem.ob_pose), dtype=np.bool_), current.landmark_kept)
     again = replace(again, trim=problem.trim, min_hits=problem.min_hits)
     solved = again.smooth(poses, landmarks)
@@ -147,7 +147,7 @@ def _round(
 
 
 def _rivals(problem: SmoothingProblem, poses: Array, landmark: Array, j: int) -> Iterator[Array]:
-    """Other places that explain the ranges of landmark j as the path stands."""
+    """Other positions that explain the ranges of landmark j, for the current path."""
     rows = problem.ob_landmark == j
     anchors = np.ascontiguousarray(se2_transform(poses[problem.ob_pose[rows]], problem.sensor[:2]))
     ranges, variances = problem.observations[rows, 0], problem.observations[rows, 2]

@@ -1,8 +1,8 @@
-"""How honest a particle map is: its moments, those of independent filters, and how far both are from the smoothed map.
+"""Consistency of a particle map: its moments, those of independent filters, and their distances to the smoothed map.
 
-Forty particles that were resampled a few times describe their own descent as much as the posterior. Two things tell:
-the distance to the Laplace Gaussian of the smoothed submap, and the scatter between filters that share nothing but the
-data. Both stand beside every map; neither changes it unless asked for.
+After a few resamplings 40 particles reflect their common ancestry as much as the posterior. Two checks: the distance to
+the Laplace Gaussian of the smoothed submap, and the scatter between independent filters on the same data. Both are in
+the report; neither changes the map, except as the chosen output.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from graphslam_frontends.landmarks.summarise import (
 )
 
 FALSE_ALARM = 0.01
-"""Share of the submaps of honest filters that each test of the flag may blame."""
+"""False-alarm rate per test of the flag, for consistent filters."""
 LEAST_ESS = 2.0
-"""An effective sample size below this, at any scan, raises the flag: one particle decided alone."""
+"""A smaller effective sample size at any scan raises the flag: one particle dominated."""
 LEAST_ANCESTORS = 10.0
-"""Particles that are handed over as moments and descend from fewer raise the flag: a variance made of nine degrees of
-freedom is off by a factor of two in one case of ten."""
+"""With moments as output, fewer effective ancestors raise the flag: a variance from nine degrees of freedom is off by a
+factor of two in one case of ten."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParticleGaussians:
-    """Gaussians of one submap made of particles, over the landmarks that the smoothed map holds.
+    """Gaussians of one submap from particles, over the landmarks of the smoothed map.
 
     Parameters
     ----------
     moments : Gaussian or None
-        Moments of the filter that decided (B3); None if no particle holds the common features.
+        Moments of the first filter (B3); None if no particle has the common features.
     dropped_particles : int
-        Particles left out of it (B4).
+        Number of particles left out of it (B4).
     pooled : Gaussian or None
-        Pooled moments of all filters; None without pooling, or if fewer than two filters hold the common features.
+        Pooled moments of all filters; None without pooling, or if fewer than two filters have the common features.
     dropped_filters : int
-        Filters left out of it.
+        Number of filters left out of it.
     """
 
     moments: Gaussian | None
@@ -58,16 +58,16 @@ class ParticleGaussians:
 def particle_gaussians(
     filters: Sequence[ParticleSet], association: LandmarkAssociation, smoothed: SmoothingResult, *, inflate: bool
 ) -> ParticleGaussians:
-    """Moments of the particles of one submap, alone and pooled.
+    """Moments of the particles of one submap, of the first filter and pooled.
 
     Parameters
     ----------
     filters : sequence of ParticleSet
-        The first one decided; the others saw the same scans with random numbers of their own.
+        The first one determined the association; the others used the same scans with other random numbers.
     association : LandmarkAssociation
         Of the standard particle of the first.
     smoothed : SmoothingResult
-        Says which landmarks are left.
+        Its landmarks are used.
     inflate : bool
         See :func:`graphslam_frontends.landmarks.summarise.gaussian_of_particles`; only the first filter's own moments
         are inflated.
@@ -94,10 +94,10 @@ def _moments(particles: ParticleSet, association: LandmarkAssociation, inflate: 
 
 
 def pool_gaussians(gaussians: Sequence[Gaussian]) -> Gaussian:
-    """One Gaussian of K independent estimates of the same posterior: within + (1 + 1/K) between.
+    """Pool K independent Gaussian estimates of the same posterior: within + (1 + 1/K) between.
 
-    The mean of their covariances, and the unbiased scatter of their means with a 1/K share for the error of the pooled
-    mean itself (Rubin's rule of multiple imputation; the factor is 1.2 for five filters).
+    The mean of their covariances, plus the unbiased scatter of their means with a 1/K part for the error of the pooled
+    mean (Rubin's rule of multiple imputation; the factor is 1.2 for five filters).
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def pool_gaussians(gaussians: Sequence[Gaussian]) -> Gaussian:
 
 
 def gaussian_discrepancy(prefix: str, particle: Gaussian | None, smoothed: Gaussian) -> dict[str, Any]:
-    """How far a Gaussian made of particles is from the smoothed one, as ``prefix_…`` figures; None where it is missing.
+    """Discrepancy of a Gaussian from particles to the smoothed one, as metrics ``prefix_…``; None if it is missing.
 
     ``d2_per_dof``: Mahalanobis distance² of the means under the particles' covariance, over the dimension; ``kl``:
     KL(smoothed ‖ particles) in nats; ``pose_variance_ratio``: particles / smoothed, for x, y and heading.
@@ -129,15 +129,15 @@ def gaussian_discrepancy(prefix: str, particle: Gaussian | None, smoothed: Gauss
 
 
 def consistency_flag(report: dict[str, Any], particles: int) -> list[str]:
-    """Why a map is not to be taken at its particles' word; empty if it may be.
+    """Reasons why the particle map is inconsistent; empty if there are none.
 
     Parameters
     ----------
     report : dict
-        With the figures of :func:`gaussian_discrepancy`, ``min_ess``, ``effective_ancestors``, ``handover``, and
+        With the metrics of :func:`gaussian_discrepancy`, ``min_ess``, ``effective_ancestors``, ``handover``, and
         ``chi2`` with ``dof`` of the smoothing.
     particles : int
-        A set smaller than :data:`LEAST_ESS` cannot reach it and is not blamed for that alone.
+        A set smaller than :data:`LEAST_ESS` cannot reach it, and is not flagged for that alone.
     """
     reasons = []
     handed = {"moments": "moment", "pooled": "pooled"}.get(report.get("handover", "smoothed"))
@@ -160,10 +160,10 @@ def consistency_flag(report: dict[str, Any], particles: int) -> list[str]:
 
 
 def variance_bounds(samples: float) -> tuple[float, float]:
-    """Between which a variance made of independent samples lies, over the true one, in honest maps.
+    """Bounds of the ratio of a variance from independent samples to the true one, for consistent maps.
 
-    It is ``χ²_ν / samples``, ``ν = samples - 1``, and three of them are looked at (Bonferroni). Fewer than two samples
-    have no bounds: they say nothing.
+    It is ``χ²_ν / samples``, ``ν = samples - 1``, and three of them are tested (Bonferroni). Fewer than two samples
+    have no bounds.
     """
     nu = samples - 1.0
     if nu < 1.0:

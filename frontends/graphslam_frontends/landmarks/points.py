@@ -1,7 +1,7 @@
-"""Landmark submaps in space: identified points, as a stereo or depth camera sees them, smoothed with odometry.
+"""3-D landmark submaps: points with identities, as from a stereo or depth camera, smoothed with odometry.
 
-Each submap is one least-squares problem over its poses and points (:mod:`graphslam.linear.space_maps`). What is handed
-over is the Gaussian of its end and its landmarks, in the group chart of SE₁₊ₙ(3).
+Each submap is one least-squares problem over its poses and points (:mod:`graphslam.linear.space_maps`). The result is
+the Gaussian of its end pose and its landmarks, in the group parametrisation of SE₁₊ₙ(3).
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class PointsConfig:
     """Options of the front end ``points``."""
 
     max_distance: float = 20.0
-    """A submap ends after this many metres."""
+    """A submap ends after this many metres …"""
     max_scans: int = 100
     """… or after this many scans, or with :data:`MAX_LANDMARKS` landmarks."""
     min_hits: int = 2
-    """Landmarks that are handed over were seen at least this often in the submap."""
+    """Landmarks of a submap were observed at least this often in it."""
     gate: float = 0.9999
-    """A sighting farther from what all others say than this share of honest ones is left out, and counted."""
+    """χ² gate (probability, 3 dof) of an observation against all others; those beyond it are left out and counted."""
 
     def __post_init__(self) -> None:
         if self.max_distance <= 0 or min(self.max_scans, self.min_hits) < 1:
@@ -60,7 +60,7 @@ class PointsConfig:
 
 
 class Points(FrontEnd):
-    """Submaps of identified points in space."""
+    """Front end for submaps of 3-D points with identities."""
 
     name: ClassVar[str] = "points"
     config: PointsConfig
@@ -77,7 +77,7 @@ class Points(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :meth:`FrontEnd.submaps`; nothing is drawn."""
+        """See :meth:`FrontEnd.submaps`; deterministic."""
         motion, seen = log.of_type(Odometry), log.of_type(PointObservations)
         if motion is None or log[motion].increments.shape[1] != 7:
             raise MissingDataError("no odometry in space", where=log.name, wanted="Odometry with increments (n, 7)")
@@ -102,7 +102,7 @@ class Points(FrontEnd):
             first, key = last, key + 1
 
     def _end(self, steps: Odometry, points: PointObservations, first: int) -> tuple[int, str]:
-        """The last scan of the submap that begins at scan ``first``, and why."""
+        """The last scan of the submap that begins at scan ``first``, and the reason."""
         c, way = self.config, 0.0
         hits: dict[int, int] = {}
         end = len(points.times) - 1
@@ -124,7 +124,7 @@ class Points(FrontEnd):
 
 @dataclass
 class _Smoothing:
-    """One submap as a least-squares problem: from scan ``first``, which is its base, to scan ``last``."""
+    """One submap as a least-squares problem, from scan ``first``, its base, to scan ``last``."""
 
     config: PointsConfig
     steps: Odometry
@@ -132,7 +132,7 @@ class _Smoothing:
     first: int
     last: int
     own_scan: bool
-    """Do the sightings of the base belong to it? Those of a later submap's base were spent by the one before."""
+    """Are the observations at the base used? Those of later submaps' bases were already used by the previous submap."""
     outliers: int = field(default=0, init=False)
 
     def submap(self, key: int, reason: str) -> Submap:
@@ -151,7 +151,7 @@ class _Smoothing:
         for turn in range(_ROUNDS):
             names, mark = np.unique(ids[keep], return_inverse=True)
             found = self._solve(pose[keep], mark, len(names), places[keep], information[keep])
-            # every sighting is judged by what the kept ones say: one that was left out for another's fault comes back
+            # each observation is tested against the kept ones: one left out because of another's error is used again
             judged = np.flatnonzero(usable & np.isin(ids, names))
             mark = np.searchsorted(names, ids[judged])
             d2 = self._squared(found.poses, found.points, pose[judged], mark, places[judged], information[judged])
@@ -202,7 +202,7 @@ class _Smoothing:
         whole = np.vstack([SE3.identity, poses])
         start = np.zeros((marks, 3))
         at = se3_transform(whole[pose + 1], places)
-        start[mark[::-1]] = at[::-1]  # where it was seen first
+        start[mark[::-1]] = at[::-1]  # position at the first observation
         for k in np.unique(pose).tolist():
             rows = np.flatnonzero(pose == k)
             seen = SpaceMap(
@@ -213,7 +213,7 @@ class _Smoothing:
 
     @staticmethod
     def _squared(poses: Array, points: Array, pose: Ints, mark: Ints, places: Array, information: Array) -> Array:
-        """Squared distance of every sighting from where its landmark is ``(q,)``."""
+        """Squared Mahalanobis distance of every observation from its landmark ``(q,)``."""
         whole = np.vstack([SE3.identity, poses])
         e = se3_transform(whole[pose + 1], places) - points[mark]
         R = quat_to_matrix(whole[pose + 1, 3:])
@@ -222,7 +222,7 @@ class _Smoothing:
 
     @staticmethod
     def _worst(d2: Array, mark: Ints, gate: float) -> npt.NDArray[np.bool_]:
-        """Of every landmark the sighting that is farthest off, if that is beyond the gate."""
+        """For every landmark the worst observation, if it is beyond the gate."""
         order = np.lexsort([-d2, mark])
         first = order[np.r_[True, np.diff(mark[order]) > 0]] if len(order) else order
         out = np.zeros(len(d2), dtype=bool)

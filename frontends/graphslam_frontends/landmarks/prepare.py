@@ -1,7 +1,7 @@
-"""A log made ready for a landmark filter: which observations count, their variances, and the motion between scans.
+"""Preparation of a log for a landmark filter: usable observations, their variances, and the motion between scans.
 
-Every landmark front end starts here, so that all of them work on the same observations and the same increments. A log
-that is still being recorded is made ready scan by scan: as soon as the motion until a scan has come.
+All landmark front ends use this, so they have the same observations and increments. A log that is still being recorded
+is prepared scan by scan, as soon as the motion up to a scan has arrived.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from graphslam_frontends.odometry.motion_gaps import SHORTEST, MotionGap, dead_r
 
 Ints = npt.NDArray[np.int64]
 CONTROL_HOLD = 0.5
-"""Scans up to this long before the first control are used, with that control held backwards [s]."""
+"""Longest time of scans before the first control; that control is held backwards [s]."""
 
 
 class PrepareConfig(Protocol):
-    """What :func:`prepare_log` reads of a front end's configuration."""
+    """The part of a front end's configuration that :func:`prepare_log` reads."""
 
     @property
     def association(self) -> str:
-        """``known`` uses the identities in the log and nothing without one; any other word ignores them."""
+        """``known`` uses the identities in the log, and only observations with one; other values ignore them."""
 
     @property
     def max_range(self) -> float:
-        """Observations beyond are not used [m]."""
+        """Observations beyond this range are not used [m]."""
 
     @property
     def longest_gap(self) -> float:
-        """Longest time without a record of the motion that is bridged [s]."""
+        """Longest gap in the records of the motion that is bridged [s]."""
 
     @property
     def motion(self) -> MotionNoise:
@@ -50,7 +50,7 @@ class PrepareConfig(Protocol):
 
     @property
     def noise(self) -> RangeBearingNoise | None:
-        """Observation noise in the filter; None: the log's sigmas."""
+        """Observation noise in the filter; None: the sigmas of the log."""
 
     @property
     def smoothing_noise(self) -> RangeBearingNoise | None:
@@ -58,17 +58,17 @@ class PrepareConfig(Protocol):
 
     @property
     def detector(self) -> TreeDetectorConfig:
-        """Used where the log holds raw scans."""
+        """Used if the log has raw scans."""
 
 
 @dataclass(frozen=True, slots=True)
 class PreparedLog:
-    """A log made ready for a filter.
+    """A log prepared for a filter.
 
     Parameters
     ----------
     observations : LandmarkObservations
-        Those that count; all scans stay, also empty ones.
+        Usable ones; all scans stay, including empty ones.
     original : (q,) int64
         Index of each observation in the log's stream, before the unused ones were dropped.
     rows : (q, 4)
@@ -80,7 +80,7 @@ class PreparedLog:
     t_start : float
         Stamp of the first base [s].
     uses : frozenset of str
-        Names of the streams worked on.
+        Names of the streams used.
     """
 
     observations: LandmarkObservations
@@ -91,12 +91,13 @@ class PreparedLog:
     t_start: float
     uses: frozenset[str]
     gaps: tuple[MotionGap, ...] = ()
-    """Gaps of the motion that were bridged."""
+    """Bridged gaps of the motion."""
     noise: Array = field(default_factory=lambda: np.zeros((1, 3)))
-    """Until each scan ``(n + 1, 3)``: sums of variances of ranges [m²] and bearings [rad²], number of bearings."""
+    """Cumulative sums until each scan ``(n + 1, 3)``: variances of ranges [m²] and bearings [rad²], number of bearings.
+    """
 
     def usual_sigma(self, scan: int) -> Array:
-        """Mean measurement noise until a scan, that one included, as x, y [m] and heading [rad]."""
+        """Mean measurement noise up to and including a scan, as x, y [m] and heading [rad]."""
         n, (ranges, bearings, told) = int(self.observations.offsets[scan + 1]), self.noise[scan + 1]
         if not n:
             return np.ones(3)
@@ -104,20 +105,19 @@ class PreparedLog:
         return np.array([along, along, np.sqrt(bearings / told) if told else np.inf])
 
     def unseen_gap(self, scan: int) -> bool:
-        """Does a gap of the motion end at a scan, with no scan in it? Then nothing tells where the robot went."""
+        """Does a gap of the motion without scans end at this scan? Then the motion in it is unknown."""
         t0 = self.observations.times[scan - 1] if scan else self.t_start
         t1 = self.observations.times[scan]
         return any(min(g.end, t1) - max(g.begin, t0) > SHORTEST for g in self.gaps)
 
     def scan(self, scan: int) -> slice:
-        """Rows of a scan that a submap can use: none after an unseen gap, for the base is no longer near them."""
+        """Usable rows of a scan; none after an unseen gap, because its motion is too uncertain."""
         rows = self.observations.scan(scan)
         return slice(rows.start, rows.start) if self.unseen_gap(scan) else rows
 
     def splits(self, scan: int) -> bool:
-        """Does a submap end before a scan? The motion over an unseen gap is a submap by itself: its uncertainty is too
-        large for a map to be linear in it.
-        """
+        """Does a submap end before a scan? The motion over an unseen gap is a submap of its own: its uncertainty is too
+        large for a linearised map."""
         return scan < len(self) and (self.unseen_gap(scan) or (scan > 0 and self.unseen_gap(scan - 1)))
 
     def gaps_in(self, first: int, last: int) -> list[dict[str, float]]:
@@ -133,12 +133,12 @@ class PreparedLog:
 
     @property
     def has_bearing(self) -> npt.NDArray[np.bool_]:
-        """Which observations have a bearing that is used ``(q,)``."""
+        """Which observations have a usable bearing ``(q,)``."""
         return np.asarray(np.isfinite(self.rows[:, 3]))
 
 
 def landmark_stream(log: SensorLog, detector: TreeDetectorConfig) -> tuple[str, LandmarkObservations]:
-    """Name of the stream to work on, and the landmark observations in it (detected, where it holds raw scans)."""
+    """Name of the stream to use, and the landmark observations in it (detected from raw scans if necessary)."""
     stream = log.of_type(LandmarkObservations)
     if stream is not None:
         return stream, log[stream]
@@ -149,14 +149,14 @@ def landmark_stream(log: SensorLog, detector: TreeDetectorConfig) -> tuple[str, 
 
 
 def prepare_log(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> PreparedLog:
-    """Detect, drop what cannot be used (counted), and integrate the motion between scans.
+    """Detect landmarks, drop and count unusable observations, and integrate the motion between scans.
 
     Parameters
     ----------
     log : SensorLog
         With a stream of controls or odometry, and one of landmark observations or laser scans.
     drops : DropCounter
-        Where scans and observations that are not used are counted.
+        Counts unused scans and observations.
     """
     made = LogPreparation(RecordSource(log), config, drops)
     made.advance()
@@ -164,9 +164,9 @@ def prepare_log(log: SensorLog, config: PrepareConfig, drops: DropCounter) -> Pr
 
 
 class LogPreparation:
-    """What :func:`prepare_log` makes of a log, while its records come.
+    """Incremental version of :func:`prepare_log`, while records arrive.
 
-    The streams that are worked on are those that are there when the first scan can be made ready.
+    The streams are chosen when the first scan can be prepared.
 
     Parameters
     ----------
@@ -178,25 +178,25 @@ class LogPreparation:
         self.feed, self.config, self.drops = feed, config, drops
         self.made: PreparedLog | None = None
         self.done = False
-        """Is the log at its end, and all of it made ready?"""
+        """Is the log at its end, and prepared completely?"""
         self._streams: tuple[str, str] | None = None
         self._taken, self._rows = 0, 0  # scans and observations of the stream
 
     @property
     def prepared(self) -> PreparedLog:
-        """All scans so far; there is one at least."""
+        """All prepared scans; at least one."""
         assert self.made is not None
         return self.made
 
     def reach(self, scan: int) -> Generator[None, None, bool]:
-        """Wait until a scan is there, and known to be the last or not; False: the log ended before it."""
+        """Wait until a scan has arrived and it is known whether it is the last; False: the log ended before it."""
         while not self.done and (self.made is None or len(self.made) <= scan + 1):
             if not self.advance():
                 yield None
         return scan < len(self.prepared)
 
     def resume(self, after: Submap | None) -> Generator[None, None, tuple[int, int, float]]:
-        """Key, first scan and start [s] of the submap behind ``after``; None: of the first one."""
+        """Key, first scan and start [s] of the submap after ``after``; None: of the first one."""
         yield from self.reach(0)
         if after is None:
             return 0, 0, self.prepared.t_start
@@ -206,7 +206,7 @@ class LogPreparation:
         return after.key + 1, scan, t_start
 
     def advance(self) -> bool:
-        """Make ready what has come; False: that was nothing."""
+        """Prepare the records that have arrived; False: there were none."""
         if self.done or not (self._named() or self.feed.ended):
             return False
         ended = self.feed.ended
@@ -229,7 +229,7 @@ class LogPreparation:
         return True
 
     def _named(self) -> bool:
-        """Are the streams there?"""
+        """Have the streams been found?"""
         if self._streams is None:
             motion = motion_stream_name(self.feed)
             stream = self.feed.of_type(LandmarkObservations) or self.feed.of_type(LaserScans)
@@ -239,7 +239,7 @@ class LogPreparation:
         return True
 
     def _missing(self) -> tuple[str, str]:
-        """The streams of a log that ended with hardly a record, or the error that names what is missing."""
+        """The streams of a log that ended with few records; raises if one is missing."""
         motion, _ = motion_stream(self.feed.log)
         stream = self.feed.of_type(LandmarkObservations) or self.feed.of_type(LaserScans)
         if stream is None:
@@ -249,12 +249,12 @@ class LogPreparation:
         return motion, stream
 
     def _take(self, part: Any, motion_name: str, motion: Motion, stream: str, last: bool) -> None:
-        """The scans of a part of the stream, behind those that are there."""
+        """Append the scans of a part of the stream."""
         config, drops, where = self.config, self.drops, f"{self.feed.name}/{stream}"
         observations = part if isinstance(part, LandmarkObservations) else detect_trees(part, config.detector)
         early = int(np.searchsorted(observations.times, motion.times[0] - CONTROL_HOLD, side="left"))
         late = len(observations.times)
-        if last and isinstance(motion, Odometry):  # controls are held to the end; recorded odometry ends where it ends
+        if last and isinstance(motion, Odometry):  # controls are held to the end; recorded odometry is not
             late = int(np.searchsorted(observations.times, motion.times[-1] + CONTROL_HOLD, side="right"))
             late = max(late, early)
         drops.drop(stream, "before the first control", early)
@@ -290,11 +290,11 @@ class LogPreparation:
     def _append(
         self, scans: LandmarkObservations, original: Ints, motion_name: str, motion: Motion, stream: str
     ) -> None:
-        """Scans that count, with their variances and the motion into them."""
+        """Append usable scans, with their variances and the motion into them."""
         config, before, count = self.config, self.made, DropCounter()
         filter_var = _variances(scans, config.noise)
         smooth_var = filter_var.copy() if config.smoothing_noise is None else _variances(scans, config.smoothing_noise)
-        smooth_var[np.isinf(filter_var[:, 1]), 1] = np.inf  # the map is made of what the filter saw
+        smooth_var[np.isinf(filter_var[:, 1]), 1] = np.inf  # only bearings that the filter used
         t_start = (
             float(min(motion.times[0], scans.times[0])) if before is None else float(before.observations.times[-1])
         )
@@ -330,7 +330,7 @@ class LogPreparation:
 
 
 def _behind(a: PreparedLog, b: PreparedLog) -> PreparedLog:
-    """The scans of two, one behind the other."""
+    """Concatenate the scans of two prepared logs."""
     x, y = a.observations, b.observations
     observations = replace(
         x,
@@ -361,21 +361,21 @@ def _behind(a: PreparedLog, b: PreparedLog) -> PreparedLog:
 
 
 def _variances(scans: LandmarkObservations, noise: RangeBearingNoise | None) -> Array:
-    """``(q, 2)`` variances of range and bearing, from the model or the log; an absent bearing stays absent."""
+    """``(q, 2)`` variances of range and bearing, from the model or the log; missing bearings stay missing."""
     if noise is None:
         return np.asarray(scans.sigmas**2)
     return np.where(scans.has_bearing[:, None] | [True, False], noise.variances(scans.ranges), np.inf)
 
 
 def known_slots(observations: LandmarkObservations, rows: slice, slots: dict[int, int]) -> Ints:
-    """Slot of every observation ``rows`` by its identity; the first sighting of an identity opens the next slot.
+    """Slot of every observation ``rows`` by its identity; the first observation of an identity opens the next slot.
 
     Parameters
     ----------
     observations : LandmarkObservations
         With identities.
     slots : dict
-        Identity to slot; grows.
+        Identity to slot; new ones are added.
 
     Returns
     -------

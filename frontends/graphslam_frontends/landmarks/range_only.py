@@ -1,11 +1,11 @@
-"""Beacons known by ranges alone, until they can be landmarks: delayed initialisation, particle by particle.
+"""Range-only beacons: delayed initialisation, per particle.
 
-A range says that the beacon is on a circle, which no Gaussian describes. So ranges wait, each with the places where
-every particle believes it was taken, until a trilateration is well conditioned and has no rival; the fit then is the
-landmark, and its ranges are spent. Their likelihood, with the beacon integrated out, weighs the particles.
+A range constrains the beacon to a circle, which no Gaussian describes. So ranges are stored, with the sensor position
+of every particle, until a trilateration is well conditioned and unique; the fit then is the landmark, and its ranges
+are used up. Their likelihood, with the beacon integrated out, weights the particles.
 
-Each particle has its own fit from its own path, but all of them start a beacon at the same scan: weights can be
-compared only between particles that have accounted for the same observations.
+Each particle has its own fit from its own path, but all of them initialise a beacon at the same scan: weights are
+comparable only between particles that used the same observations.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ from graphslam_frontends.landmarks.range_only_kernels import (
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-_GROWTH = 1.2  # a beacon that could not start is tried again with a fifth more ranges
+_GROWTH = 1.2  # a beacon that could not be initialised is tried again with 20 % more ranges
 
 
 @dataclass(frozen=True, slots=True)
 class BeaconInitialisation:
-    """A beacon becomes a landmark.
+    """Initialisation of a beacon as a landmark.
 
     Parameters
     ----------
     observations : (k,) int64
-        The ranges spent on it, as they were numbered when they came.
+        Indices of the ranges used.
     used : (n, k) bool
-        Which of them are inliers to each particle.
+        Which of them are inliers for each particle.
     solved : (n,) bool
-        Particles that have a fit; the others cannot explain the ranges.
+        Particles with a fit; the others cannot explain the ranges.
     mean : (n, 2)
     covariance : (n, 3)
         xx, xy, yy, given the particle's path.
     log_likelihood : (n,)
-        Of all k ranges given the path, the beacon integrated out.
+        Of all k ranges given the path, with the beacon integrated out.
     """
 
     slot: int
@@ -68,12 +68,12 @@ class BeaconInitialisation:
 
 
 class WaitingRanges:
-    """Ranges that wait, with where each of n particles believes they were taken.
+    """Stored ranges, with the sensor position of each of n particles.
 
     Parameters
     ----------
     limit : float
-        χ² gate (1 dof) beyond which a range is an outlier of the fit; inf = none is.
+        χ² gate (1 dof) for outliers of the fit; inf = no outliers.
     """
 
     def __init__(self, particles: int, config: DelayedInitialisation, limit: float) -> None:
@@ -84,25 +84,25 @@ class WaitingRanges:
         self._anchor = np.zeros((particles, 0, 2))
         self._tried: dict[int, int] = {}
         self.unspent = 0
-        """Ranges forgotten because a bearing founded the landmark first."""
+        """Number of ranges discarded because a bearing initialised the landmark first."""
 
     def __len__(self) -> int:
-        """Number of ranges that wait."""
+        """Number of stored ranges."""
         return len(self._slot)
 
     @property
     def slots(self) -> Ints:
-        """Beacons that wait."""
+        """Beacons with stored ranges."""
         return np.unique(self._slot)
 
     def add(self, slots: Ints, observations: Ints, ranges: Array, variances: Array, here: Array) -> None:
-        """Let ranges wait.
+        """Store ranges.
 
         Parameters
         ----------
         slots, observations, ranges, variances : (k,)
         here : (n, 2)
-            Sensor of every particle.
+            Sensor position of every particle.
         """
         self._slot = np.concatenate([self._slot, slots])
         self._observation = np.concatenate([self._observation, observations])
@@ -110,12 +110,12 @@ class WaitingRanges:
         self._anchor = np.concatenate([self._anchor, np.repeat(here[:, None], len(slots), axis=1)], axis=1)
 
     def resample(self, source: Ints) -> None:
-        """Let particle k go on from particle ``source[k]``."""
+        """Particle k continues from particle ``source[k]``."""
         if len(self):
             self._anchor = self._anchor[source]
 
     def forget(self, slot: int) -> None:
-        """Stop waiting for a beacon that has become a landmark otherwise."""
+        """Discard the ranges of a beacon that was initialised otherwise."""
         self.unspent += self._take_out(slot)
 
     def _take_out(self, slot: int) -> int:
@@ -129,7 +129,7 @@ class WaitingRanges:
         return int((~keep).sum())
 
     def ready(self, slots: Ints, weights: Array) -> Iterator[BeaconInitialisation]:
-        """Beacons among ``slots`` that can start now; what they were made of no longer waits.
+        """Beacons among ``slots`` that can be initialised now; their ranges are removed from the store.
 
         Parameters
         ----------
@@ -146,8 +146,8 @@ class WaitingRanges:
                 continue
             self._tried[slot] = len(rows)
             z = np.ascontiguousarray(self._anchor[:, rows]), self._range[rows], self._variance[rows]
-            # the best particle searches the circle, and the others start from the minima it found: their paths differ
-            # by the noise of the motion, so theirs are near
+            # the best particle searches the circle, and the others start from its minima: their paths differ by motion
+            # noise only
             starts = circle_starts(z[0][best], z[1], self.limit)
             fit, used, minima = np.empty(FIT_LENGTH), np.zeros(len(rows), dtype=np.bool_), np.empty((len(starts), 3))
             found = trilaterate_kernel(z[0][best], z[1], z[2], self.limit, starts, fit, used, minima)
@@ -170,7 +170,7 @@ class WaitingRanges:
                 yield start
 
     def _good(self, fits: Array, k: int) -> Bools:
-        """Fits ``(n, FIT_LENGTH)`` of k ranges that are well conditioned and have no rival."""
+        """Fits ``(n, FIT_LENGTH)`` of k ranges that are well conditioned and unique."""
         c = self.config
         a, b, d = fits[:, FIT_XX], fits[:, FIT_XY], fits[:, FIT_YY]
         largest = 0.5 * (a + d) + np.sqrt((0.5 * (a - d)) ** 2 + b**2)  # eigenvalue of the covariance

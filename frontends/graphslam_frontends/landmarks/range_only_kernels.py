@@ -1,8 +1,8 @@
-"""Compiled trilateration: a beacon from ranges taken along a known path, with its covariance and its rivals.
+"""Compiled trilateration: a beacon from ranges along a known path, with covariance and alternative solutions.
 
-One range is a circle, two circles cross twice, and a straight path cannot tell left from right. So Gauss-Newton starts
-from several points of one circle, every minimum it finds is kept, and the caller learns how much worse the second best
-one fits.
+One range is a circle, two circles intersect twice, and ranges from a straight path are symmetric to it. So Gauss-Newton
+is started at several points of one circle, every minimum found is kept, and the χ² difference to the second best one is
+returned.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FIT_LENGTH = 10
 def _normal(x, y, anchors, ranges, variances, limit, out):
     """Truncated χ² Σ min(d², limit) at (x, y); out: gradient (2), Gauss-Newton matrix (xx, xy, yy), inliers.
 
-    Derivatives are those of the inliers alone, so a step ignores what is outside the gate *now*.
+    Derivatives are those of the inliers only, so a step ignores ranges that are *currently* outside the gate.
     """
     cost = 0.0
     out[:] = 0.0
@@ -84,9 +84,9 @@ def _descend(p, anchors, ranges, variances, limit, n):
 
 @njit(error_model="numpy")
 def circle_starts(anchors, ranges, limit):
-    """Points (m, 2) on the circle of the shortest range, where the beacon lies within its noise.
+    """Points (m, 2) on the circle of the shortest range, which the beacon is on, within noise.
 
-    Where ranges may be outliers (finite ``limit``) the shortest may be one, and the median range gives as many again.
+    With outliers (finite ``limit``) the shortest range may be one, so as many points on the median range are added.
     """
     order = np.argsort(ranges)
     circles = 1 if math.isinf(limit) else 2
@@ -101,27 +101,27 @@ def circle_starts(anchors, ranges, limit):
 
 @njit(error_model="numpy")
 def trilaterate_kernel(anchors, ranges, variances, limit, starts, fit, used, minima):
-    """Beacon seen at ``ranges`` (k,) with ``variances`` (k,) from ``anchors`` (k, 2); ranges with d² > limit go unused.
+    """Beacon from ``ranges`` (k,) with ``variances`` (k,) at ``anchors`` (k, 2); ranges with d² > limit are not used.
 
-    Descends from every one of starts (m, 2). Fills fit (FIT_LENGTH): position, covariance, χ² of the inliers, margin by
-    which the second best minimum fits worse (inf if there is none), log of the likelihood of all ranges with the beacon
-    integrated out (Laplace, flat prior; an outlier counts as one that just fails the gate), number of inliers and their
-    mean range; used (k,) bool; and minima (m, 3): x, y, truncated χ² of the different minima found.
-    Returns their number; 0, with fit undefined, if none has three inliers and full rank.
+    Descends from each of starts (m, 2). Fills fit (FIT_LENGTH): position, covariance, χ² of the inliers, χ² margin to
+    the second best minimum (inf if there is none), log-likelihood of all ranges with the beacon integrated out
+    (Laplace, flat prior; an outlier counts as one at the gate), number of inliers and their mean range; used (k,) bool;
+    and minima (m, 3): x, y, truncated χ² of the distinct minima. Returns their number; 0, with fit undefined, if none
+    has three inliers and full rank.
     """
     n = np.empty(6)
     p = np.empty(2)
     count = 0
     for start in range(len(starts)):
         p[0], p[1] = starts[start, 0], starts[start, 1]
-        # outliers first weigh like everything else: a far start must feel every range
+        # outliers first have full weight: a distant start must use every range
         cost = _descend(p, anchors, ranges, variances, np.inf, n)
         if not math.isinf(limit):
             cost = _descend(p, anchors, ranges, variances, limit, n)
         if n[5] < 3.0 or not n[2] * n[4] - n[3] * n[3] > 1e-12 * n[2] * n[4]:
             continue
         known = False
-        for i in range(count):  # the same one, in units of its own noise
+        for i in range(count):  # the same minimum, within its own σ
             dx, dy = p[0] - minima[i, 0], p[1] - minima[i, 1]
             if n[2] * dx * dx + 2.0 * n[3] * dx * dy + n[4] * dy * dy < 1e-6:
                 known = True
@@ -139,7 +139,7 @@ def trilaterate_kernel(anchors, ranges, variances, limit, starts, fit, used, min
     cost = _normal(x, y, anchors, ranges, variances, limit, n)
     det = n[2] * n[4] - n[3] * n[3]
     margin = np.inf
-    for i in range(count):  # a rival is a minimum elsewhere, outside what this one calls noise
+    for i in range(count):  # an alternative is a minimum more than 3 σ away
         dx, dy = minima[i, 0] - x, minima[i, 1] - y
         if n[2] * dx * dx + 2.0 * n[3] * dx * dy + n[4] * dy * dy > 9.0:
             margin = min(margin, minima[i, 2] - cost)

@@ -1,4 +1,4 @@
-"""RBPF-EKF local maps: FastSLAM decides the association, one smoothing makes the Gaussian (Combined SLAM section 4)."""
+"""RBPF-EKF local maps: association by FastSLAM, Gaussian by one smoothing (Combined SLAM section 4)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class RbpfEkf(FrontEnd):
     def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
         """See :class:`~graphslam_frontends.base.FrontEnd`.
 
-        What a calibration leaves of systematic errors, or removed wrongly, the graph estimates with the map.
+        The graph estimates systematic errors that a calibration did not remove, or removed wrongly.
         """
         if not corrected or self.config.lasting is not None or "lasting" in asked:
             return self
@@ -78,9 +78,9 @@ class RbpfEkf(FrontEnd):
     def with_particles(
         self, feed: RecordSource, *, seed: SeedTree, after: Submap | None = None, drops: DropCounter | None = None
     ) -> Iterator[tuple[Submap, ParticleSet] | None]:
-        """The submaps of :meth:`follow`, each with the particles it was made of as they stood at its last scan.
+        """The submaps of :meth:`follow`, each with its particles at its last scan.
 
-        To look at; with pooled filters those of the one that decides.
+        For inspection; with pooled filters the particles of the first one.
         """
         data = LogPreparation(feed, self.config, drops if drops is not None else DropCounter())
         key, scan, t_start = yield from data.resume(after)
@@ -90,7 +90,7 @@ class RbpfEkf(FrontEnd):
             key, t_start = key + 1, submap.interval[1]
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
-        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans)."""
+        """Name of the stream used, and the landmark observations in it (detected from raw scans if necessary)."""
         return landmark_stream(log, self.config.detector)
 
     def _build(
@@ -103,7 +103,7 @@ class RbpfEkf(FrontEnd):
         filters = [
             ParticleSet(c, obs.T_base_sensor, obs.field_of_view, miss_range, branch.generator()) for branch in branches
         ]
-        particles = filters[0]  # it decides alone; the others only watch
+        particles = filters[0]  # it alone determines the association; the others are for comparison
         stopping = StoppingRule(c.stopping)
         slots: dict[int, int] = {}
         ended, scan = None, first
@@ -193,12 +193,12 @@ class RbpfEkf(FrontEnd):
             positions=handed.mean[3:].reshape(-1, 2),
             covariance=handed.covariance,
             sightings=np.column_stack([data.original[used], lm_index]),
-            chart="group" if whole else "cartesian",  # particles: as the paper has them
+            chart="group" if whole else "cartesian",  # particles: as in the paper
             path=None if way is None else fix_points(smoothed, way),
             lasting=lasting,
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)
-        if not whole:  # the path's end is the Gaussian's
+        if not whole:  # the end of the path is that of the Gaussian
             cov = trajectory.covariances
             assert cov is not None
             cov[-1] = vector_to_tangent_covariance(handed.mean[:3], handed.covariance[:3, :3])
@@ -237,7 +237,7 @@ class RbpfEkf(FrontEnd):
         made: ParticleGaussians,
         span: slice,
     ) -> dict[str, Any]:
-        """Of scans, observations and particles, and how well the smoothing fits, for the report of a submap."""
+        """Counts of scans, observations and particles, and the fit of the smoothing, for the report of a submap."""
         obs, first, last = data.observations, span.start, span.stop
         return {
             "gaps": data.gaps_in(first, last),
@@ -260,7 +260,7 @@ class RbpfEkf(FrontEnd):
 
 
 def _trajectory(t_start: float, times: Array, smoothed: SmoothingResult) -> Trajectory:
-    """Path in the base frame; the base itself stands first, exactly known, unless the first scan is the base."""
+    """Path in the base frame; the base itself is first, with zero covariance, unless the first scan is the base."""
     if t_start < times[0]:
         return Trajectory(
             np.concatenate([[t_start], times]),

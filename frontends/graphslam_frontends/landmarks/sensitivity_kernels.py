@@ -1,4 +1,4 @@
-"""Compiled sensitivities of a smoothed submap to constants that all its residuals know."""
+"""Compiled sensitivities of a smoothed submap to constant errors common to all its residuals."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from graphslam_frontends.landmarks.smoothing_kernels import _at_optimum, _odomet
 
 @njit(error_model="numpy")
 def bias_sensitivities(poses, landmarks, evidence, along, seen):
-    """How the optimum moves with constants that all residuals know, and what the residuals say of these.
+    """Change of the optimum with constants common to all residuals, and the score of these constants.
 
     Parameters
     ----------
     along : (T, 3, c)
-        Change of the odometry's residual ``u⁻¹ ∘ (x_{k-1}⁻¹ ∘ x_k)`` with each constant, the poses held.
+        Change of the odometry residual ``u⁻¹ ∘ (x_{k-1}⁻¹ ∘ x_k)`` with each constant, at fixed poses.
     seen : (q, 2, c)
-        Change of measured less predicted range and bearing, poses and landmarks held.
+        Change of measured minus predicted range and bearing, at fixed poses and landmarks.
 
     Returns
     -------
@@ -29,12 +29,12 @@ def bias_sensitivities(poses, landmarks, evidence, along, seen):
     shifted : (2L, c)
         Of the landmarks.
     score, information : (c,), (c, c)
-        Of the constants, poses and landmarks left free.
+        Of the constants, with poses and landmarks free.
     """
     T, n, c = len(poses), 2 * len(landmarks), along.shape[2]
     u, W, ob_pose, ob_lm, ob, weight, sensor = evidence
     Ainv, B, C, joint = _at_optimum(poses, landmarks, evidence)
-    g, gl = np.zeros((T, 3, c)), np.zeros((n, c))  # minus the gradient's change with the constants
+    g, gl = np.zeros((T, 3, c)), np.zeros((n, c))  # minus the change of the gradient with the constants
     score, information = np.zeros(c), np.zeros((c, c))
     e, h, base = np.empty(6), np.empty(12), np.zeros(3)
     Jb, Ad = np.zeros((3, 3)), np.zeros((3, 3))
@@ -64,7 +64,7 @@ def bias_sensitivities(poses, landmarks, evidence, along, seen):
         bound_bearing_slopes(h, ob[o, 2])
         w0, w1 = weight[o] / ob[o, 2], weight[o] / ob[o, 3]
         for a in range(c):
-            # measured less predicted falls by h' δ and changes by seen g
+            # measured minus predicted decreases by h' δ and changes by ``seen``
             d0, d1 = w0 * seen[o, 0, a], w1 * seen[o, 1, a]
             score[a] -= d0 * n0 + d1 * n1
             for b in range(c):

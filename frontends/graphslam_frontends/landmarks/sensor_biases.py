@@ -1,9 +1,9 @@
-"""Constant errors of wheels and sensor beside a smoothed submap, for a graph to estimate
+"""Constant errors of wheels and sensor of a smoothed submap, for a graph to estimate
 (:mod:`graphslam.core.sensor_biases`).
 
-What is measured is taken to be: turns ``b`` too large for each second in motion, or each metre driven; distances too
-long by the factor ``e^s``; ranges too long by ``o``; the sensor turned to the left by ``y``, or ranges that have no
-bearing too long by the factor ``e^y``; the sensor stands ``x`` further ahead, and ``y`` further to the left.
+Model of the measurements: rotations are ``b`` too large per second of motion, or per metre; distances are too long by
+the factor ``e^s``; ranges are too long by ``o``; the sensor is rotated to the left by ``y``, or ranges without bearing
+are too long by the factor ``e^y``; the sensor is ``x`` further ahead, and ``y`` further to the left.
 """
 
 from __future__ import annotations
@@ -23,23 +23,22 @@ from graphslam_frontends.landmarks.summarise import SmoothingResult
 from graphslam_frontends.odometry.motion import motion_stream
 
 MOVING = 1e-6
-"""An increment of the odometry that is shorter and turns less is rest [m, rad]."""
+"""An increment of the odometry with smaller translation and rotation is rest [m, rad]."""
 
 STEERING = float(np.deg2rad(1.0))
-"""σ of the turn of a steered vehicle that is systematic beside its calibration [rad/m]: a degree of the wheel at 1 m
-wheelbase."""
+"""σ of the systematic steering error after calibration [rad/m]: 1° of the wheel at 1 m wheelbase."""
 TYRES, RANGE_SCALE = 0.01, 0.05
-"""σ of the logarithm of the scale of distances by wheels, and of ranges measured by radio."""
+"""σ of the logarithm of the scale of wheel distances, and of radio ranges."""
 MOUNT = 0.3
-"""σ of the position of a sensor whose position is not given [m]."""
+"""σ of the position of a sensor if it is not given [m]."""
 
 
 def possible_biases(log: SensorLog, detector: TreeDetectorConfig) -> SensorBiasConfig:
-    """Which systematic errors a log of landmarks may have.
+    """Systematic errors that a log of landmarks may have.
 
-    A steered vehicle turns too much by the metre, a robot with a gyro or two driven wheels by the second. Ranges
-    without bearings have no direction, but may have a scale; the scale of the map is then that of the wheels, within
-    what load and pressure of the tyres leave open.
+    A steered vehicle has a rotation error per metre, a robot with a gyro or two driven wheels one per second. Ranges
+    without bearings have no yaw, but may have a scale; the scale of the map is then that of the wheels, within the
+    uncertainty by load and tyre pressure.
     """
     steers = isinstance(motion_stream(log)[1], SteeringControls)
     turn = {"yaw_bias": 0.0, "turn_per_metre": STEERING} if steers else {}
@@ -53,21 +52,21 @@ def possible_biases(log: SensorLog, detector: TreeDetectorConfig) -> SensorBiasC
 def estimate_sensor_biases(
     config: SensorBiasConfig, smoothed: SmoothingResult, seconds: Array, way: FixPlacement | None, *, base: bool
 ) -> SensorBiases:
-    """What a smoothed submap is with constant errors, and what it says of them.
+    """Sensitivity of a smoothed submap to constant errors, and its information on them.
 
     Parameters
     ----------
     seconds : (T,)
-        Of each increment of the odometry.
+        Duration of each increment of the odometry.
     way : FixPlacement or None
         Points of the path at fixes.
     base : bool
-        The trajectory begins with the base, which does not move.
+        The trajectory begins with the base, which is fixed.
     """
     names, sigmas = config.chosen()
     evidence, T = smoothed.evidence, len(smoothed.poses)
     ob, x = evidence.ob, smoothed.poses
-    # errors are shares of the motion and the ranges as smoothed: noise of what was measured would feign a scale
+    # errors relative to smoothed motion and ranges: measurement noise would cause a spurious scale
     u = se2_between(np.concatenate([np.zeros((1, 3)), x[:-1]]), x)
     still = np.hypot(evidence.u[:, 0], evidence.u[:, 1]) + np.abs(evidence.u[:, 2]) < MOVING
     at = x[evidence.ob_pose]
@@ -79,7 +78,7 @@ def estimate_sensor_biases(
     along, seen = np.zeros((T, 3, len(CONSTANTS))), np.zeros((len(ob), 2, len(CONSTANTS)))
     if names[0]:
         weight = metres if names[0] == "turn_per_metre" else seconds * ~still
-        half = 0.5 * np.stack([-u[:, 1], u[:, 0]], -1)  # the heading errs by half of it on the way
+        half = 0.5 * np.stack([-u[:, 1], u[:, 0]], -1)  # on average over the step the heading error is half of it
         along[:, :2, 0] = weight[:, None] * np.einsum("kji,kj->ki", R_end, half)
         along[:, 2, 0] = weight
     if names[1]:
@@ -90,7 +89,7 @@ def estimate_sensor_biases(
         seen[:, 0, 3] = -ranges
     elif names[3]:
         seen[:, 1, 3] = 1.0
-    if names[4]:  # a bearing by its own inverse range has no bound: nearer than its σ a range tells no place
+    if names[4]:  # bearing effects grow with 1/range without bound: the range is limited to its σ
         ahead, near = off / ranges[:, None], np.maximum(ranges, np.sqrt(ob[:, 2]))
         seen[:, 0, 4], seen[:, 0, 5] = ahead[:, 0], ahead[:, 1]
         seen[:, 1, 4], seen[:, 1, 5] = -ahead[:, 1] / near, ahead[:, 0] / near

@@ -1,8 +1,8 @@
 """Compiled Gauss-Newton smoothing of one submap: all poses and landmarks under a given association.
 
-The normal equations are a block-tridiagonal chain of poses with an arrow of landmark columns. Poses are eliminated
-from the base towards the exit, so that what remains is the information matrix of {exit pose, landmarks}: exactly the
-marginal that the submap hands over. Cost is poses × landmarks²; nothing of size poses² is formed.
+The normal equations are a block-tridiagonal chain of poses with an arrow of landmark columns. Poses are eliminated from
+the base towards the exit. The remaining matrix is the information matrix of {exit pose, landmarks}: the marginal that
+the submap needs. Cost is poses × landmarks²; no matrix of size poses² is formed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graphslam_frontends.landmarks.measurement_kernels import observe_landmark, 
 
 
 class SmoothingMeasurements(NamedTuple):
-    """What is known of T poses and L landmarks."""
+    """Measurements of T poses and L landmarks."""
 
     u: Any
     """(T, 3): odometry increments."""
@@ -54,7 +54,7 @@ class NormalBlocks(NamedTuple):
 
 @njit(error_model="numpy")
 def bound_bearing_slopes(h, variance):
-    """Bound the derivatives of a bearing, 1/r, where the landmark is nearer than the σ of the range."""
+    """Bound the derivatives of a bearing, 1/r, if the landmark is nearer than the σ of the range."""
     near = math.sqrt(variance)
     if h[0] < near:
         share = h[0] / near
@@ -220,7 +220,7 @@ def _reduced(A, C, H):
 
 @njit(error_model="numpy")
 def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
-    """Damped Gauss-Newton over poses (T,3) and landmarks (L,2), both changed in place; base pose fixed at identity.
+    """Damped Gauss-Newton over poses (T,3) and landmarks (L,2), both updated in place; base pose fixed at identity.
 
     Returns (objective, iterations, converged). Converged: relative decrease below ``tolerance``.
     """
@@ -275,7 +275,7 @@ def smooth_kernel(poses, landmarks, evidence, max_iterations, tolerance):
 
 @njit
 def observed_columns(T, n, ob_pose, ob_lm):
-    """last_seen[k]: number of leading landmark columns that poses 0 … k touch (landmarks come in order of sighting)."""
+    """last_seen[k]: number of leading landmark columns of poses 0 … k (landmarks in order of first observation)."""
     out = np.zeros(T, np.int64)
     for o in range(len(ob_pose)):
         w = 2 * ob_lm[o] + 2
@@ -338,7 +338,7 @@ def smoothed_covariances(poses, landmarks, evidence):
 def path_covariances(poses, landmarks, evidence, at, G0, G1):
     """Joint covariances of points of the path, by the backward recursion of :func:`smoothed_covariances`.
 
-    Point p moves by ``G0[p] ξ_k + G1[p] ξ_{k+1}`` with k = at[p] (right tangents; k = -1 is the base, which is held).
+    Point p moves by ``G0[p] ξ_k + G1[p] ξ_{k+1}`` with k = at[p] (right tangents; k = -1 is the base, which is fixed).
 
     Parameters
     ----------
@@ -389,11 +389,11 @@ def path_covariances(poses, landmarks, evidence, at, G0, G1):
 
 @njit(error_model="numpy")
 def second_order_bias(poses, landmarks, evidence):
-    """What curvature adds to ranges and bearings on average, by the covariance of each landmark as its sensor has it.
+    """Mean effect of curvature on ranges and bearings, from the covariance of each landmark relative to its sensor.
 
-    The line of sight q, in the frame of the pose, moves by ``F`` times the errors of pose and landmark; with its
-    covariance ``Q = F Σ Fᵀ`` a range is ``tr(n nᵀ Q) / 2 r`` larger on average than at the mean, n across the line of
-    sight u, and a bearing off by ``-uᵀ Q n / r²``. A turn of everything changes neither.
+    The line of sight q, in the frame of the pose, changes by ``F`` times the errors of pose and landmark; with its
+    covariance ``Q = F Σ Fᵀ`` a range is on average larger by ``tr(n nᵀ Q) / 2 r`` than at the mean, n across the line
+    of sight u, and a bearing is off by ``-uᵀ Q n / r²``. A common rotation changes neither.
 
     Returns
     -------
@@ -419,7 +419,7 @@ def second_order_bias(poses, landmarks, evidence):
             i = order[o]
             j = ob_lm[i]
             observe_landmark(poses[k, 0], poses[k, 1], poses[k, 2], sensor, landmarks[j, 0], landmarks[j, 1], h)
-            r = max(h[0], math.sqrt(ob[i, 2]))  # nearer than its σ a range tells no place
+            r = max(h[0], math.sqrt(ob[i, 2]))  # a range shorter than its σ gives no direction
             ux, uy = -h[2], -h[3]
             F[0, 2], F[1, 2] = r * uy + sensor[1], -r * ux - sensor[0]
             P[:3, 3:], P[3:, 3:] = X[:, 2 * j : 2 * j + 2], Sl[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]

@@ -1,4 +1,4 @@
-"""When a submap ends (Combined SLAM B8): no features, lost diversity, enough features; and two practical limits."""
+"""End of a submap (Combined SLAM B8): no features, lost diversity, enough features; and two practical limits."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from graphslam_frontends.landmarks.config import StoppingConfig
 
 
 class GrowingMap(Protocol):
-    """What a filter tells of itself while it builds a submap."""
+    """State of a filter that the criteria read."""
 
     @property
     def scans(self) -> int:
-        """Scans taken in so far."""
+        """Number of scans processed."""
 
     @property
     def confirmed(self) -> int:
-        """Features that are no longer provisional (of the standard particle, where there are several)."""
+        """Number of features that are no longer provisional (of the standard particle, if there are several)."""
 
     @property
     def resamplings(self) -> int:
-        """Resamplings so far; 0 for a filter without particles."""
+        """Number of resamplings; 0 for a filter without particles."""
 
     @property
     def ancestors(self) -> int | None:
-        """Distinct first particles that still have descendants; None for a filter without particles."""
+        """Number of initial particles with descendants; None for a filter without particles."""
 
     def pose_std(self) -> Array:
         """Standard deviation of x, y [m] and heading [rad], ``(3,)``."""
 
 
 class StoppingRule:
-    """Watches one submap grow."""
+    """The criteria for one growing submap."""
 
     def __init__(self, config: StoppingConfig) -> None:
         self.config = config
@@ -42,7 +42,7 @@ class StoppingRule:
         self.distance = 0.0
 
     def reason(self, growing: GrowingMap, dt: float, u: Array, n_obs: int, epsilon: Array) -> str | None:
-        """Why the submap ends after this scan, or None.
+        """Reason why the submap ends after this scan, or None.
 
         Parameters
         ----------
@@ -53,7 +53,7 @@ class StoppingRule:
         u : (3,)
             Motion since the last scan.
         n_obs : int
-            Features seen in this scan.
+            Number of observations in this scan.
         epsilon : (3,)
             ε: mean measurement noise as x, y [m] and heading [rad].
         """
@@ -69,7 +69,7 @@ class StoppingRule:
             sigma = np.maximum(growing.pose_std(), 1e-12)
             if self.without_features > c.time_max * min(1.0, float(np.min(epsilon / sigma))):
                 return "no-features"
-        # (ii) diversity: only resampling can lose it
+        # (ii) diversity: only resampling reduces it
         if growing.resamplings > 0 and self._diversity_lost(growing):
             return "diversity"
         # (iii) enough features in the standard particle

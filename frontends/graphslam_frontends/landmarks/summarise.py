@@ -1,8 +1,8 @@
-"""From particles to one Gaussian: common features (B4), moment matching (B3), and smoothing under the winner.
+"""Summary of particles as one Gaussian: common features (B4), moment matching (B3), and smoothing.
 
-A moment-matched set of 40 particles is overconfident by itself (finite sample), so the default hand-over smooths the
-submap once under the winning particle's association and gives the optimum with its Laplace covariance; the
-moment-matched Gaussian stays as the paper's mode and as a figure of honesty beside every map.
+Moments of 40 particles are overconfident (finite sample), so by default the submap is smoothed once under the winning
+particle's association; the result is the optimum with its Laplace covariance. The moment-matched Gaussian is kept as
+the paper's mode and as a consistency check of every map.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from graphslam_frontends.landmarks.smoothing_kernels import (
 Ints = npt.NDArray[np.int64]
 _HUBER2 = 1.345**2
 REGULARISER = 1e-9
-"""Added to the diagonal of every covariance made of particles [m², rad²]. A single particle, or identical ones, have no
-spread: this keeps the matrix invertible and is negligible beside any measurement. Read the NEES of such a set as
-infinite."""
+"""Added to the diagonal of every covariance from particles [m², rad²]: a single particle, or identical ones, have no
+spread. It keeps the matrix invertible and is negligible compared with any measurement; the NEES of such a set is
+meaningless."""
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkAssociation:
-    """The winning association of a submap: which observation saw which landmark, landmarks in order of sighting.
+    """The winning association of a submap: landmark of each observation, landmarks in order of first observation.
 
     Parameters
     ----------
     slots : (L,)
         Slot of each landmark in the winning particle.
     observation : (q,)
-        Index of each used observation inside the submap.
+        Index in the submap of each observation used.
     landmark : (q,)
         Its landmark, 0 … L-1.
     """
@@ -54,7 +54,7 @@ class LandmarkAssociation:
 
 
 def winning_association(particles: ParticleSet, min_hits: int) -> LandmarkAssociation:
-    """Association of the standard particle, restricted to landmarks seen at least ``min_hits`` times."""
+    """Association of the standard particle, restricted to landmarks observed at least ``min_hits`` times."""
     a = particles.assoc[particles.best, : particles.observations].astype(np.int64)
     used = np.flatnonzero(a >= 0)
     slots, first, counts = np.unique(a[used], return_index=True, return_counts=True)
@@ -68,15 +68,15 @@ def winning_association(particles: ParticleSet, min_hits: int) -> LandmarkAssoci
 
 
 def common_features(particles: ParticleSet, association: LandmarkAssociation) -> tuple[Ints, Ints]:
-    """Order every particle's features as the standard particle has them (eq. 9–11).
+    """Slots of every particle's features in the order of the standard particle (eq. 9–11).
 
-    A feature of another particle corresponds to a common feature if it holds the majority of the observations (unique
-    indices) of that feature. A particle that lacks one, or maps two to the same, is dropped.
+    A feature of another particle corresponds to a common feature if it has the majority of its observations (unique
+    indices). A particle without one, or with one feature for two, is dropped.
 
     Returns
     -------
     kept : (k,)
-        Particles kept.
+        Indices of the particles kept.
     slots : (k, L)
         Their slot of each common feature.
     """
@@ -85,19 +85,19 @@ def common_features(particles: ParticleSet, association: LandmarkAssociation) ->
 
 
 def majority_slots(table: Ints, landmark: Ints, count: int) -> tuple[Ints, Ints]:
-    """Slot of each common feature in each particle: the one that holds the majority of the feature's observations.
+    """Slot of each common feature in each particle: the one with the majority of the feature's observations.
 
     Parameters
     ----------
     table : (n, q)
-        Slot of each observation in each particle; negative where it has none.
+        Slot of each observation in each particle; negative if it has none.
     landmark : (q,)
         Common feature of each observation, 0 … count-1.
 
     Returns
     -------
     kept : (k,)
-        Particles that hold every feature, each in a slot of its own.
+        Particles with every feature, each in a different slot.
     slots : (k, count)
     """
     size = np.bincount(landmark, minlength=count)
@@ -115,7 +115,7 @@ def majority_slots(table: Ints, landmark: Ints, count: int) -> tuple[Ints, Ints]
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """First two moments of a particle set over ``[pose, landmark_1, …]``, kept apart (eq. 7–8).
+    """First two moments of a particle set over ``[pose, landmark_1, …]``, within and between particles (eq. 7–8).
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class Moments:
         return np.asarray(self.within[:, [[0, 1], [1, 2]]] + between + REGULARISER * np.eye(2))
 
     def joint(self, *, inflation: float = 1.0) -> Gaussian:
-        """The Gaussian over everything (eq. 8), with the part between the particles times ``inflation``."""
+        """The Gaussian of all variables (eq. 8), with the between-particle part times ``inflation``."""
         floor = REGULARISER * np.eye(len(self.mean))
         between = (self.weights[:, None] * self.deviations).T @ self.deviations
         within = np.zeros_like(floor)
@@ -180,7 +180,7 @@ def gaussian_of_particles(
     Parameters
     ----------
     inflate : bool
-        Multiply the between-particle part by 1 + 40/N (finite-sample repair for poor sensors).
+        Multiply the between-particle part by 1 + 40/N (finite-sample correction for imprecise sensors).
     """
     kept, slots = common_features(particles, association)
     n = len(particles.pose)
@@ -198,17 +198,17 @@ class SmoothingResult:
     poses, pose_covariances : (T, 3), (T, 3, 3)
         Smoothed path and right-tangent marginals.
     kept : (q,) bool
-        Observations that survived the trimming.
+        Observations kept by the trimming.
     landmark_kept : (L,) bool
-        Landmarks that still have ``min_hits`` of them; the Gaussian holds these, in order.
+        Landmarks that still have ``min_hits`` of them; the Gaussian contains these, in order.
     chi2, dof : float
         Objective at the optimum and its degrees of freedom.
     parts : (3,)
         Shares of the objective: odometry, range, bearing.
     landmarks : (L, 2)
-        Those that were kept.
+        Landmarks kept.
     evidence : SmoothingMeasurements
-        What was smoothed.
+        The measurements used.
     """
 
     gaussian: Gaussian
@@ -224,7 +224,7 @@ class SmoothingResult:
     evidence: SmoothingMeasurements
 
     def report(self) -> dict[str, Any]:
-        """How well the submap fits its measurements, for the report of the submap."""
+        """Fit of the submap to its measurements, for its report."""
         return {
             "chi2": self.chi2,
             "dof": self.dof,
@@ -237,11 +237,11 @@ class SmoothingResult:
         }
 
     def nonlinearity(self) -> float:
-        """Distance², under the own covariance, by which curvature moves the optimum from the mean; 0 if all is linear.
+        """Squared Mahalanobis norm, under its own covariance, of the curvature bias of the optimum; 0 if linear.
 
-        A sighting holds a landmark on an arc, a Gaussian holds it on the tangent. Where bearings are vague beside the
-        ranges, arcs bend by more than what the map claims to know across them. It is the squared norm of the bias of
-        nonlinear least squares (Box 1971), with the curvature of ranges and bearings alone.
+        An observation constrains a landmark to an arc, a Gaussian to the tangent. If bearings are imprecise compared
+        with ranges, the arc deviates by more than the map's σ across it. This is the squared norm of the bias of
+        nonlinear least squares (Box 1971), with the curvature of ranges and bearings only.
         """
         if not len(self.landmarks):
             return 0.0
@@ -255,7 +255,7 @@ class SmoothingResult:
 
 @dataclass(frozen=True, slots=True)
 class SmoothingProblem:
-    """Odometry and observations of a submap, to be smoothed with the base fixed at identity.
+    """Odometry and observations of a submap, for smoothing with the base fixed at identity.
 
     Parameters
     ----------
@@ -264,14 +264,14 @@ class SmoothingProblem:
     ob_pose, ob_landmark : (q,)
         Pose and landmark of each observation.
     observations : (q, 4)
-        Range, bearing, variances; an infinite variance of the bearing says that there is none.
+        Range, bearing, variances; an infinite variance of the bearing means no bearing.
     sensor : (3,)
         ``T_base_sensor``.
     trim : float
-        If positive: one Huber pass, then observations with d² above ``trim`` (2 dof; the same tail where there is one
-        channel) are dropped, then plain least squares.
+        If positive: a robust (Huber) iteration, then observations with d² above ``trim`` (2 dof; same tail probability
+        with one channel) are dropped, then plain least squares.
     min_hits : int
-        A landmark left with fewer observations after the trimming goes, with them.
+        Landmarks with fewer observations after the trimming are removed, with these.
     """
 
     increments: Array
@@ -293,7 +293,7 @@ class SmoothingProblem:
         args = (self.increments, W, self.ob_pose, self.ob_landmark, observations)
         if self.trim > 0.0 and len(observations):
             smooth_kernel(p, l, SmoothingMeasurements(*args, weight, self.sensor), 6, 1e-3)
-            for _ in range(3):  # Huber by reweighting; few passes, it only has to unmask the outliers
+            for _ in range(3):  # Huber by reweighting; few iterations, because it only has to reveal the outliers
                 smoothing_cost(p, l, SmoothingMeasurements(*args, weight, self.sensor), d2, parts)
                 weight = np.minimum(1.0, np.sqrt(_HUBER2 / np.maximum(d2, 1e-12)))
                 smooth_kernel(p, l, SmoothingMeasurements(*args, weight, self.sensor), 3, 1e-3)
@@ -325,7 +325,7 @@ class SmoothingProblem:
         )
 
     def restricted(self, observations: npt.NDArray[np.bool_], landmarks: npt.NDArray[np.bool_]) -> SmoothingProblem:
-        """The same with some observations and landmarks, all of them inliers."""
+        """The problem with a subset of observations and landmarks, without trimming."""
         rank = np.cumsum(landmarks) - 1
         keep = observations & landmarks[self.ob_landmark]
         return replace(

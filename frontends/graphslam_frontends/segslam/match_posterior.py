@@ -1,7 +1,7 @@
 """Acceptance of matches (A9): gates, weights, and a draw that always includes "no match".
 
 A false match is far more harmful than a missed one, and later stages cannot repair it, so the gates are strict. Matches
-that pass are drawn at random: particles represent several topologies, and those with a wrong one lose their weight
+that pass are sampled: particles represent several topologies, and those with a wrong one lose their weight
 later.
 """
 
