@@ -1,1 +1,1 @@
-"""Detectors that turn raw scans into landmark observations."""
+"""Detectors: raw scans in, landmark observations out."""

@@ -12,16 +12,16 @@ that beam is
     r = ρ cos(φ - β) - √(R² - ρ² sin²(φ - β)) ≈ ρ (1 - g),    g = √(α² - (φ - β)²) = √(u v),
 
 so the centre lies at ρ = r / (1 - g). Mean and variance of g follow from those of √u and √v, which are independent;
-for one beam E g = (4/9) δ and Var g = (1/4 - 16/81) δ². The stated covariance is then
+for one beam E g = (4/9) δ and Var g = (1/4 - 16/81) δ². The covariance is then
 
     σ²_range = σ_beam² / (k (1 - g)²) + r² cos²g / (1 - sin g)⁴ · Var g        (k = 1 or 2 middle beams)
     σ²_bearing = δ² / 24                                                       (mean of two uniform edges)
 
 which grows with range, and most for few beams. From :data:`FIT_BEAMS` beams on, (ρ, β, R) is the weighted least-squares
 fit to both edges (σ = δ/√12) and to the ranges of the beams that do not graze the trunk, and the covariance is that of
-the fit; a cluster that is no circle (χ² > 9 a beam) keeps the closed form.
+the fit; for a cluster that is no circle (χ² > 9 per beam) the closed form is used.
 
-Bark, branches, lean and undergrowth are not in this model: it describes the sensor. ``noise="fixed"`` therefore states
+Bark, branches, lean and undergrowth are not in this model: it describes the sensor. ``noise="fixed"`` therefore uses
 σ_range = range_sigma + range_slope · ρ and σ_bearing = bearing_sigma instead, and is the default.
 """
 

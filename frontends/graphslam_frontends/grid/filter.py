@@ -329,7 +329,7 @@ class GridFilter:
         self.update(k)
         return effective, ancestors
 
-    # --- what they are made of -------------------------------------------------------------------------------
+    # --- internals -------------------------------------------------------------------------------------------
 
     def weighed_beams(self, k: int) -> list[tuple[Ints, EndpointLikelihood | CastLikelihood]]:
         """Beams of step k for the weights, with their likelihood; only non-empty sets.

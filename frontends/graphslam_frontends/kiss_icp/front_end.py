@@ -7,9 +7,9 @@ pose of KISS-ICP:
 
 - information by window pose, and noise of the gradient, as in ``lidar-odometry``;
 - the optimum of the cells, started at the pose of KISS-ICP, is a second estimate from the same scan. The difference of
-the two is propagated through the window as one error, and its outer product is added;
+  the two is propagated through the window as one error, and its outer product is added;
 - along unobservable directions the motion may be anything from zero to the predicted one: the whole predicted motion is
-added as σ.
+  added as σ.
 
 The map of the cells uses the poses of KISS-ICP. If both maps drift together (few points, mostly in rings on a level
 floor), the covariance does not include it.

@@ -5,9 +5,9 @@ residuals give two results:
 
 - χ² of all residuals over their degrees of freedom: are wheels and observations consistent with one map?
 - for every systematic error (:data:`PARAMETERS`), the *score* ``g = Bᵀ W r`` and its information
-``S = Bᵀ W B - Bᵀ W A (Aᵀ W A)⁻¹ Aᵀ W B``: B is the Jacobian of the residuals by the error, A that by path and
-landmarks. Without errors ``g ~ N(0, S)``; otherwise ``S⁻¹ g`` estimates the error (one step of Gauss-Newton over path,
-landmarks and calibration), with its σ.
+  ``S = Bᵀ W B - Bᵀ W A (Aᵀ W A)⁻¹ Aᵀ W B``: B is the Jacobian of the residuals by the error, A that by path and
+  landmarks. Without errors ``g ~ N(0, S)``; otherwise ``S⁻¹ g`` estimates the error (one step of Gauss-Newton over
+  path, landmarks and calibration), with its σ.
 
 Windows are independent, so both are sums (:mod:`graphslam.evaluate.bias_test` reads them). Not observable in principle:
 a common scale of ranges and distances, and bearings and rotations mirrored together. They give a map similar to the

@@ -338,7 +338,7 @@ class EkfMap:
         self._aPhi = np.zeros((room, self._n0))
         self._aPhi[: self._n0] = np.eye(self._n0)
 
-    # ---- what it believes
+    # ---- estimates
 
     @property
     def pose(self) -> Array:

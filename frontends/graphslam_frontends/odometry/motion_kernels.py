@@ -16,7 +16,7 @@ def steering_increments_kernel(controls, first, model, wheelbase, encoder_offset
     """Compose the fine steps ``first[k]:first[k + 1]`` into increment k with its covariance.
 
     controls : (3, s) lengths of fine steps, speed and steering, constant during each.
-    noise : (8,) speed, speed fraction, steering, correlated flag, lateral per m, heading per m, floors xy and heading.
+    noise : (12,) speed, speed fraction, steering, correlated flag, lateral and heading per m, 2 floors; 4 not used.
     increments : (n, 3) out; covs : (n, 3, 3) out, right tangent at the end of the increment.
     """
     dt, speed, steering = controls[0], controls[1], controls[2]

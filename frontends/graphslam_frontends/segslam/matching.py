@@ -323,7 +323,7 @@ class Matcher:
         ends = set(segmap.table.end[segmap.alive].tolist())
         self._fields.keep(lambda known: known[1] in ends)
 
-    # --- what is drawn ---------------------------------------------------------------------------------------
+    # --- proposals -------------------------------------------------------------------------------------------
 
     def _proposals(
         self, c: SegmentCandidates, results: dict[int, list[Registration]], ahead: LookAheadScan, seed: SeedTree

@@ -103,7 +103,7 @@ class SegMap:
         """Indices of the viable segments, ascending."""
         return np.flatnonzero(self.table.alive).astype(np.int64)
 
-    # --- life of the current segments ------------------------------------------------------------------------
+    # --- opening and closing of segments ---------------------------------------------------------------------
 
     def open(
         self, step: int, entries: Sequence[SegmentEntry], which: Iterable[int] | None = None
@@ -205,7 +205,7 @@ class SegMap:
             self.entries[p], self.start[p], self.previous[p] = None, step, i
         return out
 
-    # --- what fits together ----------------------------------------------------------------------------------
+    # --- compatible segments ---------------------------------------------------------------------------------
 
     def ending_at(self, step: int) -> Ints:
         """Viable segments that end at a boundary, ascending: possible predecessors of those that begin there."""
@@ -241,7 +241,7 @@ class SegMap:
         m = int(self.table.map[self._alive(index)])
         return cast(EvidenceGrid, self.maps.grids[m]), self.table.T_map[index]
 
-    # --- care ------------------------------------------------------------------------------------------------
+    # --- pruning, locking, merging ---------------------------------------------------------------------------
 
     def prune(self) -> int:
         """Drop the segments that are not viable any more, and free their maps; returns their number.
@@ -297,7 +297,7 @@ class SegMap:
             "matches": int(np.sum(t.alive & (t.kind == MATCH))),
         }
 
-    # --- inside ----------------------------------------------------------------------------------------------
+    # --- internals -------------------------------------------------------------------------------------------
 
     def _append(self, p: int, step: int, e: SegmentEntry, grid: EvidenceGrid, path: Array) -> int:
         interval = (int(self.start[p]), step)

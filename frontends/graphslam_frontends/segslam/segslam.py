@@ -177,7 +177,7 @@ class _Run:
             self.ahead = gather_look_ahead(self.steps, k, self.config.segmentation.window)
         return self.ahead
 
-    # --- when a segment ends ---------------------------------------------------------------------------------
+    # --- end of a segment ------------------------------------------------------------------------------------
 
     def _ending(self, k: int, now: float) -> tuple[npt.NDArray[np.bool_], str]:
         """Which particles' segments end here, and the reason of the first of them (A7, A8)."""
@@ -318,7 +318,7 @@ class _Run:
         last = int(self.closed[best]) if k == len(self.steps) - 1 else int(self.segmap.previous[best])
         return SegSlamProgress(k + 1, len(self.steps), float(self.path_length[k]), self.segmap, last)
 
-    # --- the end ---------------------------------------------------------------------------------------------
+    # --- result ----------------------------------------------------------------------------------------------
 
     def result(self) -> SegSlamResult:
         """Result of the run; all segments are closed."""
