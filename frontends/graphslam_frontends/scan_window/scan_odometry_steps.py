@@ -21,7 +21,7 @@ from graphslam_frontends.scan_window.tracker import TrackedPath, track_steps
 
 @dataclass(frozen=True, slots=True)
 class ScanOdometryErrors:
-    """Covariance of a tracked path over any interval (`PathErrors`), from scan-to-window odometry.
+    """Covariance of a tracked path over any interval (`IntervalCovariance`), from scan-to-window odometry.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ def run_segslam(
 
 
 def near_pose(path: Array, T: Array, radius: float) -> npt.NDArray[np.bool_]:
-    """Which poses of a path ``(n, 7)`` or ``(n, 3)`` are within ``radius`` [m] of a pose, in 3-D."""
+    """Which poses of a path ``(n, 7)`` or ``(n, 3)`` are within ``radius`` [m] of a pose, in 2-D or 3-D."""
     return np.asarray(np.linalg.norm((path - T)[:, : group_of(T).dim], axis=1) <= radius)
 
 

@@ -79,7 +79,7 @@ def drift_by_path(segmap: SegMap, chain: Sequence[int] | Ints, model: FilterDrif
 
 
 def drift_by_errors(errors: _Errors, *, gravity: bool) -> Drift:
-    """The drift covariance that the source of the motion gives for any interval (`PathErrors`)."""
+    """The drift covariance that the source of the motion gives for any interval (`IntervalCovariance`)."""
 
     def drift(start: int, end: int, *, level_end: bool) -> Array:
         return errors.between(start, end, level_start=gravity, level_end=gravity and level_end)[1]
