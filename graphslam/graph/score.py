@@ -22,9 +22,9 @@ class ClassScore:
     factors, rows : int
         Number of factors, and of scalars they measure.
     dof : int
-        ``rows`` less the unknowns that this class alone brings in: poses and landmarks for submaps, the datum for GPS,
-        biases for their priors, the tilt for attitudes, velocities and biases of an IMU for its ways. Summed over the
-        classes it is the dof of the whole.
+        ``rows`` minus the unknowns that this class introduces: poses and landmarks for submaps, the datum for GPS,
+        biases for their priors, the tilt for attitudes, velocities and biases for IMU factors. The sum over the classes
+        is the dof of the graph.
     """
 
     chi2: float
@@ -34,7 +34,7 @@ class ClassScore:
 
     @property
     def chi2_per_dof(self) -> float:
-        """About 1 where the covariances are honest; ``nan`` without redundancy."""
+        """About 1 if the covariances are consistent; ``nan`` without redundancy."""
         return self.chi2 / self.dof if self.dof > 0 else float("nan")
 
 
@@ -60,7 +60,7 @@ class GraphScore:
 
     @property
     def dof(self) -> int:
-        """Rows less states."""
+        """Number of rows minus number of states."""
         return sum(c.dof for c in self.classes.values())
 
     def _repr_html_(self) -> str:

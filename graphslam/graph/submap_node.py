@@ -1,8 +1,8 @@
-"""What a graph keeps of a submap besides its factors: its nodes, and how to get from them to any instant inside.
+"""Nodes of a submap in a graph, and the body poses between them.
 
-A dense submap may have *inner nodes*: frames ``T_base_node`` at poses of its own path, so that a loop can bend it. What
-hangs on the submap at time t (a fix, a match, the full-rate path) then hangs on the nearest of them, by a fixed local
-pose whose covariance is what the path says to have lost between the two.
+A dense submap may have *inner nodes*: frames ``T_base_node`` at poses of its own path, so that a loop can deform it. A
+factor at time t (a fix, a match) and the full-rate path are attached to the nearest node by a fixed local pose; its
+covariance is the one that the path accumulates between the two.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.noise import whitener
 
-# What two marginals of a path leave of the error between them is made positive semi-definite; directions below this
-# share of the path's own variance are rounding.
+# The difference of two marginals of a path is made positive semi-definite; directions below this share of the path's
+# own variance are rounding errors.
 _FLOOR = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathBridge:
-    """Instants of a path between two nodes a and b, given both.
+    """Path instants between two nodes a and b, conditioned on both.
 
-    Inside a stretch the error walks from a to b. If the increment a → b has the covariance S, of which Q had been
-    collected at the instant, the walk that ends with the residual e at b is on the average at ``K e``,
-    ``K = Q Aᵀ S⁻¹`` (A carries an error of the instant on to b), and about that it keeps ``Q - K A Q``.
+    Between the nodes the error is a random walk. If the increment a → b has the covariance S, with Q accumulated up to
+    the instant, and the residual at b is e, the conditional mean of the error at the instant is ``K e``,
+    ``K = Q Aᵀ S⁻¹`` (A transforms an error at the instant to b), and its conditional covariance is ``Q - K A Q``.
 
     Parameters
     ----------
     T_node_body : (q, 3|7)
-        From node a.
+        Relative to node a.
     gain : (q, d, d)
         K.
     left : (q, d, d)
@@ -53,20 +53,20 @@ class PathBridge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerPoints:
-    """Points of the path of a landmark submap, and what a graph makes of them.
+    """Points of the path of a landmark submap, with their factor in the graph.
 
     Parameters
     ----------
     mean, joint : (n,), (n, n)
-        Of exit and landmarks, as the submap states them.
+        Of end pose and landmarks, from the submap.
     scale : float
         Factor on all covariances.
     factor_id : int or None
         Its :class:`~graphslam.graph.factors.landmark_submap.PathRecord`, once a fix is used.
     rows : mapping of int to int
-        Points that are used → rows of the graph's points.
+        Used points → rows of the graph's points.
     lasting : SensorBiases or None
-        What all of it is with constant errors.
+        Dependence of these quantities on constant errors.
     """
 
     path: PathPoints
@@ -78,7 +78,7 @@ class InnerPoints:
     lasting: SensorBiases | None = None
 
     def record(self, submap: SubmapRecord, factor_id: int) -> PathRecord:
-        """Factor of the points that are used, beside the submap's own."""
+        """Factor of the used points, in addition to the submap's own."""
         used = sorted(self.rows)
         gain, left = self.path.given(self.joint, used)
         W = whitener(left, what=f"path of submap {submap.submap_key} at its fixes", scale=self.scale)
@@ -107,24 +107,24 @@ class SubmapNode:
     factor_id : int
         Its factor, or the first of the factors of its chain.
     nodes : (k + 2,) int
-        Base, inner nodes in order of time, exit.
+        Base, inner nodes in order of time, end.
     times : (k + 2,)
-        When the body was there [s].
+        Time of each node [s].
     T_base_node : (k + 2, 3|7)
-        Identity, poses of the path, exit.
+        Identity, poses of the path, end pose.
     covariances : (k + 1, d, d)
-        Of the increments from node to node as they stand in the graph, right tangent at the later one.
+        Of the increments between nodes as in the graph, right tangent at the later node.
     stated : (k + 1, d, d)
-        The same as the submap stated them, before a levelled exit gave up its relative roll and pitch: what a chain of
-        relative poses by itself is worth, for instance in cycles of loops and chain. Of a landmark submap, its exit.
+        The same before relative roll and pitch were removed from a levelled end pose: uncertainty of the chain of
+        relative poses alone, for instance in cycles of loops and chain. For a landmark submap, its end pose.
     inner_points : InnerPoints or None
-        Of a landmark submap that holds points of its path.
+        Of a landmark submap with points of its path.
     lasting : SensorBiases or None
-        What a landmark submap is with constant errors of the robot's wheels and sensor, and
+        Dependence of a landmark submap on constant errors of the robot's wheels and sensor.
     robot : int
-        their row in the graph; -1: it has none.
+        Row of these errors in the graph; -1: none.
     factor_ids : tuple of int
-        The chain from node to node, and what came with it (the attitude of a levelled exit).
+        The chain between the nodes, and factors added with it (the attitude of a levelled end pose).
     """
 
     key: int
@@ -144,39 +144,39 @@ class SubmapNode:
 
     @property
     def exit_node(self) -> int:
-        """Node at its end, where the next submap begins."""
+        """Node at its end, the base of the next submap."""
         return self.nodes[-1]
 
     @property
     def inner(self) -> tuple[int, ...]:
-        """Nodes between base and exit."""
+        """Nodes between base and end."""
         return self.nodes[1:-1]
 
     def before(self, times: Array) -> npt.NDArray[np.intp]:
-        """Index ``(q,)`` into :attr:`nodes` of the last node at or before each of ``times``; never the exit."""
+        """Index ``(q,)`` into :attr:`nodes` of the last node at or before each of ``times``; never the end node."""
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.nodes) - 2)
 
     def nearest(self, times: Array) -> npt.NDArray[np.intp]:
-        """Index ``(q,)`` into :attr:`nodes` of the node nearest in time; never the exit."""
+        """Index ``(q,)`` into :attr:`nodes` of the node nearest in time; never the end node."""
         t = np.asarray(times, dtype=np.float64)
         i = self.before(t)
         j = np.minimum(i + 1, len(self.nodes) - 2)
         return np.asarray(np.where(np.abs(self.times[j] - t) < np.abs(t - self.times[i]), j, i))
 
     def local(self, times: Array, at: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
-        """Poses of the body seen from nodes, and their covariances.
+        """Poses of the body relative to nodes, and their covariances.
 
         Parameters
         ----------
         times : (q,)
         at : (q,) int
-            Index into :attr:`nodes`, not the exit.
+            Index into :attr:`nodes`, not the end node.
 
         Returns
         -------
         T_node_body : (q, 3|7)
         covariance : (q, d, d) or None
-            Right tangent at the body; None where the path has none.
+            Right tangent at the body; None if the path has none.
         """
         assert self.trajectory is not None
         path = self.trajectory
@@ -184,25 +184,25 @@ class SubmapNode:
         return self._seen(np.asarray(times, dtype=np.float64), path.interpolate(times), P, at)
 
     def local_rows(self, rows: npt.NDArray[Any], at: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
-        """The same at the path's own instants ``rows`` (mask or integers)."""
+        """The same at the path's own times, ``rows`` (mask or integers)."""
         assert self.trajectory is not None
         path = self.trajectory
         P = None if path.covariances is None else path.covariances[rows]
         return self._seen(path.times[rows], path.poses[rows], P, at)
 
     def between(self, rows: npt.NDArray[Any], at: npt.NDArray[np.intp]) -> PathBridge:
-        """The path's own instants ``rows`` between the nodes ``at`` and the next ones: what each of the two says."""
+        """Path rows between the nodes ``at`` and the next ones, conditioned on both nodes."""
         T, Q = self.local_rows(rows, at)
         if self.trajectory is None or Q is None:
             raise DataError(f"path of submap {self.key} has no covariances", wanted="covariances")
         group = group_of(T)
         ahead = group.between(self.trajectory.poses[rows], self.T_base_node[at + 1])
-        A = group.adjoint(group.inverse(ahead))  # an error of the body, carried on to the next node
+        A = group.adjoint(group.inverse(ahead))  # transforms an error of the body to the next node
         L = np.linalg.cholesky(self.covariances)[at]
         B = np.linalg.solve(L, A)
         M = B @ Q @ np.swapaxes(B, 1, 2)
         w, V = np.linalg.eigh(0.5 * (M + np.swapaxes(M, 1, 2)))
-        w = np.clip(w, 0.0, 1.0)[:, None, :]  # marginals may claim more than the whole increment has
+        w = np.clip(w, 0.0, 1.0)[:, None, :]  # a marginal covariance may exceed that of the whole increment
         Vt = np.swapaxes(V, 1, 2)
         back = np.linalg.solve(B, np.broadcast_to(np.eye(group.dof), B.shape))
         gain = back @ ((V * w) @ Vt) @ np.linalg.inv(L)
@@ -221,7 +221,7 @@ class SubmapNode:
             P_node = path.interpolate_covariance(self.times[at[inner]])
             after = t[inner] >= self.times[at[inner]]
             ahead = added_covariance(group, P_node, P[inner], out[inner])
-            # a body before the node: the error from it to the node, seen from the other side
+            # a body before the node: the error between them, transformed to the body
             back = group.inverse(out[inner])
             ad = group.adjoint(out[inner])
             behind = ad @ added_covariance(group, P[inner], P_node, back) @ np.swapaxes(ad, 1, 2)
@@ -232,8 +232,8 @@ class SubmapNode:
 def added_covariance(group: Group, P_a: Array, P_b: Array, T_ab: Array) -> Array:
     """Covariance ``(q, d, d)`` that a path adds from a to b: ``P_b - Ad(T_ab⁻¹) P_a Ad(T_ab⁻¹)ᵀ``.
 
-    Made positive semi-definite (in units of the spread at b): a path told by its marginals may seem to know more later
-    than before, as a levelled one does of its roll and pitch.
+    Made positive semi-definite (in units of the spread at b): marginal covariances of a path may decrease with time,
+    for example roll and pitch of a levelled path.
 
     Parameters
     ----------

@@ -1,19 +1,19 @@
-"""Kinds of variables of a graph, in one table: what they are called, how wide they are, how they move.
+"""Kinds of variables of a graph in one table: names, degrees of freedom, and how they are updated.
 
-A kind is a row of :data:`KINDS`. Values, columns, GTSAM's keys, thresholds of relinearisation, the counting of degrees
-of freedom and the words of a diagnosis are all made from that table, so that a new kind of variable is one row.
+A kind is a row of :data:`KINDS`. Values, columns, GTSAM's keys, relinearisation thresholds, degrees of freedom and the
+texts of a diagnosis are all made from that table, so that a new kind of variable is one row.
 
-Variables are named by short strings that also stand in messages: ``x3`` (pose of node 3), ``l17`` (landmark 17),
-``point3`` (where the antenna was at a fix inside a landmark submap), ``datum`` (``T_gps_world``), ``bias2`` (position
-bias of GPS segment 2), ``tilt`` (where up is in the frame of the first base, in space only), ``velocity4`` and
-``imubias4`` (of an IMU, in the order in which its nodes were tied), ``compass0`` (zero and deviation of a compass),
+Variables have short names, which messages use too: ``x3`` (pose of node 3), ``l17`` (landmark 17),
+``point3`` (antenna position at a fix inside a landmark submap), ``datum`` (``T_gps_world``), ``bias2`` (position
+bias of GPS segment 2), ``tilt`` (up direction in the frame of the first base, 3-D only), ``velocity4`` and
+``imubias4`` (of an IMU, in the order in which its nodes were added), ``compass0`` (zero and deviation of a compass),
 ``beacon7`` (position of beacon 7), ``wheels0``, ``sensor0`` and ``mount0`` (constant errors of a robot).
-The first base ``x0`` is fixed at the origin and is no variable at all: no prior has
-to hold it, and nothing is lost to a badly scaled one.
+The first base ``x0`` is fixed at the origin and is not a variable, so it needs no prior, and a badly scaled prior
+cannot cause errors.
 
-Poses are SE(2) ``(3,)`` or SE(3) ``(7,)`` and move by right tangents in GTSAM's order: x, y, θ in the plane, rotation
-before translation in space. The datum is SE(2) in the plane. In space it is ``[x, y, z, heading]``: the GPS frame and
-the frame of the first base are both level, so four numbers lie between them, and they move by plain addition.
+Poses are SE(2) ``(3,)`` or SE(3) ``(7,)`` and updated in right tangents in GTSAM's order: x, y, θ in 2-D, rotation
+before translation in 3-D. The datum is SE(2) in 2-D. In 3-D it is ``[x, y, z, heading]``: the GPS frame and the level
+frame of the first base differ by four numbers, which are updated by addition.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ class VariableKind:
     Parameters
     ----------
     word : str
-        What its names begin with; behind it comes the number of the variable.
+        Prefix of its names, followed by the number of the variable.
     letter : str
         Of its GTSAM symbols.
     units : mapping of int to str
         By dimension of the graph, one letter for each degree of freedom: ``m`` a length or a speed [m, m/s], ``r`` an
-        angle or a rate [rad, rad/s]. A dimension that is missing has no such variables.
+        angle or a rate [rad, rad/s]. A missing dimension has no such variables.
     group : bool
-        A pose: it moves by right tangents. Everything else moves by plain addition.
+        A pose, updated in right tangents. All others are updated by addition.
     single : bool
         There is at most one, and its name has no number.
     classes : tuple of str
-        Classes of factors that bring such variables in; the first that a graph has pays their degrees of freedom.
+        Factor classes that introduce such variables; the first one in a graph gets their degrees of freedom.
     remedy : str
-        What to do about one that nothing constrains.
+        Advice if nothing constrains such a variable.
     """
 
     word: str
@@ -65,15 +65,15 @@ class VariableKind:
     remedy: str = ""
 
     def dof(self, dim: int) -> int:
-        """Degrees of freedom, and columns, in a graph of so many dimensions; 0 where there are none."""
+        """Degrees of freedom, and columns, in a graph of that dimension; 0 if it has no such variables."""
         return len(self.units.get(dim, ""))
 
     def size(self, dim: int) -> int:
-        """Numbers of a value."""
+        """Number of values of a variable."""
         return 7 if self.group and self.dof(dim) == 6 else self.dof(dim)
 
     def pose_group(self, dim: int) -> Group | None:
-        """SE(2) or SE(3) of a pose; None for what moves by addition."""
+        """SE(2) or SE(3) for a pose; None for variables updated by addition."""
         return {3: SE2, 6: SE3}.get(self.dof(dim)) if self.group else None
 
 
@@ -82,7 +82,7 @@ KINDS: dict[str, VariableKind] = {}
 
 
 def register_variable(kind: VariableKind) -> VariableKind:
-    """Enter a kind of variable into the table."""
+    """Add a kind of variable to the table."""
     if kind.word in KINDS or any(kind.letter == k.letter for k in KINDS.values()):
         raise ValueError(f"a kind of variable called {kind.word!r} or with the letter {kind.letter!r} is there already")
     KINDS[kind.word] = kind
@@ -97,7 +97,7 @@ for _kind in (
         remedy="a point of a submap's path has no submap: remove the GPS fixes of this point.",
     ),
     # Constant errors of a robot (graphslam.core.sensor_biases): turn and log distance of its wheels; ranges and
-    # bearings of # its sensor, and where that stands.
+    # bearings of its sensor, and the sensor's position.
     VariableKind(
         "wheels", "w", {2: "rr"}, classes=("lasting",),
         remedy="constant errors of the wheels need a prior.",
@@ -110,7 +110,7 @@ for _kind in (
         "mount", "m", {2: "mm"}, classes=("lasting",),
         remedy="the sensor position needs a prior.",
     ),
-    # In space the datum's heading stands last and it moves by addition.
+    # In 3-D the datum's heading is last, and it is updated by addition.
     VariableKind("datum", "g", {2: "mmr", 3: "mmmr"}, group=True, single=True, classes=("gps", "control")),
     VariableKind(
         "bias", "b", {2: "mm", 3: "mmm"}, classes=("gps-bias",),
@@ -165,7 +165,7 @@ def key_name(key: int) -> str:
 
 
 class _Rows:
-    """Rows of one kind, which grow at a constant cost each: the array behind them has room to spare."""
+    """Rows of one kind in a buffer with spare capacity; appending has a constant amortised cost per row."""
 
     __slots__ = ("_buffer", "count")
 
@@ -196,14 +196,14 @@ class Values:
     dim : int
         2 or 3.
     blocks : mapping of str to (n, size)
-        By word of the kind; what is left out has no rows. ``x`` holds row 0 too, the fixed first base.
+        By word of the kind; missing kinds have no rows. ``x`` includes row 0, the fixed first base.
     landmark_ids : (n,) int64, optional
         Of the rows of ``l``.
 
     Notes
     -----
     :attr:`poses`, :attr:`landmarks`, :attr:`datum`, :attr:`biases`, :attr:`tilt`, :attr:`velocities` and
-    :attr:`imu_biases` are the blocks under the names by which factors know them.
+    :attr:`imu_biases` are the blocks under the names that factors use.
     """
 
     __slots__ = ("_ids", "_rows", "dim")
@@ -215,7 +215,7 @@ class Values:
 
     @classmethod
     def empty(cls, dim: int) -> Values:
-        """The first base at the origin and nothing else."""
+        """Only the first base, at the origin."""
         return cls(dim, {"x": np.zeros((1, 3)) if dim == 2 else np.array([[0.0, 0, 0, 0, 0, 0, 1]])})
 
     # ---------------------------------------------------------------- blocks
@@ -229,7 +229,7 @@ class Values:
         self._rows[word] = _Rows(np.asarray(rows, dtype=np.float64))
 
     def append(self, word: str, rows: Array) -> int:
-        """Rows behind those of a kind, at a constant cost each; returns the number of the first."""
+        """Append rows of a kind, at a constant cost per row; returns the number of the first."""
         rows = np.asarray(rows, dtype=np.float64).reshape(-1, KINDS[word].size(self.dim))
         if word not in self._rows:
             self._rows[word] = _Rows(rows.copy())
@@ -239,7 +239,7 @@ class Values:
         return first
 
     def count(self, word: str) -> int:
-        """How many variables of a kind there are (of poses with the fixed first one)."""
+        """Number of variables of a kind (for poses with the fixed first one)."""
         rows = self._rows.get(word)
         return 0 if rows is None else rows.count
 
@@ -258,19 +258,19 @@ class Values:
         self.append("l", positions)
 
     poses = property(lambda self: self["x"], lambda self, a: self.__setitem__("x", a))
-    """``(m + 1, 3|7)`` ``T_world_node``: bases, inner nodes, the last exit; row 0 is the fixed first base."""
+    """``(m + 1, 3|7)`` ``T_world_node``: bases, inner nodes, the last end; row 0 is the fixed first base."""
     landmarks = property(lambda self: self["l"], lambda self, a: self.__setitem__("l", a))
     """``(n, dim)`` world positions [m]."""
     biases = property(lambda self: self["bias"], lambda self, a: self.__setitem__("bias", a))
     """``(s, dim)`` GPS biases of the segments in the GPS frame [m]."""
     velocities = property(lambda self: self["velocity"], lambda self, a: self.__setitem__("velocity", a))
-    """``(v, dim)`` of an IMU in the frame of the first base [m/s]; which nodes they are of, the factors say."""
+    """``(v, dim)`` of an IMU in the frame of the first base [m/s]; the factors have their nodes."""
     imu_biases = property(lambda self: self["imubias"], lambda self, a: self.__setitem__("imubias", a))
-    """``(b, 6)`` of its gyro [rad/s] and its accelerometer [m/s²]; ``(b, 3)`` in the plane: yaw rate, x and y."""
+    """``(b, 6)`` of its gyro [rad/s] and its accelerometer [m/s²]; ``(b, 3)`` in 2-D: yaw rate, x and y."""
     datum = property(lambda self: self._one("datum"), lambda self, a: self._set_one("datum", a))
-    """``(3,)``, ``(4,)`` or None: ``T_gps_world``, positions counted from the first fix."""
+    """``(3,)``, ``(4,)`` or None: ``T_gps_world``, with positions relative to the first fix."""
     tilt = property(lambda self: self._one("tilt"), lambda self, a: self._set_one("tilt", a))
-    """``(2,)`` or None: rotation vector about x and y [rad] from the z axis of the first base to where up is."""
+    """``(2,)`` or None: rotation vector about x and y [rad] from the z axis of the first base to the up direction."""
 
     def _one(self, word: str) -> Array | None:
         return self[word][0] if self.count(word) else None
@@ -297,34 +297,34 @@ class Values:
         return VariableLayout(self.dim, tuple(self.count(w) for w in KINDS), self.landmark_ids)
 
     def retract(self, step: Array) -> Values:
-        """See :meth:`VariableLayout.retract`, with the first pose alone held."""
+        """See :meth:`VariableLayout.retract`, with only the first pose fixed."""
         return self.layout().retract(self, step)
 
     def distance(self, other: Values) -> float:
-        """Greatest difference of any number."""
+        """Largest absolute difference of any value."""
         return max((float(np.abs(self[w] - other[w]).max(initial=0.0)) for w in KINDS), default=0.0)
 
     def is_finite(self) -> bool:
-        """Every number finite."""
+        """Is every value finite?"""
         return all(bool(np.all(np.isfinite(r.array))) for r in self._rows.values())
 
 
 class VariableLayout:
-    """Columns of the free scalars: kinds in the order of :data:`KINDS`, rows in their order, unless told otherwise.
+    """Columns of the free scalars: kinds in the order of :data:`KINDS`, rows in their order, unless ``order`` is given.
 
     Parameters
     ----------
     dim : int
         2 or 3.
     counts : tuple of int
-        Rows of every kind, held poses included.
+        Rows of every kind, fixed poses included.
     landmark_ids : (n,) int64
         In row order.
     fixed : tuple of int
-        Rows of ``x`` that are held: they have no columns. In a graph of submaps that is ``x0``.
+        Rows of ``x`` that are fixed: they have no columns. In a graph of submaps that is ``x0``.
     order : (v,) int, optional
-        Variables, counted through all kinds, in the order of their columns: an order of elimination, say. Held ones
-        are left out.
+        Variables, numbered through all kinds, in the order of their columns, for example an elimination order. Fixed
+        ones are omitted.
     """
 
     def __init__(
@@ -350,7 +350,7 @@ class VariableLayout:
 
     @cached_property
     def _first(self) -> dict[str, Index]:
-        """By kind, the first column of every row; -1 of a held one."""
+        """By kind, the first column of every row; -1 for a fixed one."""
         width = np.repeat([k.dof(self.dim) for k in KINDS.values()], self.counts)
         free = np.ones(len(width), dtype=bool)
         free[list(self.fixed[: len(width)])] = False  # poses come first
@@ -360,7 +360,7 @@ class VariableLayout:
         return dict(zip(KINDS, np.split(first, np.cumsum(self.counts)[:-1])))
 
     def retract(self, values: Values, step: Array) -> Values:
-        """Values after a step ``(size,)``: poses (and the datum of the plane) ``T ∘ Exp(ξ)``, all else plus."""
+        """Values after a step ``(size,)``: poses (and the 2-D datum) ``T ∘ Exp(ξ)``, all others by addition."""
         new = {}
         for word, kind in KINDS.items():
             rows = values[word]
@@ -384,37 +384,37 @@ class VariableLayout:
     __hash__ = None  # type: ignore[assignment]
 
     def count(self, word: str) -> int:
-        """Rows of a kind."""
+        """Number of rows of a kind."""
         return self.counts[list(KINDS).index(word)]
 
     def start(self, word: str) -> int:
-        """First column of a kind (or of what follows it)."""
+        """First column of a kind (of the next kind if it has no rows)."""
         return self._start[word]
 
     def stop(self, word: str) -> int:
-        """Column behind the last one of a kind."""
+        """Column after the last one of a kind."""
         rows = self.count(word) - (len(self.fixed) if word == "x" else 0)
         return self._start[word] + KINDS[word].dof(self.dim) * max(rows, 0)
 
     def first(self, word: str, rows: npt.ArrayLike) -> Index:
-        """First column of rows ``(k,)`` of a kind; -1 of held poses, -2 for negative rows (a variable left out)."""
+        """First column of rows ``(k,)`` of a kind; -1 for fixed poses, -2 for negative rows (an absent variable)."""
         r = np.asarray(rows, dtype=np.int64)
         have = self._first[word]
         return np.where(r < 0, -2, have[np.maximum(r, 0)] if len(have) else -2)
 
     def at(self, word: str, rows: npt.ArrayLike) -> Index:
-        """Columns ``(k, dof)`` of rows ``(k,)`` of a kind; -1 for negative rows and for held poses."""
+        """Columns ``(k, dof)`` of rows ``(k,)`` of a kind; -1 for negative rows and for fixed poses."""
         first = self.first(word, rows)[..., None]
         return np.where(first < 0, -1, first + np.arange(KINDS[word].dof(self.dim)))
 
     @property
     def ordered(self) -> bool:
-        """Whether the columns are in an order of elimination."""
+        """Are the columns in a given order?"""
         return self._order is not None
 
     @property
     def nodes(self) -> int:
-        """Nodes with the fixed first base."""
+        """Number of nodes with the fixed first base."""
         return self.count("x")
 
     @property
@@ -443,7 +443,7 @@ class VariableLayout:
         return [out[k] for k in order[first[order] >= 0].tolist()]
 
     def owner_of_columns(self) -> list[str]:
-        """Name of the variable that each column belongs to."""
+        """Name of the variable of each column."""
         return [name for name in self.names() for _ in range(split_name(name)[0].dof(self.dim))]
 
     def columns(self, name: str) -> npt.NDArray[np.intp]:
@@ -456,7 +456,7 @@ class VariableLayout:
         return c[c >= 0].astype(np.intp)
 
     def pose_columns(self, nodes: npt.ArrayLike) -> Index:
-        """Columns ``(k, dof)`` of nodes ``(k,)``; -1 for held ones."""
+        """Columns ``(k, dof)`` of nodes ``(k,)``; -1 for fixed ones."""
         return self.at("x", nodes)
 
     def columns_of(self, names: Iterable[str]) -> npt.NDArray[np.intp]:
@@ -482,7 +482,7 @@ def vector_form(cov: Array, poses: Array, pose_columns: Sequence[int]) -> Array:
 
 
 def thresholds(dim: int, metres: float, radians: float) -> dict[str, Any]:
-    """By letter, how far each degree of freedom may move before it is linearised again ``(dof,)``."""
+    """By letter, the change of each degree of freedom above which it is relinearised ``(dof,)``."""
     return {
         k.letter: np.array([metres if u == "m" else radians for u in k.units[dim]])
         for k in KINDS.values()

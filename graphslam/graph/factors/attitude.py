@@ -1,12 +1,12 @@
-"""Gravity seen from a node: two degrees of freedom, roll and pitch, that do not drift.
+"""Gravity direction in the frame of a node: constrains roll and pitch, without drift.
 
-The frame of the first base was levelled by the same gravity as every other one, with an error of its own, so its z axis
-is not exactly up. The *tilt* τ ``(2,)`` says where up is in that frame, ``u(τ) = Exp([τ_x, τ_y, 0]) e_z``, and is a
-variable: held by what the first base itself saw of gravity (a factor on x_0) and by all others. Without it the error
-of one levelling would turn the whole map, unnoticed by its covariances.
+The frame of the first base was levelled like every other one, with its own error, so its z axis is not exactly up. The
+variable *tilt* τ ``(2,)`` is the up direction in that frame, ``u(τ) = Exp([τ_x, τ_y, 0]) e_z``. It is constrained by
+the gravity measured at the first base (a factor on x_0) and by all others. Without it, the error of one levelling would
+rotate the whole map without any effect on its covariances.
 
-The residual of a node is the part of the predicted direction ``h = -R_kᵀ u(τ)`` that lies across the measured one,
-``r = Bᵀ h`` with ``B`` ``(3, 2)`` across ``direction``: the sine of the angle between the two, within a quarter turn.
+The residual of a node is the part of the predicted direction ``h = -R_kᵀ u(τ)`` that is perpendicular to the measured
+one, ``r = Bᵀ h`` with ``B`` ``(3, 2)`` perpendicular to ``direction``: the sine of the angle between them, up to 90°.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ DOWN = np.array([0.0, 0.0, -1.0])
 """Direction of gravity in a level frame."""
 
 LEVELLED = "levelled"
-"""Ledger kind and class of the attitudes of levelled bases."""
+"""Ledger kind and class of the attitude factors of levelled bases."""
 
 GIVEN_UP = 1.0
-"""Standard deviation [rad] of relative roll and pitch where a submap gave them up for absolute ones."""
+"""σ of relative roll and pitch after they were replaced by absolute ones [rad]."""
 
 
 def without_tilt(covariance: Array) -> Array:
-    """An exit's covariance ``(6, 6)`` that knows nothing of roll and pitch any more.
+    """An end-pose covariance ``(6, 6)`` without information on roll and pitch.
 
-    Adding a large variance to two components leaves the marginal of the others as it was: only what the exit said of
-    relative roll and pitch is gone.
+    A large variance added to two components does not change the marginal of the others: only the information on
+    relative roll and pitch is removed.
     """
     out = covariance.copy()
     out[[0, 1], [0, 1]] += GIVEN_UP**2
@@ -47,7 +47,7 @@ def without_tilt(covariance: Array) -> Array:
 
 
 def tangent_basis(direction: ArrayLike) -> Array:
-    """Two orthonormal columns ``(..., 3, 2)`` across unit vectors ``(..., 3)``; for :data:`DOWN` the axes x and y."""
+    """Two orthonormal columns ``(..., 3, 2)`` perpendicular to unit vectors ``(..., 3)``; for :data:`DOWN` x and y."""
     d = np.asarray(direction, dtype=np.float64)
     axis = np.where(np.abs(d[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     first = axis - np.sum(axis * d, axis=-1, keepdims=True) * d
@@ -83,14 +83,14 @@ def attitude_terms(poses: Array, tilt: Array, direction: Array) -> tuple[Array, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeRecord:
-    """Where gravity points, seen from a node; see :mod:`graphslam.graph.factors.attitude` for the residual.
+    """Direction of gravity at a node; see :mod:`graphslam.graph.factors.attitude` for the residual.
 
     Parameters
     ----------
     direction : (3,)
         Unit vector of gravity (down) in the node's frame.
     whitener : (2, 2)
-        Of the two components across ``direction`` [1/rad].
+        Of the two components perpendicular to ``direction`` [1/rad].
     """
 
     factor_id: int
@@ -136,7 +136,7 @@ class AttitudeBatch(UniformBatch):
 
     @classmethod
     def gtsam(cls, record: AttitudeRecord, origin: Array) -> gtsam.NonlinearFactor:
-        """``W Bᵀ (-Rᵀ u(τ))`` in small matrices: the terms of the batch would cost ten times as much on one row."""
+        """``W Bᵀ (-Rᵀ u(τ))`` in small matrices: the terms of the batch would take ten times as long for one row."""
         names = record.variables()
         pose, tilt = node_rotation_position(names[0], origin), gtsam_key("tilt")
         free = [n for n in names if n != "x0"]

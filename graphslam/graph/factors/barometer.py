@@ -1,8 +1,8 @@
 """Heights of nodes by air pressure: ``r = u(τ) · (p + R a) + h_0 - z``.
 
-p and R are position and attitude of the node, a is the body seen from it, u the vertical in the frame of the first base
-(:mod:`graphslam.graph.factors.attitude`; its z axis where the graph has no tilt), and h_0 the height of the first base
-over the level of the barometer, a variable.
+p and R are position and attitude of the node, a is the position of the body in its frame, u the vertical in the frame
+of the first base (:mod:`graphslam.graph.factors.attitude`; its z axis if the graph has no tilt), and the variable h_0
+is the height of the first base above the reference level of the barometer.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class BarometerRecord:
     Parameters
     ----------
     arm : (3,)
-        The body seen from the node [m].
+        Position of the body in the frame of the node [m].
     height, sigma : float
         [m]
     baselevel : int
@@ -84,7 +84,7 @@ class BarometerBatch(UniformBatch):
 
     @staticmethod
     def whitener(record: BarometerRecord) -> Array:
-        """Of σ."""
+        """``1/σ``."""
         return np.array([[1.0 / record.sigma]])
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:

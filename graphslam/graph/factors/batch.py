@@ -1,10 +1,10 @@
-"""Factors of one kind, all at once: columns, whitened residuals and Jacobians, Gauss–Newton blocks, GTSAM's factors.
+"""Vectorised factors of one kind: columns, whitened residuals and Jacobians, Gauss–Newton blocks, GTSAM's factors.
 
-A kind of factor is one file of this package: a *record* (the facts of one factor, with the names of its variables) and
-a *batch* (a vectorised residual and Jacobian of all factors of the kind). Registering the batch
-(:func:`register_factor`) is all that is needed: batch solving, covariances, diagnosis, scores and the incremental
-solver find it by the type of the record. GTSAM gets a factor of its own where it has one (:meth:`FactorBatch.gtsam`),
-else a custom factor that calls the batch on one row. A record of a kind that nobody registered is refused at once.
+A kind of factor is one file of this package: a *record* (the data of one factor, with the names of its variables) and
+a *batch* (a vectorised residual and Jacobian of all factors of the kind). Only the batch must be registered
+(:func:`register_factor`): batch solving, covariances, diagnosis, scores and the incremental solver find it by the type
+of the record. GTSAM gets a native factor if the kind has one (:meth:`FactorBatch.gtsam`), otherwise a custom factor
+that calls the batch on one row. A record of an unregistered kind is refused at once.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ Index = npt.NDArray[np.int64]
 
 
 class FactorRecord(Protocol):
-    """The facts of one factor: plain arrays, enough to make it again.
+    """The data of one factor: plain arrays, from which it can be made again.
 
-    Solvers never keep the only copy of anything: GTSAM's incremental solver is lost after a failed update, so whatever
-    it held is made again from the records.
+    A solver never has the only copy of anything: GTSAM's incremental solver is unusable after a failed update, and is
+    then rebuilt from the records.
     """
 
     @property
     def factor_id(self) -> int:
-        """Number of the factor in its graph."""
+        """Id of the factor in its graph."""
         ...
 
     @property
     def group(self) -> str:
-        """Class of factors under which χ² is reported."""
+        """Factor class of the reported χ²."""
         ...
 
     @property
@@ -65,7 +65,7 @@ def block_offsets(lengths: Sequence[int] | Index) -> Index:
 
 
 class LazyRecords(Sequence[Any]):
-    """Records of factors that stand in arrays, each made when somebody asks for it."""
+    """Records of factors that are stored in arrays; each is made on request."""
 
     def __init__(self, count: int, make: Callable[[int], Any]) -> None:
         self._count, self._make = count, make
@@ -92,18 +92,18 @@ class FactorBatch(ABC):
     Attributes
     ----------
     arity : (k,) int
-        Variables of each factor, held ones and ones left out included.
+        Number of variables of each factor, with fixed and absent ones.
     first, width : (Σ arity,) int
-        First column of each of these in the layout (-1: held, -2: left out), and its degrees of freedom.
+        First column of each of these in the layout (-1: fixed, -2: absent), and its degrees of freedom.
     code, k : (k,)
         Robust kernel of each (:func:`~graphslam.graph.noise.robust_terms`).
     """
 
     record: ClassVar[type]
     prior: ClassVar[bool] = False
-    """A factor of this kind ties its variables to known values although no other factor meets them."""
+    """A factor of this kind constrains its variables alone, without any other factor."""
     group: str | None = None
-    """Class of all of them, where they were made from arrays."""
+    """Class of all factors, if they were made from arrays."""
     arity: Index
     first: Index
     width: Index
@@ -120,7 +120,7 @@ class FactorBatch(ABC):
 
     @property
     def columns(self) -> Index:
-        """Columns of the scalars of all variables, factor by factor; -1 where there is none."""
+        """Columns of the scalars of all variables, factor by factor; -1 if there is none."""
         within = np.arange(self.width.sum()) - np.repeat(np.cumsum(self.width) - self.width, self.width)
         first = np.repeat(self.first, self.width)
         return np.where(first < 0, -1, first + within)
@@ -131,7 +131,7 @@ class FactorBatch(ABC):
         return np.array([r.rows for r in self.records], dtype=np.int64)
 
     def classes(self) -> Iterator[tuple[str, Index]]:
-        """Classes of factors in here, with the numbers of their factors."""
+        """Factor classes in this batch, with the indices of their factors."""
         if self.group is not None:
             yield self.group, np.arange(len(self))
             return
@@ -143,18 +143,18 @@ class FactorBatch(ABC):
 
     @abstractmethod
     def squared(self, values: Values) -> Array:
-        """``rᵀ Λ r`` ``(k,)``, kernels left aside."""
+        """``rᵀ Λ r`` ``(k,)``, without robust kernels."""
 
     @abstractmethod
     def blocks(self, values: Values, hessian: bool, H: Array, H_offset: Index, g: Array, g_offset: Index) -> Array:
-        """Fill this batch's part of the flat blocks; return its losses ``(k,)`` (``2 ρ`` where a kernel acts).
+        """Fill this batch's part of the flat blocks; return its losses ``(k,)`` (``2 ρ`` with a robust kernel).
 
         Parameters
         ----------
         H : flat
-            Row-major ``w Jᵀ Λ J`` of the factors, one after the other; ``H_offset`` ``(k + 1,)`` says where.
+            Row-major ``w Jᵀ Λ J`` of the factors, one after the other, at the offsets ``H_offset`` ``(k + 1,)``.
         g : flat
-            ``w Jᵀ Λ r``; ``g_offset`` ``(k + 1,)``.
+            ``w Jᵀ Λ r``, at the offsets ``g_offset`` ``(k + 1,)``.
         """
 
     @classmethod
@@ -164,13 +164,13 @@ class FactorBatch(ABC):
 
 
 class UniformBatch(FactorBatch):
-    """Factors that all have the same kinds of variables: :meth:`terms` is all that a kind has to say.
+    """Factors that all have the same kinds of variables; a subclass mainly implements :meth:`terms`.
 
     Attributes
     ----------
     slots : tuple of str
-        Words of the kinds of its variables (:data:`~graphslam.graph.variables.KINDS`), in the order of the columns. A
-        record that lacks one has None in its place in :meth:`keys`.
+        Words of the kinds of its variables (:data:`~graphslam.graph.variables.KINDS`), in the order of the columns. If
+        a record lacks one, :meth:`keys` has None at its place.
     """
 
     slots: ClassVar[tuple[str, ...]]
@@ -189,7 +189,7 @@ class UniformBatch(FactorBatch):
     def _bare(
         cls, rows: Index, whiteners: Array, layout: VariableLayout, group: str, record: Callable[[int], Any]
     ) -> Self:
-        """A batch from arrays, to which the kind adds its measurements; ``record`` makes a record for messages."""
+        """A batch from arrays, without measurements; ``record`` makes a record for messages."""
         out = cls.__new__(cls)
         out.records, out.layout, out.group = LazyRecords(len(rows), record), layout, group
         out.code, out.k = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), NO_KERNEL.k)
@@ -198,7 +198,7 @@ class UniformBatch(FactorBatch):
         return out
 
     def _fill(self, layout: VariableLayout, rows: Index, whiteners: Array) -> None:
-        """Columns and noise of factors whose variables stand in ``rows`` ``(k, slots)``."""
+        """Set columns and noise of factors with the variables in ``rows`` ``(k, slots)``."""
         self.dim, self._rows, self.whiteners = layout.dim, rows, whiteners
         widths = [KINDS[word].dof(layout.dim) for word in self.slots]
         self.arity = np.full(len(rows), len(widths), dtype=np.int64)
@@ -213,7 +213,7 @@ class UniformBatch(FactorBatch):
     @staticmethod
     @abstractmethod
     def keys(record: Any) -> Sequence[int | None]:
-        """Numbers of its variables, slot by slot; of landmarks their ids."""
+        """Numbers of its variables, slot by slot; for landmarks their ids."""
 
     @staticmethod
     def whitener(record: Any) -> Array:
@@ -227,7 +227,7 @@ class UniformBatch(FactorBatch):
         Parameters
         ----------
         blocks : (k, size) each
-            Values of the variables, slot by slot; zeros where a record lacks one.
+            Values of the variables, slot by slot; zeros if a record lacks one.
         """
 
     def gather(self, values: Values) -> list[Array]:
@@ -241,7 +241,7 @@ class UniformBatch(FactorBatch):
         return out
 
     def residuals(self, *blocks: Array) -> Array:
-        """The residuals ``(k, d)`` of :meth:`terms` alone; a kind may have a shorter way to them."""
+        """Only the residuals ``(k, d)`` of :meth:`terms`; subclasses may have a faster version."""
         return self.terms(*blocks)[0]
 
     def whitened(self, values: Values) -> tuple[Array, Array]:
@@ -272,7 +272,7 @@ class UniformBatch(FactorBatch):
 
     @classmethod
     def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
-        """A custom factor that calls :meth:`terms` on one row: slow, and right for every kind."""
+        """A custom factor that calls :meth:`terms` on one row: slow, but valid for every kind."""
         return custom_factor(cls, record, origin)
 
 
@@ -282,7 +282,7 @@ _BATCHES: dict[type, type[FactorBatch]] = {}
 
 
 def register_factor(batch: type[FactorBatch]) -> type[FactorBatch]:
-    """Enter a kind of factor, by the type of its record."""
+    """Register a kind of factor, by the type of its record."""
     if batch.record in _BATCHES:
         raise ConfigError(f"factors of {batch.record.__name__} are registered twice")
     _BATCHES[batch.record] = batch
@@ -303,7 +303,7 @@ def factor_kinds() -> list[type[FactorBatch]]:
 
 
 def gtsam_factor(record: Any, origin: Array) -> gtsam.NonlinearFactor:
-    """The GTSAM factor of a record; one on the fixed first base, at ``origin`` ``(3|7,)``, loses that key."""
+    """The GTSAM factor of a record; one on the fixed first base, at ``origin`` ``(3|7,)``, has no key for it."""
     return batch_of(type(record)).gtsam(record, origin)
 
 
@@ -311,7 +311,7 @@ def gtsam_factor(record: Any, origin: Array) -> gtsam.NonlinearFactor:
 
 
 def gtsam_pose(pose: Array) -> Any:
-    """``Pose2`` of ``(3,)``, ``Pose3`` of ``(7,)``; GTSAM takes any quaternion in silence, so it is normalised here."""
+    """``Pose2`` of ``(3,)``, ``Pose3`` of ``(7,)``; normalised, because GTSAM does not check quaternions."""
     if len(pose) == 3:
         return gtsam.Pose2(*pose)
     x, y, z, w = quat_normalize(pose[3:])
@@ -326,12 +326,12 @@ def pose_array(pose: Any) -> Array:
 
 
 def gtsam_value(value: Array, name: str, dim: int) -> Any:
-    """A variable's value as GTSAM holds it: a pose, or a vector."""
+    """A variable's value in GTSAM's form: a pose, or a vector."""
     return gtsam_pose(value) if split_name(name)[0].pose_group(dim) is not None else np.ascontiguousarray(value)
 
 
 def read_value(values: gtsam.Values, name: str, key: int, dim: int) -> Array:
-    """A variable's value out of GTSAM's."""
+    """Read a variable's value from GTSAM's values."""
     kind = split_name(name)[0]
     group = kind.pose_group(dim)
     if group is not None:
@@ -348,15 +348,15 @@ def with_kernel(base: Any, robust: RobustKernel) -> Any:
 
 
 def unit_noise(record: Any) -> Any:
-    """Noise of unit size, with the record's kernel: for factors that whiten by themselves."""
+    """Unit noise with the record's kernel, for factors that whiten their residuals."""
     return with_kernel(gtsam.noiseModel.Unit.Create(record.rows), getattr(record, "robust", NO_KERNEL))
 
 
 def safe_factor(noise: Any, names: Sequence[str], widths: Sequence[int], rows: int, terms: Any) -> gtsam.CustomFactor:
-    """A custom factor that never raises and fills every Jacobian it is asked for.
+    """A custom factor that never raises and fills every requested Jacobian.
 
-    GTSAM turns an exception inside a factor into a broken solver, and crashes on a missing Jacobian. So whatever goes
-    wrong is a residual of nan, which the solver refuses by name.
+    An exception inside a factor makes GTSAM's solver unusable, and a missing Jacobian crashes it. So an error gives a
+    residual of nan, which the solver refuses by name.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def safe_factor(noise: Any, names: Sequence[str], widths: Sequence[int], rows: i
 
 
 def custom_factor(batch: type[UniformBatch], record: Any, origin: Array) -> gtsam.CustomFactor:
-    """A custom factor of any kind, by the terms of its batch on one row (the default of every kind)."""
+    """A custom factor of any kind, from the terms of its batch on one row (the default of every kind)."""
     dim = group_of(origin).dim
     slots = list(zip(batch.slots, batch.keys(record)))
     one = _alone(batch, record, dim)
@@ -407,5 +407,5 @@ def custom_factor(batch: type[UniformBatch], record: Any, origin: Array) -> gtsa
 
 
 def _alone(batch: type[UniformBatch], record: Any, dim: int) -> UniformBatch:
-    """A batch of one factor whose columns nobody asks for."""
+    """A batch of one factor, without columns."""
     return batch([record], VariableLayout(dim, tuple(0 for _ in KINDS), np.zeros(0, dtype=np.int64)))

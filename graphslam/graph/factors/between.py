@@ -88,7 +88,7 @@ class BetweenBatch(UniformBatch):
         group: str = "between",
         ids: npt.NDArray[Any] | None = None,
     ) -> BetweenBatch:
-        """A batch without an object for each factor.
+        """A batch from arrays, without an object per factor.
 
         Parameters
         ----------
@@ -97,9 +97,9 @@ class BetweenBatch(UniformBatch):
         T_ij : (m, 3|7)
         whiteners : (m, d, d)
         group : str
-            Class of all of them.
+            Class of all factors.
         ids : (m,) int, optional
-            Numbers of the factors; counted from 0 if not given.
+            Ids of the factors; default: numbered from 0.
         """
 
         def record(k: int) -> BetweenRecord:
@@ -136,8 +136,8 @@ class BetweenBatch(UniformBatch):
 
     @classmethod
     def gtsam(cls, record: BetweenRecord, origin: Array) -> gtsam.NonlinearFactor:
-        """GTSAM's own, or a prior where one node is the fixed first base."""
-        # Not SqrtInformation(W): GTSAM wants it upper triangular, and of a lower one it keeps the diagonal in silence.
+        """GTSAM's own, or a prior if one node is the fixed first base."""
+        # Not SqrtInformation(W): GTSAM expects an upper triangular one, and uses only the diagonal of a lower one.
         information = record.whitener.T @ record.whitener
         noise = with_kernel(gtsam.noiseModel.Gaussian.Information(information), record.robust)
         group = group_of(record.T_ij)
@@ -146,7 +146,7 @@ class BetweenBatch(UniformBatch):
             ki, kj = gtsam_key(f"x{record.i}"), gtsam_key(f"x{record.j}")
             between = gtsam.BetweenFactorPose2 if plane else gtsam.BetweenFactorPose3
             return between(ki, kj, gtsam_pose(record.T_ij), noise)
-        if record.j:  # from the fixed base: the same residual Log(T⁻¹ x_0⁻¹ x_j) is that of a prior on x_j
+        if record.j:  # from the fixed base: Log(T⁻¹ x_0⁻¹ x_j) is the residual of a prior on x_j
             prior = gtsam.PriorFactorPose2 if plane else gtsam.PriorFactorPose3
             return prior(gtsam_key(f"x{record.j}"), gtsam_pose(group.compose(origin, record.T_ij)), noise)
         # To the fixed base: Log(T⁻¹ x_i⁻¹ x_0) is not a prior's residual, so the base is a constant of a custom factor.

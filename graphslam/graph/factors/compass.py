@@ -1,13 +1,13 @@
-"""Headings of a compass: absolute, with a zero, a declination and the deviation of iron on the robot.
+"""Compass headings, with the variables zero and hard-iron deviation, and the magnetic declination.
 
-A reading z is the heading of the body's x axis, counter-clockwise from magnetic east. With the node's own heading ψ in
-the frame of the first base, the *zero* c of the compass in that frame, and the deviation d of hard iron (the classical
+A reading z is the heading of the body's x axis, counter-clockwise from magnetic east. With the node's heading ψ in
+the frame of the first base, the *zero* c of the compass in that frame, and the hard-iron deviation d (the classical
 coefficients of a single turn)::
 
     r = wrap(ψ + c + d_1 sin z + d_2 cos z - z)
 
-In space ψ is the heading of the body's x axis, projected on the level plane of the first base. Where the graph has a
-GPS datum and the declination D (magnetic north east of true north is positive) is known, the zero is tied to it::
+In 3-D, ψ is the heading of the body's x axis, projected on the level plane of the first base. If the graph has a GPS
+datum and the declination D (positive if magnetic north is east of true north) is known, it constrains the zero::
 
     r = wrap(c - (ψ_datum + D))
 """
@@ -46,7 +46,7 @@ class CompassRecord:
     heading : float
         z [rad].
     sigma : float
-        Of the reading and of the body's heading in the node's frame together [rad].
+        Of the reading and of the body's heading in the node's frame combined [rad].
     compass : int
         Number of its zero.
     deviation : int or None
@@ -80,7 +80,7 @@ class CompassRecord:
 
 
 class CompassBatch(UniformBatch):
-    """Readings of compasses, in the plane or in space."""
+    """Compass readings, 2-D or 3-D."""
 
     record = CompassRecord
     slots = ("x", "compass", "deviation")
@@ -92,12 +92,12 @@ class CompassBatch(UniformBatch):
 
     @staticmethod
     def keys(record: CompassRecord) -> Sequence[int | None]:
-        """Node, zero, deviation if it is estimated."""
+        """Node, zero, and deviation if it is estimated."""
         return record.node, record.compass, record.deviation
 
     @staticmethod
     def whitener(record: CompassRecord) -> Array:
-        """Of σ."""
+        """``1/σ``."""
         return np.array([[1.0 / record.sigma]])
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
@@ -123,7 +123,7 @@ class CompassBatch(UniformBatch):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeclinationRecord:
-    """The zero of a compass seen from the GPS frame.
+    """The zero of a compass relative to the GPS frame.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class DeclinationRecord:
 
 
 class DeclinationBatch(UniformBatch):
-    """Zeros of compasses tied to the GPS frame."""
+    """Zeros of compasses relative to the GPS frame."""
 
     record = DeclinationRecord
     slots = ("compass", "datum")
@@ -168,11 +168,11 @@ class DeclinationBatch(UniformBatch):
 
     @staticmethod
     def whitener(record: DeclinationRecord) -> Array:
-        """Of σ."""
+        """``1/σ``."""
         return np.array([[1.0 / record.sigma]])
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
-        """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`; the datum's heading stands last."""
+        """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`; the datum's heading is last."""
         zero, datum = blocks
         r = wrap_angle(zero[:, 0] - datum[:, -1] - self._declination)
         J = np.zeros((len(r), 1, 1 + (3 if self.dim == 2 else 4)))
@@ -182,7 +182,7 @@ class DeclinationBatch(UniformBatch):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviationPriorRecord:
-    """How large a deviation by hard iron may be: ``N(0, sigma² I)``."""
+    """Prior on a hard-iron deviation: ``N(0, sigma² I)``."""
 
     factor_id: int
     deviation: int
@@ -217,7 +217,7 @@ class DeviationPriorBatch(UniformBatch):
 
     @staticmethod
     def whitener(record: DeviationPriorRecord) -> Array:
-        """Of σ."""
+        """``I/σ``."""
         return np.eye(2) / record.sigma
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
-"""Control points and measured distances: a place of the map in the frame of a survey, or how far two places are apart.
+"""Control points and measured distances: coordinates of a place in a survey frame, or the distance of two places.
 
 A place p is a point of the body at a node, ``x a``, a landmark, or a point of the path of a landmark submap. Its
-coordinates give ``r = T_survey_world p - z``, where ``T_survey_world`` is the datum of the graph, in space turned by
+coordinates give ``r = T_survey_world p - z``, where ``T_survey_world`` is the datum of the graph, in 3-D rotated by
 the tilt as for GPS fixes (:mod:`graphslam.graph.factors.gps`). A distance gives ``r = |p - q| - d``.
 """
 
@@ -24,16 +24,16 @@ from graphslam.graph.variables import VariableLayout
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControlRecord(AntennaRecord):
-    """Coordinates of a place; exactly one of ``node``, ``landmark`` and ``point`` is there.
+    """Coordinates of a place; exactly one of ``node``, ``landmark`` and ``point`` is given.
 
     Parameters
     ----------
     time : float
-        [s]; of a landmark that of the first base.
+        [s]; for a landmark that of the first base.
     z : (dim,)
-        Counted from the origin of the datum [m].
+        Relative to the origin of the datum [m].
     whitener : (dim, dim)
-        In the frame of z, of coordinates and arm together.
+        In the frame of z, of coordinates and lever arm combined.
     arm : (dim,)
         The measured point in the frame of the node.
     tilt : bool
@@ -111,7 +111,7 @@ def _names(*rows: int | None) -> list[str]:
 
 
 class _Places:
-    """One place of each record.
+    """Position of one place per record.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def survey_terms(points: Array, datum: Array, tilt: Array | None, level: Any = N
     turn : (k, dim, dim)
         On the points.
     by : (k, dim, c)
-        On the datum, in space also on the tilt.
+        On the datum, in 3-D also on the tilt.
     """
     group = SE2 if points.shape[1] == 2 else SE3
     still = np.tile(group.identity, (len(points), 1))
@@ -197,13 +197,13 @@ class DistanceBatch(UniformBatch):
 
     @staticmethod
     def keys(record: DistanceRecord) -> Sequence[int | None]:
-        """Node, landmark and point of either end."""
+        """Node, landmark and point of both ends."""
         r = record
         return r.node, r.landmark, r.point, r.node_to, r.landmark_to, r.point_to
 
     @staticmethod
     def whitener(record: DistanceRecord) -> Array:
-        """Of σ."""
+        """``1/σ``."""
         return np.array([[1.0 / record.sigma]])
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:

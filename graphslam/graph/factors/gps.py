@@ -1,18 +1,18 @@
-"""Position fixes as factors on the submap that holds them, in the plane and in space.
+"""GPS fixes as factors on the submap of their time, 2-D and 3-D.
 
-A fix at time t inside submap k sees the antenna at ``arm = T_start_body(t) · lever`` in the base frame of the submap,
-so the world position is ``x_k ∘ arm`` and the measurement is ``z = T_gps_world ∘ x_k ∘ arm + bias + noise``. The first
-base stays fixed; the *datum* ``T_gps_world`` is a variable, so the heading of the GPS frame is solved for, not assumed.
+At time t inside submap k the antenna is at ``arm = T_start_body(t) · lever`` in the base frame of the submap, so its
+world position is ``x_k ∘ arm`` and the measurement is ``z = T_gps_world ∘ x_k ∘ arm + bias + noise``. The first base
+stays fixed; the *datum* ``T_gps_world`` is a variable, so the heading of the GPS frame is estimated, not assumed.
 
-The residual is taken in the base frame of the submap: ``r = arm - x_k⁻¹ T_gps_world⁻¹ (z - bias)``. A fix that is
-equally uncertain in all directions may be turned as one likes, and there the uncertainty of the arm (from the submap's
-own trajectory) has a constant covariance that is simply added to it. A fix with a covariance of its own has its
-residual in the frame where that is constant, ``r = T_gps_world x_k arm + bias - z``; the arm's is turned into it as the
-map lies when the fix enters.
+The residual is in the base frame of the submap: ``r = arm - x_k⁻¹ T_gps_world⁻¹ (z - bias)``. The covariance of an
+isotropic fix does not change by rotation, and in this frame the covariance of the arm (from the submap's own
+trajectory) is constant, so the two are added. A fix with a full covariance has its residual in the frame in which that
+is constant, ``r = T_gps_world x_k arm + bias - z``; the arm's covariance is rotated into it with the map at the time at
+which the fix is added.
 
-In space the datum is ``[x, y, z, ψ]``: the GPS frame (east, north, up) and the level frame of the first base differ by
-a turn about the vertical and a shift. Where the graph knows the tilt of its first base
-(:mod:`~graphslam.graph.factors.attitude`), level is what the tilt says; else its z axis is taken as up::
+In 3-D the datum is ``[x, y, z, ψ]``: the GPS frame (east, north, up) and the level frame of the first base differ by
+a rotation about the vertical and a translation. If the graph has the tilt of its first base
+(:mod:`~graphslam.graph.factors.attitude`), it defines the level frame; otherwise the z axis is assumed to be up::
 
     p_world = Exp(τ) R_z(ψ)ᵀ (z - bias - t),   r = arm - x⁻¹ p_world
 """
@@ -40,7 +40,7 @@ Terms = Callable[[gtsam.Values, "list[Array] | None"], Array]
 
 
 class AntennaRecord:
-    """A measurement of where an antenna is in the GPS frame: it holds the datum, and has a field ``tilt``."""
+    """A measured antenna position in the GPS frame: it constrains the datum, and has a field ``tilt``."""
 
     __slots__ = ()
 
@@ -52,22 +52,22 @@ class GpsRecord(AntennaRecord):
     Parameters
     ----------
     node : int
-        Node that the fix hangs on: the base of the submap that holds it, or the nearest inner node.
+        Node that the fix is attached to: the base of the submap of its time, or the nearest inner node.
     arm : (dim,)
         Antenna in the node's frame, ``T_node_body(t) · lever``.
     z : (dim,)
-        Fix in the GPS frame, counted from the first fix.
+        Fix in the GPS frame, relative to the first fix.
     whitener : (dim, dim)
-        Of fix and arm together, in the node's frame.
+        Of fix and arm combined, in the node's frame.
     bias : int or None
-        GPS segment whose bias it carries.
+        Number of its bias.
     tilt : bool
-        The graph knows where up is, and the level datum is turned by it.
+        The graph has the variable ``tilt``, which rotates the level datum.
     uneven : bool
-        Residual and whitener are in the GPS frame, since coordinates there are not equally sure.
+        Residual and whitener are in the GPS frame, because the fix is not isotropic there.
     point : int or None
-        Where the antenna was, as a point of its submap's path that the graph solves for (in the plane); residual
-        ``T_gps_world point + bias - z`` and whitener are in the GPS frame then, and node and arm only say where it is.
+        Antenna position as a variable: a point of its submap's path (2-D). Residual ``T_gps_world point + bias - z``
+        and whitener are then in the GPS frame, and node and arm are for information only.
     stated : (dim, dim) or None
         Covariance of the fix alone, in the GPS frame.
     """
@@ -105,18 +105,18 @@ class GpsRecord(AntennaRecord):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BiasPriorRecord:
-    """What a bias of fixes is before any fix tells: ``bias - keep · before ~ N(0, sigma² shape)``.
+    """Prior on a bias of fixes: ``bias - keep · before ~ N(0, sigma² shape)``.
 
     Parameters
     ----------
     sigma : float
         [m]
     before : int or None
-        The bias that it follows from; None: it starts from zero.
+        The previous bias; None: zero.
     keep : float
-        Share of that one that is left, ``exp(-Δt/τ)``.
+        Factor on the previous bias, ``exp(-Δt/τ)``.
     shape : (dim, dim) or None
-        Where coordinates are not equally sure; None: the identity.
+        If the bias is not isotropic; None: the identity.
     """
 
     factor_id: int
@@ -158,7 +158,7 @@ def gps_terms(x: Array, datum: Array, bias: Array, arm: Array, z: Array) -> tupl
     RxT = np.swapaxes(Rx, 1, 2)
     J[:, :, :2] = np.eye(2)  # x Exp(ξ): q → Exp(-ξ) q
     J[:, 0, 2], J[:, 1, 2] = -q[:, 1], q[:, 0]
-    J[:, :, 3:5] = RxT  # datum Exp(ξ): p → Exp(-ξ) p, seen through R_xᵀ
+    J[:, :, 3:5] = RxT  # datum Exp(ξ): p → Exp(-ξ) p, rotated by R_xᵀ
     J[:, :, 5] = np.einsum("kij,kj->ki", RxT, np.stack([-p[:, 1], p[:, 0]], -1))
     J[:, :, 6:8] = RxT @ RD.T
     return arm - q, J
@@ -204,11 +204,11 @@ def antenna_terms(
     poses : (k, 3) or (k, 7)
     datum : (3,) or (4,)
     tilt : (2,) or None
-        Not in the plane.
+        3-D only.
     arm : (k, dim)
         In the frames of the poses.
     level : (k,) bool, optional
-        Rows that take the z axis of the first base for up, whatever the tilt.
+        Rows that assume the z axis of the first base as up, whatever the tilt.
 
     Returns
     -------
@@ -253,7 +253,7 @@ def level_datum_pose(datum: Array, tilt: Array | None = None) -> Array:
 
 
 class GpsBatch(UniformBatch):
-    """Position fixes, in the plane or in space."""
+    """GPS fixes, 2-D or 3-D."""
 
     record = GpsRecord
     slots = ("x", "datum", "bias", "tilt", "point")
@@ -266,7 +266,7 @@ class GpsBatch(UniformBatch):
 
     @staticmethod
     def keys(record: GpsRecord) -> Sequence[int | None]:
-        """Node or point of the path, datum, bias if there is one, tilt if the graph knows it."""
+        """Node or point of the path, datum, bias if there is one, tilt if the graph has it."""
         return (
             None if record.point is not None else record.node,
             0,
@@ -310,7 +310,7 @@ class GpsBatch(UniformBatch):
         return np.where(in_theirs[:, None, None], np.eye(self.dim), turn)
 
     def _in_node_frame(self, x: Array, datum: Array, bias: Array, tilt: Array) -> tuple[Array, Array]:
-        """Residuals and Jacobians as if all were equally uncertain in all directions."""
+        """Residuals and Jacobians as if all fixes were isotropic."""
         if self.dim == 2:
             r, J = gps_terms(x, datum[0], bias, self._arm, self._z)
             J[self._rows[:, 2] < 0, :, 6:] = 0.0
@@ -326,7 +326,7 @@ class GpsBatch(UniformBatch):
 
     @classmethod
     def gtsam(cls, record: GpsRecord, origin: Array) -> gtsam.NonlinearFactor:
-        """A custom factor in scalars: every fix hangs on the datum, so that this runs more often than anything else."""
+        """A custom factor in scalar arithmetic: every fix depends on the datum, so this is evaluated most often."""
         if record.uneven or record.point is not None:
             return super().gtsam(record, origin)
         names = record.variables()
@@ -339,8 +339,8 @@ class GpsBatch(UniformBatch):
 def _in_the_plane(names: list[str], record: GpsRecord, origin: Array) -> Terms:
     """``W (arm - x⁻¹ T_gps_world⁻¹ (z - bias))`` (see :mod:`graphslam.graph.sensors.gps`) in scalar arithmetic.
 
-    There are hundreds of fixes and every one hangs on the datum, so this runs more often than anything else here:
-    numpy's overhead on arrays of two would be most of the time.
+    There may be hundreds of fixes, which all depend on the datum, so this is evaluated most often. With numpy arrays of
+    two elements most of the time would be overhead.
     """
     ax, ay = map(float, record.arm)
     zx, zy = map(float, record.z)
@@ -425,7 +425,7 @@ def _in_space(names: list[str], record: GpsRecord, origin: Array) -> Terms:
 
 
 class BiasPriorBatch(UniformBatch):
-    """Priors on the biases of GPS segments, and how one follows from another."""
+    """Priors on the biases of GPS fixes, and links between consecutive biases."""
 
     record = BiasPriorRecord
     slots = ("bias", "bias")
@@ -437,7 +437,7 @@ class BiasPriorBatch(UniformBatch):
 
     @staticmethod
     def keys(record: BiasPriorRecord) -> Sequence[int | None]:
-        """The one before, if it follows from one, and the bias."""
+        """The previous bias, if there is one, and the bias."""
         return record.before, record.bias
 
     @staticmethod
@@ -455,7 +455,7 @@ class BiasPriorBatch(UniformBatch):
 
     @classmethod
     def gtsam(cls, record: BiasPriorRecord, origin: Array) -> gtsam.NonlinearFactor:
-        """GTSAM's own, where it starts from zero and is round."""
+        """GTSAM's own prior, if the mean is zero and the covariance isotropic."""
         if record.before is not None or record.shape is not None:
             return super().gtsam(record, origin)
         noise = gtsam.noiseModel.Isotropic.Sigma(record.dim, record.sigma)

@@ -1,8 +1,8 @@
 """A landmark submap: one n-ary factor with its full joint covariance (Combined SLAM eq. 15).
 
-All submaps together are one compiled loop. One of them is a GTSAM factor in Python by the same kernel: it never raises,
-fills every Jacobian it is asked for, and whitens by itself, telling GTSAM that its noise is of unit size: handing over
-some twenty small blocks to be whitened one by one costs more than the whole linearisation here.
+All submaps together are one compiled loop. A single one is a GTSAM factor in Python with the same kernel: it never
+raises, fills every requested Jacobian, and whitens its residual itself, with unit noise in GTSAM: whitening some twenty
+small blocks one by one in GTSAM takes longer than the whole linearisation here.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graphslam.graph.factors.batch import FactorBatch, Index, block_offsets, saf
 from graphslam.graph.variables import Values, VariableLayout, gtsam_key
 
 CONSTANT = ("wheels", "sensor", "mount")
-"""Kinds of variables that hold the constant errors of a robot, a pair each."""
+"""Kinds of variables with the constant errors of a robot, two values each."""
 
 
 def _entries(landmark_ids: npt.NDArray[np.int64], points: npt.NDArray[np.int64], robot: int) -> list[str]:
@@ -35,17 +35,17 @@ class SubmapRecord:
     Parameters
     ----------
     landmark_ids : (n,) int64
-        Graph landmark of every entry; an id may stand twice.
+        Graph landmark of every entry; an id may be repeated.
     z : (3 + 2n,)
-        ``[exit x, y, θ, l1x, l1y, …]`` in the base frame; with constant errors six zeros behind them.
+        ``[exit x, y, θ, l1x, l1y, …]`` in the base frame; with constant errors followed by six zeros.
     whitener : (3 + 2n, 3 + 2n)
-        ``W`` with ``Wᵀ W`` = information; with constant errors six columns ``-W S`` more, of what they move.
+        ``W`` with ``Wᵀ W`` = information; with constant errors six more columns ``-W S``, S being their response.
     information : ((3 + 2n)²,)
-        Row major; made here.
+        Row major; computed here.
     chart : str
-        In which the residual is taken (:mod:`graphslam.core.charts`).
+        Parametrisation of the residual (:mod:`graphslam.core.charts`).
     robot : int
-        Row of its constant errors (:mod:`graphslam.core.sensor_biases`); -1: it has none.
+        Row of its constant errors (:mod:`graphslam.core.sensor_biases`); -1: none.
     """
 
     factor_id: int
@@ -64,7 +64,7 @@ class SubmapRecord:
 
     @property
     def points(self) -> npt.NDArray[np.int64]:
-        """Rows of points of the path: none here."""
+        """Rows of points of the path: empty here."""
         return np.zeros(0, dtype=np.int64)
 
     @property
@@ -74,7 +74,7 @@ class SubmapRecord:
 
     @property
     def own(self) -> tuple[Array, Array]:
-        """Measurement and whitener of exit and landmarks alone, as if there were no constant errors."""
+        """Measurement and whitener of end pose and landmarks alone, without constant errors."""
         m = 3 + 2 * len(self.landmark_ids)
         return self.z[:m], self.whitener[:, :m]
 
@@ -83,7 +83,7 @@ class SubmapRecord:
         return self.z[3 : 3 + 2 * len(self.landmark_ids)].reshape(-1, 2)
 
     def entries(self) -> list[str]:
-        """Names of what stands behind the two poses, in the order of z."""
+        """Names of the variables after the two poses, in the order of z."""
         return _entries(self.landmark_ids, self.points, self.robot)
 
     def variables(self) -> list[str]:
@@ -97,11 +97,11 @@ class SubmapRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathRecord:
-    """Points of the path inside a landmark submap, given its exit and its landmarks.
+    """Points of the path inside a landmark submap, conditioned on its end pose and landmarks.
 
-    The joint Gaussian of exit, landmarks and points is that of exit and landmarks, which is the submap's own factor,
-    times that of the points given them, which is this: ``u_p - K u_o ~ N(0, S)`` for the residuals u of the submap's
-    chart, ``K = P_po P_oo⁻¹``, ``S = P_pp - K P_op``. So a point that nobody measures tells nothing of anything.
+    The joint Gaussian of end pose, landmarks and points is the product of that of end pose and landmarks (the submap's
+    own factor) and this conditional: ``u_p - K u_o ~ N(0, S)`` for the residuals u in the submap's parametrisation,
+    ``K = P_po P_oo⁻¹``, ``S = P_pp - K P_op``. So a point without a measurement adds no information.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class PathRecord:
     points : (p,) int64
         Rows of the points among the graph's.
     z : (3 + 2n + 2p,)
-        Exit, landmarks and points in the base frame.
+        End pose, landmarks and points in the base frame.
     whitener : (2p, 3 + 2n + 2p)
         ``S^{-1/2} [-K, I]``.
     """
@@ -136,7 +136,7 @@ class PathRecord:
         return len(self.whitener)
 
     def entries(self) -> list[str]:
-        """Names of what stands behind the two poses, in the order of z."""
+        """Names of the variables after the two poses, in the order of z."""
         return _entries(self.landmark_ids, self.points, self.robot)
 
     def variables(self) -> list[str]:
@@ -158,7 +158,7 @@ class SubmapBatch(FactorBatch):
         row, marks, robots = layout.row_of, layout.count("l"), layout.count("wheels")
         self._start = np.array([r.start for r in records], dtype=np.int64)
         self._constant = marks + layout.count("point")
-        # points stand behind the landmarks, and constant errors behind the points
+        # points come after the landmarks, and constant errors after the points
         rows = [[*(row[i] for i in r.landmark_ids.tolist()), *(marks + r.points).tolist()] for r in records]
         rows = [
             x if r.robot < 0 else [*x, *(self._constant + k * robots + r.robot for k in range(len(CONSTANT)))]
@@ -241,9 +241,9 @@ def submap_jacobian(
 
 
 def submap_factor(record: SubmapRecord | PathRecord, origin: Array) -> gtsam.CustomFactor:
-    """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start where that is the fixed first base, at ``origin``.
+    """Factor on ``(x_start, x_{start+1}, l_…)``; without x_start if that is the fixed first base, at ``origin``.
 
-    A landmark that stands twice gives one key, whose Jacobian sums both entries.
+    A repeated landmark has one key, whose Jacobian is the sum of its entries.
     """
     entries = record.entries()
     unique = {name: k for k, name in enumerate(dict.fromkeys(entries))}
@@ -261,7 +261,7 @@ def _terms(
 ) -> Callable[..., Array]:
     from graphslam.graph.normal_kernels import whiten_submap  # numba takes a third of a second to load
 
-    constants = len(CONSTANT) if record.robot >= 0 else 0  # keys that stand last
+    constants = len(CONSTANT) if record.robot >= 0 else 0  # these keys are last
     first, last = 1 if fixed else 2, len(keys) - constants
     rows, places = entry_of.astype(np.int64), len(entry_of) - constants
     W, z, group = np.ascontiguousarray(record.whitener), record.z, record.chart == "group"
