@@ -1,4 +1,4 @@
-"""Loop candidates by what places look like, for drift that proximity cannot bear."""
+"""Loop candidates by similarity of places, for drift that is too large for proximity."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from graphslam.registration.place_descriptor import PlaceDescriptors, descriptor
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AppearanceConfig:
-    """Which places that look alike are tried."""
+    """Which similar places are candidates."""
 
     top: int = 2
-    """Of each place, so many others at most, in different stretches."""
+    """Largest number of candidates of each place, in different stretches."""
     least: float = 0.5
-    """Correlation of descriptors, at least …"""
+    """Minimum correlation of descriptors …"""
     lead: float = 0.05
-    """… and so much better than the next stretch that is not given: where many places look the same, none is tried."""
+    """… and its minimum lead over the next stretch: if many places look the same, none is a candidate."""
     least_way: float = 30.0
-    """Places nearer along the way are not tried [m]."""
+    """Minimum path length between the two places [m]."""
     stretch: float = 12.0
-    """Places nearer than this along the way are one stretch [m]."""
+    """Places with a smaller distance along the path are in one stretch [m]."""
     sigma: float = 2.0
-    """σ of the position that a descriptor predicts [m] …"""
+    """σ of the position predicted by a descriptor [m] …"""
     height: float = 1.0
     """… of its height [m] …"""
     angle: float = 0.1
@@ -52,20 +52,20 @@ def appearance_candidates(
     *,
     exclude: Collection[tuple[int, int]] = (),
 ) -> list[LoopCandidate]:
-    """Pairs of places in different submaps that look alike, most alike first; one place of a stretch, not all.
+    """Pairs of similar places in different submaps, most similar first; only one place per stretch.
 
     Parameters
     ----------
     descriptors : PlaceDescriptors
         Of these places.
     exclude : collection of (int, int)
-        Pairs of submaps, either way round, that are not tried.
+        Pairs of submaps, in any order, that are not compared.
 
     Returns
     -------
     list of LoopCandidate
-        ``T_ij`` has no translation but the heading at which the two look most alike; its covariance is the stated one.
-        ``facts``: ``correlation`` and ``lead``, by how much it is better than what was not taken.
+        ``T_ij`` has no translation, and the heading of the largest correlation; its covariance is that of the
+        configuration. ``facts``: ``correlation`` and ``lead`` over the best place that is not a candidate.
     """
     c = AppearanceConfig() if config is None else config
     if len(descriptors) != len(places):
@@ -88,7 +88,7 @@ def appearance_candidates(
             continue
         correlation, turn = descriptor_similarity(descriptors, j, descriptors, rows)
         best = _stretches(places.way[rows], correlation, c.stretch, c.top + 1)
-        # the best as a group must stand out from the next stretch, else this place looks like many
+        # the best ones together must lead over the next stretch; otherwise this place looks like many others
         beaten = float(correlation[best[c.top]]) if len(best) > c.top else -1.0
         for k in best[: c.top]:
             lead = float(correlation[k]) - beaten
@@ -117,7 +117,7 @@ def _covariance(c: AppearanceConfig, dim: int) -> Array:
 
 
 def _stretches(way: Array, score: Array, stretch: float, count: int) -> list[int]:
-    """The best of ``score``, one a stretch."""
+    """Indices of the best ``score``, one per stretch."""
     left = np.ones(len(way), bool)
     out: list[int] = []
     for k in np.argsort(-score, kind="stable").tolist():
@@ -130,7 +130,7 @@ def _stretches(way: Array, score: Array, stretch: float, count: int) -> list[int
 
 
 def _thinned(places: Places, found: list[LoopCandidate], stretch: float) -> list[LoopCandidate]:
-    """One pair of two stretches, the best."""
+    """The best pair of each two stretches."""
     kept: list[LoopCandidate] = []
     for x in found:
         if all(

@@ -1,10 +1,10 @@
-"""Which pairs of places are worth trying to match, and in which order.
+"""Select and rank pairs of places for registration.
 
-Two places may see the same surroundings if the joint marginal of the graph lets them lie so near to each other that
-their maps overlap. Registration costs far more than looking, and a loop that tells nothing new is not worth its risk:
-so pairs are ordered by what a match would tell, ``½ log det(I + P R⁻¹)`` (P the covariance of the relative pose now, R
-that of a match), times the chance that the two overlap, over what it costs to search; and of one stretch against
-one submap one place is tried, not all.
+Two places are a candidate if, by the joint marginal of the graph, they may be so near to each other that their maps
+overlap. Registration takes much longer than this selection, and a loop without new information is not worth its risk.
+So pairs are ranked by the expected information gain of a match, ``½ log det(I + P R⁻¹)`` (P: current covariance of the
+relative pose, R: that of a match), times the probability of overlap, divided by the search cost; and of each stretch
+only one place is registered to a submap.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ FRONT_END, PROXIMITY, APPEARANCE, TIE = "front-end", "proximity", "appearance", 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CandidateConfig:
-    """Which pairs are tried."""
+    """Which pairs of places are candidates."""
 
     overlap: float = 8.0
-    """Maps of two places overlap enough to be matched if the places are nearer than this [m] …"""
+    """Maps of two places overlap enough to be matched if the distance of the places is smaller than this [m] …"""
     height: float = 1.0
-    """… and not farther above each other than this [m]: storeys look alike."""
+    """… and their height difference not larger than this, because levels of a building look alike [m]."""
     sigmas: float = 2.5
-    """A pair is a candidate if this many σ of its relative pose bring it within that."""
+    """A pair is a candidate if it may be within these limits by this many σ of its relative pose."""
     least_way: float = 30.0
-    """Places nearer along the way are not tried: they share scans or are neighbours anyway [m]."""
+    """Minimum path length between the two places: nearer ones share scans or are neighbours [m]."""
     least_gain: float = 2.0
-    """Pairs whose match would tell less are not tried [nat]."""
+    """Minimum expected information gain of a match [nat]."""
     stretch: float = 12.0
-    """Of one stretch of this length only the best place is tried against one submap [m]."""
+    """Only the best place of each stretch of this length is registered to a submap [m]."""
     keep: int = 200
-    """Candidates, at most."""
+    """Largest number of candidates."""
     match_sigma: float = 0.1
-    """σ of a match that is expected: position [m] …"""
+    """Expected σ of a match: position [m] …"""
     match_angle: float = 0.012
     """… and angles [rad]."""
     search_sigma: float = 2.0
-    """A search over this σ costs twice as much as the registration [m]."""
+    """σ of the relative position at which the search takes as long as the registration [m]."""
     least_support: float = 0.05
-    """Front ends' matches with less support of their particles are left out."""
+    """Front-end matches with less support of the particles are not used."""
     batch: int = 20000
-    """Pairs whose joint marginals are asked for at once."""
+    """Number of pairs whose joint marginals are computed at once."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -66,24 +66,24 @@ class CandidateConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopCandidate:
-    """A pair of places that may be tied.
+    """A pair of places that may be a loop closure.
 
     Parameters
     ----------
     i, j : int
-        Places, ``i`` before ``j`` on the way: the map of i's submap is the target, what j sees the source.
+        Places, ``i`` before ``j`` along the path: the map of i's submap is the target, the view from j the source.
     source : str
         ``front-end``, ``proximity``, ``appearance``, ``tie`` (:mod:`~graphslam.loops.overlap_constraints`).
     T_ij : (7,) or (3,)
-        The prediction; for a front end's match or a tie the measurement itself.
+        The prediction; for a front-end match or an overlap constraint the measurement itself.
     covariance : (d, d)
         Of it, right tangent.
     gain : float
-        What a match is expected to tell [nat].
+        Expected information gain of a match [nat].
     score : float
-        What candidates of one source are ordered by.
+        Rank among candidates of one source.
     facts : dict
-        What else the source says: support and fitness of a front end's match, distance of descriptors.
+        Other values from the source: support and fitness of a front-end match, correlation of descriptors.
     """
 
     i: int
@@ -97,7 +97,7 @@ class LoopCandidate:
 
 
 def information_gain(P: Array, match_sigma: float, match_angle: float, dim: int) -> Array:
-    """``½ log det(I + P R⁻¹)`` of relative poses with covariances ``P (k, d, d)`` and a match of stated σ ``(k,)``."""
+    """``½ log det(I + P R⁻¹)`` of relative poses with covariances ``P (k, d, d)`` and a match of given σ ``(k,)``."""
     d = P.shape[-1]
     inverse_sigma = np.full(d, 1.0 / match_angle)
     inverse_sigma[slice(0, 2) if dim == 2 else slice(3, 6)] = 1.0 / match_sigma
@@ -106,11 +106,10 @@ def information_gain(P: Array, match_sigma: float, match_angle: float, dim: int)
 
 
 def overlap_probability(T: Array, P: Array, config: CandidateConfig) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Chance that two places overlap ``(k,)``, and whether they may ``(k,)``.
+    """Probability that two places overlap ``(k,)``, and whether they may ``(k,)``.
 
-    Horizontally by the distance and its σ along the line between the two (or across it, where they may coincide), in
-    the axes of the first; vertically by the difference of heights.
-
+    Horizontally by the distance and the larger horizontal σ, in the axes of the first place; vertically by the
+    height difference.
     Parameters
     ----------
     T : (k, 7) or (k, 3)
@@ -142,24 +141,24 @@ def proximity_candidates(
     tried: Sequence[tuple[int, int]] = (),
     since: int = 0,
 ) -> list[LoopCandidate]:
-    """Pairs that may see the same surroundings by what the graph knows, most telling first.
+    """Pairs of places that may observe the same surroundings by the graph's estimate, best first.
 
     Parameters
     ----------
     relative : RelativePoses
-        Of the graph, asked for the nodes of places.
+        Of the graph, for the nodes of the places.
     exclude : collection of (int, int)
-        Pairs of submaps (either way round) that are not tried: their maps hold the same scans.
+        Pairs of submaps (in any order) that are not compared, because their maps include the same scans.
     tried : sequence of (int, int)
-        Pairs of places that were tried before: their stretches are not tried again.
+        Pairs of places that were registered before; their stretches are not registered again.
     since : int
-        Only pairs whose later place lies in this submap of the chain or a later one.
+        Only pairs whose later place is in this submap of the chain or a later one.
     """
     c = CandidateConfig() if config is None else config
     n = len(places)
     first, second = np.triu_indices(n, 1)
     far = places.way[second] - places.way[first] >= c.least_way
-    # a map against itself finds itself: stretches of one submap are no pair
+    # places of one submap are no pair: the map would be matched with itself
     far &= (places.submap[first] != places.submap[second]) & (places.submap[second] >= since)
     if exclude:
         m = int(places.submap.max()) + 1
@@ -207,21 +206,21 @@ def thin_candidates(
     keep: int,
     taken: Sequence[tuple[int, float]] = (),
 ) -> list[int]:
-    """Best pairs of which no two try places of one stretch against one submap, best first.
+    """Best pairs, best first, with at most one place per stretch for each target submap.
 
     Parameters
     ----------
     target : (m,) int
-        Submaps that would be searched, whole.
+        Target submap of each pair.
     way : (m,)
-        Of the places that would be looked for [m].
+        Path length at the source place [m].
     score : (m,)
     stretch : float
         [m]
     keep : int
-        At most.
+        Largest number of pairs.
     taken : sequence of (int, float)
-        Target and way of pairs that were tried already.
+        Target and path length of pairs that were used before.
     """
     left = np.ones(len(score), bool)
     for m, w in taken:
@@ -239,10 +238,10 @@ def thin_candidates(
 def front_end_candidates(
     submaps: Sequence[Submap], places: Places, config: CandidateConfig | None = None
 ) -> list[LoopCandidate]:
-    """Matches that the front end made, most supported first; they are measured already, and need no registration.
+    """Matches of the front end, most supported first; they are measured already and need no registration.
 
     ``i`` is the place of the target nearest to the match, ``j`` the base of the submap that entered it. Matches into
-    submaps that are not in the chain are left out.
+    submaps that are not in the chain are omitted.
     """
     c = CandidateConfig() if config is None else config
     number = {s.key: k for k, s in enumerate(submaps)}
@@ -271,11 +270,11 @@ def front_end_candidates(
 
 
 def pairs_sharing_scans(submaps: Sequence[Submap]) -> set[tuple[int, int]]:
-    """Pairs of submaps whose maps hold the same scans, by number: one entered the other's map and went on in it.
+    """Pairs of submaps whose maps include the same scans, by number: one continued in the other's map.
 
-    Matching the two would find what the front end put there. What submaps hold is said by ``report["holds"]``, the keys
-    of the submaps whose scans are in; without it a submap that was entered by a match is taken to hold its heaviest
-    target's, and so on from there.
+    A match between them would find the front end's own alignment. ``report["holds"]`` has the keys of the submaps whose
+    scans are in a map; without it, a submap that was entered by a match is assumed to include the scans in the maps of
+    its targets.
     """
     number = {s.key: k for k, s in enumerate(submaps)}
     holds: list[set[int]] = []

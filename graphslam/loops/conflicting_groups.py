@@ -1,10 +1,10 @@
-"""Two groups of loops that cannot both be right: which of them does the rest of the graph bear out, if any?
+"""Decide between two groups of loops that contradict each other, by their agreement with the rest of the graph.
 
-Loops that take one place for another agree with each other, so their number says little: ten loops of one mistake are
-one mistake. What does tell is how far the chain had to be bent for either side. With the posterior of everything but
-the two sides, every loop of a side has a χ² of the same error, the side's common motion; its median stands for the
-side, and the difference of the two is twice the logarithm of their odds. Number counts a little. Where neither speaks
-clearly the answer is that it is not known, and neither side is believed.
+Loops with the same wrong association agree with each other, so their number is weak evidence: ten loops of one mistake
+are one mistake. Better evidence is how much the chain must be deformed for either side. Relative to the posterior
+without both sides, every loop of a side has a χ² of the same error, the common motion of the side; its median
+represents the side, and the difference of the two is twice the log-odds. The number of loops has a small weight. If
+neither side is clearly better, the result is ambiguous and neither is accepted.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from graphslam.core.geometry import Array
 from graphslam.loops.map_overlap_test import ERROR
 
 DOUBT = 4.0
-"""A side is believed if the other's χ² is greater by so much: odds of e² to 1."""
+"""A side is accepted if the other's score is larger by this: odds of e² to 1."""
 MAJORITY = 1.0
-"""χ² that a loop more is worth."""
+"""χ² equivalent of one more loop."""
 CLASH = 0.9999
-"""Two right loops contradict each other with one minus this probability."""
+"""Two correct loops contradict each other with one minus this probability."""
 
 NEARBY = 20
-"""Loops are of one group whose ends are so many nodes apart, both together."""
+"""Loops are in one group if their ends are at most this many nodes apart, summed over both ends."""
 SHUTS_OUT = 0.25
-"""A loop that contradicts this share of a group that was shut out is a rival of that group."""
+"""A loop that contradicts this share of an excluded group is a rival of that group."""
 OUTNUMBERED = 4
-"""A group with so many times as many rivals is wrong."""
+"""Largest ratio of rivals to loops of a group; with more rivals the group is assumed wrong."""
 
 AMBIGUOUS = "ambiguous"
-"""What begins the reasons of loops of which nothing tells whether they are right …"""
+"""Start of the reason of loops that are undecided …"""
 SETTLED = ("dispute", AMBIGUOUS)
-"""… and of all that lost a dispute."""
+"""… and of all loops that lost a dispute."""
 
 Outcome = Literal["stays", "changes", "ambiguous"]
 
@@ -45,25 +45,25 @@ Outcome = Literal["stays", "changes", "ambiguous"]
 def find_conflicting_groups(
     D2: Array, inside: int, ends: npt.NDArray[np.int64], clash: float, least: int = 2
 ) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
-    """Sides that contradict each other.
+    """Groups of loops that contradict loops in the graph.
 
     Parameters
     ----------
     D2 : (l, l)
         χ² of all pairs, loops in the graph first.
     inside : int
-        How many of them there are.
+        Number of loops in the graph.
     ends : (l, 2)
     clash : float
-        Two loops contradict each other beyond this.
+        Two loops contradict each other above this.
     least : int
-        Loops of a group outside.
+        Minimum number of loops of a group outside the graph.
 
     Returns
     -------
     list of (rows, rows)
-        In the graph, and outside: groups of neighbours that agree, the largest first, each with those that
-        shut out a good part of it. Not where these are too many to be one mistake.
+        In the graph, and outside: groups of neighbours that agree, the largest first, each with its rivals in the
+        graph. Groups with too many rivals are omitted.
     """
     out = np.arange(inside, len(D2))
     agree = ~(D2[inside:, inside:] > clash)
@@ -79,16 +79,16 @@ def find_conflicting_groups(
 
 
 def choose_group(inside: Array, outside: Array, maps: float = 0.0) -> tuple[Outcome, str]:
-    """Which of two sides is believed, and why in words.
+    """Choose one of two contradictory sides, with the reason as text.
 
     Parameters
     ----------
     inside, outside : (a,), (b,)
-        χ² of the loops of the side in the graph and of the other, against the graph without either.
+        χ² of the loops of the side in the graph and of the other, relative to the graph without both.
     maps : float
-        Log of how much likelier the maps are with the other side
-        (:func:`graphslam.loops.map_overlap_test.overlap_log_likelihood_ratio`). Against one loop alone nothing else
-        speaks.
+        Log-likelihood ratio of the maps in favour of the other side
+        (:func:`graphslam.loops.map_overlap_test.overlap_log_likelihood_ratio`). A single loop can replace the side in
+        the graph only by this.
     """
     own, other = float(np.median(inside)), float(np.median(outside))
     score = own - other + MAJORITY * (len(outside) - len(inside))

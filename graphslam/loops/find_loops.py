@@ -1,4 +1,4 @@
-"""Loops between the submaps of a solved graph: found, measured, decided on; the graph is solved with those it keeps."""
+"""Find loops between the submaps of a solved graph: candidates, registration, decisions, and a new solution."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FindConfig:
-    """How loops are looked for."""
+    """Options of the loop search."""
 
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
-    """Proximity, and which of the front end's matches count."""
+    """Proximity, and minimum support of front-end matches."""
     pairs: PairConfig = field(default_factory=PairConfig)
     """Registration and its gates."""
     decisions: LoopConfig = field(default_factory=LoopConfig)
-    """What is believed."""
+    """Tests for accepting loops."""
     appearance: AppearanceConfig | None = None
-    """Also by what places look like; None: not."""
+    """Options of candidates by appearance; None: off."""
     descriptors: DescriptorConfig = field(default_factory=DescriptorConfig)
-    """Of the places, for that."""
+    """Descriptors of places for appearance."""
     front_end: bool = False
-    """Also the front end's matches; not where they are factors of the graph already."""
+    """Include the front end's matches; not if they are factors of the graph already."""
     ties: OverlapConfig | None = field(default_factory=OverlapConfig)
-    """Along submaps, where they were in a map that holds them (with ``front_end``: by its matches that are believed);
-    None: not. They come last, and one is worth as much as the match by which it is in that map."""
+    """Overlap constraints along submaps that continued in an older map (with ``front_end``: by accepted matches); None:
+    off. They are added last, and removed together with the match that they depend on."""
     rounds: int = 3
-    """Proximity is asked, again after loops were taken, at most so often: the graph knows more by then (0: never)."""
+    """Largest number of proximity rounds; repeated while loops are accepted, which improve the estimate (0: off)."""
 
     def __post_init__(self) -> None:
         if self.rounds < 0:
@@ -78,17 +78,17 @@ def find_loops(
         Those of the graph in their order, with dense maps.
     config : FindConfig, optional
     progress : bool
-        Show a bar.
+        Show a progress bar.
 
     Returns
     -------
     LoopCloser
-        Its ``ledger`` holds every decision; the graph holds what was accepted, and stands at its optimum.
+        Its ``ledger`` has every decision; the graph has the accepted loops and is at its optimum.
 
     Raises
     ------
     DataError
-        The submaps are not those of the graph, one has no map, or the graph is no chain.
+        The submaps are not those of the graph, one has no map, or the graph is not a chain.
 
     Examples
     --------
@@ -103,11 +103,11 @@ def find_loops(
 
 
 class LoopSearch:
-    """Looks for loops in a graph again and again while it grows; what was decided is decided on again with what is new.
+    """Repeated loop search in a growing graph; earlier decisions are revised with new loops.
 
-    A look compares the submaps that came since the one before with all of them. The last look takes all pairs, also
-    those that were refused, for the graph knows more of them by then; and it takes what asks for the whole chain:
-    places that look alike, ties.
+    A search compares the submaps added since the previous search with all of them. The last search compares all pairs,
+    also rejected ones, because the estimate has improved; it also includes the parts that need the whole chain:
+    appearance and overlap constraints.
     """
 
     def __init__(self, config: FindConfig | None = None) -> None:
@@ -125,7 +125,7 @@ class LoopSearch:
         last: bool = False,
         progress: bool = False,
     ) -> LoopCloser:
-        """Look for loops; parameters and errors are those of :func:`find_loops`; ``last``: no more submaps come."""
+        """Search for loops; parameters and errors as in :func:`find_loops`; ``last``: no more submaps follow."""
         c = self.config
         if [s.key for s in submaps] != [s.key for s in graph.submaps]:
             raise DataError("the submaps are not those of the graph", got=len(submaps), wanted=len(graph.submaps))
@@ -151,7 +151,7 @@ class LoopSearch:
 
         if c.front_end:
             go([x for x in front_end_candidates(submaps, p, c.candidates) if p.submap[x.j] >= self._seen])
-        # what was refused may have a better place beside it by now
+        # pairs that failed the registration may be tried again at another place
         tried = [(x.i, x.j) for x in closer.loops.values() if not x.why]
         for _ in range(c.rounds):
             near = proximity_candidates(p, ours.relative, c.candidates, exclude=shared, tried=tried, since=since)
@@ -175,13 +175,13 @@ class LoopSearch:
         tried: Sequence[tuple[int, int]],
         go: Callable[[Sequence[LoopCandidate]], int],
     ) -> None:
-        """Also places that look alike, wherever they are."""
+        """Candidates by appearance, at any distance."""
         c, measurer = self.config, self._measurer
         if c.appearance is None or measurer is None or len(measurer.submaps) < 2:
             return
         parts = []
         for k, s in enumerate(measurer.submaps):
-            # a dense submap without a map is refused there; landmark submaps have none
+            # a dense submap without a map raises an error there; landmark submaps have no map
             view = None if s.landmarks is not None and not has_dense_view(s) else measurer.prepared(k).view
             parts.append(describe_places(view, p.T_base_node[p.of_submap(k)], c.descriptors))
         seen = {(int(p.submap[i]), round(float(p.way[j]), 1)) for i, j in tried}
@@ -190,13 +190,13 @@ class LoopSearch:
 
 
 def _believed(closer: LoopCloser) -> set[Entry]:
-    """Entries of the front end that are in the graph, by keys of submaps."""
+    """Front-end matches that are in the graph, by keys of submaps."""
     inside = (closer.loops[n] for n in closer.accepted)
     return {x.submaps for x in inside if x.source == FRONT_END}
 
 
 def _drop_orphans(closer: LoopCloser) -> None:
-    """Ties whose entry was switched off, perhaps by their company, go too."""
+    """Remove overlap constraints whose match was rejected."""
     believed = _believed(closer)
     for n in closer.accepted:
         if not overlap_entries(closer.loops[n].gates) <= believed:

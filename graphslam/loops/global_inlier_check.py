@@ -1,8 +1,8 @@
-"""All loops of a chain judged together, by truncated least squares: a second opinion for who decides one by one.
+"""Joint inlier test of all loops of a chain by truncated least squares, independent of their order.
 
-Loops that are taken one after the other can go wrong together: three groups of loops that are wrong by the same motion
-bear each other out, and once they are in, every right loop of the place is refused. Judged together from the beginning
-(:mod:`graphslam.solve.network.robust`), each of these groups must be paid for by the chain.
+Sequential decisions can fail together: several groups of loops that are wrong by the same motion support each other,
+and once they are accepted, every correct loop there is rejected. In a joint test
+(:mod:`graphslam.solve.network.robust`), each of these groups must fit the chain.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def truncated_least_squares_inliers(
     loops: tuple[npt.NDArray[np.int64], Array, Array],
     level: float = LEVEL,
 ) -> npt.NDArray[np.bool_]:
-    """Which loops a chain and the other loops bear out.
+    """Inliers among the loops, given the chain and the other loops.
 
     Parameters
     ----------
@@ -36,12 +36,12 @@ def truncated_least_squares_inliers(
     loops : tuple
         Ends ``(l, 2)``, relative poses ``T_ij (l, 7|3)``, covariances of their right tangents ``(l, d, d)``.
     level : float
-        Every right loop is kept with this probability, if the covariances are honest.
+        Probability that a correct loop is kept, if the covariances are consistent.
 
     Returns
     -------
     (l,) bool
-        Loops between neighbouring nodes are not judged, and True.
+        Loops between neighbouring nodes are not tested, and True.
     """
     g = group_of(increments)
     ends = np.asarray(loops[0], dtype=np.intp).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""A pose graph of dense submaps as loops see it: its places, its chain, and the verbs that decisions need."""
+"""A pose graph of dense submaps as a graph with loops: its places, its chain, and the functions for loop decisions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints, Places, places_at_nodes
 
 GROUP = "loop"
-"""Class under which the graph's objective reports loops."""
+"""Factor class of loops in the graph's objective."""
 
 
 class GraphSolver(Protocol):
@@ -45,10 +45,10 @@ def places_of_graph(graph: FactorGraph) -> Places:
 
 
 def chain_of_graph(graph: FactorGraph) -> tuple[Array, Array]:
-    """Increments ``(n, 7|3)`` from node to node and their covariances ``(n, d, d)``, as the submaps stated them.
+    """Increments ``(n, 7|3)`` between nodes and their covariances ``(n, d, d)``, as in the submaps.
 
-    The factor of a levelled exit gave up its relative roll and pitch to an attitude, which a chain by itself has not.
-    Of a landmark submap it is the exit alone.
+    In the graph, the factor of a levelled end pose has no relative roll and pitch; here it has them. For a landmark
+    submap it is the end pose only.
     """
     T: list[Array] = []
     P: list[Array] = []
@@ -72,7 +72,7 @@ class GraphLoops:
     Parameters
     ----------
     graph : FactorGraph
-        Of one chain of dense submaps; may hold GPS and attitudes too.
+        Of one chain of dense submaps; may also have GPS and attitude factors.
     solver : GraphSolver
         Of that graph.
     """
@@ -96,7 +96,7 @@ class GraphLoops:
         return relative_poses(x[i], x[j], S[a, :, a], S[a, :, b], S[b, :, b])
 
     def add_loop(self, loop: Loop, robust: RobustKernel) -> int:
-        """A between-factor of declared ``shared-scan`` evidence."""
+        """Add a between-factor as declared ``shared-scan`` evidence."""
         s = self.graph.submaps[int(self.places.submap[loop.j])]
         used = EvidenceUse(["match"], s.interval, "shared-scan")
         g = TIE if loop.source == TIE else GROUP
@@ -126,7 +126,7 @@ class GraphRelativePoses:
         nodes, at = np.unique(np.concatenate([i, j]), return_inverse=True)
         a, b = at[: len(i)], at[len(i) :]
         poses, d = self.graph.values.poses, self.graph.values.group.dof
-        free = np.flatnonzero(nodes > 0)  # x0 is held
+        free = np.flatnonzero(nodes > 0)  # x0 is fixed
         P = self.graph.covariance().joint([f"x{n}" for n in nodes[free]]).reshape(len(free), d, len(free), d)
         S = np.zeros((len(nodes), d, len(nodes), d))
         S[free[:, None], :, free[None, :]] = np.swapaxes(P, 1, 2)

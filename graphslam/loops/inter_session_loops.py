@@ -1,11 +1,11 @@
-"""Where one session of dense submaps lies in another: ties by what places look like, registered, and made to agree.
+"""Align one session of dense submaps with another: candidates by appearance, registration, and pairwise consistency.
 
-Nothing is known beforehand of how two sessions lie to each other, so there is no prediction to gate a match by, and in
-a building that repeats itself a place that looks right is often wrong. What decides is agreement: two ties (a, b) and
-(c, d) and the two chains between their ends must close a cycle (:mod:`~graphslam.association.consistent_set`, with the
-chain cut between the sessions). The largest set of ties that agree two by two must be large enough, stretch over
-some of the way, and leave no second set of others that is nearly as large; else the answer is that nothing is known,
-and why.
+The relative pose of two sessions is unknown, so there is no prediction to gate a match, and in a building with
+repeating structure a similar place is often wrong. The decision is by consistency: two loop closures (a, b) and (c, d)
+and the two chains between their ends must form a closed cycle (:mod:`~graphslam.association.consistent_set`, with the
+chain cut between the sessions). The largest set of loop closures that are pairwise consistent must be large enough,
+extend over some path length, and there must be no second set of similar size; otherwise no alignment is returned, with
+the reason.
 """
 
 from __future__ import annotations
@@ -40,33 +40,33 @@ from graphslam.registration.place_descriptor import (
 )
 
 Mask = npt.NDArray[np.bool_]
-_APART = 1000.0  # sessions lie so far apart along the common way [m]: no two of their places are one stretch
+_APART = 1000.0  # path length between the sessions [m], so that no two of their places are in one stretch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InterSessionConfig:
-    """When ties between two sessions are believed."""
+    """Tests for accepting loop closures between two sessions."""
 
     top: int = 3
-    """Of each place so many places of the other session are tried at most."""
+    """Largest number of candidates in the other session for each place."""
     alike: float = 0.5
-    """Correlation of their descriptors, at least."""
+    """Minimum correlation of descriptors."""
     stretch: float = 6.0
-    """Places nearer than this along the way are one stretch [m]."""
+    """Places with a smaller distance along the path are in one stretch [m]."""
     keep: int = 60
-    """Candidates that are registered at most, most alike first."""
+    """Largest number of candidates that are registered, most similar first."""
     level: float = 0.99
-    """Two right ties agree with this probability."""
+    """Probability that two correct loop closures are consistent."""
     least: int = 3
-    """Ties that agree, at least …"""
+    """Minimum number of consistent loop closures …"""
     reach: float = 6.0
-    """… over so much of the way of the session that is tied [m]."""
+    """… and of the path length of the new session that they cover [m]."""
     rival: float = 0.5
-    """A second set, of ties that the first has not, may have at most this share of its number."""
+    """Largest size of a second consistent set of other loop closures, as a share of the first."""
     heard: int = 10
-    """Other places that ties bring near each other have a say where there are so many, at least …"""
+    """Minimum number of other places near each other in the alignment for a further test …"""
     borne: float = 0.1
-    """… of which such a share must match: blocks of houses look alike in part."""
+    """… and minimum share of them that must match, because blocks of houses look alike in part."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -85,7 +85,7 @@ class SessionMap:
     submaps : sequence of Submap
         Dense, with paths and maps.
     spacing : float
-        Of the nodes [m]; node k is the k-th that a graph would have which begins with these submaps at this spacing.
+        Of the nodes [m]; node k is node k of a graph that starts with these submaps at this spacing.
     """
 
     def __init__(self, submaps: Sequence[Submap], spacing: float = 3.0) -> None:
@@ -118,11 +118,11 @@ class SessionMap:
         )
         self.increments, self.covariances = np.concatenate(steps), np.concatenate(covariances)
         self.length = begin
-        """Of the way [m]."""
+        """Path length [m]."""
 
     @cached_property
     def descriptors(self) -> PlaceDescriptors:
-        """Of the places; made when they are first asked for."""
+        """Of the places; computed at first use."""
         config, out = DescriptorConfig(), []
         for k, s in enumerate(self.submaps):
             T = self.places.T_base_node[self.places.of_submap(k)]
@@ -132,20 +132,20 @@ class SessionMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InterSessionLoops:
-    """What was tried to tie one session to another, and what came of it.
+    """Candidates of loop closures between two sessions, with results.
 
     Parameters
     ----------
     loops : tuple of Loop
         Every candidate as measured; ``i`` is a node of the map's chain, ``j`` one of the session's own chain.
     accepted : (n,) bool
-        Those that agree with each other.
+        Pairwise consistent ones.
     reasons : tuple of str
-        Of each, in words.
+        Text for each.
     why : str
-        Why the ties as a whole are not believed; empty if they are.
+        Why the set as a whole is rejected; empty if it is accepted.
     rival : int
-        Size of the largest set of others that agree.
+        Size of the largest consistent set of other loop closures.
     """
 
     loops: tuple[Loop, ...]
@@ -156,11 +156,11 @@ class InterSessionLoops:
 
     @property
     def chosen(self) -> list[Loop]:
-        """The ties that agree; none if they are not believed."""
+        """The consistent loop closures; empty if the set is rejected."""
         return [x for x, yes in zip(self.loops, self.accepted) if yes] if not self.why else []
 
     def rows(self) -> list[dict[str, object]]:
-        """A row a candidate: submaps, nodes, score, verdict, why, and the figures of its gates."""
+        """One row per candidate: submaps, nodes, score, decision, reason, and the values of its gates."""
         return [
             {
                 "submap_map": x.submaps[0],
@@ -178,14 +178,14 @@ class InterSessionLoops:
 
 
 class TwoSessions:
-    """Two sessions side by side: candidates between them, registrations, agreement.
+    """Two sessions: candidates between them, registration, consistency.
 
     Parameters
     ----------
     known, new : SessionMap
-        The map, and the session that is to be placed in it.
+        The map, and the session to align with it.
     pairs : PairConfig, optional
-        Of the registration.
+        Options of the registration.
     """
 
     def __init__(self, known: SessionMap, new: SessionMap, pairs: PairConfig | None = None) -> None:
@@ -194,7 +194,7 @@ class TwoSessions:
         if group_of(a.T_base_node).dim != group_of(b.T_base_node).dim:
             raise DataError("a 2-D and a 3-D session cannot be aligned")
         self.offset = len(known.increments) + 1
-        """Of the new session's nodes in the chain of both: the end of the known one is a node, too."""
+        """Offset of the new session's nodes in the chain of both; the end of the known session is a node, too."""
         self.places = Places(
             np.concatenate([a.node, self.offset + b.node]),
             np.concatenate([a.submap, len(known.submaps) + b.submap]),
@@ -205,7 +205,7 @@ class TwoSessions:
         self.measurer = LoopMeasurer([*known.submaps, *new.submaps], self.places, pairs)
         bridge, d = group_of(a.T_base_node).identity[None], known.covariances.shape[1]
         joined = np.ones(self.offset + len(new.increments), dtype=np.bool_)
-        joined[self.offset - 1] = False  # what lies between the sessions is not known
+        joined[self.offset - 1] = False  # the increment between the sessions is unknown
         self.chain = OdometryChain.of(
             np.concatenate([known.increments, bridge, new.increments]),
             np.concatenate([known.covariances, np.eye(d)[None], new.covariances]),
@@ -214,7 +214,7 @@ class TwoSessions:
 
     @property
     def within(self) -> set[tuple[int, int]]:
-        """Pairs of submaps of one session: they are not tied here."""
+        """Pairs of submaps of the same session, which are not compared."""
         n = len(self.known.submaps)
         m = n + len(self.new.submaps)
         return {*combinations(range(n), 2), *combinations(range(n, m), 2)}
@@ -226,7 +226,7 @@ class TwoSessions:
         return appearance_candidates(self.places, both, appearance, exclude=self.within)[: config.keep]
 
     def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
-        """Registered; ``i`` and ``j`` are nodes of the chain of both."""
+        """Register candidates; ``i`` and ``j`` are nodes of the chain of both."""
         found = self.measurer.measure(candidates, progress=progress)
         node = self.places.node
         loops = [replace(x, i=int(node[x.i]), j=int(node[x.j])) for x in found]
@@ -234,13 +234,13 @@ class TwoSessions:
         for k, x in enumerate(loops):
             if x.why:
                 continue
-            if (x.i, x.j) in seen:  # two candidates that ended at the same place are one measurement
+            if (x.i, x.j) in seen:  # two candidates with the same result are one measurement
                 loops[k] = replace(x, why="the same as another candidate")
             seen.add((x.i, x.j))
         return loops
 
     def agree(self, loops: Sequence[Loop], config: InterSessionConfig) -> InterSessionLoops:
-        """The largest set of measured ties that agree with each other, and whether it is to be believed.
+        """The largest consistent set of measured loop closures, and whether it is accepted.
 
         Parameters
         ----------
@@ -280,12 +280,12 @@ class TwoSessions:
         return InterSessionLoops(loops=tuple(own), accepted=accepted, reasons=tuple(reasons), why=why, rival=rival)
 
     def find(self, config: InterSessionConfig | None = None, *, progress: bool = False) -> InterSessionLoops:
-        """Candidates by appearance, registered, agreed upon."""
+        """Candidates by appearance, registered and tested for consistency."""
         c = InterSessionConfig() if config is None else config
         return self.agree(self.measure(self.candidates(c), progress=progress), c)
 
     def thinned(self, loops: Sequence[Loop], stretch: float) -> list[Loop]:
-        """The most alike of ties of which no two tie one stretch [m] to one submap: their surroundings are the same.
+        """The most similar loop closures, at most one per stretch [m] and target submap (same surroundings).
 
         Parameters
         ----------
@@ -302,11 +302,11 @@ class TwoSessions:
         return [loops[k] for k in sorted(chosen)]
 
     def _rows(self, loops: Sequence[Loop]) -> Ints:
-        """Places of the new session that ties end at; a node that is no place is the end of the chain."""
+        """Places of the new session at the ends of loop closures."""
         return np.array([x.j - self.offset for x in loops], dtype=np.int64)
 
     def _disagreement(self, loops: Sequence[Loop]) -> Array:
-        """``D²`` of every pair of ties; nothing says of one by itself whether it is right."""
+        """``D²`` of every pair of loop closures; single loop closures cannot be tested."""
         ends = np.array([[x.i, x.j] for x in loops], dtype=np.int64)
         arrays = LoopArrays.of(
             self.chain, ends, np.stack([x.T_ij for x in loops]), np.stack([x.covariance for x in loops])
@@ -319,7 +319,7 @@ class TwoSessions:
 
 
 def session_start(ties: Sequence[Loop], known: Array, new: Array) -> Array:
-    """Where a session begins in the map by the middlemost of its ties: the start value of a solver.
+    """Initial pose of a session in the map: the medoid of the poses from its loop closures.
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def session_start(ties: Sequence[Loop], known: Array, new: Array) -> Array:
     Returns
     -------
     (7,) or (3,)
-        Of the tie whose own start is nearest to all others'.
+        From the loop closure with the smallest sum of distances to the others.
     """
     g = group_of(known)
     starts = np.stack([g.compose(g.compose(known[x.i], x.T_ij), g.inverse(new[x.j])) for x in ties])

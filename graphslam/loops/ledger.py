@@ -1,4 +1,4 @@
-"""The ledger of loops: every decision with its reasons and figures, as events that outlive the run."""
+"""The ledger of loops: every decision with its reason and values, as events stored in the run folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopDecision:
-    """What was decided of a loop, and on what grounds; the latest of a loop is the one in force.
+    """A decision on a loop, with its reasons; the latest decision on a loop is the current one.
 
     Parameters
     ----------
@@ -48,33 +48,33 @@ class LoopDecision:
         Number of the loop in the ledger.
     verdict : {"accepted", "rejected", "switched-off", "undone"}
     why : str
-        In words.
+        Reason as text.
     i, j : int
         Nodes.
     submap_i, submap_j : int
         Keys of their submaps.
     source : str
-        Who proposed it: ``front-end``, ``proximity``, ``appearance``.
+        Source of the candidate: ``front-end``, ``proximity``, ``appearance`` or ``tie``.
     score, gain : float
         Of the candidate.
     gates : dict
-        Figures of its registration.
+        Values of its registration.
     chi2 : float
-        Against the graph's joint marginal when it was decided on; once it is in, against the graph without it.
+        Relative to the graph's joint marginal at the decision, later to the graph without the loop.
     weight : float
-        Of the robust kernel at the solution; 0 of a loop that is not in the graph.
+        Of the robust kernel at the solution; 0 for a loop that is not in the graph.
     effect_predicted : float
-        By how much it was expected to raise the objective: ``eᵀ (P + R)⁻¹ e``.
+        Predicted increase of the objective: ``eᵀ (P + R)⁻¹ e``.
     effect : float
-        By how much it did.
+        Actual increase.
     effect_earlier : float
-        Of that, what the factors bear that were there before.
+        Part of it in the factors that existed before.
     factor_id : int
         In the graph; −1 if it is not there.
     T_ij : list of float
-        The measurement; empty where the registration came to nothing.
+        The measurement; empty if the registration failed.
     covariance : list of list of float
-        Of it, right tangent: with the two a loop can be put into another graph.
+        Of it, right tangent.
     """
 
     loop: int
@@ -103,7 +103,7 @@ class LoopDecision:
 
 
 class LoopLedger:
-    """Decisions in the order in which they were made.
+    """Decisions in chronological order.
 
     Examples
     --------
@@ -119,7 +119,7 @@ class LoopLedger:
 
     @classmethod
     def from_events(cls, events: Iterable[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
-        """The ledger of a run from its events; those of other kinds are passed over."""
+        """The ledger of a run from its events; other events are ignored."""
         out = []
         names = set(LoopDecision.__slots__)
         for k, e in enumerate(events):
@@ -141,32 +141,32 @@ class LoopLedger:
         return len(self.decisions)
 
     def current(self) -> list[LoopDecision]:
-        """The decision in force of every loop, by its number."""
+        """The current decision on every loop, by its number."""
         last: dict[int, LoopDecision] = {}
         for d in self.decisions:
             last[d.loop] = d
         return [last[k] for k in sorted(last)]
 
     def of(self, loop: int) -> LoopDecision:
-        """The decision in force of one loop."""
+        """The current decision on one loop."""
         for d in reversed(self.decisions):
             if d.loop == loop:
                 return d
         raise DataError(f"loop {loop} is not in the ledger", wanted=f"one of {len(self.current())} loops")
 
     def events(self) -> list[dict[str, Any]]:
-        """All decisions, ready for ``events.jsonl``."""
+        """All decisions as lines for ``events.jsonl``."""
         return [d.event() for d in self.decisions]
 
     def counts(self) -> dict[str, int]:
-        """Loops by verdict in force."""
+        """Number of loops by current decision."""
         out: dict[str, int] = {}
         for d in self.current():
             out[d.verdict] = out.get(d.verdict, 0) + 1
         return out
 
     def table(self, *, history: bool = False) -> pd.DataFrame:
-        """A row a loop with the decision in force, or with ``history`` a row a decision."""
+        """One row per loop with its current decision, or with ``history`` one row per decision."""
         import pandas as pd
 
         rows = []
@@ -181,7 +181,7 @@ class LoopLedger:
 
 
 DECIDED = "decided on with all loops"
-"""Why a factor of a front end's match is taken out where it is a loop among others from then on."""
+"""Reason for removing the factor of a front-end match that is then decided on like other loops."""
 
 
 def ledger_of_events(events: Sequence[Mapping[str, Any]], *, where: str = "events") -> LoopLedger:
@@ -198,7 +198,7 @@ def ledger_of_events(events: Sequence[Mapping[str, Any]], *, where: str = "event
 
 
 def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> LoopDecision | None:
-    """A front end's match that became a factor, or did not; None for other events."""
+    """Decision on a front-end match that became a factor, or did not; None for other events."""
     taken = e.get("event") == "between" and e.get("group") == "match"
     if not taken and e.get("event") != "match-not-used":
         return None
@@ -210,7 +210,7 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Loo
     fid = int(e.get("factor_id", -1))
     gone = taken and fid in removed
     if gone and removed[fid] == DECIDED:
-        return None  # it is among the loops
+        return None  # it is in the ledger as a loop
     support = figure("support")
     why = f"removed: {removed[fid]}" if gone else f"support {support:.2f}"
     return LoopDecision(
@@ -230,9 +230,9 @@ def _match(e: Mapping[str, Any], number: int, removed: Mapping[Any, str]) -> Loo
 
 
 def same_loop(d: LoopDecision, ledger: LoopLedger) -> LoopDecision | None:
-    """The loop of another ledger that is in the graph, between the same nodes, and found the same way; or None.
+    """The accepted loop of another ledger with the same source, submaps and nodes; or None.
 
-    Numbers may differ where something else was tried in between; of several the one of that number is taken.
+    Numbers may differ if other candidates were tested; of several loops the one with the same number is returned.
     """
     found = [x for x in ledger.current() if x.verdict == "accepted" and _identity(x) == _identity(d)]
     found.sort(key=lambda x: x.loop != d.loop)

@@ -1,22 +1,22 @@
-"""Which loops are believed: each is tried against the graph, against the others, and by what it does once it is in.
+"""Decide on loops: each is tested with the graph, with the other loops, and by its effect on the solution.
 
-One wrong loop ruins a map, so a loop passes, in this order,
+One wrong loop ruins a map, so a loop must pass these tests, in this order:
 
 1. the gates of its registration (:mod:`graphslam.registration.gates`);
-2. the χ² of the chain of submaps alone, and all other loops two by two: the largest set that agrees (pairwise
-   consistency);
-3. the χ² of its residual against the joint marginal of the graph as it is by then, most likely first;
-4. the solution: a loop that raises the χ² of what was there before by more than chance is taken out again, and once all
-   are in, every one is asked what the graph *without* it says of it;
-5. and if more loops that agree were shut out by a group than the group has, the two change places: by what pairs say,
-   and by what a second opinion says that judges all of them together;
-6. of two groups that cannot both be right the one is believed by which maps lie on each other as they do elsewhere
-   (:mod:`~graphslam.loops.map_overlap_test`); if they do not tell, the one that the rest of the graph bears out,
-   whatever their number; neither, if that cannot tell (:mod:`~graphslam.loops.conflicting_groups`).
+2. its χ² with the chain of submaps alone, and pairwise consistency: it is in the largest set of loops that are
+   consistent with each other;
+3. the χ² of its residual with the current joint marginal of the graph, most likely loops first;
+4. the solution: a loop that raises the χ² of earlier factors significantly is removed, and after all loops were added,
+   each is compared with the graph *without* it;
+5. if a group excludes a larger set of consistent loops, the two are exchanged, by pairwise consistency and by a joint
+   test of all loops;
+6. of two contradictory groups the one with the more consistent map overlap is accepted
+   (:mod:`~graphslam.loops.map_overlap_test`); if the maps do not decide, the one that agrees better with the rest of
+   the graph; if this is ambiguous, neither (:mod:`~graphslam.loops.conflicting_groups`).
 
-With the residual r of a loop that is in the graph, of covariance R, and the posterior P of the relative pose, the graph
+With the residual r of a loop in the graph, its covariance R, and the posterior P of the relative pose, the graph
 without it predicts r with covariance ``R - P``, so ``r' = R (R - P)⁻¹ r`` and its χ² is ``rᵀ (R - P)⁻¹ r``: no second
-solution is needed for it. Every step writes a :class:`~graphslam.loops.ledger.LoopDecision`.
+solution is needed. Every step writes a :class:`~graphslam.loops.ledger.LoopDecision`.
 """
 
 from __future__ import annotations
@@ -51,20 +51,20 @@ from graphslam.registration.submap_pairs import prediction_chi2
 
 
 class LoopCloser:
-    """Decides on loops, and keeps the ledger.
+    """Decides on loops, and writes the loop ledger.
 
     Parameters
     ----------
     increments, covariances : (n, 7|3), (n, d, d)
-        The chain alone, from node to node, right tangents: what pairwise consistency goes by.
+        The chain alone, between nodes, right tangents, for pairwise consistency.
     ledger : LoopLedger, optional
-        To go on with.
+        Earlier ledger to continue.
     judge : callable, optional
-        Which of all loops the chain and the others bear out, judged together: from increments, covariances and the
-        loops' ends, relative poses and covariances to ``(l,) bool``
+        Joint inlier test of all loops, from increments, covariances, and loops (ends, poses, covariances) to a mask
         (:func:`graphslam.loops.global_inlier_check.truncated_least_squares_inliers`).
     witness : callable, optional
-        What the maps of loops say at relative poses of their ends (:mod:`graphslam.loops.map_overlap_test`).
+        Contradiction between the maps of loops at relative poses of their ends
+        (:mod:`graphslam.loops.map_overlap_test`).
     """
 
     def __init__(
@@ -89,24 +89,24 @@ class LoopCloser:
     # ---------------------------------------------------------------- deciding
 
     def extend_chain(self, graph: LoopGraph, increments: Array, covariances: Array) -> None:
-        """The chain has grown: the same loops, in a longer chain."""
+        """Continue with a longer chain and the same loops."""
         self.graph, self.increments, self.covariances = graph, increments, covariances
 
     @property
     def accepted(self) -> list[int]:
-        """Numbers of the loops that are in the graph."""
+        """Numbers of the loops in the graph."""
         return [d.loop for d in self.ledger.current() if d.verdict == "accepted"]
 
     @property
     def undecided(self) -> list[tuple[list[int], list[int]]]:
-        """Pairs of groups that cannot both be right, of which nothing tells which is: neither is in the graph."""
+        """Pairs of contradictory groups without a decision: neither is in the graph."""
         torn = {d.loop for d in self.ledger.current() if d.why.startswith(AMBIGUOUS)}
         pairs = [([n for n in a if n in torn], [n for n in b if n in torn]) for a, b in self._torn]
         return [(a, b) for a, b in pairs if a and b]
 
     @contextmanager
     def with_trial_loops(self, numbers: Sequence[int]) -> Iterator[list[int]]:
-        """Of loops that are not in the graph those that it bears, in it while the block lasts; nothing is written."""
+        """Context with additional loops, as far as the graph accepts them; removed at the end, not in the ledger."""
         inside: dict[int, int] = {}
         for _, n in sorted(zip(self._against_chain(list(numbers)), numbers)):
             verdict, _, facts = self._try(n)
@@ -120,12 +120,12 @@ class LoopCloser:
             self.graph.solve()
 
     def propose(self, loops: Sequence[Loop]) -> list[LoopDecision]:
-        """Decide on new loops, and again on those that are in or were refused by the company they were in.
+        """Decide on new loops, and again on accepted ones and on those rejected because of other loops.
 
         Returns
         -------
         list of LoopDecision
-            In force for the new ones, in their order.
+            Current decisions on the new ones, in their order.
         """
         first = 1 + max((d.loop for d in self.ledger.decisions), default=-1)
         numbers = list(range(first, first + len(loops)))
@@ -142,7 +142,7 @@ class LoopCloser:
         return [self.ledger.of(n) for n in numbers]
 
     def undo(self, loop: int, why: str = "asked for") -> LoopDecision:
-        """Take a loop out of the graph, and solve without it."""
+        """Remove a loop from the graph, and solve without it."""
         d = self.ledger.of(loop)
         if d.verdict != "accepted":
             raise DataError(f"loop {loop} is not in the graph", got=d.verdict, wanted="an accepted loop")
@@ -154,9 +154,9 @@ class LoopCloser:
         return self.ledger.of(loop)
 
     def _decide(self, new: list[int]) -> None:
-        """Rounds: what the graph refuses of the largest set that agrees has no say about the others any more."""
+        """Rounds: loops that the graph rejects no longer take part in pairwise consistency."""
         out: set[int] = set()
-        self._torn = []  # all that lost a dispute are decided on again
+        self._torn = []  # loops that lost a dispute are decided on again
         while True:
             refused = self._round(new, out)
             refused |= self._reconsider()
@@ -168,7 +168,7 @@ class LoopCloser:
         if self._second_opinion():
             self._reconsider()
         seen: list[list[int]] = []
-        while self.accepted not in seen:  # what a group held down may now stand against the next one
+        while self.accepted not in seen:  # removing one group may start a dispute with the next one
             seen.append(self.accepted)
             if self._disputes():
                 self._reconsider()
@@ -179,8 +179,8 @@ class LoopCloser:
         self._say_weights()
 
     def _round(self, new: list[int], out: set[int]) -> set[int]:
-        """One round over all loops but ``out``; those of the largest set that agrees which the graph refused."""
-        # loops that disagreed with others may turn out right when more are there
+        """One round over all loops except ``out``; returns consistent loops that the graph rejected."""
+        # loops that were inconsistent with others may be accepted with more loops
         again = [n for n in self._refused_by_company() if n not in new]
         numbers = [n for n in sorted({*new, *self.accepted, *again}) if n not in out]
         if not numbers:
@@ -209,18 +209,18 @@ class LoopCloser:
         return set(tried) - set(self.accepted)
 
     def _refuse(self, n: int, why: str, chi2: float) -> None:
-        """Write a refusal, unless that is what the ledger says already."""
+        """Write a rejection, unless it is the latest decision already."""
         last = [d for d in self.ledger.decisions if d.loop == n][-1:]
         if not last or last[0].why != why:
             self._write(n, "rejected", why, chi2=chi2)
 
     def _one_by_one(self, numbers: list[int]) -> None:
-        for n in numbers:  # each against the graph as it is by then
+        for n in numbers:  # each with the current graph
             verdict, why, facts = self._try(n)
             self._write(n, verdict, why, **facts)
 
     def _try(self, n: int) -> tuple[Verdict, str, dict[str, float]]:
-        """Add one loop if the graph bears it: verdict, reason, figures."""
+        """Add one loop if the graph accepts it: decision, reason, values."""
         c, d, loop = self.config, self._dof, self.loops[n]
         limit = chi2_quantile(c.level, d)
         earlier_limit = chi2_quantile(c.earlier, d)
@@ -244,10 +244,10 @@ class LoopCloser:
         return "accepted", acceptance_reason(expected, d), {**facts, "factor_id": fid, "weight": weight}
 
     def _exchange(self) -> bool:
-        """Were more loops shut out by the company of others than these are? Then they take the others' place.
+        """Exchange loops in the graph with a larger set of consistent loops that they exclude.
 
-        Pairs are compared with the chain between them, which may bear much; loops that agree two by two may still not
-        fit into one graph together with a group that is wrong, and each of them is refused by itself.
+        Pairs are compared along the chain, which may have a large covariance. So loops that are pairwise consistent may
+        still not fit into one graph together with a wrong group, and are rejected one by one.
         """
         inside, outside = self.accepted, self._refused_by_company()
         outside = [n for n in outside if self._bears(n)]
@@ -257,12 +257,12 @@ class LoopCloser:
         outside = [n for n, good in zip(outside, agreed) if good]
         both = self._consistent([*inside, *outside])
         clash = both.chi2[: len(inside), len(inside) :] > both.limit
-        # a right pair disagrees now and then by chance: rivals are those that shut out many
+        # correct pairs are sometimes inconsistent by chance: rivals exclude many loops
         rivals = [n for n, row in zip(inside, clash) if row.mean() > SHUTS_OUT]
         return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)
 
     def _second_opinion(self) -> bool:
-        """What all loops together say, judged without regard to which came first."""
+        """Joint test of all loops, independent of their order."""
         inside = self.accepted
         asked = sorted({*inside, *(n for n in self._refused_by_company() if self._bears(n))})
         if self.judge is None or not inside or len(asked) < 2:
@@ -273,7 +273,7 @@ class LoopCloser:
         return len(outside) > len(rivals) > 0 and self._swap(rivals, outside)
 
     def _swap(self, rivals: list[int], outside: list[int]) -> bool:
-        """Take loops out and try others instead; back as it was if not more of them fit."""
+        """Replace loops by others; undone if not more of them are accepted."""
         for n in rivals:
             self.graph.remove_loop(self.ledger.of(n).factor_id)
         self.graph.solve()
@@ -298,10 +298,10 @@ class LoopCloser:
         return False
 
     def _disputes(self) -> bool:
-        """Groups that cannot both be right: the one that the rest of the graph bears out, or neither."""
+        """Decide between contradictory groups: accept the one that agrees with the rest of the graph, or neither."""
         inside = self.accepted
         outside = [n for n in self._refused_by_company() if self._bears(n)]
-        least = 2 if self.witness is None else 1  # the maps may tell of one loop alone
+        least = 2 if self.witness is None else 1  # maps can decide on a single loop
         if not inside or len(outside) < least:
             return False
         both = [*inside, *outside]
@@ -311,7 +311,7 @@ class LoopCloser:
         for rows, columns in find_conflicting_groups(self._consistent(both).chi2, len(inside), ends, limit, least):
             a, b = [both[k] for k in rows], [both[k] for k in columns]
             if not set(a) <= set(self.accepted):
-                continue  # another dispute has changed that
+                continue  # changed by another dispute
             with_a = self._relative([*a, *b])
             for n in a:
                 self.graph.remove_loop(self.ledger.of(n).factor_id)
@@ -336,12 +336,12 @@ class LoopCloser:
         return changed
 
     def _maps_say(self, a: list[int], b: list[int], with_a: Array) -> float:
-        """Log of how much likelier the maps are with the loops b than with a; neither is in the graph.
+        """Log-likelihood ratio of the maps with the loops b to those with a; neither is in the graph.
 
         Parameters
         ----------
         with_a : (k, 7|3)
-            Relative poses of the ends of all of them when a was.
+            Relative poses of the ends of all of them in the solution with a.
         """
         others = [n for n in self.accepted if n not in a]
         if self.witness is None or not others:
@@ -355,7 +355,7 @@ class LoopCloser:
         asked, calm = [self.loops[n] for n in [*a, *b]], [self.loops[n] for n in others]
         at, g = self._relative(others), group_of(with_a)
         D = g.between(with_a, with_b)
-        # by what the solutions differ there, one after the other, both ways
+        # move undisputed loops by the differences between the two solutions, in turn, in both directions
         D = np.concatenate([D, g.inverse(D)])
         moved = g.compose(at, D[np.arange(len(at)) % len(D)])
         shares = [self.witness(x, T) for x, T in ((calm, at), (calm, moved), (asked, with_b), (asked, with_a))]
@@ -364,22 +364,22 @@ class LoopCloser:
         )
 
     def _relative(self, numbers: list[int]) -> Array:
-        """Relative poses of the ends of loops in the graph as it is ``(k, 7|3)``."""
+        """Relative poses of the ends of loops in the current graph ``(k, 7|3)``."""
         x = [self.loops[n] for n in numbers]
         return self.graph.relative(np.array([a.i for a in x]), np.array([a.j for a in x]))[0]
 
     def _against_graph(self, numbers: list[int]) -> Array:
-        """χ² of loops that are not in the graph, each by itself ``(k,)``."""
+        """χ² of loops that are not in the graph, each separately ``(k,)``."""
         x = [self.loops[n] for n in numbers]
         T, P = self.graph.relative(np.array([a.i for a in x]), np.array([a.j for a in x]))
         return np.array([prediction_chi2(a.T_ij, a.covariance, T[k], P[k]) for k, a in enumerate(x)])
 
     def _bears(self, n: int) -> bool:
-        """Whether the chain alone bears a loop."""
+        """Is a loop consistent with the chain alone?"""
         return self._against_chain([n])[0] <= chi2_quantile(self.config.chain, self._dof)
 
     def _reconsider(self) -> set[int]:
-        """Switch off, worst first, what the rest of the graph contradicts; which these were."""
+        """Switch off loops that the rest of the graph contradicts, worst first; returns their numbers."""
         limit = chi2_quantile(self.config.off, self._dof)
         gone: set[int] = set()
         while inside := self.accepted:
@@ -393,7 +393,7 @@ class LoopCloser:
         return gone
 
     def _say_weights(self) -> None:
-        """The kernels' weights have changed since loops were taken."""
+        """Write the weights of the kernels, which have changed since loops were accepted."""
         chi2 = self.graph.chi2()
         for n in self.accepted:
             d = self.ledger.of(n)
@@ -402,7 +402,7 @@ class LoopCloser:
                 self.ledger.write(replace(d, weight=weight))
 
     def without(self, numbers: Sequence[int]) -> Array:
-        """χ² of loops that are in the graph against the graph without them ``(k,)``, each by itself.
+        """χ² of loops in the graph relative to the graph without them ``(k,)``, each separately.
 
         ``rᵀ (R - P)⁻¹ r`` with the residual r and the posterior P of the relative pose
         (:func:`~graphslam.loops.rules.chi2_without`).
@@ -414,7 +414,7 @@ class LoopCloser:
     # ---------------------------------------------------------------- writing
 
     def switch_off(self, n: int, why: str, chi2: float = math.nan) -> None:
-        """Take a loop that is in the graph out of it, since something contradicts it, and solve without it."""
+        """Remove a contradicted loop from the graph, and solve without it."""
         d = self.ledger.of(n)
         before = sum(self.graph.chi2().values())
         self.graph.remove_loop(d.factor_id)
@@ -466,5 +466,5 @@ class LoopCloser:
 
 
 def acceptance_reason(chi2: float, dof: int) -> str:
-    """Why a loop was accepted, in words."""
+    """Reason for the acceptance of a loop, as text."""
     return f"agrees with the graph: χ² {chi2:.1f} of {dof}"

@@ -1,10 +1,9 @@
-"""What maps say of two groups of loops that cannot both be right: in which of two solutions do they deny each other?
+"""Test by overlapping maps which of two contradictory groups of loops is right.
 
-A loop that takes one place for another brings two maps together that do not belong together, and walls of the one then
-stand in what the other has free. How much maps deny each other where they do belong together, and how much where they
-do not, differs from sensor to sensor and world to world; so both are told by the run itself, at loops that nobody
-disputes: as they lie, and moved by what the two solutions differ by. In a world that repeats itself with that motion
-both are alike, and then the maps say nothing.
+A wrong loop brings two maps together that do not belong together, so walls of one are in free space of the other. The
+size of this contradiction, for correct and for wrong overlaps, depends on sensor and world. So both distributions are
+learnt from the run itself, at undisputed loops: at their relative poses, and moved by the difference between the two
+solutions. In a world that repeats with this motion both distributions are equal, and the maps do not decide.
 """
 
 from __future__ import annotations
@@ -22,28 +21,28 @@ Witness = Callable[[Sequence[Loop], Array], Array]
 """Share of contradiction between the maps of loops ``(k,)``, at the relative poses ``(k, 7|3)`` of their ends."""
 
 ERROR = 1e-3
-"""The maps decide where they are so much likelier by one solution: by Markov's inequality they decide wrongly with no
-greater probability than this."""
+"""The maps decide if the likelihood ratio is above one over this: by Markov's inequality the probability of a wrong
+decision is not larger."""
 FEWEST = 10
-"""Pairs of submaps that must tell how maps lie on each other before they are asked."""
+"""Minimum number of submap pairs for learning the distributions."""
 GRAIN = 0.5 / math.sqrt(500)
-"""Least σ of the angle of a share: that of counting in 500 points."""
+"""Minimum σ of the angle of a share, from counting 500 points."""
 
 
 def overlap_log_likelihood_ratio(right: Array, moved: Array, first: Array, second: Array) -> float:
-    """Logarithm of how much likelier the shares of contradiction are if the first of two solutions is right.
+    """Log-likelihood ratio of the shares of contradiction, in favour of the first of two solutions.
 
     Parameters
     ----------
     right, moved : (n,), (m,)
-        Shares at loops that nobody disputes: as they lie, and moved from there.
+        Shares at undisputed loops, at their relative poses and moved.
     first, second : (k,), (k,)
-        Shares at the places in dispute, in either solution; each is one piece of evidence.
+        Shares at the disputed places, in each solution; each is one independent piece of evidence.
 
     Returns
     -------
     float
-        0 where there are too few to learn from.
+        0 if there are too few undisputed ones.
     """
     if min(len(right), len(moved)) < FEWEST:
         return 0.0
@@ -52,13 +51,13 @@ def overlap_log_likelihood_ratio(right: Array, moved: Array, first: Array, secon
 
 
 def disagreement_shares(loops: Sequence[Loop], shares: Array) -> Array:
-    """Mean share of each pair of submaps: its places see the same walls, and are one piece of evidence."""
+    """Mean share of each pair of submaps, because its places observe the same walls."""
     _, row = np.unique(np.sort([x.submaps for x in loops], axis=1), axis=0, return_inverse=True)
     return np.asarray(np.bincount(row.ravel(), weights=shares) / np.bincount(row.ravel()))
 
 
 def _law(shares: Array) -> Callable[[Array], Array]:
-    """Log density of the next share, given these: Student's, of the angle whose squared sine it is."""
+    """Predictive log density of a share given these: Student's t of the angle whose squared sine it is."""
     from scipy import stats  # takes half a second to load
 
     z, n = _angle(shares), len(shares)

@@ -1,4 +1,4 @@
-"""From candidates to measured loops: every pair is registered, judged, and hung on the nearest places."""
+"""Register candidates, test the result, and attach the loops to the nearest places."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graphslam.registration.submap_pairs import PreparedMap, contradiction_share
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loop:
-    """A measured loop, before it is decided on.
+    """A measured loop before the decision.
 
     Parameters
     ----------
@@ -29,13 +29,13 @@ class Loop:
         Places, which are nodes of the chain.
     T_ij : (7,) or (3,)
     covariance : (d, d)
-        Right tangent; NaN where the registration came to nothing.
+        Right tangent; NaN if the registration failed.
     source : str
-        Who proposed it.
+        Source of the candidate.
     score, gain : float
         Of the candidate.
     why : str
-        Gates of the registration that it fails; empty for one that may be taken.
+        Failed gates of the registration; empty if it passed.
     gates : dict
         Values that were tested; JSON-serialisable.
     submaps : (int, int)
@@ -55,11 +55,11 @@ class Loop:
 
 
 ROOM = 256_000_000
-"""What prepared maps may take of the memory [bytes]."""
+"""Largest memory of prepared maps [bytes]."""
 
 
 class LoopMeasurer:
-    """Registers candidates; maps that are prepared are kept as far as there is room.
+    """Registers candidates; prepared maps are cached up to :data:`ROOM`.
 
     Parameters
     ----------
@@ -73,21 +73,21 @@ class LoopMeasurer:
         self._maps: dict[int, PreparedMap] = {}
 
     def extend_chain(self, submaps: Sequence[Submap], places: Places) -> None:
-        """The chain has grown; maps that are prepared stay so."""
+        """Continue with a longer chain; prepared maps are kept."""
         self.submaps, self.places = submaps, places
 
     def forget(self) -> None:
-        """Let go of what was prepared of the maps; it is made again where it is asked for."""
+        """Free the prepared maps; they are computed again when needed."""
         self._maps.clear()
 
     def prepared(self, k: int) -> PreparedMap:
-        """The map of submap ``k`` of the chain."""
+        """The prepared map of submap ``k`` of the chain."""
         found = self._maps.pop(k, None)
         self._maps[k] = found = PreparedMap(dense_view(self.submaps[k]), self.config) if found is None else found
         return found
 
     def _let_go(self) -> None:
-        """Of the maps that take much memory, those that were used longest ago."""
+        """Free the least recently used maps above the memory limit."""
         held = sum(m.nbytes for m in self._maps.values())
         for k in list(self._maps):
             if held <= ROOM:
@@ -95,11 +95,11 @@ class LoopMeasurer:
             held -= self._maps.pop(k).nbytes
 
     def measure(self, candidates: Sequence[LoopCandidate], *, progress: bool = False) -> list[Loop]:
-        """Loops of candidates, in their order; a front end's match or a tie is one already."""
+        """Loops of candidates, in their order; front-end matches and overlap constraints are measured already."""
         return [self.one(c) for c in Bar(candidates, "matching submaps", shown=progress)]
 
     def one(self, c: LoopCandidate) -> Loop:
-        """The loop of one candidate, accepted by the gates or not."""
+        """The loop of one candidate, whether it passes the gates or not."""
         p = self.places
         a, b = int(p.submap[c.i]), int(p.submap[c.j])
         keys = (self.submaps[a].key, self.submaps[b].key)
@@ -114,7 +114,7 @@ class LoopMeasurer:
         self._let_go()
         i = c.i
         if m.registration is not None:
-            # what the place sees there was mapped from the nearest stretch of the target's path
+            # what is observed there was mapped from the nearest part of the target's path
             i = p.nearest(a, m.T_target_source[: g.dim])
         return Loop(
             i=i, j=c.j, T_ij=g.between(p.T_base_node[i], m.T_target_source), covariance=m.covariance, source=c.source,

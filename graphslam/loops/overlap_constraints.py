@@ -1,16 +1,15 @@
-"""Ties along a submap: where its body came back into a map that holds it, and was held by it.
+"""Overlap constraints along a submap that came back into a map and was localised in it.
 
-A re-entry says where a segment began in an older map. Its body went on in that map, and what it saw there placed it,
-step by step, beside the stretch of the older path that had laid the map down; and on the way back out of a dead end it
-is placed by the map of its own way in. A path says so (its poses are beside each other where the bodies were), its
-covariance does not: that is what drift alone leaves. So places of a path that lie beside an earlier stretch in the same
-map become loops of their own: the relative pose of the two in the frame of that map, with the covariance with which a
-map places a body.
+A re-entry is the start of a segment in an older map. Its body continued in that map, and each step was localised near
+the part of the older path from which the map was built; on the way back out of a dead end it is localised in its own
+map. The path contains this (its poses are near each other where the body was), but its covariance does not: it is that
+of drift alone. So places of a path near an earlier part in the same map become loops: the relative pose of the two in
+the frame of that map, with the covariance of localisation in a map.
 
-In simulated buildings such pairs were off by 0.07 m along, 0.03 to 0.05 m across, 0.02 to 0.03 m in height, and 0.01
-rad (RMS of 92 within segments and 87 between them), whatever the way between the two. Ties are evidence that was in
-the path already (declared ``shared-scan``): only submaps whose exits state drift as if no ground had been seen twice,
-as those of :mod:`graphslam_frontends.grid.filter_error_model` do, may be given them.
+In simulated buildings the errors of such pairs were 0.07 m along, 0.03 to 0.05 m across, 0.02 to 0.03 m in height, and
+0.01 rad (RMS of 92 within segments and 87 between them), independent of the path length between the two. These
+constraints are evidence that is in the path already (declared ``shared-scan``). They are only valid for submaps whose
+end-pose covariance models drift without revisits, as in :mod:`graphslam_frontends.grid.filter_error_model`.
 """
 
 from __future__ import annotations
@@ -30,23 +29,23 @@ from graphslam.loops.candidates import TIE, LoopCandidate
 from graphslam.loops.places import Places
 
 Entry = tuple[int, int]
-"""Keys of the submap that was entered and of the one that entered it."""
+"""Keys of the entered submap and of the one that entered it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverlapConfig:
-    """Where ties are, and how well a map places a body."""
+    """Where overlap constraints are added, and the accuracy of localisation in a map."""
 
     spacing: float = 6.0
-    """Between the ties of a submap [m]: neighbours share what they are off by."""
+    """Path length between overlap constraints of a submap [m]; neighbours share errors."""
     reach: float = 2.5
-    """The body is beside an earlier stretch if it is nearer than this [m] …"""
+    """The body is near an earlier part of the path if the distance is smaller than this [m] …"""
     height: float = 1.25
-    """… and not farther above or below than this [m]."""
+    """… and the height difference not larger than this [m]."""
     least_way: float = 12.0
-    """Ground of the same submap counts as seen again after so much way [m]."""
+    """Minimum path length before a revisit within the same submap counts [m]."""
     sigma: float = 0.08
-    """σ of a tie along and across [m] …"""
+    """σ of an overlap constraint along and across [m] …"""
     sigma_height: float = 0.03
     """… in height [m] …"""
     sigma_angle: float = 0.011
@@ -59,7 +58,7 @@ class OverlapConfig:
                 raise ConfigError(f"ties: {f.name} = {value}; wanted a number > 0")
 
     def covariance(self, group: Group) -> Array:
-        """Of a tie ``(d, d)``, right tangent."""
+        """Of an overlap constraint ``(d, d)``, right tangent."""
         s = np.full(group.dof, self.sigma_angle)
         s[group.position] = self.sigma
         if group.dim == 3:
@@ -70,20 +69,20 @@ class OverlapConfig:
 def overlap_candidates(
     submaps: Sequence[Submap], places: Places, entries: Collection[Entry] = (), config: OverlapConfig | None = None
 ) -> list[LoopCandidate]:
-    """Places of submaps beside an earlier stretch of a map that held the body there.
+    """Places of submaps near an earlier part of the path in a map in which the body was localised.
 
     Parameters
     ----------
     places : Places
-        Of these.
+        Of these submaps.
     entries : collection of (int, int)
-        Re-entries that are believed: keys of target and submap. The submap is one that went on in the target's map
-        (its ``report["holds"]`` names the target).
+        Accepted re-entries: keys of target and submap. The submap must have continued in the target's map
+        (its ``report["holds"]`` contains the target).
 
     Returns
     -------
     list of LoopCandidate
-        Along the way. ``facts["entries"]`` names the entries by which the two places are in one map (none: it is the
+        In path order. ``facts["entries"]`` lists the entries by which the two places are in one map (empty for the
         submap's own).
     """
     c = OverlapConfig() if config is None else config
@@ -93,7 +92,7 @@ def overlap_candidates(
     for k in range(len(submaps)):
         mine = places.of_submap(k)
         last = -math.inf
-        for j in mine[1:].tolist():  # the base is where the entry itself is
+        for j in mine[1:].tolist():  # the base is the place of the entry itself
             way = float(places.way[j])
             if way - max(last, float(places.way[mine[0]])) < c.spacing:
                 continue
@@ -112,7 +111,7 @@ def overlap_candidates(
 
 
 def overlap_entries(gates: Mapping[str, Any]) -> set[Entry]:
-    """The entries that a tie needs, from the figures of its loop; of another loop none."""
+    """The entries that an overlap constraint depends on, from the gates of its loop; empty for other loops."""
     return {(int(a), int(b)) for a, b in gates.get("entries", ())}
 
 
@@ -120,7 +119,7 @@ _Seen = dict[int, tuple[Array, tuple[Entry, ...]]]
 
 
 def _frames(submaps: Sequence[Submap], number: dict[int, int], entries: set[Entry]) -> list[_Seen]:
-    """Of every submap: whose paths are in its map, where its base is in their frames, and by which entries."""
+    """For every submap: submaps whose paths are in its map, its base in their frames, and the entries in between."""
     out: list[_Seen] = []
     for k, s in enumerate(submaps):
         mine: _Seen = {k: (group_of(s.exit_pose).identity, ())}
@@ -135,14 +134,14 @@ def _frames(submaps: Sequence[Submap], number: dict[int, int], entries: set[Entr
 
 
 def _went_on(s: Submap, target: int) -> bool:
-    """Whether a submap went on in the map of another; one that does not say what it holds, if a match began it."""
+    """Did a submap continue in the map of another one? Without ``holds``: if it was entered by a match."""
     if "holds" in s.report:
         return target in map(int, s.report["holds"])
     return bool(s.report.get("entered") == "match")
 
 
 def _beside(places: Places, j: int, seen: _Seen, c: OverlapConfig) -> tuple[int, Array, tuple[Entry, ...]] | None:
-    """The nearest earlier place of a map to place ``j`` there: (place, ``T_ij``, by which entries)."""
+    """The nearest earlier place of a map to place ``j``: (place, ``T_ij``, entries in between)."""
     T_j = places.T_base_node[j]
     g = group_of(T_j)
     best: tuple[float, int, Array, tuple[Entry, ...]] | None = None

@@ -1,8 +1,8 @@
-"""Places of a chain of submaps that a loop may tie: a node about every so many metres, and what is known between two.
+"""Places of a chain of submaps between which loops are possible: nodes at regular distances.
 
-A place is a node of the graph: the base of a submap, or a pose of its path. The *way* says how far along the whole
-chain it lies, so that stretches can be told apart. What is known of the relative pose of two places is asked of the
-graph (:class:`RelativePoses`).
+A place is a node of the graph: the base of a submap, or a pose of its path. ``way`` is the path length along the whole
+chain, which distinguishes stretches. The relative pose of two places with its covariance comes from the graph
+(:class:`RelativePoses`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Ints = npt.NDArray[np.int64]
 
 
 class RelativePoses(Protocol):
-    """What is known of the pose of nodes j seen from nodes i, ``(k,)`` each.
+    """Estimated poses of nodes j relative to nodes i, ``(k,)`` each.
 
     Returns ``T_ij (k, 7|3)`` and its covariance ``(k, d, d)`` in the right tangent, from the joint marginal of each
     pair.
@@ -33,20 +33,20 @@ class RelativePoses(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Places of a chain of submaps, in the order of the way.
+    """Places of a chain of submaps, in path order.
 
     Parameters
     ----------
     node : (n,) int64
         In the graph.
     submap : (n,) int64
-        Number of the submap in the chain that each lies in.
+        Number of the submap of each in the chain.
     T_base_node : (n, 7) or (n, 3)
         In the frame of that submap's base.
     way : (n,)
-        Length of the path from the beginning of the chain [m].
+        Path length from the start of the chain [m].
     time : (n,)
-        When the body was there [s].
+        Time of the body at the place [s].
     """
 
     node: Ints
@@ -68,7 +68,7 @@ class Places:
         return len(self.node)
 
     def of_submap(self, k: int) -> Ints:
-        """Which places lie in submap ``k``."""
+        """Indices of the places in submap ``k``."""
         return np.flatnonzero(self.submap == k).astype(np.int64)
 
     def nearest(self, submap: int, position: Array) -> int:
@@ -81,13 +81,13 @@ class Places:
 
 
 def places_at_nodes(poses: Sequence[Array], times: Sequence[Array]) -> Places:
-    """Places at the nodes of a chain of submaps; the way is that from node to node, enough to tell stretches apart.
+    """Places at the nodes of a chain of submaps; the path length is summed between nodes, accurate enough here.
 
     Parameters
     ----------
     poses : sequence of (n, 7) or (n, 3)
-        ``T_base_node`` of every submap, the base first; the last is its exit and no place, for it is the next one's
-        base.
+        ``T_base_node`` of every submap, the base first; the last is its end, which is not a place because it is the
+        next base.
     times : sequence of (n,)
     """
     stretches = []
@@ -98,7 +98,7 @@ def places_at_nodes(poses: Sequence[Array], times: Sequence[Array]) -> Places:
 
 
 def _places(stretches: Sequence[tuple[Array, Array, Array, float]]) -> Places:
-    """Of every submap poses, ways from its base, times, and its whole length: one after the other."""
+    """Concatenate poses, path lengths from the base, and times of all submaps."""
     poses, ways, times, lengths = zip(*stretches)
     begin = np.concatenate([[0.0], np.cumsum(lengths)])
     counts = [len(T) for T in poses]

@@ -1,4 +1,4 @@
-"""What decisions on loops ask of a graph, and when a loop is believed."""
+"""Interface of a graph for loop decisions, and thresholds for accepting loops."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ Judge = Callable[[Array, Array, tuple[Ints, Array, Array]], npt.NDArray[np.bool_
 
 
 LEARNT = 0.01
-"""Least share of a loop's variance that the graph is taken not to have learnt from it."""
+"""Minimum share of a loop's variance that is assumed independent of the graph's posterior."""
 
 
 class LoopGraph(Protocol):
-    """What is asked of a graph that loops are added to."""
+    """Interface of a graph to which loops are added."""
 
     def relative(self, i: Ints, j: Ints) -> tuple[Array, Array]:
         """``T_ij (k, 7|3)`` and covariances ``(k, d, d)``, right tangents, from the joint marginals."""
         ...
 
     def add_loop(self, loop: Loop, robust: RobustKernel) -> int:
-        """Add a between-factor; its id."""
+        """Add a between-factor; returns its id."""
         ...
 
     def remove_loop(self, factor_id: int) -> None:
-        """Take it out again."""
+        """Remove a loop."""
         ...
 
     def solve(self) -> None:
-        """Bring the values to the optimum."""
+        """Solve to the optimum."""
         ...
 
     def chi2(self) -> dict[int, float]:
-        """``rᵀ P⁻¹ r`` of every factor at the values, without its kernel."""
+        """``rᵀ P⁻¹ r`` of every factor at the current values, without its kernel."""
         ...
 
 
 def chi2_without(loop: Loop, T_ij: Array, P: Array) -> float:
-    """χ² of a loop that is in a graph against the graph without it: ``rᵀ (R - P)⁻¹ r``.
+    """χ² of a loop in a graph relative to the graph without it: ``rᵀ (R - P)⁻¹ r``.
 
     Parameters
     ----------
@@ -62,16 +62,16 @@ def chi2_without(loop: Loop, T_ij: Array, P: Array) -> float:
 
     Notes
     -----
-    Where the graph learnt nearly all from the loop, R and P are the same but for what bending the graph changed of P, a
-    few thousandths: their difference says nothing there, and could even be negative. It is taken to be at least
-    ``LEARNT`` of R, which makes the test milder along such directions, never harsher.
+    If the graph got nearly all information from the loop, R and P are equal up to a few thousandths, from the change of
+    linearisation: their difference is meaningless then, and could even be negative. It is set to at least
+    ``LEARNT`` of R, which makes the test weaker along such directions, never stricter.
     """
     g = group_of(loop.T_ij)
     D = g.between(T_ij, loop.T_ij)
     A = g.adjoint(D)
     R = A @ loop.covariance @ A.T
     e = g.log(D)
-    # in units of R: what of it the graph had to learn from the loop is no test of it
+    # in units of R: directions that are determined by the loop alone cannot be tested
     L = np.linalg.cholesky(R)
     y, S = np.linalg.solve(L, e), np.linalg.solve(L, np.linalg.solve(L, P).T)
     w, V = np.linalg.eigh(0.5 * (S + S.T))
@@ -81,20 +81,20 @@ def chi2_without(loop: Loop, T_ij: Array, P: Array) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopConfig:
-    """When a loop is believed."""
+    """Thresholds for accepting loops."""
 
     level: float = 0.999
-    """A right loop passes the χ² of the graph with this probability."""
+    """Probability that a correct loop passes the χ² test of the graph."""
     chain: float = 0.9999
-    """… and that of the chain alone with this: what is wrong with the chain is wrong for all loops at once."""
+    """… and that of the chain alone, whose errors affect all loops at once."""
     pairwise: float = 0.99
-    """Two right loops agree with this probability."""
+    """Probability that two correct loops are consistent."""
     kernel: float = 0.95
-    """Loops in the graph have a Huber kernel that begins where a right loop lies with this probability."""
+    """Loops in the graph have a Huber kernel that starts at this quantile of a correct loop."""
     off: float = 0.9999
-    """A loop is switched off that the graph without it would refuse with this confidence."""
+    """A loop is switched off if the graph without it rejects it with this confidence …"""
     earlier: float = 0.9999
-    """… or that raises the χ² of earlier factors by more than this quantile of its own."""
+    """… or if it raises the χ² of earlier factors by more than this quantile of its own."""
 
     def robust(self, dof: int) -> RobustKernel:
         """The kernel of loops in the graph."""

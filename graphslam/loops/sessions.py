@@ -1,10 +1,10 @@
-"""Maps of several robots, or of several days, brought into one frame by the landmarks they share: start values only.
+"""Initial alignment of maps of several robots, or of several days, by common landmarks.
 
-What follows is one least-squares problem over all chains (:meth:`FactorGraph.start_session`); here it is decided where
-another chain begins, and which of its landmarks are which. With identities that mean the same everywhere (barcodes,
-survey numbers) a rigid fit to the common landmarks does both. Without, the two constellations are matched: every pair
-of landmarks of one map is laid on every pair of the other that is as long, and the motion that brings most landmarks
-onto others wins, if no other motion does nearly as well.
+The maps are then solved as one least-squares problem over all chains (:meth:`FactorGraph.start_session`); this module
+gives the initial pose of another chain and its landmark associations. If identities are the same everywhere (barcodes,
+survey numbers), a rigid fit to the common landmarks gives both. Otherwise the two constellations are matched: every
+pair of landmarks of one map is placed on every pair of the other with the same length, and the motion that matches most
+landmarks is used, if no other motion matches nearly as many.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Index = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Where one map lies in another.
+    """Pose of one map in another.
 
     Parameters
     ----------
@@ -32,11 +32,11 @@ class Alignment:
     pairs : (k, 2) int
         Rows of (map, reference) that are the same landmark and agree with the motion.
     rejected : int
-        Common identities that did not agree.
+        Number of common identities that did not agree.
     rms : float
         Of the distances of the pairs after the motion [m].
     runner_up : int
-        Landmarks that the best *other* motion brings together; 0 where identities were given.
+        Number of landmarks that the best *other* motion matches; 0 with given identities.
     """
 
     T_reference_map: Array
@@ -51,8 +51,8 @@ def align_by_identity(
 ) -> Alignment:
     """Rigid motion of a map onto another by landmarks of the same id.
 
-    A wrong identity must not turn a map: the motion is that of the pair of landmarks which most others agree with,
-    then a least-squares fit to all that agree.
+    Robust against wrong identities: the motion is that of the pair of landmarks with which most others agree,
+    followed by a least-squares fit to all that agree.
 
     Parameters
     ----------
@@ -78,17 +78,17 @@ def align_by_identity(
 
 
 LEAST_COMMON, MOST_ELSEWHERE = 4, 0.75
-"""Landmarks that must come together, and the share of them that a motion elsewhere (1 m or 10° away) may bring."""
+"""Minimum number of matched landmarks, and largest share that another motion (1 m or 10° away) may match."""
 
 
 def align_by_constellation(points: ArrayLike, reference: ArrayLike, *, tolerance: float = 0.3) -> Alignment:
-    """Rigid motion of a map onto another by the pattern of their landmarks alone.
+    """Rigid motion of a map onto another by the constellation of their landmarks alone.
 
     Parameters
     ----------
     points, reference : (n, 2), (m, 2)
     tolerance : float
-        Landmarks nearer than this after the motion are one [m].
+        Landmarks with a smaller distance after the motion are matched [m].
     """
     p, q = np.asarray(points, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     T = _motions(p, q, np.ones((len(p), len(q)), dtype=np.bool_), tolerance)
@@ -97,7 +97,7 @@ def align_by_constellation(points: ArrayLike, reference: ArrayLike, *, tolerance
     counts = np.concatenate([_count(part, p, q, tolerance) for part in np.array_split(T, max(1, len(T) // 2000))])
     order = np.argsort(-counts, kind="stable")
     best = None
-    for t in T[order[:20]]:  # counting by nearest is generous: settle the first few by assignment
+    for t in T[order[:20]]:  # the counts may match a landmark twice: repeat the best motions with an assignment
         pairs = _assign(t, p, q, tolerance)
         if best is None or len(pairs) > len(best[1]):
             best = t, pairs
@@ -123,13 +123,13 @@ def align_by_constellation(points: ArrayLike, reference: ArrayLike, *, tolerance
 
 
 def _motions(p: Array, q: Array, allowed: npt.NDArray[np.bool_], tolerance: float) -> Array:
-    """Motions ``(k, 3)`` that lay a pair of ``p`` on a pair of ``q`` of the same length, middle on middle."""
+    """Motions ``(k, 3)`` that place a pair of ``p`` on a pair of ``q`` of the same length, with equal midpoints."""
     a, b = np.triu_indices(len(p), 1)
     c, d = (x.ravel() for x in np.indices((len(q), len(q))))
     c, d = c[c != d], d[c != d]
     u, v = p[b] - p[a], q[d] - q[c]
     lu, lv = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
-    # a short pair says nothing of the heading
+    # a short pair does not determine the heading
     k, m = np.nonzero((np.abs(lu[:, None] - lv) <= tolerance) & (np.minimum(lu[:, None], lv) > 2 * tolerance))
     ok = allowed[a[k], c[m]] & allowed[b[k], d[m]]
     k, m = k[ok], m[ok]
@@ -140,14 +140,14 @@ def _motions(p: Array, q: Array, allowed: npt.NDArray[np.bool_], tolerance: floa
 
 
 def _count(T: Array, p: Array, q: Array, tolerance: float) -> Ints:
-    """For every motion, how many of ``p`` come near some of ``q``, by squared nearness (a tie-break below one)."""
+    """For every motion, the number of ``p`` near some of ``q``, each weighted by ``1 - d²/tolerance²``."""
     moved = se2_transform(T[:, None], p)
     d2 = ((moved[:, :, None] - q) ** 2).sum(axis=-1).min(axis=2)
     return np.asarray(np.sum(np.maximum(0.0, 1.0 - d2 / tolerance**2), axis=1))
 
 
 def _assign(T: Array, p: Array, q: Array, tolerance: float) -> Index:
-    """One-to-one pairs ``(k, 2)`` within ``tolerance`` after the motion, the sum of squares least."""
+    """One-to-one pairs ``(k, 2)`` within ``tolerance`` after the motion, with the smallest sum of squares."""
     d2 = ((se2_transform(T, p)[:, None] - q) ** 2).sum(axis=-1)
     i, j = linear_sum_assignment(np.minimum(d2, tolerance**2))
     near = d2[i, j] < tolerance**2

@@ -10,29 +10,29 @@ import numpy as np
 from graphslam.core.errors import ConfigError
 
 DISTANCES = (1.0, 0.6, 0.4, 0.3)
-"""Greatest distance of a pair in each round over all passes [m]."""
+"""Largest distance of a pair in each round with all traversals [m]."""
 MOST_BEAMS = 3_000_000
-"""Of so many beams in the log at most surfaces are made; more are thinned evenly, which bounds the memory."""
+"""Largest number of beams from which surfaces are made; more are thinned evenly, which bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineConfig:
-    """How the solved path is refined by the scans themselves."""
+    """Options of the refinement of a solved path with its scans."""
 
     use: Literal[True, False, "always"] = True
-    """Refine the solved path of runs whose front end works on scans (``lidar-odometry``: only where they contradict the
-    graph; always: also elsewhere); false: the path of the graph is the result."""
+    """Refine the solved path of runs whose front end uses scans (``lidar-odometry``: only if they contradict the graph;
+    always: in any case); false: the path of the graph is the result."""
     reach: float | None = None
-    """Chunks whose centres are nearer than this may see the same surfaces [m]; None: the range that three quarters of
-    the returns of the log stay below, 10 m at least and 30 m at most."""
+    """Chunks with a smaller distance of their centres may observe the same surfaces [m]; None: the range below which
+    three quarters of the returns of the log are, at least 10 m and at most 30 m."""
     spacing: float = 0.2
-    """In the plane: way from node to node [m]. Steps between, whole scans of the same place, follow the odometry."""
+    """2-D: path length between nodes [m]. Steps between nodes, whole scans of the same place, follow the odometry."""
     turn: float = 0.1
-    """In the plane: turn from node to node [rad]; whichever of the two is reached first."""
+    """2-D: rotation between nodes [rad]; a node is set when either limit is reached."""
     every: int = 2
-    """Every how many of the points is looked for on surfaces of other steps; all points make the surfaces."""
+    """Every n-th point is matched to surfaces of other steps; all points are used to make the surfaces."""
     most_points: int = 400_000
-    """Of so many points in the log at most; more are thinned evenly."""
+    """Largest number of points that are matched; more are thinned evenly."""
 
     def __post_init__(self) -> None:
         if self.use not in (True, False, "always"):

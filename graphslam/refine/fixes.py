@@ -1,8 +1,8 @@
-"""Position fixes in a refinement: where the antenna was along the path, in a frame that is solved for.
+"""Position fixes in a refinement: the antenna along the path, in a frame that is estimated.
 
-A fix at ``t`` between two nodes sees the antenna on the line between where it was at both. The frame of the fixes is a
-state of its own, ``T_gps_world``, since the first pose of the path is held; so are errors of fixes that last, as in the
-graph (:mod:`graphslam.graph.sensors.gps`)::
+At time ``t`` between two nodes the antenna is on the line between its positions at both. The frame of the fixes,
+``T_gps_world``, is a state, because the first pose of the path is fixed; time-correlated errors of the fixes are
+states, too, as in the graph (:mod:`graphslam.graph.sensors.gps`)::
 
     r = T_gps_world p + bias - z,    p = (1 - a) T_k l + a T_{k+1} l
 """
@@ -22,35 +22,35 @@ from graphslam.graph.sensors.gps import GpsConfig, arm_jacobian, greatest_distan
 from graphslam.refine.motion import MotionModel, MotionTerms, States
 
 FARTHEST = 3.0
-"""A fix between nodes that are farther apart is left out: nobody knows the antenna's way between them [m]."""
+"""Fixes between nodes that are farther apart are not used: the antenna path between them is unknown [m]."""
 UPRIGHT = 1e-4
-"""σ of up in the frame of the fixes, where gravity says where it is [rad]."""
+"""σ of the up direction in the frame of the fixes, if gravity was measured [rad]."""
 LEANING = 0.5
-"""… and where nothing says it but fixes [rad]."""
+"""… and without gravity [rad]."""
 CONTRADICTED = 1.5
-"""Median χ² of fixes, beside that of errors as stated, beyond which they contradict scans and motion."""
+"""Ratio of the median χ² of fixes to its expected value above which they contradict scans and motion."""
 ALIKE = 0.3
-"""Autocorrelation of residuals from fix to fix beyond which, and beyond what chance does, their errors last."""
+"""Autocorrelation of consecutive residuals above which, if significant, their errors are time-correlated."""
 RARE = 0.999
-"""A fix that is farther off than this share of all would be is a wild one."""
+"""A fix beyond this quantile is an outlier."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixReport:
-    """What fixes did in a refinement.
+    """Report on the fixes in a refinement.
 
     Parameters
     ----------
     used, left : int
-        Fixes in the problem; outside the path, or where it has a gap.
+        Number of fixes in the problem; number outside the path, or in a gap of it.
     typical : float
-        Median χ² of their residuals beside that of errors as stated: about 1 where all is as stated.
+        Ratio of the median χ² of their residuals to its expected value: about 1 if the noise model is right.
     wild : int
-        Fixes that are farther off than 99.9 % would be: the kernel takes their weight.
+        Number of fixes beyond the 99.9 % quantile; the robust kernel reduces their weight.
     alike : float
-        Autocorrelation of the residuals from one fix to the next; above 0.3 and chance their errors last.
+        Autocorrelation of consecutive residuals; if above 0.3 and significant, errors are time-correlated.
     rms : float
-        Of the distances from the fixes that are not wild [m].
+        Of the distances from the fixes that are no outliers [m].
     T_gps_world : (7,) or (3,)
         From the refined path to the frame of the stream.
     """
@@ -65,19 +65,19 @@ class FixReport:
 
     @property
     def contradicted(self) -> bool:
-        """Are errors of fixes larger than stated, or do they last?"""
+        """Are errors of fixes larger than assumed, or time-correlated?"""
         return self.typical > CONTRADICTED or self.alike > max(ALIKE, 4.0 / np.sqrt(max(self.used, 1)))
 
 
 class FixModel:
-    """Fixes as factors on the nodes of a refinement, with nodes of their own after those of the motion.
+    """Fixes as factors on the nodes of a refinement, with additional nodes after those of the motion.
 
     These are one for the datum ``T_gps_world`` (right tangent), and one for each bias.
 
     Parameters
     ----------
     poses : (n, 7) or (n, 3)
-        Where the refinement starts.
+        Initial path of the refinement.
     """
 
     def __init__(self, gps: Gps, config: GpsConfig, motion: MotionModel, poses: Array) -> None:
@@ -109,14 +109,14 @@ class FixModel:
         self._datum_nodes = np.array([[self.datum_node]])
 
     def ready(self, baseline: float, poses: Array) -> bool:
-        """Do fixes and path span as much as says where north is?"""
+        """Do fixes and path span enough to determine the heading?"""
         d = self.group.dim
         if len(self.times) < 3:
             return False
         return min(greatest_distance(self.positions[:, :2]), greatest_distance(poses[self.k, :d][:, :2])) >= baseline
 
     def _biases(self, config: GpsConfig, uneven: bool) -> None:
-        """Which bias each fix carries, and how each bias follows from the one before."""
+        """Assign a bias to each fix, and link each bias to the previous one."""
         d = self.group.dim
         self.bias = np.zeros(len(self.times), np.int64)
         keep: list[float] = []
@@ -125,7 +125,7 @@ class FixModel:
         for i, t in enumerate(self.times.tolist()) if config.bias_sigma is not None else ():
             hold = config.bias_every
             if config.bias_time is not None and config.bias_sigma is not None:
-                # while a bias holds, it wanders by no more than half the white σ
+                # over its validity, a bias changes by at most half the white σ
                 white = float(np.trace(self.covariances[i])) / d
                 hold = min(hold, config.bias_time * white / (8.0 * config.bias_sigma**2))
             if t - previous > config.segment_gap or t - begin >= hold:
@@ -144,7 +144,7 @@ class FixModel:
     # --- states: datum and biases, the last two of all ----------------------------------------------------------------
 
     def start(self, poses: Array) -> tuple[Array, Array]:
-        """Datum ``(7,)`` or ``(3,)`` from a rigid alignment that one wild fix does not turn, and biases of zero."""
+        """Datum ``(7,)`` or ``(3,)`` from a robust rigid alignment, and biases of zero."""
         p, z = self.antennas(poses), self.positions
         sigma = np.sqrt(np.einsum("kii->k", self.covariances[:, :2, :2]) / 2.0)
         flat = start_datum(p[:, :2], z[:, :2], sigma)
@@ -155,7 +155,7 @@ class FixModel:
         level = np.concatenate([flat[:2], [np.median(z[:, 2] - p[:, 2])], turn])
         if self.gravity:
             return level, biases
-        # nothing says where up is: fixes in space may, if their way is no straight line
+        # the up direction is unknown: 3-D fixes may determine it, if their path is not a straight line
         free, w = se3.align_se3(p, z)[0], np.sqrt(np.einsum("kii->k", self.covariances) / 3.0)
         cost = [np.median(np.linalg.norm(se3.se3_transform(T, p) - z, axis=1) / w) for T in (level, free)]
         lean = np.arccos(np.clip(se3.quat_to_matrix(np.asarray(free)[3:])[2, 2], -1.0, 1.0))
@@ -173,7 +173,7 @@ class FixModel:
     # --- factors -----------------------------------------------------------------------------------------------------
 
     def antennas(self, poses: Array) -> Array:
-        """Where the antenna was ``(q, dim)`` at each fix, in the frame of the path."""
+        """Antenna positions ``(q, dim)`` at the fixes, in the frame of the path."""
         g = self.group
         lever = np.broadcast_to(self.lever, (len(self.k), g.dim))
         a, b = g.transform(poses[self.k], lever), g.transform(poses[self.k + 1], lever)
@@ -185,7 +185,7 @@ class FixModel:
         return np.asarray(e + states[-1][self.bias] if len(self.keep) else e)
 
     def terms(self, poses: Array, states: States) -> list[MotionTerms]:
-        """Fixes under their kernel, what biases are beforehand, and up where gravity tells it."""
+        """Fixes with their kernel, priors of biases, and the up direction if gravity was measured (3-D)."""
         g, d = self.group, self.group.dim
         datum, biases = states[-2:]
         p, q = self.antennas(poses), len(self.k)
@@ -229,11 +229,11 @@ class FixModel:
         return out
 
     def report(self, poses: Array, states: States) -> FixReport:
-        """What came of them."""
+        """Report on the residuals."""
         e = self.residuals(poses, states)
         w = np.einsum("kij,kj->ki", self.whiteners, e)
         d2 = np.sum(w**2, axis=1)
-        # a wild fix says nothing of how the others follow each other
+        # limit outliers, so that they do not affect the autocorrelation
         limit = chi2_quantile(RARE, self.group.dim)
         w = w / np.sqrt(np.maximum(d2 / limit, 1.0))[:, None]
         near = d2 <= limit if np.any(d2 <= limit) else np.ones(len(d2), bool)

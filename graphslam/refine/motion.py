@@ -1,10 +1,10 @@
-"""What the motion of the steps and gravity say of the refined path, errors that last being unknowns of their own.
+"""Motion and gravity of the steps as factors of the refined path, with systematic errors as states.
 
-Increments of odometry are compared with the path, roll and pitch with gravity. Errors that do not fade within a step
-would be promised away many times over if they were taken for white, so they are states: the bias of the yaw rate, which
-may walk; the scale of distances; the direction in which the body is said to move (a scanner that is mounted askew
-against the odometry); the offset between the clocks of motion and scans; the constant part of gravity's roll and pitch;
-in the plane what wheels turn too much for each metre and each radian.
+Increments of odometry are compared with the path, roll and pitch with gravity. Errors that persist over many steps
+would give far too small covariances if they were modelled as white noise, so they are states: the bias of the yaw rate,
+with a random walk; the scale of distances; the direction of the motion relative to the scanner (a wrong mounting angle
+between scanner and odometry); the offset between the clocks of motion and scans; constant errors of gravity's roll and
+pitch; in 2-D the turn error of wheels per metre and per radian.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ from graphslam.refine.scans import Scans
 
 Index = npt.NDArray[np.int64]
 States = tuple[Array, ...]
-"""Yaw bias at the knots ``(k,)``, constants ``(c,)``; with fixes their datum and biases follow."""
+"""Yaw bias at the knots ``(k,)``, constants ``(c,)``; with fixes followed by their datum and biases."""
 
 SAMPLED = 24
-"""Steps at which the leverage of the odometry is computed."""
+"""Number of steps at which the leverage of the odometry is computed."""
 LEFT = 0.02
-"""Share of a residual below which it says nothing of its noise."""
+"""Minimum remaining share of a residual (1 - leverage); smaller ones have no information on the noise."""
 MEDIAN = 0.4549
 """Median of χ² of one degree of freedom."""
 RARE = 10.8
 """χ² of one degree of freedom at 99.9 %."""
 SCALE, SIDE, RISE, CLOCK, ROLL, PITCH, BEND, TURN = range(8)
-"""Places of the constant states: scale of distances; the scanner's direction, to the left of the motion and below it
-[rad]; by how much the motion's stamps are early beside the scans' [s]; gravity's constant roll and pitch [rad]; what
-wheels turn too much for each metre [rad/m] and for each radian. In 3-D: all but the last two. In 2-D: the first,
-second, fourth and the last two."""
+"""Indices of the constant states: scale of distances; the scanner's direction, to the left of the motion and below it
+[rad]; time by which stamps of the motion are early relative to the scans [s]; constant errors of gravity's roll and
+pitch [rad]; wheel turn error per metre [rad/m] and per radian. 3-D: all but the last two. 2-D: the first, second,
+fourth and the last two."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionTerms:
-    """Whitened residuals of one kind of factor, with what they depend on.
+    """Whitened residuals of one kind of factor, with their variables.
 
     Parameters
     ----------
     r : (f, m)
     J : (f, m, Σ widths)
     nodes : (f, s) int
-        Of each slot of columns.
+        Node of each slot of columns.
     widths : (s,) int
     """
 
@@ -69,7 +69,7 @@ class MotionModel:
     knot : float
         Time between knots of the yaw bias [s].
     bridge : (n,), optional
-        Share of an increment's variance that is left of it in the beams of its step.
+        Share of an increment's variance that remains in the beams of its step.
     """
 
     def __init__(self, steps: Scans, *, knot: float = 30.0, bridge: Array | None = None) -> None:
@@ -94,7 +94,7 @@ class MotionModel:
         g = self.group
         xi = g.log(u)
         twist = xi / self.dt[:, None] if len(xi) else xi
-        edge = np.zeros((n, g.dof))  # rate at each stamp: the mean of its two sides
+        edge = np.zeros((n, g.dof))  # rate at each stamp: the mean before and after it
         if n > 2:
             edge[1:-1] = 0.5 * (twist[1:] + twist[:-1])
             edge[0], edge[-1] = twist[0], twist[-1]
@@ -103,7 +103,7 @@ class MotionModel:
         B[:, g.heading, 0] = -self.dt * (1.0 - share)
         B[:, g.heading, 1] = -self.dt * share
         P = np.arange(g.dof)[g.position]
-        # odometry is measured = true × (1 + s), turned by the direction, stamped early by the clock
+        # measured odometry = true × (1 + s), rotated by the direction, with stamps early by the clock offset
         B[:, P, 2 + self.at[SCALE]] = -move
         B[:, P[0], 2 + self.at[SIDE]] = move[:, 1]
         B[:, P[1], 2 + self.at[SIDE]] = -move[:, 0]
@@ -115,7 +115,7 @@ class MotionModel:
             B[:, 2, 2 + self.at[TURN]] = -xi[:, 2]
         B[:, :, 2 + self.at[CLOCK]] = -(edge[1:] - edge[:-1])
         keep = np.arange(g.dof)
-        if self.gravity:  # roll and pitch of the increments are gravity's own: they are read there
+        if self.gravity:  # roll and pitch of the increments come from gravity and are used there
             keep = keep[2:]
         self.keep = keep
         self.bridge = np.zeros(n) if bridge is None else bridge
@@ -145,20 +145,20 @@ class MotionModel:
         return sigma
 
     def whiteners(self) -> Array:
-        """``W`` ``(n - 1, m, m)`` with ``Wᵀ W`` = information of the increments, at their present scales."""
+        """``W`` ``(n - 1, m, m)`` with ``Wᵀ W`` = information of the increments, at their current scales."""
         s = self.scales
         L = np.linalg.cholesky(self.covariances * s[:, None] * s[None, :])
         return np.asarray(np.linalg.inv(L))
 
     def corrections(self, poses: Array) -> Array:
-        """By what the increment that ends at each step was wrong ``(n, d)``, right tangent; the first is not known."""
+        """Error of the increment that ends at each step ``(n, d)``, right tangent; zero for the first."""
         g = self.group
         e = g.log(g.between(self.steps.odometry.increments[1:], g.between(poses[:-1], poses[1:])))
         return np.concatenate([np.zeros((1, g.dof)), e])
 
     @property
     def within(self) -> Array:
-        """Covariance ``(n, d, d)`` of the beams of a step against its pose, by the motion between, as widened."""
+        """Covariance ``(n, d, d)`` of the beams of a step relative to its pose, from the motion (with its scales)."""
         C = self.steps.odometry.covariances.copy()
         s = np.ones(self.group.dof)
         s[self.keep] = self.scales
@@ -167,12 +167,11 @@ class MotionModel:
         return np.asarray(C * s[:, None] * s[None, :] * self.bridge[:, None, None])
 
     def widen(self, poses: Array, states: States, factor: BlockFactor) -> None:
-        """Widen what the motion promises where the scans show more: its σ by component, and the walk of the yaw bias.
+        """Increase the noise of the motion if the scans show more: σ per component, and random walk of the yaw bias.
 
-        A residual is smaller than the error by as much as it took part in the estimate (its leverage
-        ``(J C Jᵀ)_cc / Σ_cc``), so the variance is the sum of squares over what is left of the degrees of freedom
-        (restricted maximum likelihood); the leverage is computed at some steps evenly over the way. Never narrowed:
-        what a log states of its motion is believed as far as nothing speaks against it.
+        A residual is smaller than the error because it took part in the estimate (leverage ``(J C Jᵀ)_cc / Σ_cc``), so
+        the variance is the sum of squares divided by the remaining degrees of freedom (restricted maximum likelihood).
+        The leverage is computed at some steps, evenly spaced. The noise is never reduced below that of the log.
         """
         g, n, K = self.group, len(self.steps), len(self.knots)
         e, J = self._increments(poses, states)
@@ -186,7 +185,7 @@ class MotionModel:
             P = factor.inverse_block(rows)
             left[m] = 1.0 - np.einsum("ci,ij,cj->c", J[k], P, J[k]) / (C[k] * self.scales**2)
         left = np.maximum(np.mean(left, axis=0), LEFT)
-        # single slips are no matter of σ
+        # single slips do not affect σ
         r2 = np.minimum(e**2 / C, RARE * self.scales**2)
         self.scales = np.sqrt(np.maximum(np.mean(r2, axis=0) / left, 1.0))
         q = self.sigmas.yaw_walk * np.sqrt(np.diff(self.knots))
@@ -194,7 +193,7 @@ class MotionModel:
         P = factor.inverse_block(n * g.dof + np.arange(K))
         D = np.diff(np.eye(K), axis=0)
         left_walk = np.maximum(1.0 - np.einsum("ci,ij,cj->c", D, P, D) / (q * self.walk) ** 2, 0.0)
-        # by the median of steps that the scans decided: one bent by a wrong place shall not excuse itself
+        # median over steps that the scans determine: one that is bent by a wrong match must not increase its own σ
         decided = left_walk > LEFT
         if np.count_nonzero(decided) >= 3:
             spread = float(np.median(z[decided] ** 2 / left_walk[decided])) / MEDIAN
@@ -226,7 +225,7 @@ class MotionModel:
         e, J = self._increments(poses, states)
         W = self.whiteners()
         if self.group.dim == 2:
-            # wheels that slip, and records that lie, are no matter of σ: beyond what chance does, less weight
+            # slipping wheels and wrong records do not affect σ: improbable increments get less weight
             r = np.einsum("kij,kj->ki", W, e)
             W = W * np.sqrt(np.minimum(1.0, SLIPPED / np.maximum(np.sum(r**2, axis=1), 1e-12)))[:, None, None]
         dof = self.group.dof
@@ -255,9 +254,9 @@ class MotionModel:
         return [first, walk, fixed]
 
     def _gravity(self, poses: Array, states: States) -> list[MotionTerms]:
-        """Errors of roll and pitch are an Ornstein–Uhlenbeck process: each is new only in so far as it is not the last.
+        """Roll and pitch errors are an Ornstein–Uhlenbeck process: each residual is conditioned on the previous one.
 
-        So every reading is spent once, be it as an absolute one or as the change since the one before.
+        So every reading is used once, with its new information only.
         """
         steps, n = self.steps, len(self.steps)
         assert steps.tilt is not None
@@ -285,7 +284,7 @@ class MotionModel:
         return [first, later]
 
     def gauge(self, poses: Array, held: Array) -> MotionTerms:
-        """Position and heading of the first pose held at ``held``; with gravity its roll and pitch are free."""
+        """Fix position and heading of the first pose at ``held``; roll and pitch too, if there is no gravity."""
         g = self.group
         e = g.log(g.between(held, poses[0]))
         if self.gravity:
@@ -300,6 +299,6 @@ class MotionModel:
 
 
 SLIPPED = 16.3
-"""χ² of an increment in the plane beyond which it is none of those whose σ is stated: 99.9 %."""
+"""χ² limit of a 2-D increment (99.9 %); larger ones get less weight."""
 HELD = 1e-5
-"""σ of the gauge [m, rad]: far below what anything else says."""
+"""σ of the gauge [m, rad], far below that of any measurement."""

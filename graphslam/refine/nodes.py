@@ -1,8 +1,8 @@
-"""Which steps are the nodes of a refinement, and the path of the steps between them.
+"""Choose the steps that are nodes of a refinement, and compute the path of the steps between them.
 
-A planar scanner sends ten whole scans while the robot moves by its own length: their surfaces are the same, and so are
-the errors of their beams. As nodes of their own they cost the cube of their number, and tell nothing new. Nodes are
-therefore the steps between which the body moved; what lies between follows the odometry from node to node.
+A planar scanner makes about ten scans while the robot moves by its own length: their surfaces are the same, and so are
+the errors of their beams. Nodes for all of them cost the cube of their number and add no information. Nodes are
+therefore steps after some motion; the steps in between follow the odometry from node to node.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Index = npt.NDArray[np.int64]
 
 
 def find_nodes(steps: Scans, spacing: float, turn: float) -> Index:
-    """Numbers ``(m,)`` of the steps that are nodes: first, last, and each that moved enough since the one before.
+    """Indices ``(m,)`` of the steps that are nodes: first, last, and each that moved enough since the previous one.
 
-    In space a step may hold a part of a turn of the scanner only, and all are nodes.
+    In 3-D a step may be a part of a scanner revolution only, and all steps are nodes.
 
     Parameters
     ----------
     spacing, turn : float
-        Way [m] and turn [rad] by the odometry from node to node; a step is one as soon as either is reached.
+        Path length [m] and rotation [rad] of the odometry between nodes; a step is a node if either is reached.
     """
     n, g = len(steps), steps.group
     if g.dim == 3 or n < 3:
@@ -69,7 +69,7 @@ def scans_at(steps: Scans, nodes: Index) -> Scans:
 
 
 def thin_beams(steps: Scans, most: int) -> Scans:
-    """The same steps with so many beams at most, spread evenly over all there are."""
+    """The same steps with at most ``most`` beams, thinned evenly."""
     q = len(steps.points)
     if q <= most:
         return steps
@@ -100,16 +100,16 @@ def motion_from_node(steps: Scans, nodes: Index) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class StepsBetweenNodes:
-    """Steps along the path of the nodes, each between two of them.
+    """Steps between the nodes of a path, with their dependence on the nodes.
 
     Parameters
     ----------
     a, b : (n,)
-        Numbers of the nodes before and after.
+        Indices of the previous and the next node.
     by_a, by_b : (n, d, d)
-        By how much errors of the two move the step, right tangents.
+        Derivatives of the step by the errors of these nodes, right tangents.
     own : (n, d, d)
-        Covariance of a step that it shares with no node.
+        Covariance of a step that is independent of the nodes.
     """
 
     a: Index
@@ -120,7 +120,7 @@ class StepsBetweenNodes:
 
     @classmethod
     def at_nodes(cls, n: int, dof: int) -> StepsBetweenNodes:
-        """All steps are nodes."""
+        """For steps that are all nodes."""
         every = np.arange(n, dtype=np.int64)
         none = np.zeros((n, dof, dof))
         return cls(every, every, none + np.eye(dof), none, none)
@@ -131,8 +131,8 @@ def path_between(
 ) -> tuple[Array, Array, StepsBetweenNodes]:
     """All steps along the refined path of the nodes.
 
-    The odometry from node to node is off by what the path tells; how much of that had come about at a step is told by
-    its covariance so far (a Gaussian bridge): while wheels stand, hardly anything.
+    The error of the odometry between two nodes is given by the path; its share up to a step is computed from the
+    covariance so far (a Gaussian bridge): almost none while the robot is static.
 
     Parameters
     ----------
@@ -141,17 +141,15 @@ def path_between(
         Of the nodes.
     covariances : (m, d, d)
     scales : (d,)
-        By which the σ of the odometry was widened.
-
+        Factors on the σ of the odometry.
     Returns
     -------
     poses : (n, 7|3)
     covariances : (n, d, d)
-        Errors of two nodes in a row are taken to be as alike as they can be.
+        Assumes the largest possible correlation between the errors of two consecutive nodes.
     between : StepsBetweenNodes
-        What steps between nodes do not share with a node holds, where wheels slipped on the way, the jump itself: a
-        step at the share s of the way lies before it with the probability 1 - s, and its mean is off by the variance
-        s (1 - s) of that.
+        After wheel slip, the independent covariance includes the jump: a step at the share s of the interval is before
+        it with the probability 1 - s, so the variance of its mean is s (1 - s) times the squared jump.
     """
     g, n = steps.group, len(steps)
     wide = scales[:, None] * scales[None, :]
@@ -161,14 +159,14 @@ def path_between(
     b = a + 1
     whole = scans_at(steps, nodes).odometry
     left = g.log(g.between(whole.increments[b], g.between(poses[a], poses[b])))
-    on = g.adjoint(g.between(whole.increments[b], U))  # from an error at the step to one at the node after it
+    on = g.adjoint(g.between(whole.increments[b], U))  # transforms an error at the step to the next node
     Q = whole.covariances[b]
     by_b = np.swapaxes(np.linalg.solve(Q, on @ P), 1, 2)
     out = g.compose(g.compose(poses[a], U), g.exp(np.einsum("kij,kj->ki", by_b, left)))
     out[nodes] = poses
     own = P - by_b @ on @ P
     s = np.clip(np.einsum("kii->k", by_b) / g.dof, 0.0, 1.0)[:, None, None]
-    # wheels that slipped did so at one instant, which nothing tells: spread evenly is a guess with the jump's own size
+    # wheels slip at one unknown instant: spreading it evenly is a guess with an error of the size of the jump
     inside = np.setdiff1d(np.arange(n), nodes)
     x = np.linalg.solve(Q[inside], left[inside, :, None])[:, :, 0]
     slipped = inside[np.sum(left[inside] * x, axis=1) > SLIPPED]

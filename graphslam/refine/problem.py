@@ -1,4 +1,4 @@
-"""The joint problem of a refinement: its blocks, its Gauss–Newton steps, its covariance."""
+"""The joint least-squares problem of a refinement: blocks, Gauss–Newton steps, covariance."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Index = npt.NDArray[np.int64]
 
 
 class BlockStructure:
-    """Which nodes of a refinement share a block, and where the blocks stand in one flat array.
+    """Pairs of nodes that share a block, and the offsets of the blocks in one flat array.
 
     Parameters
     ----------
     widths : (N,)
     a, b : (k,)
-        Pairs of nodes, in any order, repeated at will.
+        Pairs of nodes, in any order, with repetitions.
     """
 
     def __init__(self, widths: Index, a: Index, b: Index) -> None:
@@ -55,12 +55,12 @@ class BlockStructure:
         self.symbolic = BlockSymbolic(order, widths, ptr, columns.astype(np.int64))
 
     def _sorted(self, a: Index, b: Index) -> tuple[Index, Index]:
-        """Pairs with the node first that is eliminated first."""
+        """Pairs sorted so that the node that is eliminated first comes first."""
         earlier = self.rank[a] <= self.rank[b]
         return np.where(earlier, a, b), np.where(earlier, b, a)
 
     def at(self, a: Index, b: Index) -> Index:
-        """Where blocks begin; the rows are those of the node that is eliminated first."""
+        """Offsets of blocks; their rows are those of the node that is eliminated first."""
         out = np.empty(len(a), np.int64)
         for s in row_blocks(len(a)):
             rows, columns = self._sorted(a[s], b[s])
@@ -68,7 +68,7 @@ class BlockStructure:
         return out
 
     def add(self, terms: MotionTerms, H: Array, g: Array) -> float:
-        """Add the blocks of a kind of factor to ``H`` and ``Jᵀ r`` to ``g``; the sum of squares."""
+        """Add the blocks of a kind of factor to ``H`` and ``Jᵀ r`` to ``g``; returns the sum of squares."""
         first = np.cumsum((0, *terms.widths))
         JtJ = np.swapaxes(terms.J, 1, 2) @ terms.J
         Jtr = np.einsum("kij,ki->kj", terms.J, terms.r)
@@ -77,7 +77,7 @@ class BlockStructure:
             np.add.at(g, self.begin[nu][:, None] + np.arange(wu), Jtr[:, first[u] : first[u + 1]])
             for v, wv in enumerate(terms.widths):
                 nv = terms.nodes[:, v]
-                some = self.rank[nu] <= self.rank[nv]  # the other triangle is its mirror
+                some = self.rank[nu] <= self.rank[nv]  # the other triangle is symmetric
                 if not np.any(some):
                     continue
                 block = JtJ[some, first[u] : first[u + 1], first[v] : first[v + 1]].reshape(-1, wu * wv)
@@ -101,19 +101,19 @@ class LinearisedProblem:
 
 
 FEW = 200
-"""Pairs below which the noise of ranges is not told from that of surfaces."""
+"""Minimum number of pairs for separate estimates of range noise and surface noise."""
 BINS = 6
-"""Classes of incidence, and classes of the share of motion in each of them."""
+"""Number of classes of incidence, and of classes of motion variance in each of them."""
 MOTION = 0.25
-"""Greatest share of the motion within a step in the spread of residuals that shall tell other noise."""
+"""Largest share of the motion within a step in the residual variance for classes that estimate other noise."""
 
 
 def pair_noise(pairs: SurfacePairs, residuals: Array) -> Array:
-    """Variances ``(3,)`` of a range and of the surfaces themselves [m²], from the residuals; 1 for the motion.
+    """Variances ``(3,)`` of a range and of the surfaces [m²], from the residuals; 1 for the motion.
 
-    A beam that grazes a floor misses it by far less than its range is wrong, so the spread of residuals follows the
+    At grazing incidence the residual is much smaller than the range error, so the spread of residuals depends on the
     incidence of their beams: squared spreads (1.48 × the median absolute residual) of classes of incidence are
-    fitted by a line with two parts that are never negative.
+    fitted by a line with two non-negative coefficients.
     """
     if not len(residuals):
         return np.array([0.0, 1e-4, 1.0])
@@ -128,28 +128,28 @@ def pair_noise(pairs: SurfacePairs, residuals: Array) -> Array:
     ]
     A = np.array([np.median(pairs.once[c], axis=0) for c in classes])
     v = np.array([(1.4826 * np.median(np.abs(residuals[c]))) ** 2 for c in classes])
-    # a step's own pose takes up some of what its motion did: classes that motion rules say too little
+    # a step's own pose absorbs a part of the motion error: classes dominated by motion have too small residuals
     ruled = A[:, 2] / np.maximum(v, LEAST_SPREAD**2)
     some = ruled <= max(MOTION, float(np.quantile(ruled, 0.25)))
     A, v = A[some, :2], np.maximum(v[some] - A[some, 2], LEAST_SPREAD**2)
-    w = 1.0 / np.maximum(v, 1e-3 * spread + LEAST_SPREAD**2)  # the spread of a variance is in proportion to it
+    w = 1.0 / np.maximum(v, 1e-3 * spread + LEAST_SPREAD**2)  # the σ of a variance is proportional to it
     found, _ = nnls(A * w[:, None], v * w)
     return np.append(np.maximum(found, [0.0, LEAST_SPREAD**2]), 1.0)
 
 
 LEAST_SPREAD = 1e-3
-"""No surface is known better [m]."""
+"""Minimum σ of a surface [m]."""
 
 
 def agreeing_share(found: SurfacePairs, r: Array, noise: Array) -> float:
-    """Share of the source points with a surface within reach that lie on it, to three times their σ."""
+    """Share of the source points with a surface in reach that are on it, within three times their σ."""
     near = np.maximum(1.0 - r**2 / (9.0 * found.once @ noise), 0.0)
     weight = 1.0 / found.spent[:, 1]
     return float(np.sum(near * weight) / max(np.sum(weight), 1.0))
 
 
 def point_information(pairs: SurfacePairs, residuals: Array, noise: Array, least: float = 0.0) -> Array:
-    """Information of each pair: Geman–McClure weight over the variance of what it newly spends.
+    """Information of each pair: Geman–McClure weight divided by its variance.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def point_information(pairs: SurfacePairs, residuals: Array, noise: Array, least
     noise : (3,)
         Variances of a range and of the surfaces [m²], and 1 (:func:`pair_noise`).
     least : float
-        Residuals are not doubted below it: before the path is right, they are wide for its sake [m].
+        Residuals below it are not down-weighted, because they are large while the path is wrong [m].
     """
     doubt = np.maximum(4.0 * pairs.once @ noise, least**2)
     w = 1.0 / (1.0 + residuals**2 / doubt) ** 2
@@ -165,20 +165,20 @@ def point_information(pairs: SurfacePairs, residuals: Array, noise: Array, least
 
 
 ALIKE = 80
-"""Beams of a step in a row whose errors may be alike: a line of a scanner, a wall. Also tried: all of a step."""
+"""Number of consecutive beams of a step whose errors may be correlated: a scan line, a wall. Also tried: all of a
+step."""
 FEWEST_SUMS = 50
-"""Sums of residuals below which it is not told whether errors are alike."""
+"""Minimum number of sums of residuals to estimate their correlation."""
 
 
 def correlation_factor(found: SurfacePairs, cloud: ScanReturns, residuals: Array, noise: Array) -> float:
-    """By how much the variance of sums of residuals is larger than if the errors of points were independent, ≥ 1.
+    """Ratio of the variance of sums of residuals to that of independent errors of points, ≥ 1.
 
-    Beams of one scan share errors: of a line of the scanner, of the material and the slant of a wall, of a sweep that
-    was unbent wrongly. A mean over them is then worse than its number promises. Residuals of points that follow each
-    other in a step, on surfaces of one chunk, are added up; as independent errors each source point brings half of the
-    variance of its residual, each target as much times the square of its pairs, and the motion within the step is
-    shared by all. What sums vary by beyond that is taken to hold for all directions alike.
-
+    Beams of one scan share errors: of a scan line, of the material and the incidence of a wall, of a wrong motion
+    correction. A mean over them is then less accurate than their number suggests. Residuals of consecutive points of a
+    step, on surfaces of one chunk, are added. If errors are independent, each source point contributes half of the
+    variance of its residual, each target this times the square of its number of pairs; the motion within the step is
+    common to all. The same ratio is assumed for all directions.
     Parameters
     ----------
     residuals : (k,) [m]
@@ -215,20 +215,20 @@ def surface_residuals(pairs: PlanePairs, cloud: ScanReturns, surfaces: Surfaces,
 
 
 FEIGNED = 1.5
-"""Of what noise of the normals feigns so many times as much is taken off: groups scatter about the average."""
+"""Factor on the average spurious information of noisy normals that is subtracted, because groups scatter."""
 
 
 def chunk_information(
     found: SurfacePairs, cloud: ScanReturns, surfaces: Surfaces, poses: Array, information: Array
 ) -> GroupInformation:
-    """What each two chunks hold of each other, without what the noise of normals feigns.
+    """Information between each two chunks, without the spurious information of noisy normals.
 
-    Normals of a smooth wall are tilted along it at random. Squared and added up over thousands of pairs they look as if
-    they held the way along it, and they pull it to where the pairs were found. With the variance of each normal both
-    the information ``F`` that is feigned on average and the pull are known. The pull is taken off the gradient; of a
-    direction whose information is h times what is feigned, the share 1 - 1/h of each derivative is held, which leaves
-    ``(h - 1)² / h``: what an estimate without that pull is worth. In a corridor this is nothing of the way along it, in
-    a round room nothing of the turn, over a plain neither.
+    Normals of a smooth wall have random errors along it. Their squares, summed over thousands of pairs, look like
+    information on the motion along the wall, and pull the path to where the pairs were found. The variance of each
+    normal gives the average spurious information ``F`` and the pull. The pull is subtracted from the gradient. In a
+    direction whose information is h times the spurious one, the share 1 - 1/h of each derivative is kept, which leaves
+    ``(h - 1)² / h``, the information of an estimate without that pull. In a corridor nothing remains along it, in a
+    round room nothing of the rotation, over a plain neither.
     """
     pairs, group = found.pairs, found.whose
     d = cloud.points.shape[1]
@@ -258,7 +258,7 @@ class RefinementProblem:
     Parameters
     ----------
     held : (7,) or (3,)
-        Where the first pose is held.
+        Fixed value of the first pose.
     """
 
     def __init__(self, motion: MotionModel, cloud: ScanReturns, held: Array, fixes: FixModel | None = None) -> None:
@@ -272,7 +272,7 @@ class RefinementProblem:
         if self._key != key:
             n = self.motion.steps_count
             nodes = self.motion.nodes
-            met = np.unique(pairs.i * n + pairs.j)  # of millions of pairs of points some thousands of steps
+            met = np.unique(pairs.i * n + pairs.j)  # pairs of steps: far fewer than pairs of points
             a, b = [met // n], [met % n]
             for u in range(nodes.shape[1]):
                 for v in range(u):
@@ -287,7 +287,7 @@ class RefinementProblem:
                         a.append(t.nodes[:, u])
                         b.append(t.nodes[:, v])
             self._pattern = BlockStructure(self.widths, np.concatenate(a), np.concatenate(b))
-            self._key, self._held = key, (pairs.source, extra)  # held: an address is a name while it lives
+            self._key, self._held = key, (pairs.source, extra)  # references keep the ids in the key valid
         assert self._pattern is not None
         return self._pattern
 
@@ -301,7 +301,7 @@ class RefinementProblem:
         extra: list[MotionTerms] | None = None,
         holds: GroupInformation | None = None,
     ) -> tuple[LinearisedProblem, Array]:
-        """Factorised Gauss–Newton matrix at a path, and the step ``(N scalars,)``; None: pairs hold all they say."""
+        """Factorised Gauss–Newton matrix at a path, and the step ``(N scalars,)``; ``holds`` None: no correction."""
         more = [*(extra or []), *([] if self.fixes is None else self.fixes.terms(poses, states))]
         pattern, motion = self._pattern_of(pairs, more), self.motion
         n, w = motion.steps_count, motion.group.dof

@@ -1,8 +1,8 @@
-"""Refinement of a solved path by its own scans: rounds of association and Gauss–Newton, guarded.
+"""Refine a solved path with its scans: rounds of association and Gauss–Newton, with checks of the result.
 
-Nodes are the steps. The measurements are the points of the scans on surfaces that other steps saw, the increments of
-the odometry with lasting errors as unknowns, and gravity. Exits of submaps, matches and loops of the run are where the
-refinement starts, and enter no sum: they were made of the same scans.
+Nodes are steps. The measurements are the points of the scans on surfaces of other steps, the increments of the odometry
+with systematic errors as unknowns, and gravity. End poses of submaps, matches and loops of the run are only the initial
+guess, because they were made from the same scans.
 """
 
 from __future__ import annotations
@@ -56,25 +56,25 @@ log = logging.getLogger(__name__)
 Index = npt.NDArray[np.int64]
 
 NEAR = ((1.0, 0.10), (0.7, 0.07))
-"""Distance and σ of the rounds over neighbours on the way [m]; the last is repeated until the path stands still."""
+"""Distance and σ of the rounds with consecutive chunks [m]; the last is repeated until the path has converged."""
 STILL = 0.01, 1e-4
-"""A round moved the path by less than so much [m], or than this share of its length: it stands still."""
+"""The path has converged if a round moved it by less than this [m], or than this share of its length."""
 MOST_ROUNDS = 10
 MOST_GATES = 6
 WIDE = 3.0, 2.0
-"""Greatest distances of pairs before those of the configuration, where no guide brought passes together [m]."""
+"""Largest distances of pairs before those of the configuration, if no guide aligned the traversals [m]."""
 DOUBTED = 0.2
-"""Residuals below this share of the greatest distance of a pair are not doubted."""
+"""Residuals below this share of the largest distance of a pair are not down-weighted."""
 FEWEST = 3
-"""Chunks of one pass that a chunk is paired with at least; over a reach there lie so many as fit."""
+"""Minimum number of chunks of one traversal that a chunk is paired with; otherwise the number that fits in a reach."""
 KEPT = 2
-"""Surfaces are found anew in so many rounds over all passes; then the steps about a point move no more."""
+"""Surfaces are computed again in this number of rounds with all traversals; later, steps hardly move."""
 CHUNK_LENGTH = 3.0
-"""Way over which the points of steps are searched together [m] …"""
+"""Path length over which the points of steps are searched together [m] …"""
 CHUNK_TIME = 10.0
-"""… the longest time of such a chunk, for robots that stand still [s] …"""
+"""… largest duration of such a chunk, for static robots [s] …"""
 CHUNK_TURN = 0.5
-"""… and in the plane the greatest turn within it [rad]; a scanner that looks one way soon sees other walls."""
+"""… and in 2-D its largest rotation [rad], because a scanner with a limited field of view soon observes other walls."""
 
 
 def refine_by_scans(
@@ -85,16 +85,16 @@ def refine_by_scans(
     gps: tuple[Gps, GpsConfig] | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Refinement:
-    """Refine a path by the scans of its steps.
+    """Refine a path with the scans of its steps.
 
     Parameters
     ----------
     start : (n, 7) or (n, 3)
-        Poses of the base at the stamps of the steps; in space the frame is level.
+        Poses of the base at the stamps of the steps; in 3-D in a level frame.
     gps : (Gps, GpsConfig), optional
-        Fixes that hold the path, too, and how they enter.
+        Fixes to use as well, and their options.
     progress : callable, optional
-        Told each round in words.
+        Called with a text after each round.
     """
     work, nodes = _begin(steps, start, config or RefineConfig(), gps, progress)
     return work.run().at_all_steps(steps, start, nodes)
@@ -107,9 +107,9 @@ def refine_if_contradicted(
     *,
     progress: Callable[[str], Any] | None = None,
 ) -> Refinement | ScanCheck:
-    """Refine a path only if its scans contradict it: otherwise the check alone, at about a third of the time.
+    """Refine a path only if its scans contradict it; otherwise return the check, in about a third of the time.
 
-    For scans that the odometry behind the path has already matched. Parameters as of :func:`refine_by_scans`.
+    For scans that the odometry of the path has already matched. Parameters as of :func:`refine_by_scans`.
     """
     work, nodes = _begin(steps, start, config or RefineConfig(), None, progress)
     check = work.check()
@@ -123,7 +123,7 @@ def _begin(
     gps: tuple[Gps, GpsConfig] | None,
     progress: Callable[[str], Any] | None,
 ) -> tuple[_Refiner, Index]:
-    """A refiner of the steps that are nodes, and which steps these are."""
+    """A refiner of the steps that are nodes, and the indices of these steps."""
     g = steps.group
     if start.shape != (len(steps), g.size) or not np.all(np.isfinite(start)):
         raise GeometryError(
@@ -169,7 +169,7 @@ NOTHING = SurfacePairs(
 
 
 class _Refiner:
-    """A refinement while it goes on."""
+    """State of a refinement."""
 
     def __init__(
         self,
@@ -201,12 +201,12 @@ class _Refiner:
         self.guided: tuple[RevisitConstraints, npt.NDArray[np.bool_]] | None = None
 
     def first_states(self) -> States:
-        """No lasting errors; fixes as they lie at the path."""
+        """Systematic errors of zero; datum of the fixes aligned to the path."""
         own = (np.zeros(len(self.motion.knots)), np.zeros(self.motion.constants))
         return own if self.fixes is None else (*own, *self.fixes.start(self.poses))
 
     def run(self) -> Refinement:
-        """All rounds; from the odometry's path once more where the start turns out to be wrong."""
+        """All rounds; repeated from the odometry's path if the initial path is wrong."""
         guides, taken = self.neighbours_and_guides()
         self.all_passes(DISTANCES)
         other = None
@@ -221,16 +221,16 @@ class _Refiner:
             taken = taken & (not other.taken)
             self.reckoned = self.agreement_along(odometry)
         found = self.result(guides.steps[~taken & guides.far(self.poses)], other)
-        if not found.input_better or self.fixes is not None:  # fixes hold a path, and odometry knows none of them
+        if not found.input_better or self.fixes is not None:  # fixes constrain the path, and the odometry has none
             return found
         self.tell("the odometry alone agrees better; its path is the result")
         return self.initial_result(found, odometry)
 
     def check(self) -> ScanCheck:
-        """Do the scans contradict the start? Only if it brings passes together are neighbours compared for it."""
+        """Do the scans contradict the initial path? Only if it has revisits, consecutive chunks are matched, too."""
         odometry_path = self.odometry_path()
         pairs = [self.pairs_along(self.start)]
-        if not np.allclose(odometry_path, self.start, rtol=0.0, atol=1e-6):  # otherwise the graph changed nothing
+        if not np.allclose(odometry_path, self.start, rtol=0.0, atol=1e-6):  # equal if the graph changed nothing
             pairs.append(self.pairs_along(odometry_path))
         noise = np.min([pair_noise(found, r) for found, r in pairs], axis=0)
         shares = [agreeing_share(found, r, noise) for found, r in pairs]
@@ -241,11 +241,11 @@ class _Refiner:
         return replace(check, refused=guides.steps[~taken & guides.far(self.poses)])
 
     def odometry_path(self) -> Array:
-        """Poses of the odometry alone, from where the start begins."""
+        """Poses of the odometry alone, from the first pose of the initial path."""
         return self.group.compose(self.start[0], chain_odometry(self.steps.odometry).poses)
 
     def initial_result(self, found: Refinement, odometry: Array) -> Refinement:
-        """The path of the odometry, as sure as motion and gravity say without any scan."""
+        """The path of the odometry, with the covariance of motion and gravity, without scans."""
         assert self.surfaces is not None
         self.poses, self.states = odometry, self.first_states()
         self.motion.scales, self.motion.walk = np.ones_like(self.motion.scales), 1.0
@@ -273,9 +273,9 @@ class _Refiner:
         return solved.factor.inverse_diagonal_blocks(np.arange(n, dtype=np.int64) * w, w)
 
     def from_odometry(self) -> AttemptComparison:
-        """Once more without the start, whose wrong loops may have pulled its right ones along or bent it too far.
+        """Repeat without the initial path, whose wrong loops may have deformed it.
 
-        The path at which the scans agree better is kept.
+        The path with the better agreement of scans is kept.
         """
         first = self.attempt()
         self.poses = self.odometry_path()
@@ -286,7 +286,7 @@ class _Refiner:
         self.neighbours()
         self.all_passes(tuple(d for d in WIDE if d > DISTANCES[0]) + DISTANCES)
         second = self.attempt()
-        # the same noise for both, or the blunter path would agree better for that alone
+        # the same noise for both; otherwise larger noise alone would give a better agreement
         noise = np.minimum(first.noise, second.noise)
         self.motion.scales = np.ones_like(self.motion.scales)
         a, b = (self.agreement(x.cloud, x.surfaces, x.poses, noise) for x in (first, second))
@@ -296,7 +296,7 @@ class _Refiner:
         return AttemptComparison(apart, max(a, b), min(a, b), b > a)
 
     def attempt(self) -> _Attempt:
-        """Where the refinement stands."""
+        """The current state of the refinement."""
         assert self.surfaces is not None
         motion = (self.motion.scales, self.motion.walk)
         return _Attempt(
@@ -312,28 +312,28 @@ class _Refiner:
         )
 
     def take_up(self, a: _Attempt) -> None:
-        """Go on from where it stood."""
+        """Restore a state of the refinement."""
         self.poses, self.states, self.surfaces, self.chunks = a.poses, a.states, a.surfaces, a.chunks
         self.found, self.noise, self.rounds = a.found, a.noise, a.rounds
         self.cloud = self.problem.cloud = a.cloud
         self.motion.scales, self.motion.walk = a.scales, a.walk
 
     def neighbours(self) -> None:
-        """Rounds over neighbours on the way, until the path stands still."""
+        """Rounds with consecutive chunks, until the path has converged."""
         for distance, sigma in NEAR:
             self.round(distance, sigma, passes=False, again=True)
         while self.rounds[-1].moved > max(STILL[0], STILL[1] * self.length) and len(self.rounds) < MOST_ROUNDS:
             self.round(*NEAR[-1], passes=False, again=False)
 
     def all_passes(self, distances: tuple[float, ...]) -> None:
-        """Rounds over all passes at falling distances."""
+        """Rounds with all traversals at decreasing distances."""
         for k, distance in enumerate(distances):
             again = k < len(distances) - len(DISTANCES) + KEPT
             self.round(distance, None, passes=True, again=again, steps=2 if k == 0 else 1)
 
     def round(self, distance: float, sigma: float | None, *, passes: bool, again: bool, steps: int = 2) -> None:
-        """Associate anew, and Gauss–Newton steps; without a σ the noise comes from the residuals."""
-        # what is made anew is let go of first: never two of them
+        """Associate, and Gauss–Newton steps; without a σ the noise is estimated from the residuals."""
+        # free the old data first, so that there are never two of them in memory
         self.found = NOTHING
         if passes:
             self.cloud = self.problem.cloud = self.raw
@@ -357,7 +357,7 @@ class _Refiner:
         before = self.poses
         solved: LinearisedProblem | None = None
         for _ in range(steps):
-            solved = None  # a factor of a long path is the largest thing here: never two of them
+            solved = None  # the factor of a long path is the largest object: never two of them in memory
             r = surface_residuals(self.found.pairs, self.cloud, self.surfaces, self.poses)
             noise = pair_noise(self.found, r) if sigma is None else np.array([0.0, sigma**2, 0.0])
             information = point_information(self.found, r, noise, DOUBTED * distance)
@@ -390,18 +390,18 @@ class _Refiner:
         return solved
 
     def neighbours_and_guides(self) -> tuple[RevisitConstraints, npt.NDArray[np.bool_]]:
-        """The first rounds, once: neighbours, then the guides and which of them the scans between allow."""
+        """Once: the rounds with consecutive chunks, then the guides, and which of them agree with the scans."""
         if self.guided is None:
             self.neighbours()
             self.guided = self.follow_guides()
         return self.guided
 
     def find_guides(self) -> RevisitConstraints:
-        """Steps of different passes that the start brings together."""
+        """Pairs of steps of different traversals that are near each other in the initial path."""
         return find_revisit_constraints(self.cloud, self.start, 0.5 * self.reach)
 
     def follow_guides(self) -> tuple[RevisitConstraints, npt.NDArray[np.bool_]]:
-        """Bring passes together as the start has them where the scans between allow it; which of the guides they do."""
+        """Align traversals as in the initial path where the scans in between allow it; returns guides and a mask."""
         guides = self.find_guides()
         if not len(guides):
             return guides, np.zeros(0, bool)
@@ -424,9 +424,9 @@ class _Refiner:
         return guides, taken
 
     def pairs(self, cloud: ScanReturns, surfaces: Surfaces, poses: Array) -> tuple[SurfacePairs, Array]:
-        """Pairs found anew at a path, among surfaces made there, and their residuals [m].
+        """Pairs found at a path with surfaces made there, and their residuals [m].
 
-        Nothing is kept of how the path came about.
+        They do not depend on how the path was estimated.
         """
         found = match_surfaces(
             cloud,
@@ -441,7 +441,7 @@ class _Refiner:
         return found, surface_residuals(found.pairs, cloud, surfaces, poses)
 
     def agreement(self, cloud: ScanReturns, surfaces: Surfaces, poses: Array, noise: Array) -> float:
-        """Share of the points that lie on the surfaces of others along a path."""
+        """Share of the points that are on the surfaces of others along a path."""
         return agreeing_share(*self.pairs(cloud, surfaces, poses), noise)
 
     def pairs_along(self, poses: Array) -> tuple[SurfacePairs, Array]:
@@ -453,7 +453,7 @@ class _Refiner:
         return agreeing_share(*self.pairs_along(poses), self.noise)
 
     def result(self, refused: Index, other: AttemptComparison | None) -> Refinement:
-        """Covariances at the end, and all that was found."""
+        """Final covariances, and all results."""
         assert self.surfaces is not None
         assert self.first is not None
         trim_heap()

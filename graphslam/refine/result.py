@@ -1,4 +1,4 @@
-"""What a refinement and the check of a path by its scans result in."""
+"""Results of a refinement, and of the check of a path with its scans."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from graphslam.refine.scans import Scans
 Index = npt.NDArray[np.int64]
 
 AGREEMENT_NOISE = 0.01
-"""Shares of agreeing points of two paths that differ by less than this do not rank the paths."""
+"""Two shares of agreeing points that differ by less are considered equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class RefinementRound:
-    """One association and what followed.
+    """One association with its Gauss–Newton steps.
 
     Parameters
     ----------
     distance : float
-        Greatest distance of a pair [m].
+        Largest distance of a pair [m].
     range_sigma, surface_sigma : float
-        σ of a range and of the surfaces themselves [m].
+        σ of a range and of the surfaces [m].
     pairs, passes : int
-        Pairs of points, and how many of them between different passes.
+        Number of pairs of points, and of those between different traversals.
     spread : float
         1.48 × the median absolute residual [m].
     moved : float
@@ -48,16 +48,16 @@ class RefinementRound:
 
 @dataclass(frozen=True, slots=True)
 class AttemptComparison:
-    """Two attempts, from the start and from the odometry alone.
+    """Comparison of two refinements, from the initial path and from the odometry alone.
 
     Parameters
     ----------
     apart : float
         RMS distance between their paths [m].
     kept, left : float
-        Agreement of the scans at the path that was kept, and at the other, to the same noise.
+        Agreement of the scans along the path that was kept, and along the other, with the same noise.
     taken : bool
-        That from the odometry was kept.
+        The one from the odometry was kept.
     """
 
     apart: float
@@ -68,15 +68,15 @@ class AttemptComparison:
 
 @dataclass(frozen=True, slots=True)
 class ScanCheck:
-    """Do the scans contradict a path? Measured before anything is refined.
+    """Agreement of the scans with a path, before a refinement.
 
     Parameters
     ----------
     odometry, start : float
-        Share of the points of passes and neighbours that lie on the surfaces of the others, along the path of the
-        odometry and along the path that was checked, to the same noise.
+        Share of the points that are on the surfaces of other traversals and neighbours, along the path of the odometry
+        and along the checked path, with the same noise.
     refused : (m, 2)
-        Steps that the path draws together although the scans between contradict it.
+        Steps that the path brings together although the scans in between contradict it.
     """
 
     odometry: float
@@ -85,21 +85,21 @@ class ScanCheck:
 
     @property
     def contradicted(self) -> bool:
-        """Do the scans agree better along the odometry, or does the path draw steps together wrongly?"""
+        """Do the scans agree better along the odometry, or does the path bring steps together wrongly?"""
         return len(self.refused) > 0 or self.odometry > self.start + AGREEMENT_NOISE
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """A refined path with its uncertainty, and what was found on the way.
+    """A refined path with its uncertainty, and other results of the refinement.
 
     Parameters
     ----------
     times : (n,)
     poses : (n, 7) or (n, 3)
-        In the frame of the start, whose first position and heading are held.
+        In the frame of the initial path, whose first position and heading are fixed.
     covariances : (n, d, d)
-        Right tangent, first position and heading held.
+        Right tangent, first position and heading fixed.
     start : (n, 7) or (n, 3)
     yaw_bias : (k, 2)
         Time [s] and bias of the yaw rate [rad/s] at the knots.
@@ -108,33 +108,33 @@ class Refinement:
     parts : dict of str to float
         Objective by kind of factor at the end.
     refused : (m, 2)
-        Steps that the start drew together although the scans between contradict it.
+        Steps that the initial path brings together although the scans in between contradict it.
     agreement : (start, refined)
-        Share of the points of passes and neighbours that lie on the surfaces of the others, at both paths.
+        Share of the points that are on the surfaces of other traversals and neighbours, at both paths.
     reckoned : float
         The same share at the path of the odometry alone.
     other : AttemptComparison or None
-        The second attempt, from the odometry, where the start contradicts the scans or the odometry agrees better.
+        A second refinement, from the odometry, if scans contradict the initial path or agree better with odometry.
     scales : (c,)
-        By which the σ of the odometry's components were widened, since the scans show more.
+        Estimated factors on the σ of the odometry's components, ≥ 1.
     walk : float
-        The same of the walk of the yaw bias.
+        The same for the random walk of the yaw bias.
     motion : float
-        χ² of the walk of the yaw bias by its degrees of freedom: far above 1 where the scans of passes and the motion
-        contradict each other.
+        χ² of the yaw-bias random walk per degree of freedom: far above 1 if the scans of several traversals contradict
+        the motion.
     solved : LinearisedProblem
         The last linearisation, for joint covariances.
     nodes : (m,)
         Steps that are nodes of the problem; between them the path follows the odometry.
     between : StepsBetweenNodes
-        How the steps lie between nodes, and what they do not share with any.
+        Steps between nodes, with their own covariance.
     fixes : FixReport or None
-        What fixes did; None: there were none, or their way is too short to say where north is.
+        Report on fixes; None: there were none, or their path is too short to determine the heading.
     alike : float
-        By how much sums of residuals of one scan vary more than independent errors would, for which covariances are
-        larger; 1: no more.
+        Ratio of the variance of sums of residuals of one scan to that of independent errors, ≥ 1; the covariance is
+        scaled by it.
     left : float or None
-        Agreement at the refined path where that of the odometry was taken instead, since scans agree better there.
+        Agreement at the refined path, if the path of the odometry is the result because scans agree better there.
     """
 
     times: Array
@@ -161,12 +161,12 @@ class Refinement:
 
     @property
     def better(self) -> bool:
-        """Do the scans agree with each other at the refined path at least as well as at the start?"""
+        """Is the scan agreement at the refined path at least as good as at the initial path?"""
         return self.agreement[1] >= self.agreement[0]
 
     @property
     def input_better(self) -> bool:
-        """Do they agree better at the path of the odometry than at the start and at the refined path?"""
+        """Is it better at the path of the odometry than at the initial path and at the refined path?"""
         return self.reckoned > max(self.agreement)
 
     def joint(self, steps: npt.ArrayLike) -> Array:
@@ -185,7 +185,7 @@ class Refinement:
         return np.asarray(C.reshape(len(k) * d, -1))
 
     def at_all_steps(self, steps: Scans, start: Array, nodes: Index) -> Refinement:
-        """A refinement of some steps, with the steps between them along the odometry."""
+        """Extend a refinement of some steps to the steps between them, along the odometry."""
         if len(nodes) == len(steps):
             return self
         poses, covariances, between = path_between(steps, nodes, self.poses, self.covariances, self.scales)

@@ -1,9 +1,9 @@
-"""What the start of a refinement says of places that were passed more than once, checked against the scans between.
+"""Relative poses of revisited places in the initial path of a refinement, checked with the scans in between.
 
-Scans of neighbouring steps hold the path together far better than any filter does, so that a start in which a wrong
-loop drew two places together contradicts them by many σ. The start's relative poses between passes therefore enter as
-guides with a robust kernel (graduated non-convexity), only to bring the path within reach of the scans of the other
-pass; they are no measurements, and are gone before the covariance is computed.
+Scans of consecutive steps constrain the path much better than a filter, so an initial path in which a wrong loop
+brought two places together contradicts them by many σ. Relative poses between traversals in the initial path are used
+as guides with a robust kernel (graduated non-convexity), only to bring the scans of the traversals within reach of each
+other. They are no measurements, and are removed before the covariance is computed.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 POSITION, ANGLE = 0.15, 0.015
-"""σ of the start's relative pose of two passes [m], [rad]: what brings scans within the capture of the first round."""
+"""σ of the initial relative pose of two traversals [m], [rad]: small enough for the matching of the first round."""
 DOUBT = 4.0
-"""Factor on the covariance of a path that scans of neighbours alone hold together."""
+"""Factor on the covariance of a path that only scans of consecutive chunks constrain."""
 FAR = 1.0, 0.1
-"""A guide that the refined path contradicts by more is a wrong loop of the start [m], [rad]."""
+"""A guide with a larger difference to the refined path is a wrong loop of the initial path [m], [rad]."""
 ACCEPTED = 16.8
-"""χ² of six degrees of freedom at 99 %: beyond it a guide contradicts the scans between."""
+"""χ² of six degrees of freedom at 99 %: above it a guide contradicts the scans in between."""
 
 
 @dataclass(frozen=True, slots=True)
 class RevisitConstraints:
-    """Relative poses of passes in the start.
+    """Relative poses between traversals in the initial path.
 
     Parameters
     ----------
     steps : (m, 2)
         Earlier and later step.
     poses : (m, 7|3)
-        ``T_earlier_later`` in the start.
+        ``T_earlier_later`` in the initial path.
     """
 
     steps: Index
@@ -70,16 +70,16 @@ class RevisitConstraints:
         return np.asarray(np.sum((e / _sigmas(g)) ** 2, axis=1))
 
     def far(self, path: Array) -> Flags:
-        """Which are wrong by more than a path is ever bent within what it knows: more than a scan could bridge."""
+        """Mask of guides with a difference to the path above :data:`FAR`, which scans could not bridge."""
         g = group_of(path)
         a, b = self.steps.T
         off, turned = tangent_lengths(g.log(g.between(self.poses, g.between(path[a], path[b]))), g)
         return np.asarray((off > FAR[0]) | (turned > FAR[1]), dtype=np.bool_)
 
     def distances(self, path: Array, solved: LinearisedProblem, width: int) -> Array:
-        """Mahalanobis distances ``(m,)``, squared, of the guides from a path whose covariance is known.
+        """Squared Mahalanobis distances ``(m,)`` of the guides from a path with known covariance.
 
-        The covariance of scans of neighbours alone promises up to :data:`DOUBT` times too much.
+        The covariance from scans of consecutive chunks alone may be too small by up to :data:`DOUBT`.
         """
         g = group_of(path)
         step = g.between(path[self.steps[:, 0]], path[self.steps[:, 1]])
@@ -96,7 +96,7 @@ class RevisitConstraints:
 
 
 def tangent_lengths(e: Array, g: Group) -> tuple[Array, Array]:
-    """Way [m] and turn [rad] of tangents ``(m, d)``, each ``(m,)``."""
+    """Translation [m] and rotation [rad] of tangents ``(m, d)``, each ``(m,)``."""
     turn = np.delete(e, np.r_[g.position], axis=1)
     return np.linalg.norm(e[:, g.position], axis=1), np.linalg.norm(turn, axis=1)
 
@@ -108,7 +108,7 @@ def _sigmas(g: Group) -> Array:
 
 
 def find_revisit_constraints(cloud: ScanReturns, start: Array, reach: float) -> RevisitConstraints:
-    """The nearest chunk of every other pass within ``reach`` [m] of each chunk, at the start ``(n, 7|3)``."""
+    """The nearest chunk of every other traversal within ``reach`` [m] of each chunk, at the path ``(n, 7|3)``."""
     d, C = cloud.points.shape[1], cloud.chunks
     first = np.searchsorted(cloud.chunk, np.arange(C))
     last = np.append(first[1:], len(cloud.chunk)) - 1
@@ -122,7 +122,7 @@ def find_revisit_constraints(cloud: ScanReturns, start: Array, reach: float) -> 
     distance = np.linalg.norm(at[pairs[:, 1]] - at[pairs[:, 0]], axis=1)
     order = np.lexsort((pairs[:, 0], pairs[:, 1]))
     pairs, distance = pairs[order], distance[order]
-    # of the later chunk's partners, those that follow each other are one pass: its nearest
+    # consecutive partners of the later chunk are one traversal: its nearest one is used
     new = (np.diff(pairs[:, 1], prepend=-1) != 0) | (np.diff(pairs[:, 0], prepend=-9) > 1)
     group = np.cumsum(new) - 1
     best = np.lexsort((distance, group))

@@ -1,4 +1,4 @@
-"""Scans of steps, with motion and gravity: all that a refinement reads of a log, and its file."""
+"""Scans of steps, with motion and gravity: all inputs of a refinement, and their file."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ FIELDS: dict[str, Field] = {
     "tilt": floats("n", "t", optional=True),
 }
 LASTING = ("yaw_bias", "yaw_walk", "scale", "direction", "clock", "tilt", "bend", "turn")
-"""``scalars``: max_range, tilt_sigma, tilt_time, these lasting errors, ``matched`` (0 where missing)."""
+"""``scalars``: max_range, tilt_sigma, tilt_time, these σ of systematic errors, ``matched`` (0 if missing)."""
 REACH = 10.0, 30.0
-"""Least and greatest distance of chunks that may see the same surfaces, where the log says which [m]."""
+"""Bounds of the reach (distance of chunks that may observe the same surfaces), if the log determines it [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,22 +47,22 @@ class Scans:
     times : (n,)
         Stamps [s].
     odometry : Odometry
-        Increments at ``times``; the covariances hold what is new in each.
+        Increments at ``times``; each covariance has only the noise that is new.
     offsets : (n + 1,) int64
         Beams of step k are rows ``offsets[k]:offsets[k + 1]``.
     points, origins : (q, dim)
-        Ends and beginnings of the beams, frame of the base at the stamp of their step, in single precision [m].
+        Ends and origins of the beams, frame of the base at the stamp of their step, in single precision [m].
     returns : (q,) bool
     ages : (q,) or None
-        Time from each beam to the stamp of its step, over which motion alone places it [s]; None: no time.
+        Time from each beam to the stamp of its step, bridged by the motion alone [s]; None: no time.
     max_range : float
         [m]
     tilt : (n, 2) or None
-        Roll and pitch by gravity [rad].
+        Roll and pitch from gravity [rad].
     tilt_sigma, tilt_time : float
-        Of their fading error [rad], [s].
+        σ and correlation time of their error [rad], [s].
     matched : bool
-        The odometry was made by matching these scans one after the other.
+        The odometry was made by matching consecutive scans.
     """
 
     times: Array
@@ -82,10 +82,10 @@ class Scans:
 
     @classmethod
     def of(cls, steps: Steps) -> Scans:
-        """Those of steps, with σ of the lasting errors that their motion states, never less
-        than :data:`~graphslam_frontends.odometry.motion_prior.LEAST`."""
+        """Scans of steps, with σ of the systematic errors of their motion, at least those
+        of :data:`~graphslam_frontends.odometry.motion_prior.LEAST`."""
         odometry = steps.odometry
-        if steps.recorded is not None:  # scans mended it: they may not be counted in its σ as well as by themselves
+        if steps.recorded is not None:  # corrected by scans: use the recorded σ, so that scans are not used twice
             odometry = replace(odometry, covariances=steps.recorded.covariances)
         same = ("times", "offsets", "returns", "max_range", "tilt", "tilt_sigma", "tilt_time", "name", "matched")
         return cls(
@@ -107,12 +107,12 @@ class Scans:
 
     @property
     def path_length(self) -> Array:
-        """Metres driven until each step ``(n,)``, by the odometry."""
+        """Path length up to each step ``(n,)``, by the odometry [m]."""
         return np.cumsum(np.linalg.norm(self.odometry.increments[:, : self.group.dim], axis=1))
 
     @property
     def reach(self) -> float:
-        """The range that three quarters of the returns stay below: places that far apart see the same things [m]."""
+        """Range below which three quarters of the returns are, clipped to :data:`REACH` [m]."""
         points = (self.points - self.origins)[self.returns]
         if not len(points):
             return REACH[0]

@@ -1,4 +1,4 @@
-"""Points of steps as surfaces, and which source points lie on which surfaces of other steps."""
+"""Points of steps as surfaces, and matching of source points to surfaces of other steps."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ Flags = npt.NDArray[np.bool_]
 
 
 SAME_SIDE = 0.85
-"""Least cosine between the two normals of a pair, which point to where the beams came from, so that the two sides of a
-wall or of a ceiling never meet."""
+"""Minimum cosine between the two normals of a pair. Normals point to the origin of the beam, so the two sides of a wall
+or of a ceiling are never matched."""
 BLOCK = 1 << 16
-"""Rows that are worked on together: a matrix for each point of a long log would take gigabytes."""
+"""Rows that are processed together: a matrix for each point of a long log would take gigabytes."""
 
 
 def row_blocks(n: int) -> Iterator[slice]:
-    """Rows ``0 … n`` a block at a time."""
+    """Slices of ``0 … n`` with at most :data:`BLOCK` rows."""
     return (slice(k, min(k + BLOCK, n)) for k in range(0, n, BLOCK))
 
 
@@ -46,14 +46,14 @@ class ScanReturns:
     Parameters
     ----------
     points : (q, d)
-        Each in the frame of its own step, as the odometry placed it there.
+        Each in the frame of its own step, placed by the odometry.
     origins : (q, d)
         Of the beams, same frames.
     step : (q,)
     age : (q,)
-        Share of the step's time between the beam and the stamp.
+        Time from the beam to the stamp as a share of the step's time.
     chunk : (n,)
-        Of each step, ascending from 0.
+        Chunk of each step, ascending from 0.
     rows : (c + 1,)
         Points of chunk k are rows ``rows[k]:rows[k + 1]``.
     """
@@ -67,7 +67,7 @@ class ScanReturns:
 
     @classmethod
     def of(cls, steps: Scans, *, chunk_length: float, chunk_time: float, chunk_turn: float = np.inf) -> ScanReturns:
-        """The returns of steps in chunks of a length [m], at most of a time [s] and of a turn of the heading [rad]."""
+        """The returns of steps, in chunks of limited length [m], time [s] and heading rotation [rad]."""
         n = len(steps)
         step = np.repeat(np.arange(n), np.diff(steps.offsets))
         hit = steps.returns
@@ -94,19 +94,19 @@ class ScanReturns:
         )
 
     def corrected(self, corrections: Array) -> ScanReturns:
-        """The cloud with beams placed anew in their steps, whose increments were wrong by ``(n, dof)``.
+        """The cloud with corrected beams, for errors ``(n, dof)`` of the increments of their steps.
 
-        An error of the increment grew evenly over the time of the step: a beam of age α was placed by the share α of
-        it too far.
+        An error of the increment grew linearly over the time of the step: a beam of age α was misplaced by the share α
+        of it.
         """
 
-        if not np.any(self.age):  # whole scans of one instant
+        if not np.any(self.age):  # all beams of a scan have the same time
             return self
 
         def moved(x: Array) -> Array:
             out = np.empty(x.shape)
             for s in row_blocks(len(x)):
-                c = -self.age[s, None] * corrections[self.step[s]]  # small: to first order
+                c = -self.age[s, None] * corrections[self.step[s]]  # small, so first order suffices
                 y = x[s]
                 if x.shape[1] == 3:
                     out[s] = y + np.cross(c[:, :3], y) + c[:, 3:]
@@ -117,7 +117,7 @@ class ScanReturns:
         return replace(self, points=moved(self.points), origins=moved(self.origins))
 
     def bridge(self) -> Array:
-        """Share ``(n,)`` of an increment's variance that is left of it in the beams of its step, mean of α (1 − α)."""
+        """Share ``(n,)`` of an increment's variance that remains in the beams of its step, mean of α (1 − α)."""
         n = len(self.chunk)
         part = np.bincount(self.step, weights=self.age * (1.0 - self.age), minlength=n)
         return np.asarray(part / np.maximum(np.bincount(self.step, minlength=n), 1))
@@ -144,13 +144,13 @@ class Surfaces:
     Parameters
     ----------
     normals : (q, d)
-        Towards where the beam came from; zero where there is no surface.
+        Towards the origin of the beam; zero without a surface.
     flat : (q,) bool
-        Is it one? Only of points that stand for themselves.
+        Is it a surface? Only for representative points.
     stands : (q,) int
-        Row of the point that stands for this one: of points of one chunk nearer together than the spacing the first.
+        Row of the point that represents this one: the first of the points of one chunk within the spacing.
     tilts : (q, d - 1, d)
-        Axes of the surface, each as long as the σ by which noise tilts the normal towards it [rad], single precision.
+        Axes of the surface, scaled to the σ of the normal's error towards them [rad], single precision.
     """
 
     normals: Array
@@ -159,18 +159,18 @@ class Surfaces:
     tilts: npt.NDArray[np.float32]
 
     def put_aside(self) -> CacheEntry[Surfaces]:
-        """On the shelf of the process: surfaces that are asked for once more at the end."""
+        """Put the surfaces into the spill cache of the process until they are used again at the end."""
         parts = [self.normals, self.flat, self.stands, self.tilts]
         size = sum(a.nbytes for a in parts)
         return SPILL_CACHE.put(self, size, lambda s: [s.normals, s.flat, s.stands, s.tilts], lambda a: Surfaces(*a))
 
 
 def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) -> Surfaces:
-    """Surfaces of all places among those of their own and the two neighbouring chunks, at a path.
+    """Surfaces of all representative points, from those of their own and the two neighbouring chunks, at a path.
 
-    Neighbours in time only: points of other passes lie beside these ones before the passes agree, and would turn the
-    normals. A surface goes through its own point, not through the mean of its neighbours: with points of the next
-    chunk in it, it would follow those that are compared with it, and the rounds would creep.
+    Only neighbours in time: points of other traversals are offset before the traversals agree, and would tilt the
+    normals. A surface goes through its own point, not through the mean of its neighbours: otherwise it would depend on
+    points of the next chunk, which are compared with it, and the rounds would converge slowly.
     """
     W, O = cloud.world(poses)
     q, d = W.shape
@@ -191,7 +191,7 @@ def find_surfaces(cloud: ScanReturns, poses: Array, config: SurfaceFitConfig) ->
 
 @dataclass(frozen=True, slots=True)
 class ChunkPairs:
-    """Which chunks see the same surfaces.
+    """Pairs of chunks that may observe the same surfaces.
 
     Parameters
     ----------
@@ -204,27 +204,27 @@ class ChunkPairs:
 
     @property
     def passes(self) -> Flags:
-        """Of different passes of the same place, not of neighbours on the way."""
+        """Are they different traversals of the same place, not neighbours along the path?"""
         return self.a - self.b > NEIGHBOURS
 
 
 ALIKE = 0.5
-"""Share of its variance in which the motion moves all beams of a step as one: a Brownian bridge over a unit of time has
-the variance 1/6 at a time drawn at random, and its mean 1/12."""
+"""Share of its variance in which the motion moves all beams of a step together: a Brownian bridge over a unit of time
+has the variance 1/6 at a random time, and its mean 1/12."""
 NEXT = 1
-"""Chunks that follow each other so closely are compared with each other."""
+"""Chunks with an index difference up to this are compared with each other."""
 NEIGHBOURS = 5
-"""Chunks that follow each other so closely are neighbours on the way; others are passes of the same place."""
+"""Chunks with an index difference up to this are neighbours along the path; others are different traversals."""
 PASSES = 2
-"""A chunk is compared with as many chunks as so many passes before it have."""
+"""A chunk is compared with at most this multiple of ``most`` chunks of earlier traversals."""
 
 
 def chunk_pairs(cloud: ScanReturns, poses: Array, reach: float, most: int, *, passes: bool) -> ChunkPairs:
-    """Chunks next to each other on the way; with ``passes`` also those whose centres are within ``reach`` [m].
+    """Consecutive chunks; with ``passes`` also those whose centres are within ``reach`` [m].
 
-    Of one pass, no more than ``most`` chunks are paired with a chunk, and of all passes before it no more than
-    ``PASSES`` times as many: the nearest. A place that was seen ten times needs no pairs of every two of them to hang
-    together, and each further one would widen the separators of the elimination.
+    A chunk is paired with at most ``most`` chunks of one traversal, and ``PASSES`` times as many of all earlier ones:
+    the nearest. If a place was observed ten times, not all pairs are needed to connect them, and each additional one
+    would widen the separators of the elimination.
     """
     C, d = cloud.chunks, cloud.points.shape[1]
     first = np.searchsorted(cloud.chunk, np.arange(C))
@@ -241,7 +241,7 @@ def chunk_pairs(cloud: ScanReturns, poses: Array, reach: float, most: int, *, pa
 
 
 def _nearest(pairs: Index, centres: Array, most: int) -> Index:
-    """Of the partners of a chunk that follow each other, and so are one pass, so many of the nearest."""
+    """The nearest partners of each chunk: at most ``most`` per traversal (consecutive partners)."""
     a, b = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
     group = np.cumsum((np.diff(a, prepend=-1) != 0) | (np.diff(b, prepend=-9) > 1))
     order = np.lexsort((np.linalg.norm(centres[a] - centres[b], axis=1), group))
@@ -255,20 +255,20 @@ def _nearest(pairs: Index, centres: Array, most: int) -> Index:
 
 @dataclass(frozen=True, slots=True)
 class SurfacePairs:
-    """Pairs of points on surfaces, and what is known of their errors.
+    """Pairs of points on surfaces, with the variances of their residuals.
 
     Parameters
     ----------
     whose : (k,)
         Number of the chunk pair of each.
     once : (k, 3)
-        Variance of the residual per unit of (σ² of a range, σ² of the surfaces themselves, the motion's own share): the
-        squared cosines of incidence of the two beams, added; 1; the variance by the motion between beam and stamp [m²].
+        Variance of the residual per unit of (σ² of a range, σ² of the surfaces, the motion's own share): the
+        sum of squared cosines of incidence of the two beams; 1; the variance by the motion between beam and stamp [m²].
     spent : (k, 3)
         The same, each part multiplied by the number of pairs that share its error: those that use the same point,
-        those that use the same step. As independent errors of these variances they are no smaller in any direction
-        than the correlated ones (the matrix of the pairs is dominated by the sums of its rows), so that nothing is
-        spent twice.
+        those that use the same step. Independent errors with these variances are in no direction smaller than the
+        correlated ones (diagonal dominance: row sums bound the covariance of the pairs), so no measurement is used
+        twice.
     """
 
     pairs: PlanePairs
@@ -293,11 +293,11 @@ def match_surfaces(
     Parameters
     ----------
     distance : float
-        Greatest distance of a pair [m].
+        Largest distance of a pair [m].
     within : (n, d, d), optional
-        Covariance of the motion that moves the beams of each step against its pose, right tangents.
+        Covariance of the motion between the beams of each step and its pose, right tangents.
     least_share : float
-        Pairs of passes whose share of paired points is below it are left out.
+        Pairs of traversals with a smaller share of paired points are not used.
     """
     W, O = cloud.world(poses)
     R = rotations(poses)
@@ -337,9 +337,9 @@ def _nearest_surfaces(
     every: int,
     least_share: float,
 ) -> tuple[Index, Index, Index]:
-    """Rows of source points, of the surfaces that they lie on, and the numbers of their chunk pairs ``(k,)``."""
+    """Rows of source points, rows of their surfaces, and indices of their chunk pairs ``(k,)``."""
     trees: dict[int, tuple[cKDTree, Index]] = {}
-    last = dict(zip(chunks.b.tolist(), range(len(chunks.b))))  # a tree is let go of after its last use
+    last = dict(zip(chunks.b.tolist(), range(len(chunks.b))))  # a tree is freed after its last use
 
     def tree(c: int) -> tuple[cKDTree, Index]:
         if c not in trees:

@@ -1,4 +1,4 @@
-"""Distances between two nodes, or between a node and a beacon whose position is unknown.
+"""Distances between two nodes, or between a node and a beacon of unknown position.
 
 With antennas at ``arm`` in the frames of their nodes, ``r = |x_i a_i - x_j a_j| - z``, or ``r = |x_i a_i - p| - z`` for
 a beacon at p in the frame of the first base.
@@ -27,7 +27,7 @@ register_variable(
 )  # fmt: skip
 
 TOUCHING = 1e-9
-"""Distances are differentiated as if they were at least this [m]."""
+"""Distances are clipped to at least this in the Jacobian [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +139,7 @@ class RangeBatch(UniformBatch):
 
     @staticmethod
     def whitener(record: RangeRecord) -> Array:
-        """Of σ."""
+        """``1/σ``."""
         return np.array([[1.0 / record.sigma]])
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
@@ -168,7 +168,7 @@ class BeaconRangeBatch(UniformBatch):
 
     @staticmethod
     def whitener(record: BeaconRangeRecord) -> Array:
-        """Of σ."""
+        """``1/σ``."""
         return np.array([[1.0 / record.sigma]])
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:

@@ -1,8 +1,8 @@
-"""What is known of the constant errors of a robot's wheels and sensor (:mod:`graphslam.core.sensor_biases`).
+"""Factors on the constant errors of a robot's wheels and sensor (:mod:`graphslam.core.sensor_biases`).
 
-Rows ``R g - d`` of unit variance over ``g = [wheels, sensor, mount]``: what is known of them beforehand, and what each
-submap's own motion and sightings say, exit and landmarks left free. How they move a submap stands in the submap's own
-factor.
+Rows ``R g - d`` of unit variance over ``g = [wheels, sensor, mount]``: their prior, and the information from each
+submap's own motion and observations, with its end pose and landmarks marginalised out. The effect of constant errors on
+a submap is in the submap's own factor.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ def sensor_biases_at(values: Values, robot: int) -> Array:
 
 
 def bias_variable_names(robot: int) -> list[str]:
-    """Names of the variables that hold them."""
+    """Names of the variables of these errors."""
     return [f"{w}{robot}" for w in CONSTANT]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorBiasRecord:
-    """One word on the constant errors of a robot.
+    """One factor on the constant errors of a robot.
 
     Parameters
     ----------
     robot : int
         Row of its variables.
     root, told : (6, 6), (6,)
-        ``R`` and ``d``; rows of zeros say nothing.
+        ``R`` and ``d``; rows of zeros have no information.
     what : str
-        Whose word it is, for messages.
+        Its source, for messages.
     """
 
     factor_id: int
@@ -68,7 +68,7 @@ class SensorBiasRecord:
 
 
 class SensorBiasBatch(UniformBatch):
-    """Words on constant errors."""
+    """Factors on constant errors."""
 
     record = SensorBiasRecord
     slots = CONSTANT
@@ -81,17 +81,17 @@ class SensorBiasBatch(UniformBatch):
 
     @cached_property
     def rows(self) -> Index:
-        """Rows that say something ``(k,)``: the others are no degrees of freedom."""
+        """Number of rows with information ``(k,)``; zero rows are no degrees of freedom."""
         return np.count_nonzero(np.any(self._root != 0.0, axis=2), axis=1).astype(np.int64)
 
     @staticmethod
     def keys(record: SensorBiasRecord) -> Sequence[int | None]:
-        """The robot's wheels, its sensor, and where that stands."""
+        """The robot's wheels, its sensor, and the sensor position."""
         return (record.robot,) * len(CONSTANT)
 
     @staticmethod
     def whitener(record: SensorBiasRecord) -> Array:
-        """Rows are of unit variance."""
+        """Identity: rows have unit variance."""
         return np.eye(SIZE)
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:

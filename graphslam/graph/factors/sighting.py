@@ -1,4 +1,4 @@
-"""One landmark seen from one pose in the plane: by bearing and range, or where it lies in the pose's frame."""
+"""Observation of one landmark from one pose in 2-D: bearing and range, or its position in the pose's frame."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from graphslam.graph.variables import VariableLayout, gtsam_key
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SightingRecord:
-    """Landmark ``landmark_id`` seen from a node.
+    """Landmark ``landmark_id`` observed from a node.
 
     Parameters
     ----------
     z : (2,)
         Bearing [rad] and range [m], or x forward and y left [m].
     polar : bool
-        Which of the two.
+        ``z`` is bearing and range.
     whitener : (2, 2)
         In the order of ``z``.
     """
@@ -53,7 +53,7 @@ class SightingRecord:
 
 
 class SightingBatch(UniformBatch):
-    """Sightings: predicted minus measured, bearings wrapped."""
+    """Observations: predicted minus measured, bearings wrapped."""
 
     record = SightingRecord
     slots = ("x", "l")
@@ -65,7 +65,7 @@ class SightingBatch(UniformBatch):
 
     @classmethod
     def of_arrays(cls, seen: Index, z: Array, polar: bool, whiteners: Array, layout: VariableLayout) -> SightingBatch:
-        """A batch without an object for each factor.
+        """A batch from arrays, without an object per factor.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class SightingBatch(UniformBatch):
 
     @classmethod
     def gtsam(cls, record: Any, origin: Array) -> gtsam.NonlinearFactor:
-        """GTSAM's own of a bearing and a range from a free node; it has none for the others."""
+        """GTSAM's own for bearing and range from a free node; otherwise a custom factor."""
         if not record.polar or record.node == 0:
             return custom_factor(cls, record, origin)
         noise = with_kernel(gtsam.noiseModel.Gaussian.Information(record.whitener.T @ record.whitener), record.robust)

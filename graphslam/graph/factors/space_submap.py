@@ -1,4 +1,4 @@
-"""Landmark submaps in space: the joint Gaussian of exit and landmarks, seen from the base (SE₁₊ₙ(3) or Cartesian)."""
+"""3-D landmark submaps: the joint Gaussian of end pose and landmarks in the base frame (SE₁₊ₙ(3) or Cartesian)."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ Index = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpaceSubmapRecord:
-    """A landmark submap in space; its residual is that of :mod:`graphslam.linear.space_maps`.
+    """A 3-D landmark submap; its residual is that of :mod:`graphslam.linear.space_maps`.
 
     Parameters
     ----------
     start : int
-        Node at its base; its exit is the next one.
+        Node at its base; its end is the next one.
     landmark_ids : (n,) int64
-        Of the graph's landmarks; one may stand twice.
+        Graph landmark of every entry; an id may be repeated.
     map : SpaceMap
-        Exit and landmarks in the frame of the base.
+        End pose and landmarks in the frame of the base.
     """
 
     factor_id: int
@@ -77,7 +77,7 @@ class SpaceSubmapRecord:
         return f"submap {self.submap_key} (factor {self.factor_id})"
 
     def exit_covariance(self) -> Array:
-        """Marginal covariance ``(6, 6)`` of the exit in its right tangent."""
+        """Marginal covariance ``(6, 6)`` of the end pose in its right tangent."""
         P = np.linalg.inv(self.map.information.toarray())[:6, :6]
         return turned_covariance(quat_to_matrix(self.map.poses[0, 3:]).T, P)
 
@@ -86,7 +86,7 @@ class SpaceSubmapRecord:
         return self.map.points
 
     def terms(self, poses: Array, points: Array) -> tuple[Array, Array]:
-        """Residual ``(r,)`` and Jacobian ``(r, 12 + 3 n)`` on the right tangents of base and exit, then the points.
+        """Residual ``(r,)`` and Jacobian ``(r, 12 + 3 n)`` on the right tangents of base and end, then the points.
 
         Parameters
         ----------
@@ -96,14 +96,14 @@ class SpaceSubmapRecord:
         """
         u, sparse = self.placed.linearise(poses, points)
         J = sparse.toarray()
-        for k in range(2):  # turns and shifts along the axes of the body
+        for k in range(2):  # rotations and translations along the axes of the body
             R = quat_to_matrix(poses[k, 3:])
             J[:, 6 * k : 6 * k + 6] = J[:, 6 * k : 6 * k + 6] @ np.kron(np.eye(2), R)
         return u, J
 
 
 class SpaceSubmapBatch(FactorBatch):
-    """Landmark submaps in space."""
+    """3-D landmark submaps."""
 
     record: ClassVar[type] = SpaceSubmapRecord
 

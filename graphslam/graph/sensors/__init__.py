@@ -1,7 +1,7 @@
 """Kinds of sensors whose readings a graph turns into factors, one file each; every file of this folder is found.
 
-A kind is a subclass of :class:`~graphslam.graph.sensors.base.SensorFactors`; with its record (``graphslam.core``) and
-its factors (:mod:`graphslam.graph.factors`) that is all a new sensor needs.
+A kind is a subclass of :class:`~graphslam.graph.sensors.base.SensorFactors`. A new sensor needs only this class, its
+record (``graphslam.core``) and its factors (:mod:`graphslam.graph.factors`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def sensor_kinds() -> dict[str, type[SensorFactors]]:
 
 
 def kind_of(readings: Any) -> type[SensorFactors]:
-    """The kind of sensor that readings are of."""
+    """The kind of sensor of these readings."""
     for kind in sensor_kinds().values():
         if isinstance(readings, kind.readings):
             return kind

@@ -1,4 +1,4 @@
-"""Heights of barometers in a graph in space."""
+"""Barometric heights in a 3-D graph."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graphslam.graph.sensors.pending import PendingMeasurement, PendingMeasureme
 
 
 class BarometerFactors(PendingMeasurements):
-    """Heights, one factor each; the level of each barometer is a variable (``baselevel0``)."""
+    """Heights, one factor each; the reference level of each barometer is a variable (``baselevel0``)."""
 
     name: ClassVar[str] = "barometer"
     title: ClassVar[str] = "barometer"

@@ -1,4 +1,4 @@
-"""What every kind of sensor of a graph does: one object for a kind and a graph, with all that waits or was used."""
+"""Base class of the sensors of a graph: one object per kind and graph, with waiting and used readings."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from graphslam.graph.submap_node import SubmapNode
 class SensorFactors(ABC):
     """The sensors of one kind in one graph.
 
-    A graph calls :meth:`add_factors` for every new submap, :meth:`remove` and :meth:`remove_unused` where something is
-    removed, and :meth:`finish` when no more submaps will come. What a sensor cannot use it counts (events of the
-    graph); it never leaves out a reading in silence.
+    A graph calls :meth:`add_factors` for every new submap, :meth:`remove` and :meth:`remove_unused` when something is
+    removed, and :meth:`finish` when no more submaps follow. Every reading that a sensor does not use is counted in the
+    events of the graph.
 
     Attributes
     ----------
     name : str
-        Of the kind; the default name of a stream, and the section of its options.
+        Of the kind; default name of a stream, and section of its options.
     title : str
         Of the kind in messages: "the log has no ...".
     readings : type
         Record type of its streams.
     options : type or None
-        Configuration; None: it has none, and a run uses every stream of the kind.
+        Configuration class; None: no options, and a run uses every stream of the kind.
     dims : tuple of int
-        Of graphs that can use it.
+        Dimensions of graphs that can use it.
     """
 
     name: ClassVar[str]
@@ -47,7 +47,7 @@ class SensorFactors(ABC):
 
     @classmethod
     def of(cls, graph: Any) -> Self:
-        """That of a graph; a new one where it has none yet."""
+        """The instance of a graph; created at first use."""
         if cls.name not in graph.sensors:
             graph.sensors[cls.name] = cls(graph)
         found = graph.sensors[cls.name]
@@ -56,20 +56,20 @@ class SensorFactors(ABC):
 
     @abstractmethod
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
-        """Take readings, at any time and in any portion; returns the ids of their factors."""
+        """Add readings, at any time and in any number; returns the ids of their factors."""
 
     def add_factors(self, submap: SubmapNode) -> None:  # noqa: B027
-        """Factors of readings that waited for a submap, which is in the graph now."""
+        """Add factors of readings that waited for this submap, which was just added to the graph."""
 
     def finish(self) -> None:  # noqa: B027
-        """No more submaps will come: readings that still wait are dropped, and counted."""
+        """No more submaps follow: drop and count readings that still wait."""
 
     def remove(self, submap: SubmapNode) -> None:  # noqa: B027
-        """Take out what hangs on a submap that is about to be removed."""
+        """Remove factors that are attached to a submap that is about to be removed."""
 
     def remove_unused(self, removed: FactorRecord) -> None:  # noqa: B027
-        """Take out variables that nothing holds any more after a factor was removed."""
+        """Remove variables that have no factor left after one was removed."""
 
     def waiting_readings(self) -> int:
-        """Readings that are no factor yet."""
+        """Number of readings that are not factors yet."""
         return 0

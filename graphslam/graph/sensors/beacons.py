@@ -21,19 +21,19 @@ from graphslam.graph.sensors.pending import PendingMeasurement, PendingMeasureme
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeaconConfig:
-    """How distances to beacons enter the graph.
+    """Use of distances to beacons in the graph.
 
-    Places from which a beacon was heard must not lie on one line, or else it waits.
+    A beacon is added only if the positions from which it was measured are not on one line.
     """
 
     sigma: float | None = None
-    """Standard deviation of a distance [m] in place of the stream's own."""
+    """Standard deviation of a distance [m], replacing that of the stream."""
     every: float = 0.0
-    """At most one distance to each beacon in so many seconds [s]."""
+    """Minimum time between two distances to the same beacon [s]."""
     least: int = 6
-    """Distances to a beacon before it gets a place."""
+    """Minimum number of distances to a beacon before its position is initialised."""
     spread: float = 0.1
-    """Least ratio of the smallest to the largest extent of the places from which a beacon was heard."""
+    """Minimum ratio of the smallest to the largest extent of the positions from which a beacon was measured."""
     robust: RobustKernel = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each distance, and its width in standard deviations."""
 
@@ -46,17 +46,17 @@ class BeaconConfig:
 
 @dataclass(slots=True, eq=False)
 class _Beacon:
-    """A beacon that is not placed yet: its distances so far."""
+    """Row of a beacon in the graph, or its distances so far."""
 
     row: int | None = None
     heard: list[BeaconRangeRecord] = field(default_factory=list)
 
 
 class BeaconFactors(PendingMeasurements):
-    """Distances to beacons, with known identities; each finds its own submap. Bearings are not used.
+    """Distances to beacons with known identities; each is assigned to its submap. Bearings are not used.
 
-    A beacon gets a place when it was heard often enough from places that do not lie on one line; its distances become
-    factors then (:mod:`graphslam.graph.factors.range`). The antenna is where the stream's sensor is; in space at the
+    A beacon is initialised after enough distances from positions that are not on one line; then its distances become
+    factors (:mod:`graphslam.graph.factors.range`). The antenna is at the position of the stream's sensor; in 3-D at the
     height of the body.
     """
 
@@ -73,7 +73,7 @@ class BeaconFactors(PendingMeasurements):
         self.beacons: dict[int, _Beacon] = {}
 
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
-        """See :meth:`SensorFactors.add`; ids one a distance that was kept."""
+        """See :meth:`SensorFactors.add`; one id per distance that is used."""
         cfg, name = config or BeaconConfig(), stream or self.name
         if readings.ids is None or np.any(readings.ids < 0):
             raise DataError("distances to beacons need to say which beacon", where=name, wanted="known identities")
@@ -106,7 +106,7 @@ class BeaconFactors(PendingMeasurements):
                 b.heard = []
 
     def held(self) -> dict[str, set[int]]:
-        """See :meth:`PendingMeasurements.held`; fewer distances than dimensions do not hold a place."""
+        """See :meth:`PendingMeasurements.held`; a beacon needs at least as many distances as dimensions."""
         g = self.graph
         heard = Counter(r.beacon for r in g.records.values() if isinstance(r, BeaconRangeRecord))
         held = {k for k, n in heard.items() if n >= g.dim}
@@ -137,7 +137,7 @@ class BeaconFactors(PendingMeasurements):
             self._place(r.part, b, cfg)
 
     def _place(self, number: int, b: _Beacon, cfg: BeaconConfig | None = None, *, last: bool = False) -> None:
-        """Give a beacon a place, and its distances factors, once they say where it is."""
+        """Initialise a beacon and add its distances as factors, if they determine its position."""
         g, cfg = self.graph, cfg or self.ranging[-1][0]
         if len(b.heard) < max(cfg.least, g.dim + 1):
             return
@@ -156,19 +156,19 @@ class BeaconFactors(PendingMeasurements):
 
 
 def trilaterate(places: Array, distances: Array, sigma: Array, *, spread: float = 0.1) -> Array | None:
-    """Where a beacon is ``(dim,)``, or None where the distances do not say.
+    """Position of a beacon ``(dim,)``, or None if the distances do not determine it.
 
     Differences of squared distances are linear in the position; a few Gauss–Newton steps with Cauchy weights of three
-    sigma follow, so that one wild distance does not move it.
+    sigma follow, which reduce the influence of outliers.
 
     Parameters
     ----------
     places : (k, dim)
-        From which it was heard.
+        Positions of the antenna.
     distances, sigma : (k,)
     spread : float
-        Least ratio of the smallest to the largest extent of the places: those on one line (in space: in one plane) are
-        as far from the beacon's mirror image.
+        Minimum ratio of the smallest to the largest extent of the positions: if they are on one line (3-D: in one
+        plane), the mirror image of the beacon has the same distances.
     """
     mean = places.mean(axis=0)
     c = places - mean

@@ -1,4 +1,4 @@
-"""Headings of compasses in a graph."""
+"""Compass headings in a graph."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from graphslam.graph.sensors.pending import PendingMeasurement, PendingMeasureme
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompassConfig:
-    """How a compass enters the graph.
+    """Use of a compass in the graph.
 
-    What disturbs a compass lasts, so that readings close to each other are wrong together. With a declination, and with
-    GPS in the graph, the zero of the compass is tied to the GPS frame; else it is found from the map alone.
+    Magnetic disturbances are time-correlated, so readings are thinned. With a declination, and with GPS in the graph,
+    the zero of the compass is linked to the GPS frame; otherwise it is estimated from the map alone.
     """
 
     sigma: float | None = None
-    """Standard deviation of a reading [rad] in place of the stream's own."""
+    """Standard deviation of a reading [rad], replacing that of the stream."""
     every: float = 1.0
-    """At most one reading in so many seconds: what disturbs a compass lasts [s]."""
+    """Minimum time between two readings, because magnetic disturbances are time-correlated [s]."""
     declination: float | None = None
-    """Magnetic declination [rad], positive where magnetic north is east of true north; ties the compass to GPS."""
+    """Magnetic declination [rad], positive if magnetic north is east of true north; links the compass to GPS."""
     declination_sigma: float = 0.01
     """Its standard deviation [rad]."""
     hard_iron: float | None = None
-    """Standard deviation of the deviation by iron on the robot [rad], which is then estimated; none: there is none."""
+    """Prior σ of the hard-iron deviation [rad], which is then estimated; none: no deviation."""
     robust: RobustKernel = flattened_field(NO_KERNEL, robust="kind", robust_width="k")
     """Robust kernel on each reading, and its width in standard deviations."""
 
@@ -51,10 +51,10 @@ class CompassConfig:
 
 
 class CompassFactors(PendingMeasurements):
-    """Headings, at any time and in any portion; each finds its own submap.
+    """Compass headings; each is assigned to its submap.
 
-    The zero of a compass, where magnetic east is in the frame of the first base, is a variable; so is the deviation by
-    iron on the robot if the configuration says so (:mod:`graphslam.graph.factors.compass`).
+    The zero of a compass (direction of magnetic east in the frame of the first base) is a variable, and also the
+    hard-iron deviation if it is configured (:mod:`graphslam.graph.factors.compass`).
     """
 
     name: ClassVar[str] = "compass"
@@ -73,7 +73,7 @@ class CompassFactors(PendingMeasurements):
         self.rows: dict[str, dict[int, int]] = {"compass": {}, "deviation": {}}  # compass -> row
 
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
-        """See :meth:`SensorFactors.add`; ids one a reading that was kept (:attr:`CompassConfig.every`)."""
+        """See :meth:`SensorFactors.add`; one id per reading that is used (:attr:`CompassConfig.every`)."""
         cfg = config or CompassConfig()
         kept = thinned(readings.times, cfg.every)
         sigma = readings.sigma if cfg.sigma is None else np.full(len(readings.times), cfg.sigma)
@@ -125,11 +125,11 @@ class CompassFactors(PendingMeasurements):
         self._declare(r.source, cfg)
 
     def _declare(self, compass: int, cfg: CompassConfig) -> None:
-        """Tie the zero of a compass to the GPS frame, once both are there."""
+        """Add the factor between the zero of a compass and the GPS frame, once both are in the graph."""
         g = self.graph
         if cfg.declination is None or not g.structure.count("datum") or compass not in self.rows["compass"]:
             return
-        if g.gps_origin is None:  # a datum of control points: nobody says where north is in their frame
+        if g.gps_origin is None:  # a datum of control points: the direction of north in their frame is unknown
             return
         zero = self.rows["compass"][compass]
         if any(isinstance(r, DeclinationRecord) and r.compass == zero for r in g.records.values()):

@@ -1,4 +1,4 @@
-"""Control points and measured distances in a graph: which node, landmark or point of a path each row is attached to."""
+"""Control points and measured distances in a graph: the node, landmark or path point that each row is attached to."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from graphslam.graph.submap_node import SubmapNode
 ROBUST = RobustKernel("cauchy", 2.385)
 """As for GPS fixes."""
 CONTROL_ROWS = "control rows"
-"""Name in the ledger; a line follows: several rows may be of one time."""
+"""Name in the ledger, followed by the line number, because several rows may have the same time."""
 SPANNED = 10.0
-"""A datum starts where control points span so many of their standard deviations."""
+"""The datum is initialised when control points span this multiple of their median σ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Site:
-    """Where a place is in the graph.
+    """A place in the graph.
 
     Parameters
     ----------
     position : (dim,)
         In the frame of the first base.
     covariance : (dim, dim)
-        In that frame: what the path of the submap is unsure of, where it is in no variable of the graph.
+        In that frame: uncertainty of the submap's path that is not in a variable of the graph.
     inner : (SubmapNode, int) or None
-        Submap and number of a point of its path, whose row is made when it is needed.
+        Submap and number of a point of its path; its variable is created when needed.
     """
 
     position: Array
@@ -50,16 +50,16 @@ class _Site:
     inner: tuple[SubmapNode, int] | None = None
 
     def key(self) -> tuple[Any, ...]:
-        """The same for places that the graph cannot tell apart."""
+        """Equal for places that are at the same point of the graph."""
         return self.node, self.landmark, None if self.inner is None else (self.inner[0].key, self.inner[1])
 
 
 class ControlFactors(SensorFactors):
-    """Rows of a control table, which become factors when no more submaps will come.
+    """Rows of a control table, which become factors when no more submaps follow.
 
-    The datum is that of the GPS fixes where the graph has one: then rows need the frame ``gps``. Without it the first
-    frame that rows have holds the datum, from two places on that lie far enough apart. Rows that cannot be used are
-    refused one by one (event ``control-refused``).
+    If the graph has GPS fixes, the datum is theirs, and rows need the frame ``gps``. Otherwise the datum is that of the
+    first frame in the rows with at least two places that are far enough apart. Unusable rows are refused one by one
+    (event ``control-refused``).
     """
 
     name: ClassVar[str] = "control"
@@ -75,7 +75,7 @@ class ControlFactors(SensorFactors):
         self.frame, self.origin = "", np.zeros(graph.dim)
 
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
-        """See :meth:`SensorFactors.add`; ids one a row."""
+        """See :meth:`SensorFactors.add`; one id per row."""
         new = [(self.graph.next_factor(), r) for r in readings.rows]
         for fid, r in new:
             time = r.place.time or 0.0
@@ -120,7 +120,7 @@ class ControlFactors(SensorFactors):
         self.graph.log_event("control-refused", line=row.line, name=row.name, why=str(why))
 
     def site(self, place: MeasuredPlace) -> _Site:
-        """Where a place is; a DataError says why it is nowhere."""
+        """Find a place in the graph; a DataError has the reason if there is none."""
         g, d = self.graph, self.graph.dim
         none, zero = np.zeros((d, d)), np.zeros(d)
         if place.time is None:
@@ -149,7 +149,7 @@ class ControlFactors(SensorFactors):
         return _Site(group.transform(pose, arm[0]), turn @ C[0] @ turn.T, arm[0], node=node)
 
     def _start(self, rows: list[tuple[ControlRow, _Site]]) -> None:
-        """Which frame holds the datum, and where the datum starts."""
+        """Choose the frame of the datum, and initialise the datum."""
         g = self.graph
         if g.structure.count("datum"):
             if g.gps_origin is not None:
@@ -198,8 +198,8 @@ class ControlFactors(SensorFactors):
         )  # fmt: skip
 
     def as_fixes(self) -> tuple[Gps, list[str]] | None:
-        """Coordinates at times, of the most frequent lever, as fixes of a path, and their names in the ledger; None:
-        there are none."""
+        """Coordinates with times and the most frequent lever arm, as fixes of a path, and their names in the ledger;
+        None if there are none."""
         rows = [r for r in self.used if r.to is None and r.place.time is not None]
         levers = [r.place.lever for r in rows]
         lever = max(levers, key=levers.count, default=())
@@ -218,7 +218,7 @@ class ControlFactors(SensorFactors):
         return fixes, names
 
     def remove(self, submap: SubmapNode) -> None:
-        """See :meth:`SensorFactors.remove`; points of its path were taken out before."""
+        """See :meth:`SensorFactors.remove`; points of its path were removed before."""
         own = set(submap.nodes[:-1])
         self._take_out(lambda r: bool({r.node, getattr(r, "node_to", None)} & own or -1 in _rows(r, "point")))
 

@@ -1,4 +1,4 @@
-"""GPS fixes until they are factors: how they enter, where they hang, and where the datum starts.
+"""GPS fixes before they are factors: waiting, attachment to nodes, and initialisation of the datum.
 
 The factor itself is in :mod:`graphslam.graph.factors.gps`.
 """
@@ -29,29 +29,29 @@ from graphslam.graph.submap_node import InnerPoints, SubmapNode
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsConfig:
-    """How fixes enter the graph.
+    """Use of GPS fixes in the graph.
 
     Parameters
     ----------
     robust : RobustKernel
         Kernel on each fix.
     sigma : float or None
-        Standard deviation of a coordinate [m] in place of the stream's own.
+        Standard deviation of a coordinate [m], replacing that of the stream.
     baseline : float
-        Fixes wait until they span this distance [m], on the ground and in the map; then a rigid alignment starts
-        the datum.
+        Fixes wait until they span this distance [m], in the GPS frame and in the map; then a rigid alignment
+        initialises the datum.
     bias_sigma : float or None
         With a number [m]: one bias per GPS segment with that prior (default: none).
     segment_gap : float
-        A pause longer than this [s] starts a new segment.
+        A longer gap between fixes [s] starts a new segment.
     bias_time : float or None
-        With a number [s]: errors last, and fade over this time. A bias then follows from the one before, as a
-        Gauss–Markov process whose σ at any time is ``bias_sigma``; a new one begins after a tenth of this time, and
-        with each segment. Of fixes whose coordinates are not equally sure it has the shape of their covariance, and
-        ``bias_sigma`` is its mean over east and north. Default: biases of segments know nothing of each other.
+        With a number [s]: correlation time of the errors. A bias is then linked to the previous one as a Gauss–Markov
+        process with the stationary σ ``bias_sigma``; a new one starts after a tenth of this time, and with each
+        segment. For anisotropic fixes it has the shape of their covariance, and ``bias_sigma`` is its mean over east
+        and north. Default: biases of segments are independent.
     errors : "fitted" or "stated"
-        Fit how long the errors of the fixes last, and how large they are, to the log at the end of a run; wild fixes go
-        first (:mod:`graphslam.backend.fix_errors`). With a ``bias_sigma`` it is stated, and nothing is fitted.
+        Fit size and correlation time of the errors to the log at the end of a run; outliers are removed first
+        (:mod:`graphslam.backend.fix_errors`). With a ``bias_sigma`` nothing is fitted.
     """
 
     robust: RobustKernel = flattened_field(RobustKernel("none", 2.385), robust="kind", robust_width="k")
@@ -72,26 +72,26 @@ class GpsConfig:
 
     @property
     def bias_every(self) -> float:
-        """Time for which a bias holds [s]: without ``bias_time`` as long as its segment."""
+        """Time after which a new bias starts [s]; infinite without ``bias_time``: one per segment."""
         return np.inf if self.bias_time is None else 0.1 * self.bias_time
 
 
 @dataclass(frozen=True, slots=True, kw_only=False)
 class FixErrors:
-    """Errors of fixes as a log tells them (:mod:`graphslam.backend.fix_errors`).
+    """Errors of fixes, estimated from a log (:mod:`graphslam.backend.fix_errors`).
 
     Parameters
     ----------
     bias_sigma : float
-        σ of the part that lasts, mean over east and north [m]; 0: none was believed.
+        σ of the time-correlated part, mean over east and north [m]; 0: not significant.
     bias_time : float
-        For which it lasts [s].
+        Its correlation time [s].
     white : float
-        White part over the stated σ.
+        Ratio of the white σ to the stated σ.
     gain : float
-        Twice the log-likelihood over white noise.
+        Twice the log-likelihood ratio to white noise.
     wild, fixes : int
-        Fixes that were taken out as wild, of so many.
+        Number of removed outliers, and of all fixes.
     """
 
     bias_sigma: float
@@ -104,7 +104,7 @@ class FixErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PendingFix:
-    """A fix that has not become a factor yet."""
+    """A fix that is not a factor yet."""
 
     factor_id: int
     time: float
@@ -113,11 +113,11 @@ class PendingFix:
     lever: Array
     config: GpsConfig
     uneven: Array | None = None
-    """Covariance of its coordinates where they are not equally sure."""
+    """Covariance of an anisotropic fix."""
 
     @property
     def alone(self) -> Array:
-        """Covariance as it is stated ``(dim, dim)``, in the GPS frame."""
+        """Covariance of the fix alone ``(dim, dim)``, in the GPS frame."""
         if self.uneven is not None:
             return self.uneven
         return np.asarray((self.config.sigma or self.sigma) ** 2 * np.eye(len(self.lever)))
@@ -125,18 +125,18 @@ class PendingFix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttachedFix:
-    """A fix with its node in a submap: all it needs but a datum."""
+    """A fix with its node in a submap, waiting for a datum."""
 
     fix: PendingFix
     node: int
     arm: Array
     covariance: Array
     point: int | None = None
-    """Row of the point of the path that it measures, where its submap has one."""
+    """Row of the path point that it measures, if its submap has one."""
 
 
 def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array, Array]:
-    """Antennas ``T · lever`` and their covariances, in the plane or in space.
+    """Antennas ``T · lever`` and their covariances, 2-D or 3-D.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array,
     -------
     arm : (q, dim)
     covariance : (q, dim, dim)
-        ``G C Gᵀ`` with ``G = R [I | (-l_y, l_x)ᵀ]``, in space ``R [-[l]× | I]``: the derivative of
+        ``G C Gᵀ`` with ``G = R [I | (-l_y, l_x)ᵀ]``, in 3-D ``R [-[l]× | I]``: the derivative of
         ``T Exp(ξ) · lever``.
     """
     dim = group_of(T).dim
@@ -162,7 +162,7 @@ def lever_arm(T: Array, covariances: Array | None, lever: Array) -> tuple[Array,
 
 
 def arm_jacobian(T: Array, lever: Array) -> Array:
-    """Derivative ``(q, dim, dof)`` of ``T Exp(ξ) · lever``, of one lever ``(dim,)`` or one each ``(q, dim)``."""
+    """Derivative ``(q, dim, dof)`` of ``T Exp(ξ) · lever``, for one lever ``(dim,)`` or one per row ``(q, dim)``."""
     group = group_of(T)
     G = np.zeros((len(T), group.dim, group.dof))
     if group.dim == 2:
@@ -177,9 +177,9 @@ def arm_jacobian(T: Array, lever: Array) -> Array:
 
 
 def datum_columns(graph: FactorGraphState, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Columns ``(k, c)`` of what an antenna at nodes ``(k,)`` depends on: node, datum, tilt if there is one; -1: held.
+    """Columns ``(k, c)`` of the variables of an antenna at nodes ``(k,)``: node, datum, tilt if any; -1: fixed.
 
-    They stand in the order of :func:`~graphslam.graph.factors.gps.antenna_terms`.
+    In the order of :func:`~graphslam.graph.factors.gps.antenna_terms`.
     """
     lay, one = graph.flat().layout, np.zeros(len(nodes), dtype=np.int64)
     words = ("datum", "tilt") if lay.count("tilt") else ("datum",)
@@ -187,15 +187,15 @@ def datum_columns(graph: FactorGraphState, nodes: npt.NDArray[np.int64]) -> npt.
 
 
 def greatest_distance(points: Array) -> float:
-    """Greatest distance from the first point [m]: zero for none."""
+    """Largest distance from the first point [m]; zero without points."""
     return float(np.max(np.linalg.norm(points - points[0], axis=1))) if len(points) else 0.0
 
 
 def start_datum(world: Array, fixes: Array, sigma: Array) -> Array:
-    """First ``T_gps_world`` from antenna positions in the map and their fixes.
+    """Initial ``T_gps_world`` from antenna positions in the map and their fixes.
 
-    Rigid alignment, reweighted a few times with Cauchy weights of three sigma (at least 1 m), so that one wild fix
-    does not turn the datum.
+    Rigid alignment, reweighted a few times with Cauchy weights of three sigma (at least 1 m), which reduces the
+    influence of outliers.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def start_datum(world: Array, fixes: Array, sigma: Array) -> Array:
 
 
 def level_datum(world: Array, fixes: Array, sigma: Array) -> Array:
-    """:func:`start_datum` of positions ``(q, dim)``; in space with the median height, as ``[x, y, z, heading]``."""
+    """:func:`start_datum` of positions ``(q, dim)``; in 3-D with the median height, as ``[x, y, z, heading]``."""
     level = start_datum(world[:, :2], fixes[:, :2], sigma)
     if world.shape[1] == 2:
         return level
@@ -220,15 +220,15 @@ def level_datum(world: Array, fixes: Array, sigma: Array) -> Array:
 
 
 class GpsFactors(SensorFactors):
-    """The fixes of a graph: those that are not factors yet, and how they become so.
+    """The fixes of a graph: waiting ones, and their conversion to factors.
 
-    Fixes wait until their submap is there, and until :attr:`GpsConfig.baseline` is spanned; then the datum starts by
-    rigid alignment and all of them become factors. The map stays where it is then, however late that be: its first
-    base is fixed and the datum is solved for. Fixes that no submap covers are dropped and counted (event
-    ``gps-dropped``). Each is attached to the node nearest in time, the base or an inner one.
+    Fixes wait for their submap, and until :attr:`GpsConfig.baseline` is spanned; then the datum is initialised by
+    rigid alignment and all of them become factors. The map does not move then, however late that is: its first base is
+    fixed and the datum is estimated. Fixes without a submap are dropped and counted (event ``gps-dropped``). Each is
+    attached to the node nearest in time, the base or an inner node.
 
     A fix at ``t`` belongs to the submap with ``t_start <= t < t_end``: exactly on a boundary it belongs to the later
-    one. The very last instant of a finished graph belongs to the last submap.
+    one. A fix at the end of a finished graph belongs to the last submap.
     """
 
     name: ClassVar[str] = "gps"
@@ -240,14 +240,14 @@ class GpsFactors(SensorFactors):
     def __init__(self, graph: FactorGraphState) -> None:
         super().__init__(graph)
         self.config = GpsConfig()
-        self.waiting: list[PendingFix] = []  # for their submap, in the order of time
+        self.waiting: list[PendingFix] = []  # for their submap, sorted by time
         self.tied: list[AttachedFix] = []  # for a datum
         self.last_time = -np.inf
         self.bias_begin = -np.inf  # of the last bias
         self.fitted: FixErrors | None = None
 
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None) -> list[int]:
-        """See :meth:`SensorFactors.add`; ids one a fix."""
+        """See :meth:`SensorFactors.add`; one id per fix."""
         g, gps, stream = self.graph, readings, stream or self.name
         if gps.positions.shape[1] != g.dim:
             raise GeometryError(
@@ -277,18 +277,18 @@ class GpsFactors(SensorFactors):
         self.attach(submap)
 
     def waiting_readings(self) -> int:
-        """For a submap, or for a datum."""
+        """Number of fixes that wait for a submap or for a datum."""
         return len(self.waiting) + len(self.tied)
 
     def finish(self) -> None:
-        """The last instant belongs to the last submap, later fixes are dropped."""
+        """Attach a fix at the end of the last submap, and drop later ones."""
         if self.graph.submaps:
             self.attach(self.graph.submaps[-1], closed=True)
         self._drop([(f.factor_id, "after the last submap") for f in self.waiting])
         self.waiting = []
 
     def attach(self, s: SubmapNode, *, closed: bool = False, more: bool = False) -> None:
-        """Give a submap its waiting fixes, ``closed`` that at its end too; with ``more`` to follow no datum starts."""
+        """Attach waiting fixes to a submap, with ``closed`` also one at its end; with ``more`` no datum is started."""
         g = self.graph
         dropped = self._queue(s, closed)
         late = [f for f in self.waiting if f.time < s.interval[0] and not more and s is g.submaps[-1]]
@@ -319,7 +319,7 @@ class GpsFactors(SensorFactors):
         self.tied = []
 
     def _in_its_frame(self, t: AttachedFix) -> Array:
-        """Covariance of a fix with its arm: in the node's frame, or in that of an uneven fix."""
+        """Covariance of a fix with its arm, in the node's frame; of an anisotropic fix in the GPS frame."""
         if t.fix.uneven is None:
             return t.covariance
         if t.point is not None:
@@ -331,7 +331,7 @@ class GpsFactors(SensorFactors):
         return np.asarray(t.fix.uneven + turn @ t.covariance @ turn.T)
 
     def remove(self, submap: SubmapNode) -> None:
-        """Take out the fixes of a submap that goes: their arms come from its trajectory."""
+        """Remove the fixes of a submap that is removed, because their arms come from its trajectory."""
         s, own = submap, set(submap.nodes[:-1])
         inside = [r.factor_id for r in self.graph.records.values() if isinstance(r, GpsRecord) and r.node in own]
         for fid in inside:
@@ -342,7 +342,7 @@ class GpsFactors(SensorFactors):
         self._leave_points(self.graph.submap(s.key))
 
     def remove_unused(self, removed: FactorRecord) -> None:
-        """A datum that no fix holds any more goes, and the biases with it."""
+        """Remove the datum if it has no factor left, with the biases."""
         g = self.graph
         if g.structure.count("datum") and not any(isinstance(r, AntennaRecord) for r in g.records.values()):
             for fid in [k for k, r in g.records.items() if isinstance(r, BiasPriorRecord)]:
@@ -358,7 +358,7 @@ class GpsFactors(SensorFactors):
             self.graph.log_event("gps-dropped", factor_id=fid, reason=reason)
 
     def _queue(self, s: SubmapNode, closed: bool) -> list[tuple[int, str]]:
-        """Move the fixes of one submap to its nodes; (factor_id, reason) of those that have no place."""
+        """Attach the fixes of one submap to its nodes; returns (factor_id, reason) of fixes that cannot be used."""
         t0, t1 = s.interval
         times = np.array([f.time for f in self.waiting])
         inside = (times >= t0) & ((times <= t1) if closed else (times < t1))
@@ -377,22 +377,22 @@ class GpsFactors(SensorFactors):
                 continue
             sigma = f.sigma if f.config.sigma is None else f.config.sigma
             point = self._inner_point(s, f)
-            if point is not None:  # what the path is unsure of is in the point
+            if point is not None:  # the uncertainty of the path is in the point
                 cov = np.zeros_like(cov)
-            # of a fix that is not equally sure in all directions the arm's alone, until the datum says how to turn it
+            # of an anisotropic fix only the arm's covariance, until the datum gives the rotation between the frames
             covariance = cov[0] if f.uneven is not None else sigma**2 * np.eye(len(f.lever)) + cov[0]
             self.tied.append(AttachedFix(f, s.nodes[int(at[0])], arm[0], covariance, point))
         self.tie_points(s)
         return dropped
 
     def _inner_point(self, s: SubmapNode, fix: PendingFix) -> int | None:
-        """Row of the point of a submap's path at a fix; a new one where it has none yet. None: no such point."""
+        """Row of the path point of a submap at a fix, created if needed; None: the submap has no such point."""
         inner = self.graph.submap(s.key).inner_points
         k = None if inner is None else inner.path.at(fix.time, fix.lever)
         return None if k is None else self.row_of_point(s, k)
 
     def row_of_point(self, s: SubmapNode, k: int) -> int:
-        """Row of point k of a submap's path; a new one where it has none yet (:meth:`tie_points` follows)."""
+        """Row of path point k of a submap, created if needed (:meth:`tie_points` must follow)."""
         g, s = self.graph, self.graph.submap(s.key)
         inner = s.inner_points
         assert inner is not None
@@ -409,7 +409,7 @@ class GpsFactors(SensorFactors):
         submaps[k] = replace(submaps[k], inner_points=inner)
 
     def tie_points(self, s: SubmapNode) -> None:
-        """Tie the points of a submap that are used to its exit and landmarks, by one factor."""
+        """Connect the used path points of a submap to its end pose and landmarks with one factor."""
         g, s = self.graph, self.graph.submap(s.key)
         inner = s.inner_points
         if inner is None or not inner.rows:
@@ -427,7 +427,7 @@ class GpsFactors(SensorFactors):
         g.insert(inner.record(submap, fid))
 
     def _leave_points(self, s: SubmapNode) -> None:
-        """Take out the points of a submap that goes; those of others move up."""
+        """Remove the path points of a submap that is removed; the others are renumbered."""
         g, inner = self.graph, s.inner_points
         if inner is None or not inner.rows:
             return
@@ -442,7 +442,7 @@ class GpsFactors(SensorFactors):
                 g.records[fid] = replace(r, points=np.array([new[k] for k in r.points.tolist()], dtype=np.int64))
                 continue
             ends = {name: getattr(r, name, None) for name in ("point", "point_to")}
-            if ends := {name: new.get(k, -1) for name, k in ends.items() if k is not None}:  # -1: its point went
+            if ends := {name: new.get(k, -1) for name, k in ends.items() if k is not None}:  # -1: a removed point
                 g.records[fid] = replace(r, **ends)  # type: ignore[type-var]
         for other in list(g.submaps):
             if other.inner_points is not None and other.key != s.key:
@@ -455,7 +455,7 @@ class GpsFactors(SensorFactors):
         g.revision += 1
 
     def _datum_if_ready(self, poses: Array, origin: Array, baseline: float) -> Array | None:
-        """First ``T_gps_world`` from the tied fixes, once they span ``baseline`` on the ground and in the map."""
+        """Initial ``T_gps_world`` from the attached fixes, once they span ``baseline`` in both frames."""
         if len(self.tied) < 2:
             return None
         group = group_of(poses)
@@ -463,7 +463,7 @@ class GpsFactors(SensorFactors):
         fixes = np.array([t.fix.position for t in self.tied]) - origin
         if (
             min(greatest_distance(world[:, :2]), greatest_distance(fixes[:, :2])) < baseline
-        ):  # only a level way says where north is
+        ):  # only a horizontal extent determines the heading
             return None
         fix = [np.zeros((group.dim, group.dim)) if t.fix.uneven is None else t.fix.uneven for t in self.tied]
         sigma = np.array([np.sqrt(np.trace((t.covariance + P)[:2, :2]) / 2.0) for t, P in zip(self.tied, fix)])

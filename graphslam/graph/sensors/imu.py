@@ -1,7 +1,7 @@
-"""What a graph makes of IMUs: ways between near nodes, gravity at far ones (in space), biases.
+"""IMU factors of a graph: preintegrated measurements between near nodes, gravity at far ones (3-D), and biases.
 
-Everything about the states of an IMU can be read off the factors: which velocity and which bias are a node's, and in
-which order the biases follow each other. So that is where it is kept, and removing factors needs no other book.
+The states of an IMU (velocity and bias of each node, order of the biases) are stored only in the factors, so nothing
+else must be updated when factors are removed.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from graphslam.graph.submap_node import SubmapNode
 logger = logging.getLogger(__name__)
 
 RECENTRE = 2e-3
-"""A way is preintegrated again if the bias has moved by more than turns it so far [rad]."""
+"""Preintegrate again if the bias change times the duration exceeds this angle [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuUse:
-    """An IMU in a graph: its readings so far, and how they were to be used.
+    """An IMU in a graph: its readings so far, and its configuration.
 
     Parameters
     ----------
     imu : Imu
-        As factors use it; in the plane in the axes of the body.
+        As used by factors; in 2-D in the axes of the body.
     given : Imu
-        As it came.
+        Unchanged input.
     """
 
     imu: Imu
@@ -65,18 +65,18 @@ class ImuUse:
 
 
 class ImuFactors(SensorFactors):
-    """The IMUs of a graph: preintegrated ways, gravity, biases.
+    """The IMUs of a graph: preintegrated measurements, gravity, biases.
 
-    In the plane it is planar, or it has three axes and the body is level
-    (:mod:`graphslam.graph.factors.imu.plane`). No start velocity is needed: a velocity follows from the two poses
-    and the accelerations of a way.
+    In 2-D the IMU is planar, or it has three axes and the body is level
+    (:mod:`graphslam.graph.factors.imu.plane`). No initial velocity is needed: it follows from the two poses and the
+    accelerations of a preintegrated measurement.
 
-    Nodes of a submap that follow each other within :attr:`ImuConfig.longest` seconds are tied by a combined
-    preintegrated way (:mod:`graphslam.graph.factors.imu.batch`), inner nodes included; inside levelled submaps
-    their relative roll and pitch is then the gyro's word alone. A way brings in the velocity of the unit and its
-    biases at both nodes; a bias starts as ``ImuNoise`` says, and walks on over pauses. In space a node without a
-    way sees gravity: the mean specific force about it, as sure as the body was still, and the first factor brings
-    in the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
+    Consecutive nodes of a submap within :attr:`ImuConfig.longest` seconds, inner nodes included, are connected by a
+    combined preintegrated measurement (:mod:`graphslam.graph.factors.imu.batch`); inside levelled submaps only the gyro
+    then determines their relative roll and pitch. Each such factor adds the velocity of the unit and its biases at both
+    nodes; a bias has the prior of ``ImuNoise``, and continues as a random walk over gaps. In 3-D a node without such a
+    factor gets a gravity factor: the mean specific force around it, with a σ that depends on the motion. The first
+    factor adds the ``tilt`` (:mod:`graphslam.graph.factors.attitude`).
     """
 
     name: ClassVar[str] = "imu"
@@ -89,26 +89,26 @@ class ImuFactors(SensorFactors):
         super().__init__(graph)
         self.used: dict[str, ImuUse] = {}
         plane = graph.dim == 2
-        self._bias = IN_PLANE["imubias"] if plane else list(range(6))  # of a bias in space, what the graph has
+        self._bias = IN_PLANE["imubias"] if plane else list(range(6))  # components of a 3-D bias that the graph has
         self._rows = PLANE_ROWS if plane else np.arange(15)
         self._gyro_rows = PLANE_ROWS[PLANE_GYRO_ROWS] if plane else GYRO_ROWS
 
     def add(self, readings: Any, *, stream: str | None = None, config: Any = None, more: bool = False) -> list[int]:
-        """Give the graph an IMU that no front end used; its readings between existing nodes become factors.
+        """Add an IMU that no front end used; its readings between existing nodes become factors.
 
-        It may be called again when there are more submaps, with the readings that follow (or with none): ways that
-        are there stay. Everything left out is counted by reason (event ``imu``).
+        It may be called again after more submaps, with the following readings (or with none); existing factors are
+        kept. Every omitted reading is counted by reason (event ``imu``).
 
         Parameters
         ----------
         readings : Imu
-            ``T_base_imu`` is its mounting on the body; the body is where the paths of the submaps say.
+            ``T_base_imu`` is its mounting on the body; the body moves along the paths of the submaps.
         stream : str
-            Its name in the ledger.
+            Name in the ledger.
         config : ImuConfig, optional
-            By default that of the call before.
+            Default: that of the previous call.
         more : bool
-            It will be called again with more submaps: the last node waits for the one that begins there, and axes are
+            It will be called again with more submaps: the last node waits for the submap that starts there, axes are
             not checked, and dropped readings are not counted.
 
         Returns
@@ -160,9 +160,9 @@ class ImuFactors(SensorFactors):
         return ids
 
     def check(self, imu: Imu, *, stream: str = "imu", axes: str = "refuse") -> str:
-        """Compare the axes of an IMU with the paths of the submaps; returns what is wrong in words, or nothing.
+        """Compare the axes of an IMU with the paths of the submaps; returns a description of errors, or an empty text.
 
-        Where paths and readings have too little in common nothing can be said (event ``imu-axes``).
+        If paths and readings overlap too little, the axes are not checked (event ``imu-axes``).
         """
         if axes == "ignore":
             return ""
@@ -184,10 +184,10 @@ class ImuFactors(SensorFactors):
         return words
 
     def recentre(self, *, limit: float = RECENTRE) -> int:
-        """Preintegrate again, about their present bias, ways whose gyro bias has moved; returns how many.
+        """Preintegrate again, about the current bias, if a gyro bias has changed; returns the number of factors.
 
-        Ways know how they change with the biases to first order only. After solving, call this and solve again until
-        it returns nothing: twice is enough, most of the time.
+        Preintegrated measurements depend on the biases to first order only. After solving, call this and solve again
+        until it returns zero; two iterations are usually enough.
         """
         changed = 0
         for stream, use in self.used.items():
@@ -208,7 +208,7 @@ class ImuFactors(SensorFactors):
         return ImuStates.of(self.graph.records.values(), stream)
 
     def remove(self, submap: SubmapNode) -> None:
-        """Take out what IMUs said inside a submap that goes."""
+        """Remove the IMU factors inside a submap that is removed."""
         inside = set(submap.nodes)
         for fid, r in list(self.graph.records.items()):
             way = isinstance(r, ImuRecord) and r.i in inside and r.j in inside
@@ -216,8 +216,8 @@ class ImuFactors(SensorFactors):
                 self.graph.take_out(fid, "its submap was removed")
 
     def remove_unused(self, removed: FactorRecord) -> None:
-        """Make good what a factor leaves that was removed: a bias that loses the way to the one before walks over the
-        time between instead; velocities and biases that nothing holds any more go."""
+        """Clean up after a factor was removed: a bias without a preintegrated measurement from the previous one is
+        linked to it as a random walk; velocities and biases without factors are removed."""
         if not self.used:
             return
         ways = {(r.i, r.j) for r in self.graph.records.values() if isinstance(r, ImuRecord)}
@@ -268,11 +268,11 @@ class ImuFactors(SensorFactors):
         return [r.factor_id for r in made]
 
     def _level_inside(self, pairs: Sequence[tuple[int, int]], *, give_up: bool) -> None:
-        """Increments inside levelled submaps give up their relative roll and pitch where a way tells them; or not.
+        """Remove relative roll and pitch from increments inside levelled submaps with an IMU factor, or restore them.
 
-        The path of a levelled submap takes its roll and pitch from gravity at every instant, so their errors do not
-        grow, and marginals cannot say how alike they are at two nodes: increments between inner nodes then claim
-        nearly exact turns (:mod:`graphslam.graph.inner_nodes`), which a gyro contradicts.
+        The path of a levelled submap gets roll and pitch from gravity at every instant, so their errors do not
+        grow, and its marginals do not contain the correlation between nodes. Increments between inner nodes then have
+        far too small rotation errors (:mod:`graphslam.graph.inner_nodes`), which contradict a gyro.
         """
         levelled = {f for f, r in self.graph.records.items() if isinstance(r, AttitudeRecord) and r.group == LEVELLED}
         chosen = set(pairs)
@@ -283,7 +283,7 @@ class ImuFactors(SensorFactors):
             for m, (pair, fid) in enumerate(zip(zip(s.nodes, s.nodes[1:]), s.factor_ids)):
                 old = self.graph.records.get(fid)
                 if pair not in chosen or m == len(covariances) - 1 or not isinstance(old, BetweenRecord):
-                    continue  # the last one has given it up already
+                    continue  # the last one has none already
                 covariances[m] = without_tilt(s.stated[m]) if give_up else s.stated[m]
                 W = whitener(covariances[m], what=f"covariance of {old.label()}", dim=6)
                 self.graph.insert(replace(old, whitener=W))
@@ -296,7 +296,7 @@ class ImuFactors(SensorFactors):
         pairs: Sequence[tuple[int, int]],
         unit: dict[int, tuple[Array, Array]],
     ) -> Array:
-        """Where biases start: at the last one known, or by how much faster the gyro turns than the nodes do."""
+        """Initial bias: the last one, or the median difference between the turn rates of gyro and nodes."""
         if states.bias:
             last = states.bias[states.order[-1]]
             return lift("imubias", self.graph.values.imu_biases[last : last + 1])[0].copy()
@@ -312,12 +312,12 @@ class ImuFactors(SensorFactors):
         return np.concatenate([np.median(w[weight], axis=0), np.zeros(3)])
 
     def _start_velocities(self, ways: Sequence[ImuRecord], first: int) -> None:
-        """Velocities from ``first`` on, by the ways (eq. 33 solved for them)."""
+        """Initialise velocities from row ``first`` on, from the preintegrated measurements (eq. 33 solved for them)."""
         v = self.graph.values.velocities
         if len(v) == first:
             return
         tilt = self.graph.values.tilt
-        up = np.zeros(3) if tilt is None else GRAVITY * up_turn(tilt)[0][:, 2]  # the forces of the plane have none
+        up = np.zeros(3) if tilt is None else GRAVITY * up_turn(tilt)[0][:, 2]  # 2-D forces do not include gravity
         for r in ways:
             a, b = r.velocities
             X = se3_compose(lift("x", self.graph.values.poses[[r.i, r.j]]), np.stack([r.T_i_imu, r.T_j_imu]))
@@ -326,14 +326,14 @@ class ImuFactors(SensorFactors):
             if a >= first and not np.isfinite(v[a, 0]):
                 v[a] = at_i[: self.graph.dim]
             if b >= first:
-                v[b] = (at_i - up * T + R @ r.v)[: self.graph.dim]  # the next way, if there is one, knows no better
+                v[b] = (at_i - up * T + R @ r.v)[: self.graph.dim]  # may be overwritten by the next factor's start
 
     def _weigh(self, records: Sequence[ImuRecord], pim: Preintegrated) -> None:
-        """Put ways into the graph as preintegrated, with the covariance of where the unit is on the nodes."""
-        tilt = np.zeros(2) if self.graph.values.tilt is None else self.graph.values.tilt  # the gyro alone asks for none
+        """Insert preintegrated factors, with the covariance of the unit's pose relative to the nodes."""
+        tilt = np.zeros(2) if self.graph.values.tilt is None else self.graph.values.tilt  # not used by gyro factors
         v = np.vstack(
             [lift("velocity", self.graph.values.velocities), np.zeros(3)]
-        )  # row -1: of ways by the gyro alone
+        )  # row -1: of factors with the gyro only
         b, x = lift("imubias", self.graph.values.imu_biases), lift("x", self.graph.values.poses)
         fresh = [replace(r, R=R, p=p, v=w, J=J, bias=c) for r, R, p, w, J, c in zip(
             records, pim.R, pim.p, pim.v, pim.J, pim.bias)]  # fmt: skip
@@ -385,7 +385,7 @@ class ImuFactors(SensorFactors):
         return ids
 
     def _relink(self, stream: str) -> list[int]:
-        """The first bias starts, and each that no way ties to the one before walks on from it."""
+        """Set the prior of the first bias, and random-walk links to biases without a preintegrated measurement."""
         noise = self.used[stream].imu.noise
         wanted = required_bias_links(self.states(stream), self.graph.records.values(), stream, noise)
         wanted = {link: sigma[self._bias] for link, sigma in wanted.items()}
@@ -407,7 +407,7 @@ class ImuFactors(SensorFactors):
         return ids
 
     def _compact(self) -> None:
-        """Velocities and biases that no factor holds any more go; the others move up."""
+        """Remove velocities and biases without factors; the others are renumbered."""
         changed, v, b = renumber_states(self.graph.records)
         if changed or len(v) < len(self.graph.values.velocities) or len(b) < len(self.graph.values.imu_biases):
             self.graph.values.velocities, self.graph.values.imu_biases = (

@@ -1,7 +1,7 @@
-"""Readings at instants that wait for the submap that holds them: one factor each, on the node nearest in time.
+"""Scalar readings that wait for the submap of their time: one factor each, on the node nearest in time.
 
-A reading at t inside a submap becomes a factor on the node of that submap that is nearest in time, by the pose of the
-body seen from the node; what the submap's own path has lost between the two is added to the reading's variance.
+A reading at t inside a submap becomes a factor on the node of that submap that is nearest in time, with the pose of the
+body relative to the node; the covariance that the submap's path accumulates between the two is added to the reading's.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from graphslam.graph.submap_node import SubmapNode
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PendingMeasurement:
-    """One reading that waits.
+    """A reading that waits for its submap.
 
     Parameters
     ----------
     source : int
         Number of its sensor among those of the kind.
     part : int
-        Which of several things that are measured at one instant, such as a beacon; -1: there is but one.
+        Which of several quantities at one instant, such as a beacon; -1: there is only one.
     """
 
     time: float
@@ -44,14 +44,14 @@ class PendingMeasurement:
 
 
 class PendingMeasurements(SensorFactors):
-    """Sensors of a kind whose readings are numbers at instants.
+    """Sensors whose readings are scalars with a time.
 
     Attributes
     ----------
     unit : str
-        What a reading is called in messages.
+        Name of a reading in messages.
     holders : mapping of str to tuple of type
-        By variable kind, the records that name one of its rows, in a field of that name. They go with the readings.
+        By variable kind, the records that refer to its rows in a field of that name; removed with the readings.
     """
 
     unit: ClassVar[str]
@@ -64,19 +64,19 @@ class PendingMeasurements(SensorFactors):
 
     @abstractmethod
     def tie(self, reading: PendingMeasurement, node: int, T_node_body: Array, covariance: Array | None) -> None:
-        """Make the factor of a reading; ``T_node_body`` ``(1, 3|7)``, ``covariance`` ``(1, d, d)`` of it."""
+        """Make the factor of a reading; ``T_node_body`` ``(1, 3|7)`` with its ``covariance`` ``(1, d, d)``."""
 
     @abstractmethod
     def held(self) -> dict[str, set[int]]:
-        """By variable kind, the rows that readings hold."""
+        """By variable kind, the rows that readings use."""
 
     def moved(self, word: str, rows: dict[int, int]) -> None:
-        """Rows of a variable kind have new numbers; those that are missing went."""
+        """Update row numbers of a variable kind: old → new; missing rows were removed."""
 
     def enter(
         self, stream: str, rows: Sequence[tuple[float, float, float, int]], source: int, left_out: int
     ) -> list[int]:
-        """Enter readings (time, value, σ, part) in the ledger, all or none, and in the queue; returns factor ids."""
+        """Add readings (time, value, σ, part) to the ledger, all or none, and to the queue; returns factor ids."""
         g, new = self.graph, []
         names = [f"{stream}/{part}" if part >= 0 else stream for *_, part in rows]
         for (t, *_), name in zip(rows, names):
@@ -91,7 +91,7 @@ class PendingMeasurements(SensorFactors):
         return [r.factor_id for r in new]
 
     def add_factors(self, submap: SubmapNode, *, closed: bool = False) -> None:
-        """Give a submap its readings; one at an instant that two submaps share belongs to the later."""
+        """Add the readings of a submap; one exactly between two submaps belongs to the later one."""
         t0, t1 = submap.interval
         first = bisect_left(self.waiting, t0, key=lambda r: r.time)
         last = (bisect_right if closed else bisect_left)(self.waiting, t1, key=lambda r: r.time)
@@ -104,7 +104,7 @@ class PendingMeasurements(SensorFactors):
             return
         outside, spent = [], []
         for r in mine:
-            # parts are entered by name, since several come at one instant: the stream itself is the front end's
+            # with parts, ledger names contain the part; the stream itself is in the ledger if the front end used it
             if r.part >= 0 and self.graph.ledger.conflict(r.stream, (r.time, r.time)) is not None:
                 spent.append(r)
                 continue
@@ -133,7 +133,7 @@ class PendingMeasurements(SensorFactors):
         )
 
     def remove_unused(self, removed: Any) -> None:
-        """Variables that no reading holds any more go, and what was said of them; the others move up."""
+        """Remove variables without readings, and other factors on them; renumber the others."""
         g = self.graph
         if not any(g.structure.count(word) for word in self.holders):
             return
@@ -141,7 +141,7 @@ class PendingMeasurements(SensorFactors):
             self.moved(word, self._keep(word, rows))
 
     def _keep(self, word: str, rows: set[int]) -> dict[int, int]:
-        """Keep these rows of a kind of variable; old row → new row."""
+        """Keep these rows of a kind of variable; returns old row → new row."""
         g = self.graph
         new = {old: k for k, old in enumerate(sorted(rows))}
         if len(new) == g.structure.count(word):
@@ -159,14 +159,14 @@ class PendingMeasurements(SensorFactors):
         return new
 
     def take_out(self, *factor_ids: int) -> None:
-        """Factors go, and their evidence is free again."""
+        """Remove factors and release their ledger entries."""
         for fid in list(factor_ids):
             del self.graph.records[fid]
             self.graph.ledger.release(fid)
             self.graph.revision += 1
 
     def drop(self, readings: Iterable[PendingMeasurement], why: str) -> None:
-        """Readings that get no factor are counted."""
+        """Count readings that get no factor, and release their ledger entries."""
         count = 0
         for r in readings:
             self.graph.ledger.release(r.factor_id)
@@ -176,7 +176,7 @@ class PendingMeasurements(SensorFactors):
 
 
 def thinned(times: Array, every: float) -> list[int]:
-    """Records that are at least ``every`` seconds apart."""
+    """Indices of records that are at least ``every`` seconds apart."""
     kept: list[int] = []
     for k, t in enumerate(times.tolist()):
         if not kept or t - times[kept[-1]] >= every:

@@ -1,13 +1,13 @@
-"""Are the axes of an IMU those that its mounting says? Swapped or turned ones are found by their residuals, and named.
+"""Check the axes of an IMU against its mounting: swapped or reversed axes are detected by their residuals, and named.
 
-Over windows of about a second the gyro's turn and the mean specific force are compared with what a path says of them,
-``m = A r + b T`` and ``f = A Rᵀ (0, 0, g)``, for all 48 ways A in which three axes can be exchanged and turned round.
-Between the ends of a window the gyro tells, by the same A, how the body leans: a robot that balances leans to and fro
-about once a second, and the mean of its two ends may be the opposite of the mean over the window.
-What moves the body cancels out of f over many windows; the bias b is solved for. Ways that nothing tells apart (x and y
-of a body that stays level) are no reproach: only what contradicts the stated mounting is. Where no way
-explains gyro and accelerometer alike, the one that contradicts is named: a path that was made of a turned gyro agrees
-with it, and not with the forces.
+Over windows of 1 s the gyro's rotation and the mean specific force are compared with those of a path,
+``m = A r + b T`` and ``f = A Rᵀ (0, 0, g)``, for all 48 signed permutations A of the three axes. The attitude inside a
+window is interpolated with the gyro, by the same A: a balancing robot leans to and fro about once a second, so the mean
+over the window may differ in sign from the mean of its two ends.
+Accelerations of the body average out of f over many windows; the bias b is estimated. Permutations that cannot be
+distinguished (x and y of a body that stays level) are no error: only a contradiction to the stated mounting is. If no
+permutation explains both gyro and accelerometer, the contradicting one is named: a path that was made with a wrongly
+mounted gyro agrees with it, but not with the forces.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from graphslam.core.trajectory import Trajectory
 
 _AXES = "xyz"
 TURNING = 0.05
-"""Turns of a body over a window that a path should know of [rad/s]."""
+"""Turn rate over a window that a correct path should contain [rad/s]."""
 
 
 def signed_permutations() -> Array:
-    """All ways ``(48, 3, 3)`` to exchange axes and turn them round, the identity first; half of them are mirrored."""
+    """All signed permutations ``(48, 3, 3)`` of the axes, the identity first; half of them are reflections."""
     out = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
@@ -41,23 +41,23 @@ def signed_permutations() -> Array:
 
 @dataclass(frozen=True, slots=True)
 class AxesCheck:
-    """What a path says of the axes of an IMU.
+    """Result of the comparison of an IMU's axes with a path.
 
     Parameters
     ----------
     wrong : bool
         The stated mounting is contradicted.
     A : (3, 3)
-        What explains the readings best: ``reading = A · what the stated mounting would read``.
+        Best explanation: ``reading = A · reading of a correctly mounted unit``.
     excess : float
-        By how much the residuals of the stated mounting are larger, in units of the noise that the best leaves (χ²).
+        χ² of the stated mounting minus that of the best explanation, in units of the noise left by the best.
     alike : int
-        Ways that explain the readings as well as the best one.
+        Number of permutations that explain the readings as well as the best one, with itself.
     sensor : {"both", "accelerometer", "gyro"}
-        Whose readings A explains.
+        Sensor whose readings A explains.
     turns : (float, float) or None
-        What the gyro turns by (root mean square over the windows), and by how much the path turns otherwise whatever
-        the axes [rad/s], where that is as much: nothing can be said of the axes then.
+        RMS turn rate of the gyro, and RMS difference to the path for the best axes [rad/s], if they are similar: then
+        the axes cannot be checked.
     """
 
     wrong: bool
@@ -69,7 +69,7 @@ class AxesCheck:
     turns: tuple[float, float] | None = None
 
     def words(self) -> str:
-        """Which axis reads what: ``"x reads −y, y reads x"``; empty if they are as stated."""
+        """Reading of each wrong axis: ``"x reads −y, y reads x"``; empty if all are as stated."""
         if not self.wrong:
             return ""
         said = []
@@ -94,12 +94,12 @@ class AxesCheck:
 
 
 WINDOW, LIMIT, FORCE_SIGMA = 1.0, 50.0, 0.3
-"""Means are over windows [s]; a mounting is contradicted if its χ² exceeds that of the best explanation by the limit;
-accelerations leave at least this σ in the mean specific force of a window [m/s²]."""
+"""Length of a window [s]; limit on the χ² of the stated mounting minus that of the best explanation; minimum σ of the
+mean specific force of a window due to accelerations [m/s²]."""
 
 
 def check_imu_axes(imu: Imu, path: Trajectory) -> AxesCheck:
-    """Compare an IMU with a path that is about right and whose frame is about level.
+    """Compare an IMU with an approximately correct path in an approximately level frame.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def check_imu_axes(imu: Imu, path: Trajectory) -> AxesCheck:
     ways = signed_permutations()
     r = rate - np.einsum("aij,kj->aki", ways, turn)
     r -= r.mean(axis=1, keepdims=True)  # the bias
-    # a gyro that no way brings near the path (degrees for radians) tells nothing of how the body leans
+    # a gyro that no permutation brings near the path (degrees for radians) is not used for the attitude
     squares = float((r**2).sum(axis=(1, 2)).min()), float(((rate - rate.mean(axis=0)) ** 2).sum())
     missed, moved = (float(np.sqrt(x / len(rate))) for x in squares)
     believed = missed**2 < 0.5 * moved**2
@@ -138,20 +138,20 @@ def check_imu_axes(imu: Imu, path: Trajectory) -> AxesCheck:
     turned = _turned(imu) if believed else np.zeros((len(imu.times), 3))
     ends = np.stack([np.interp(edges, imu.times, turned[:, k]) for k in range(3)], axis=1)
     since, left = mean(turned) - ends[:-1][full], ends[1:][full] - mean(turned)
-    since, left = (np.einsum("aji,kj->aki", ways, x) for x in (since, left))  # in the axes that A says
+    since, left = (np.einsum("aji,kj->aki", ways, x) for x in (since, left))  # in the axes of each A
     up = 0.5 * (ups[:-1][full] - np.cross(since, ups[:-1][full]) + ups[1:][full] + np.cross(left, ups[1:][full]))
     f = force - np.einsum("aij,akj->aki", ways, up)
     gyro, pull = (r**2).sum(axis=(1, 2)), (f**2).sum(axis=(1, 2))
-    # what the best way of each sensor leaves is its noise, path errors and all
+    # the residual of the best permutation of each sensor is its noise, with the errors of the path
     rows = 3.0 * len(rate)
     s2_gyro = max(float(gyro.min()) / rows, imu.noise.gyro**2 / WINDOW, 1e-12)
     s2_pull = max(float(pull.min()) / rows, FORCE_SIGMA**2)
-    # forces that one way explains are a word on the mounting even where the path turns by itself
+    # if one permutation explains the forces, the mounting is tested although the rotations of the path differ
     unlike &= float(pull.min()) > 0.25 * float(pull[0])
     gyro, pull = (gyro - gyro.min()) / s2_gyro, (pull - pull.min()) / s2_pull
     chi2, sensor = gyro + pull, "both"
     if max(gyro[np.argmin(chi2)], pull[np.argmin(chi2)]) > LIMIT:
-        # no way explains both: one of them was turned, or the path was made of the very gyro; the other one is named
+        # no permutation explains both: one sensor is turned, or the path was made with this gyro; name the other one
         chi2, sensor = (pull, "accelerometer") if pull[0] > LIMIT else (gyro, "gyro")
     best = int(np.argmin(chi2))
     excess = float(chi2[0] - chi2[best])

@@ -1,15 +1,14 @@
-"""Factors of an IMU: preintegrated ways between nodes, biases, specific forces. Residuals and Jacobians.
+"""Residuals and Jacobians of IMU factors: preintegrated measurements between nodes, biases, specific forces.
 
-With the unit at ``X = x · T_node_imu`` = (R, p), gravity ``g = -G u(τ)`` (:mod:`graphslam.graph.factors.attitude` says
-what u is), velocities v of the unit in the frame of the first base, and ``δ = b_i - b̄``, the residual of a way is
-(Forster et al. 2017, eq. 45, and the walk of the biases)::
-
+With the unit at ``X = x · T_node_imu`` = (R, p), gravity ``g = -G u(τ)`` (u: see
+:mod:`graphslam.graph.factors.attitude`), velocities v of the unit in the frame of the first base, and ``δ = b_i - b̄``,
+the residual of a preintegrated measurement is (Forster et al. 2017, eq. 45, with the random walk of the biases)::
     r_φ = Log((ΔR Exp(J_φ δ_g))ᵀ R_iᵀ R_j)
     r_p = R_iᵀ (p_j - p_i - v_i T - ½ g T²) - Δp - J_p δ
     r_v = R_iᵀ (v_j - v_i - g T) - Δv - J_v δ
     r_b = b_j - b_i
 
-and that of a specific force about a node ``r = Rᵀ G u(τ) + b_a - f``.
+and that of a specific force at a node is ``r = Rᵀ G u(τ) + b_a - f``.
 """
 
 from __future__ import annotations
@@ -50,11 +49,11 @@ PLANE_ROWS = np.array([2, 3, 4, 6, 7, 11, 12, 13])
 PLANE_COLUMNS = np.concatenate([block.start + np.array(IN_PLANE[word]) for word, block in _BLOCKS])
 PLANE_GYRO_ROWS = np.array([0, 5, 6, 7])
 PLANE_GYRO_COLUMNS = np.r_[0:3, 5:11, 13:16]
-"""Of the rows and columns of the plane, those of the gyro alone."""
+"""Gyro rows and columns among those of 2-D."""
 
 
 class PreintegrationArrays:
-    """The constants of preintegrated ways, one row each (:class:`~graphslam.graph.factors.imu.records.ImuRecord`)."""
+    """Arrays of preintegrated measurements, one row each (:class:`~graphslam.graph.factors.imu.records.ImuRecord`)."""
 
     def __init__(self, records: Sequence[ImuRecord]) -> None:
         self.T = np.array([r.seconds for r in records])
@@ -99,7 +98,7 @@ def preintegration_terms(
 
     k = len(r)
     inverse = so3_left_jacobian_inverse(-phi)  # Log(e Exp(δ)) ≈ Log(e) + J_r⁻¹ δ
-    U_i, U_j = np.zeros((k, 15, 6)), np.zeros((k, 15, 6))  # by right turns and shifts of the unit's own pose
+    U_i, U_j = np.zeros((k, 15, 6)), np.zeros((k, 15, 6))  # by the right tangent of the unit's own pose
     U_i[:, :3, :3] = -inverse @ np.swapaxes(E, 1, 2)
     U_i[:, 3:6, :3], U_i[:, 6:9, :3] = skew(a_p), skew(a_v)
     U_i[:, 3:6, 3:] = -np.eye(3)
@@ -119,7 +118,7 @@ def preintegration_terms(
 
 
 def planar_terms(ways: PreintegrationArrays, *blocks: Array) -> tuple[Array, Array]:
-    """The same in the plane: residuals ``(k, 8)`` and Jacobians ``(k, 8, 16)``, of what is left of both there.
+    """The same in 2-D: residuals ``(k, 8)`` and Jacobians ``(k, 8, 16)``, the planar components of both.
 
     Parameters
     ----------
@@ -137,7 +136,7 @@ def force_terms(x: Array, L: Array, bias: Array, tilt: Array, force: Array) -> t
     Parameters
     ----------
     x, L : (k, 7)
-        Nodes, and the unit seen from them.
+        Nodes, and the unit relative to them.
     bias : (k, 6)
     tilt : (2,)
     force : (k, 3)
@@ -153,7 +152,7 @@ def force_terms(x: Array, L: Array, bias: Array, tilt: Array, force: Array) -> t
 
 
 class ImuBatch(UniformBatch):
-    """Preintegrated ways."""
+    """Preintegrated measurements."""
 
     record = ImuRecord
     slots = ("x", "velocity", "imubias", "x", "velocity", "imubias", "tilt")
@@ -177,7 +176,7 @@ class ImuBatch(UniformBatch):
 
 
 class GyroBatch(UniformBatch):
-    """Preintegrated turns of the gyro alone."""
+    """Preintegrated rotations of the gyro alone."""
 
     record = GyroRecord
     slots = ("x", "imubias", "x", "imubias")
@@ -203,7 +202,7 @@ class GyroBatch(UniformBatch):
 
 
 class ImuBiasBatch(UniformBatch):
-    """Biases at their start, and walks of biases over pauses."""
+    """Priors of biases, and random-walk links of biases over gaps."""
 
     record = ImuBiasRecord
     slots = ("imubias", "imubias")
@@ -211,12 +210,12 @@ class ImuBiasBatch(UniformBatch):
 
     @staticmethod
     def keys(record: ImuBiasRecord) -> Sequence[int | None]:
-        """The bias before (None at the start), the bias."""
+        """The previous bias (None for a prior), the bias."""
         return record.before, record.bias
 
     @staticmethod
     def whitener(record: ImuBiasRecord) -> Array:
-        """Of σ."""
+        """``1/σ``."""
         return np.diag(1.0 / record.sigma)
 
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
@@ -228,7 +227,7 @@ class ImuBiasBatch(UniformBatch):
 
 
 class ForceBatch(UniformBatch):
-    """Specific forces about nodes."""
+    """Specific forces at nodes."""
 
     record = ForceRecord
     slots = ("x", "imubias", "tilt")

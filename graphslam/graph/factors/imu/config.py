@@ -1,4 +1,4 @@
-"""How an IMU enters a graph, and where the unit is on the nodes."""
+"""Options of IMU factors, and the pose of the unit relative to the nodes."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from graphslam.graph.variables import Values
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuConfig:
-    """How readings become factors.
+    """Options for converting IMU readings to factors.
 
     Parameters
     ----------
     longest : float or None
-        Nodes that follow each other within so many seconds are tied by a preintegrated way; in space farther ones see
-        gravity. None: 10 s in space, 120 s in the plane.
+        Consecutive nodes within this time [s] are connected by a preintegrated measurement; in 3-D others get gravity
+        factors. None: 10 s in 3-D, 120 s in 2-D.
     pause : float or None
-        No way over a pause of the readings that is longer [s]; None: five times the usual, and at least 0.1 s.
+        Longest gap in the readings of a preintegrated measurement [s]; None: five times the median, at least 0.1 s.
     accelerometer : bool
-        False: the gyro alone, neither velocities nor gravity.
+        False: gyro only, without velocities and gravity.
     gravity : bool
-        In space, nodes without a way get the mean specific force about them.
+        3-D: nodes without a preintegrated measurement get the mean specific force around them.
     window : float
-        Over so many seconds it is averaged.
+        Averaging time of the mean specific force [s].
     acceleration : float
-        σ of the mean acceleration in a window where the body is not still, and what no path says [m/s²].
+        σ of the mean acceleration in a window if the body is not static [m/s²].
     still : float
-        A body that moves less than this in a window may be still [m]; that it is, the readings must say, too.
+        The body can be static only if it moves less than this in a window [m]; the readings must be quiet, too.
     axes : {"refuse", "warn", "ignore"}
-        What to do with an IMU whose readings contradict its mounting (:mod:`graphslam.graph.factors.imu.axes`).
+        Reaction to an IMU whose readings contradict its mounting (:mod:`graphslam.graph.factors.imu.axes`).
     robust : RobustKernel
-        Kernel on every way.
+        Kernel on every preintegrated measurement.
     """
 
     longest: float | None = None
@@ -66,17 +66,17 @@ class ImuConfig:
             raise ConfigError(f"imu.axes = {self.axes!r}; known: refuse, warn, ignore")
 
     def span(self, dim: int) -> float:
-        """Longest way allowed in a graph of so many dimensions [s]."""
+        """Longest preintegrated measurement in a graph of that dimension [s]."""
         return self.longest or (10.0 if dim == 3 else 120.0)
 
     def pause_of(self, times: Array) -> float:
-        """Longest pause allowed in readings at ``times`` ``(n,)``, n ≥ 2."""
+        """Longest gap allowed in readings at ``times`` ``(n,)``, n ≥ 2 [s]."""
         return max(0.1, 5.0 * float(np.median(np.diff(times)))) if self.pause is None else self.pause
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyPlace:
-    """Where the body is on a node, by the submap that holds both.
+    """Pose of the body relative to a node, from the path of the submap.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class BodyPlace:
     covariance : (6, 6)
         Right tangent at the body.
     moved : float
-        How far the body went in the window about ``time`` [m].
+        Distance that the body moved in the window around ``time`` [m].
     """
 
     time: float
@@ -99,11 +99,10 @@ class BodyPlace:
 
 
 def places_on_nodes(submaps: Sequence[SubmapNode], window: float) -> dict[int, BodyPlace]:
-    """Where the body is on every node that a path says it of.
+    """Pose of the body at every node that a path covers.
 
-    A base (or the node where one submap ends and the next begins) is a frame that may have been levelled: the body is
-    where the path that begins there says. On inner nodes it is the node itself. The last exit is where the last path
-    ends.
+    A base (or the node between two submaps) is a frame that may have been levelled: the body's pose is from the path
+    that starts there. At inner nodes the body is at the node itself. At the last node it is the end of the last path.
     """
     out: dict[int, BodyPlace] = {}
     for s in submaps:
@@ -132,7 +131,7 @@ def places_on_nodes(submaps: Sequence[SubmapNode], window: float) -> dict[int, B
 
 
 def body_path(submaps: Sequence[SubmapNode], values: Values) -> Trajectory:
-    """Path of the body in space, in the level frame at the first base, by rigid submaps at their nodes."""
+    """3-D path of the body in the level frame at the first base, with rigid submaps at their nodes."""
     times, poses = [np.zeros(0)], [np.zeros((0, 7))]
     level = SE3.identity.copy()
     if values.tilt is not None:

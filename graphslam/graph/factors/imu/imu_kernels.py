@@ -1,7 +1,7 @@
 """Compiled preintegration of inertial readings (Forster et al., On-Manifold Preintegration, 2017, section V).
 
-The error state is ``[φ, p, v, b_g, b_a]``: right tangent of ΔR, then Δp and Δv, then the biases of gyro and
-accelerometer as they are at the end less what they were taken to be.
+The error state is ``[φ, p, v, b_g, b_a]``: right tangent of ΔR, then Δp and Δv, then gyro and accelerometer biases at
+the end minus their assumed values.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ def _turn(w, R, J):
 
 @njit
 def _step(w, a, dt, noise, state):
-    """One step of constant rate ``w`` and force ``a``, biases taken off, over ``dt``: everything in place."""
+    """One step over ``dt`` with constant, bias-corrected rate ``w`` and force ``a``; updates the state in place."""
     R, p, v, P, Phi = state
     half, J_half, whole, J_whole = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     _turn(0.5 * dt * w, half, J_half)
     _turn(dt * w, whole, J_whole)
-    R_m = R @ half  # half-way: the force acts, on the average, through this attitude
+    R_m = R @ half  # attitude in the middle of the step, at which the force is applied
     f = R_m @ a
     S = np.zeros((3, 3))
     S[0, 1], S[0, 2], S[1, 2] = -a[2], a[1], -a[0]
     S[1, 0], S[2, 0], S[2, 1] = a[2], -a[1], a[0]
-    M = -R_m @ S  # change of the force by a right turn of R_m
+    M = -R_m @ S  # derivative of the force by a right rotation of R_m
     M_phi = M @ half.T  # R Exp(φ) Exp(w/2) = R_m Exp(Exp(-w/2) φ)
-    M_g = -0.5 * dt * (M @ J_half)  # the bias of the gyro turns R_m
+    M_g = -0.5 * dt * (M @ J_half)  # the gyro bias rotates R_m
     A = np.eye(15)
     A[:3, :3] = whole.T
     A[:3, 9:12] = -dt * J_whole
@@ -59,7 +59,7 @@ def _step(w, a, dt, noise, state):
     A[6:9, :3] = dt * M_phi
     A[6:9, 9:12] = dt * M_g
     A[6:9, 12:] = -dt * R_m
-    # white noise of a step has the variance σ² / dt and acts as a bias does (eq. 62); the biases walk by σ² dt
+    # white noise of a step has the variance σ² / dt and enters like a bias (eq. 62); bias random walk: σ² dt
     G = A[:9, 9:].copy()
     for k in range(6):
         G[:, k] *= noise[0 if k < 3 else 2] / math.sqrt(dt)
@@ -76,9 +76,9 @@ def _step(w, a, dt, noise, state):
 
 @njit
 def preintegrate_spans(times, rate, force, begin, end, bias, noise):
-    """Preintegrate over many spans of time.
+    """Preintegrate over many time intervals.
 
-    Readings are joined by straight lines; a step reaches from one reading to the next, or to an end of the span.
+    Readings are interpolated linearly; a step is from one reading to the next, or to an end of the interval.
 
     Parameters
     ----------
@@ -87,9 +87,9 @@ def preintegrate_spans(times, rate, force, begin, end, bias, noise):
     begin, end : (k,)
         Inside ``times``.
     bias : (k, 6)
-        Of gyro and accelerometer, taken off.
+        Of gyro and accelerometer, subtracted.
     noise : (4,)
-        Densities: gyro, walk of its bias, accelerometer, walk of its bias.
+        Densities: gyro, gyro bias random walk, accelerometer, accelerometer bias random walk.
 
     Returns
     -------

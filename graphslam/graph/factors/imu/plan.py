@@ -1,4 +1,4 @@
-"""What readings of an IMU would become in a graph, and what is left out of them and why."""
+"""Plan the factors of IMU readings in a graph, and count what is not used by reason."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from graphslam.graph.factors.imu.records import ForceRecord, ImuRecord
 from graphslam.graph.submap_node import SubmapNode
 
 FEWEST = 4
-"""Readings inside a way: with fewer Δp and Δv are not two things."""
+"""Minimum number of readings for a preintegrated measurement: with fewer, Δp and Δv are not independent."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImuFactorPlan:
-    """What readings become.
+    """Planned factors of IMU readings.
 
     Parameters
     ----------
     pairs : list of (int, int)
-        Nodes to be tied by a way.
+        Nodes to connect by a preintegrated measurement.
     gravity : list of int
-        Nodes that see gravity.
+        Nodes that get a gravity factor.
     dropped : Counter of str
-        What is left out, by reason.
+        Number of unused parts by reason.
     """
 
     pairs: list[tuple[int, int]]
@@ -51,9 +51,9 @@ def plan_factors(
     *,
     dim: int = 3,
 ) -> ImuFactorPlan:
-    """Pairs and nodes that get factors, besides those of ``records``, and a count of those that get none by reason.
+    """Pairs and nodes that get factors in addition to those of ``records``, and a count of others by reason.
 
-    A node whose next one is still ``waiting`` for its submap may get a way to it: it does not see gravity yet.
+    A node whose next one is ``waiting`` for its submap may get a preintegrated measurement later, so no gravity yet.
     """
     t, pause = imu.times, cfg.pause_of(imu.times)
     had = {(r.i, r.j) for r in records if isinstance(r, ImuRecord) and r.stream == stream}
@@ -91,12 +91,12 @@ def plan_factors(
 
 
 def force_window(t: float, cfg: ImuConfig) -> tuple[float, float]:
-    """Over which the specific force about an instant is averaged."""
+    """Interval over which the specific force around an instant is averaged."""
     return float(t) - 0.5 * cfg.window, float(t) + 0.5 * cfg.window
 
 
 def join_readings(old: Imu, new: Imu, stream: str) -> Imu:
-    """One IMU's readings in two portions."""
+    """Concatenate two portions of one IMU's readings."""
     if len(new.times) == 0:
         return old
     if new.times[0] <= old.times[-1]:
@@ -116,7 +116,7 @@ def join_readings(old: Imu, new: Imu, stream: str) -> Imu:
 
 
 def _why_not(a: BodyPlace | None, b: BodyPlace | None, t: Array, longest: float, pause: float) -> str:
-    """Why there is no way between two nodes; empty if there is one."""
+    """Reason against a preintegrated measurement between two nodes; empty if there is none."""
     if a is None or b is None:
         return "the path does not reach the node"
     if b.time - a.time > longest:

@@ -1,13 +1,13 @@
-"""An IMU in a graph of the plane: the equations of space, of which yaw and two axes are kept.
+"""An IMU in a 2-D graph: the 3-D equations, of which yaw and two axes are kept.
 
-A body in the plane turns about its vertical axis alone. So readings are turned into the axes of the body, and what is
-left of them is the yaw rate and two accelerations; a level body has no gravity in these. Poses, velocities and biases
-are embedded in space, where the same preintegration and the same residuals hold
-(:mod:`graphslam.graph.factors.imu.batch`); rows and columns out of the plane are left out, since they are zero.
+A planar body rotates about its vertical axis only. So readings are rotated into the axes of the body, and only the yaw
+rate and two accelerations are used; for a level body they contain no gravity. Poses, velocities and biases
+are embedded in 3-D, with the same preintegration and residuals
+(:mod:`graphslam.graph.factors.imu.batch`); rows and columns out of the plane are omitted because they are zero.
 
-A unit with three axes sees gravity as well. A body that leans by β has ``g sin β`` of it in the plane, which a path
-cannot say. It enters as a bias of the accelerometer: at the start within :data:`LEAN`, and walking by as much in
-:data:`LEAN_TIME`.
+A unit with three axes measures gravity too. If the body leans by β, ``g sin β`` of it is in the plane, which a planar
+path cannot explain. It is modelled as an accelerometer bias with an initial σ for :data:`LEAN`, and a random walk of
+the same size in :data:`LEAN_TIME`.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from graphslam.core.se3 import quat_rotate
 from graphslam.core.trajectory import Trajectory
 
 LEAN = 0.01
-"""σ of roll and pitch of a body that moves in a plane: mounting and floor [rad]."""
+"""σ of roll and pitch of a planar body, due to mounting and floor [rad]."""
 LEAN_TIME = 10.0
-"""Time in which they change by that much [s]."""
+"""Time in which they change by that σ [s]."""
 LEVEL_FORCE = 0.1 * GRAVITY
-"""The mean vertical force of a level unit with three axes is gravity within this [m/s²]."""
+"""Tolerance of the mean vertical force of a level unit with three axes, relative to gravity [m/s²]."""
 
 _SIZE = {"x": 7, "velocity": 3, "imubias": 6}
 IN_PLANE = {"x": [3, 4, 2], "velocity": [0, 1], "imubias": [2, 3, 4]}
-"""Degrees of freedom of space that the plane has, in the order of the plane's."""
+"""Degrees of freedom in 3-D that 2-D has, in the order of 2-D."""
 
 
 def lift(word: str, rows: Array) -> Array:
-    """Values ``(k, size)`` of a kind of variable as they stand in space; those of space as they are."""
+    """Values ``(k, size)`` of a kind of variable embedded in 3-D; 3-D values are unchanged."""
     if rows.shape[-1] == _SIZE[word]:
         return rows
     out = np.zeros((len(rows), _SIZE[word]))
@@ -48,7 +48,7 @@ def lift(word: str, rows: Array) -> Array:
 
 
 def lift_covariances(P: Array) -> Array:
-    """Covariances ``(k, 3, 3)`` of poses of the plane as ``(k, 6, 6)`` of space (right tangents)."""
+    """Covariances ``(k, 3, 3)`` of 2-D poses as ``(k, 6, 6)`` of 3-D poses (right tangents)."""
     if P.shape[-1] == 6:
         return P
     out = np.zeros((len(P), 6, 6))
@@ -57,12 +57,12 @@ def lift_covariances(P: Array) -> Array:
 
 
 def lift_path(path: Trajectory) -> Trajectory:
-    """A path as it stands in space, without its covariances."""
+    """A path embedded in 3-D; a 2-D path loses its covariances."""
     return path if path.dim == 3 else Trajectory(path.times, lift("x", path.poses))
 
 
 def with_gravity(imu: Imu) -> Imu:
-    """The readings of a level unit, gravity among them."""
+    """The readings of a level unit, with gravity in the specific force."""
     if not imu.planar:
         return imu
     up = quat_rotate(imu.T_base_imu[3:] * [-1.0, -1.0, -1.0, 1.0], np.array([0.0, 0.0, GRAVITY]))
@@ -80,8 +80,8 @@ def planar_imu(imu: Imu, where: str) -> Imu:
     Returns
     -------
     Imu
-        Entries out of the plane are zero; ``T_base_imu`` is a shift. The noise of a unit with three axes holds the
-        gravity that a body which leans has in the plane.
+        Components out of the plane are zero; ``T_base_imu`` is a translation. The noise of a unit with three axes
+        includes the planar component of gravity of a leaning body.
     """
     rate, force = (quat_rotate(imu.T_base_imu[3:], a) for a in (imu.angular_rate, imu.specific_force))
     noise = imu.noise

@@ -1,14 +1,14 @@
-"""What an IMU says of the way between two instants, whatever the velocity and the attitude were at the first one.
+"""Preintegrate IMU readings between two instants, independently of the initial velocity and attitude.
 
-For a unit with pose (R, p) and velocity v in a frame where gravity is g, and for readings with their biases taken off
+For a unit with pose (R, p) and velocity v in a frame with gravity g, and for bias-corrected readings
 (Forster et al. 2017, eq. 33)::
 
     R_j = R_i ΔR
     v_j = v_i + g T + R_i Δv
     p_j = p_i + v_i T + ½ g T² + R_i Δp
 
-ΔR, Δv, Δp depend on the readings and on the biases alone; how they change with the biases is known to first order, and
-their covariance holds the white noise of the readings and the walk of the biases.
+ΔR, Δv, Δp depend on the readings and on the biases only; their dependence on the biases is known to first order, and
+their covariance includes the white noise of the readings and the random walk of the biases.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from graphslam.core.imu import Imu, ImuNoise
 from graphslam.core.se3 import quat_multiply, quat_rotate, so3_exp
 
 LEAST_WALK = 1e-4
-"""A bias that is said not to walk walks by this share of its σ a span of time: the factor is not to be singular."""
+"""Minimum bias random walk per interval, as a share of the bias σ, so that the factor is not singular."""
 LEAST_BIAS = np.array([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 1e-5])
-"""A bias that is said to be zero is zero within this [rad/s, m/s²]."""
+"""Minimum prior σ of a bias [rad/s, m/s²]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Preintegrated:
-    """Spans of time.
+    """Preintegrated measurements of k time intervals.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Preintegrated:
     J : (k, 9, 6)
         Of ``[φ, p, v]`` by the biases of gyro and accelerometer.
     bias : (k, 6)
-        That was taken off the readings.
+        Bias that was subtracted from the readings.
     """
 
     seconds: Array
@@ -61,7 +61,7 @@ class Preintegrated:
 
 
 def bias_sigma(noise: ImuNoise) -> Array:
-    """σ ``(6,)`` of the biases of gyro [rad/s] and accelerometer [m/s²] at the start."""
+    """Prior σ ``(6,)`` of the biases of gyro [rad/s] and accelerometer [m/s²]."""
     sigma = np.repeat([noise.gyro_bias, noise.accelerometer_bias], 3)
     return np.asarray(np.maximum(sigma, LEAST_BIAS))
 
@@ -74,7 +74,7 @@ def walk_sigma(noise: ImuNoise, seconds: ArrayLike) -> Array:
 
 
 def preintegrate(imu: Imu, begin: ArrayLike, end: ArrayLike, bias: ArrayLike = 0.0) -> Preintegrated:
-    """Preintegrate readings over spans of time.
+    """Preintegrate readings over time intervals.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def preintegrate(imu: Imu, begin: ArrayLike, end: ArrayLike, bias: ArrayLike = 0
 
 
 def longest_pause(times: Array, begin: Array, end: Array) -> Array:
-    """Longest time ``(k,)`` [s] without a reading inside or about each span of time inside ``times``."""
+    """Longest time ``(k,)`` [s] without a reading inside or around each interval within ``times``."""
     gaps = np.diff(times)
     i = np.clip(np.searchsorted(times, begin, side="right") - 1, 0, len(gaps) - 1)
     j = np.clip(np.searchsorted(times, end, side="left"), i + 1, len(gaps))
@@ -111,7 +111,7 @@ def longest_pause(times: Array, begin: Array, end: Array) -> Array:
 
 
 def mean_force(imu: Imu, at: Array, half: float) -> tuple[Array, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Mean specific force about instants, turned into the unit's axes at each, by its own rates.
+    """Mean specific force around instants, rotated into the unit's axes at each instant with the gyro.
 
     Parameters
     ----------
@@ -122,9 +122,9 @@ def mean_force(imu: Imu, at: Array, half: float) -> tuple[Array, npt.NDArray[np.
     -------
     force : (k, 3)
     count : (k,) int
-        Readings; 0 where there are none.
+        Number of readings; 0 if there are none.
     still : (k,) bool
-        Neither rates nor forces change by more than three times what their noise says.
+        The standard deviations of rates and forces are below three times their noise.
     """
     rate_hz = 1.0 / float(np.median(np.diff(imu.times)))
     limits = 3.0 * np.sqrt(rate_hz) * np.array([imu.noise.gyro, imu.noise.accelerometer])

@@ -1,4 +1,4 @@
-"""Records of what an IMU says: preintegrated ways, biases, specific forces (residuals: ``batch.py``)."""
+"""Records of IMU factors: preintegrated measurements, biases, specific forces (residuals: ``batch.py``)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from graphslam.graph.noise import NO_KERNEL, RobustKernel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuRecord:
-    """The way from node i to node j, preintegrated.
+    """The preintegrated measurement from node i to node j.
 
     Parameters
     ----------
@@ -22,19 +22,19 @@ class ImuRecord:
     biases : (a, b)
         Rows of :attr:`~graphslam.graph.variables.Values.imu_biases`.
     T_i_imu, T_j_imu : (7,)
-        The unit seen from the nodes.
+        The unit relative to the nodes.
     R, p, v : (3, 3), (3,), (3,)
         ΔR, Δp, Δv.
     J : (9, 6)
         Of ``[φ, p, v]`` by the biases.
     bias : (6,)
-        About which they were preintegrated.
+        Bias that was subtracted in the preintegration.
     whitener : (15, 15)
-        Of ``[φ, p, v, b_g, b_a]``; in the plane (8, 8), of what these have in the plane.
+        Of ``[φ, p, v, b_g, b_a]``; in 2-D (8, 8), of their planar components.
     local : (2, 6, 6)
-        Covariances of ``T_i_imu`` and ``T_j_imu`` (right tangents) that the whitener holds.
+        Covariances of ``T_i_imu`` and ``T_j_imu`` (right tangents), which the whitener includes.
     planar : bool
-        In a graph of the plane: all else is embedded in space (:mod:`graphslam.graph.factors.imu.plane`).
+        In a 2-D graph: all other arrays are embedded in 3-D (:mod:`graphslam.graph.factors.imu.plane`).
     """
 
     factor_id: int
@@ -80,7 +80,7 @@ class ImuRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GyroRecord(ImuRecord):
-    """The same by the gyro alone: ``whitener`` (9, 9) of ``[φ, b_g, b_a]``, or (4, 4); no velocity, no gravity."""
+    """The same with the gyro only: ``whitener`` (9, 9) of ``[φ, b_g, b_a]``, or (4, 4); no velocity, no gravity."""
 
     def variables(self) -> list[str]:
         """Names of the variables."""
@@ -89,12 +89,12 @@ class GyroRecord(ImuRecord):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuBiasRecord:
-    """A bias at its start, or how far it walks where no preintegrated way ties it to the one before.
+    """Prior of a bias, or its random walk if no preintegrated measurement connects it to the previous one.
 
     Parameters
     ----------
     before : int or None
-        Row of the bias before; None at the start, where the bias is zero within ``sigma``.
+        Row of the previous bias; None for a prior of mean zero with ``sigma``.
     bias : int
         Row.
     sigma : (6,) or (3,)
@@ -123,7 +123,7 @@ class ImuBiasRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceRecord:
-    """The mean specific force about a node, where the unit hardly accelerates: gravity and the bias.
+    """The mean specific force at a node with little acceleration: gravity and bias.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which velocity and which bias are a node's, read off the factors of an IMU."""
+"""Velocity and bias rows of each node, taken from the factors of an IMU."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ImuStates:
 
     @classmethod
     def of(cls, records: Iterable[Any], stream: str) -> ImuStates:
-        """Of the factors of a stream."""
+        """From the factors of a stream."""
         time: dict[int, float] = {}
         velocity: dict[int, int] = {}
         bias: dict[int, int] = {}
@@ -50,7 +50,7 @@ class ImuStates:
 def required_bias_links(
     states: ImuStates, records: Iterable[Any], stream: str, noise: ImuNoise
 ) -> dict[tuple[int | None, int], Array]:
-    """(bias before or None, bias) → σ ``(6,)``: the start of the first, and walks where no way ties two."""
+    """(previous bias or None, bias) → σ ``(6,)``: prior of the first, and walks without a preintegrated measurement."""
     tied = {r.biases[1] for r in records if isinstance(r, ImuRecord) and r.stream == stream}
     out: dict[tuple[int | None, int], Array] = {}
     for before, node in zip((None, *states.order), states.order):
@@ -63,7 +63,7 @@ def required_bias_links(
 
 
 def renumber_states(records: Mapping[int, Any]) -> tuple[dict[int, Any], list[int], list[int]]:
-    """Records with the rows of velocities and biases counted anew, as far as they change, and the old rows kept."""
+    """Changed records after renumbering the used rows of velocities and biases, and the old rows that are kept."""
     v = sorted({k for r in records.values() if isinstance(r, ImuRecord) for k in r.velocities if k >= 0})
     b = sorted(
         {k for r in records.values() if isinstance(r, ImuRecord) for k in r.biases}
