@@ -235,7 +235,8 @@ def collect_messages(
 
 def _take_laser(m: Any) -> tuple[Any, ...]:
     ranges = np.asarray(m.ranges, dtype=np.float32)
-    return ranges, float(m.angle_min), float(m.angle_increment), float(m.range_min), float(m.range_max)
+    lasts = abs(float(m.time_increment)) * max(len(ranges) - 1, 0)
+    return ranges, float(m.angle_min), float(m.angle_increment), float(m.range_min), float(m.range_max), lasts
 
 
 def _take_imu(m: Any) -> list[float]:

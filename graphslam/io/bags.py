@@ -254,8 +254,14 @@ class _BagLog:
             self.notes.append("the laser does not scan level: its tilt is left out")
         known: dict[tuple[float, float, int], Array] = {}
         values = self.rows["laser"].values
+        lasts = float(np.median([v[5] for v in values]))
+        if np.isfinite(lasts) and lasts > 0.0:
+            self.notes.append(
+                f"not used: time_increment of the laser (a scan lasts {lasts:.3g} s), because all beams of a planar"
+                " scan count as of its stamp"
+            )
         scans, odd, reach = [], np.zeros(len(values), np.bool_), []
-        for k, (ranges, start, step, low, high) in enumerate(values):
+        for k, (ranges, start, step, low, high, _) in enumerate(values):
             n = len(ranges)
             if n < 2 or not np.all(finite_mask([start, step])) or not 0 < abs(step) * (n - 1) <= 2.2 * np.pi:
                 odd[k] = True

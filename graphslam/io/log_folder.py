@@ -11,11 +11,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.io.log_store import INDEX_NAME, save_log
 from graphslam.io.mesh_file import write_mesh
 
 MESH_NAME = "mesh.ply"
+_OURS = (".npz", ".ply", ".json", ".part", ".tmp")
+
+
+def check_log_folder(path: str | os.PathLike[str]) -> None:
+    """Refuse a folder for a log that holds other files: a run, or something that is not ours."""
+    root = Path(path)
+    if root.is_dir() and (others := sorted(p.name for p in root.iterdir() if p.suffix not in _OURS or p.is_dir())):
+        raise DataError(
+            "the folder for the log holds other files", where=str(root), got=others[0], wanted="a new or empty --out"
+        )
 
 
 def write_log_folder(log: SensorLog, path: str | os.PathLike[str], *, mesh: tuple[Any, Any] | None = None) -> Path:
@@ -30,6 +41,7 @@ def write_log_folder(log: SensorLog, path: str | os.PathLike[str], *, mesh: tupl
     mesh : (v, 3), (t, 3), optional
         Vertices in the frame of the truth [m], and triangles.
     """
+    check_log_folder(path)
     root = Path(path)
     root.mkdir(parents=True, exist_ok=True)
     (root / INDEX_NAME).unlink(missing_ok=True)

@@ -65,6 +65,8 @@ class RecognisedSource:
 
 def recognise(path: Path) -> RecognisedSource:
     """The first reader that can read a source."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise MissingDataError("neither a file nor a folder", where=str(path), got="a pipe, socket or device")
     look = SourceProbe(path)
     whole: list[tuple[str, ReaderMatch]] = []
     nearly: list[tuple[str, ReaderMatch]] = []

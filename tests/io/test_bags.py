@@ -182,6 +182,17 @@ def test_a_laser_upside_down_and_one_that_counts_backwards(tmp_path: Path) -> No
         np.testing.assert_allclose(laser.T_base_sensor, [0.3, 0, 0], atol=1e-9)
 
 
+def test_times_of_beams_that_are_not_used_are_said(tmp_path: Path) -> None:
+    messages = laser_world(Messages())
+    assert "time_increment" not in str(load_recording(written(tmp_path, "ros2", messages)).meta["notes"])
+    for _, kind, _, message in messages:
+        if kind == "sensor_msgs/msg/LaserScan":
+            object.__setattr__(message, "time_increment", 0.002)
+    (tmp_path / "b").mkdir()
+    notes = str(load_recording(written(tmp_path / "b", "ros2", messages)).meta["notes"])
+    assert "not used: time_increment of the laser (a scan lasts 0.038 s)" in notes
+
+
 def test_two_lidars_of_which_one_is_chosen(tmp_path: Path) -> None:
     m = Messages()
     messages = [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import graphslam as gs
-from graphslam.core.errors import FormatError, GeometryError, MissingDataError
+from graphslam.core.errors import DataError, FormatError, GeometryError, MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.range_scans import RangeScans
 from graphslam.io.log_folder import write_log_folder
@@ -87,3 +87,11 @@ def test_streams_without_records(tmp_path: Path) -> None:
     )
     back = load_log(write_log_folder(SensorLog(name="silent", streams={"s": silent}), tmp_path / "log"))
     assert back["s"].ranges.shape == (0, 2)
+
+
+def test_a_folder_with_other_files_is_refused_and_left_as_it_is(log: SensorLog, tmp_path: Path) -> None:
+    """A run folder, the root of the disk or the working folder (``--out ''``) is no place for a log."""
+    (tmp_path / "config.toml").write_text("seed = 1\n")
+    with pytest.raises(DataError, match=r"holds other files; got config\.toml; wanted a new or empty --out"):
+        write_log_folder(log, tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["config.toml"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -158,3 +159,9 @@ def test_a_file_that_no_reader_knows_is_described(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("1,2,3\n4,5,6\n")
     with pytest.raises(FormatError, match=r"no reader knows this file; .* first line '1,2,3'"):
         load_recording(tmp_path / "a.csv")
+
+
+def test_a_pipe_is_refused_as_what_it_is(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.bag")
+    with pytest.raises(MissingDataError, match=r"neither a file nor a folder; got a pipe"):
+        load_recording(tmp_path / "a.bag")

@@ -259,7 +259,9 @@ def simulate_command(
     """Simulate a robot in a world and write its log, with ground truth and all noise parameters."""
     from graphslam.app.worlds import simulate as make
     from graphslam.app.worlds import write_simulated
+    from graphslam.io.log_folder import check_log_folder
 
+    check_log_folder(out)
     changes: dict[str, Any] = {}
     for text in setting:
         changes |= parse_setting(text)
