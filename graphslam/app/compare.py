@@ -88,7 +88,7 @@ def _errors(
         raise DataError("ground truth has another dimension", got=truth.exit_poses.shape, wanted=f"(m, {g.size})")
     i, j = match_ids(np.asarray(keys), truth.keys)
     a, b = match_ids(estimate.landmark_ids, truth.landmark_ids)
-    if not isinstance(estimate, SubmapEstimate):  # right tangents of the exits, then positions
+    if not isinstance(estimate, SubmapEstimate):  # right tangents of the end poses, then positions
         layout, rows = estimate.problem.graph.flat().layout, estimate.exits[i]
         exits = pose_error(estimate.poses[rows], truth.exit_poses[j])
         marks = truth.landmarks[b] - estimate.landmarks[a]

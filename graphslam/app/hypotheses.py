@@ -178,7 +178,7 @@ def minimum_entropy_topology(
 
 
 def _finished(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
-    """The chosen alternative refined, and held against check points; all are chosen among without either."""
+    """Refine the chosen alternative and compare it with check points; both have no influence on the choice."""
     if run.folder is None:
         return found
     found, options = _refined(run, run.folder, found, submaps), RunOptions.of_folder(run.folder)
@@ -194,7 +194,7 @@ def _finished(run: Run, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> 
 
 
 def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence[Submap]) -> MinimumEntropyMap:
-    """The chosen alternative refined by the scans of the run, where the run is refined."""
+    """The chosen alternative refined with the scans of the run, if the run is refined."""
     values = read_options(folder)
     config: RefineConfig = build_config(RefineConfig, values.get("refine", {}), "refine")
     taken, generation = read_consistently(folder, read_inputs) if config.use else (None, None)
@@ -215,7 +215,7 @@ def _refined(run: Run, folder: Path, found: MinimumEntropyMap, submaps: Sequence
 
 
 def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]]]:
-    """How the graph of a run was made, and what makes the GPS, IMU and control rows of one graph more."""
+    """Back-end options of a run, and a function that makes the GPS, IMU and control inputs of a new graph."""
     values: Mapping[str, Any] = read_options(run.folder) if run.folder is not None else {}
     gps: GpsOptions = build_config(GpsOptions, values.get("gps", {}), "gps")
     if gps.use != "none" and run.fixes is None:
@@ -243,11 +243,11 @@ def _graph_options(run: Run) -> tuple[BackEndConfig, Callable[[], dict[str, Any]
 def write_minimum_entropy(
     folder: Path, found: MinimumEntropyMap, *, bands: Mapping[str, tuple[float, float]] | None = None
 ) -> list[Path]:
-    """Keep the alternatives in a run folder.
+    """Write the alternatives into a run folder.
 
-    The chosen map and its path are ``clearest.ply``, ``clearest.tum`` and so on, refined by the scans where that was
-    done; of every alternative ``alternatives/NN.tum`` has the path of its graph and ``NN.g2o`` the graph, in the order
-    of ``clearest.json``.
+    The chosen map and its path are ``clearest.ply``, ``clearest.tum`` and so on, refined with the scans if the run is.
+    For every alternative, ``alternatives/NN.tum`` has the path of its graph and ``NN.g2o`` the graph, in the order of
+    ``clearest.json``.
 
     Parameters
     ----------

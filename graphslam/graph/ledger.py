@@ -80,7 +80,7 @@ class Ledger:
     Traceback (most recent call last):
     ...
     graphslam.core.errors.EvidenceReusedError: between x0 x1 would use stream 'odometry' over [9.000, 11.000) s a \
-second time: submap 0 spent it over [0.000, 10.000) s
+second time: submap 0 used it over [0.000, 10.000) s
     """
 
     def __init__(self) -> None:

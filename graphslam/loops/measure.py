@@ -114,7 +114,7 @@ class LoopMeasurer:
         self._let_go()
         i = c.i
         if m.registration is not None:
-            # what is observed there was mapped from the nearest part of the target's path
+            # the map there was built from the nearest part of the target's path
             i = p.nearest(a, m.T_target_source[: g.dim])
         return Loop(
             i=i, j=c.j, T_ij=g.between(p.T_base_node[i], m.T_target_source), covariance=m.covariance, source=c.source,

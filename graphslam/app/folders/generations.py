@@ -111,8 +111,7 @@ def current_outputs(folder: str | os.PathLike[str]) -> Path:
 
 
 def read_consistently(folder: str | os.PathLike[str], read: Callable[[Path], T]) -> T:
-    """Read files of one state with ``read(folder)``; repeated if another state was committed
-    meanwhile."""
+    """Read files of one state with ``read(folder)``; repeated if another state was committed meanwhile."""
     while True:
         root = current_outputs(folder)
         try:

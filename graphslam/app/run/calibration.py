@@ -133,7 +133,7 @@ def calibrate_log(
 
 
 def uses_preset_noise(options: Mapping[str, Any]) -> bool:
-    """Is the noise of the preset used, not estimated or given corrections?"""
+    """Is the noise of the preset used? False with ``calibrate.given`` or ``calibrate.use = "always"``."""
     asked = options.get("calibrate", {})
     return not isinstance(asked, Mapping) or ("given" not in asked and asked.get("use", "auto") != "always")
 

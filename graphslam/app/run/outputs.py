@@ -244,7 +244,7 @@ def _same_file(a: Path, b: Path) -> bool:
 
 
 def landmarks_csv(m: GlobalMap) -> str:
-    """``id,x,y,cov_xx,cov_xy,cov_yy,hits`` in the frame of the first base [m, m²]; in space also z."""
+    """``id,x,y,cov_xx,cov_xy,cov_yy,hits`` in the frame of the first base [m, m²]; in 3-D also z."""
     P, axes = m.landmark_covariances, "xyz"[: m.dim]
     columns = {"id": m.landmark_ids, **{a: m.landmarks[:, i] for i, a in enumerate(axes)}}
     pairs = [(i, j) for i in range(m.dim) for j in range(i, m.dim)]

@@ -47,7 +47,7 @@ class RunBar(Observer):
         self._ended = threading.Event()
 
     def __enter__(self) -> RunBar:
-        if not self._bar.disable and sys.stderr.isatty():  # the clock goes on in stages without steps
+        if not self._bar.disable and sys.stderr.isatty():  # updates the time in stages without steps
             threading.Thread(target=self._tick, daemon=True).start()
         return self
 

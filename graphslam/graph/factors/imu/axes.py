@@ -50,7 +50,7 @@ class AxesCheck:
     A : (3, 3)
         Best explanation: ``reading = A · reading of a correctly mounted unit``.
     excess : float
-        χ² of the stated mounting minus that of the best explanation, in units of the noise left by the best.
+        χ² of the stated mounting minus that of the best explanation; the noise is the residual of the best.
     alike : int
         Number of permutations that explain the readings as well as the best one, with itself.
     sensor : {"both", "accelerometer", "gyro"}
