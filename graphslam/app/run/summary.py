@@ -310,7 +310,7 @@ def _error(figures: RunMetrics) -> str:
 
 
 def length_text(x: float) -> str:
-    """A length with three digits and its unit: ``4.01 km``, ``305 m``, ``1.26 m``, ``4.1 cm``, ``6.3 mm``."""
+    """A length with two or three digits and its unit: ``4.01 km``, ``305 m``, ``1.26 m``, ``4.1 cm``, ``6.3 mm``."""
     for least, unit, each, digits in ((1e3, "km", 1e3, 3), (1.0, "m", 1.0, 3), (0.01, "cm", 0.01, 2)):
         if x >= least:
             return f"{x / each:.{digits}g} {unit}" if x / each < 1e3 else f"{x / each:.0f} {unit}"
