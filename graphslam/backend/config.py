@@ -85,7 +85,7 @@ class BackEndConfig:
     node_spacing: float = 3.0
     """Approximate distance between inner nodes along the path of a dense submap [m]; 0 = no inner nodes."""
     level_sigma: float = 0.0
-    """3-D: σ of roll and pitch of an attitude factor on each base [rad]; 0 = relative roll and pitch of the end poses."""
+    """3-D: σ of roll and pitch of an attitude factor on each base [rad]; 0 = roll and pitch are in the end poses."""
     match_support: float = 0.5
     """Minimum share of the particles that a front-end match needs to become a factor; above 1 = none does."""
     loops: Literal[True, False, "auto"] = "auto"
