@@ -28,9 +28,9 @@ class PairAgreement:
     together, together_reference, together_both : int
         Pairs of observations under one label in ours, in the reference, and in both.
     mixed : int
-        Our landmarks that hold observations of more than one reference landmark.
+        Our landmarks with observations of more than one reference landmark.
     split : int
-        Reference landmarks whose observations lie in more than one of ours.
+        Reference landmarks whose observations are split over several of ours.
     """
 
     observations: int

@@ -1,15 +1,15 @@
-"""Do wheels and sightings fit one map, and if not, what would mend it? The tests on the sums of a landmark front end.
+"""Test whether odometry and landmark observations fit one map, and which calibration error explains a misfit.
 
-The front ends put sums over short windows into the reports of their submaps
-(:mod:`graphslam_frontends.landmarks.bias_score`); windows are independent, so those of all submaps add up. Two tests:
+Landmark front ends store sums over short windows in the reports of their submaps
+(:mod:`graphslam_frontends.landmarks.bias_score`); the windows are independent, so their sums are added. Two tests:
 
 - χ² of the residuals over their degrees of freedom, bounds at 99.9 %;
-- each error of calibration by itself, ``ĉ = g / S`` with σ² = 1/S. The noise of recorded logs is not white, and then
-  the windows scatter by more than S says: σ² is the larger of 1/S and what the scatter of the windows gives.
+- each calibration error alone, ``ĉ = g / S`` with σ² = 1/S. The noise of recorded logs is not white, and then the
+  windows scatter more than S predicts: σ² is the larger of 1/S and the variance from their scatter.
 
-Thresholds are quantiles of these statistics at 99.9 %, shared among the errors that are tested for (Bonferroni). On 96
-simulated logs of three noise levels (seeds 100 to 115, ``rbpf-ekf`` and ``ekf-slam``) the normalised scores had σ 0.6
-to 1.1 and a largest absolute value of 2.6, χ²/dof a mean of 1.00 to 1.01.
+Thresholds are quantiles of these statistics at 99.9 %, corrected for the number of tests (Bonferroni). On 96 simulated
+logs of three noise levels (seeds 100 to 115, ``rbpf-ekf`` and ``ekf-slam``) the normalised scores had σ 0.6 to 1.1 and
+a largest absolute value of 2.6, χ²/dof a mean of 1.00 to 1.01.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from graphslam.core.geometry import Array
 
 CERTAIN = 0.999
 UNDERSTATED = 1.5
-"""χ²/dof from which on errors are larger than stated by a quarter: covariances that follow from them are wrong."""
+"""χ²/dof above which the misfit is reported as ``bad``: the errors exceed the noise model by more than 20 % in σ."""
 AS_MUCH = 0.7
-"""Errors that take away at least this part of the χ² that the best one takes away are named as other causes."""
+"""Errors that reduce χ² by at least this fraction of the best reduction are reported as alternative causes."""
 HALF = 0.5
-"""Part of the χ² in excess that the best one must take away to be named."""
+"""Fraction of the excess χ² that the best error must remove to be reported."""
 APART = 0.05
-"""Of an error that is not told apart from those which the graph estimates by this share of its information nothing is
-said: a common scale of ranges and distances."""
+"""An error is not tested if less than this fraction of its information is independent of the errors that the graph
+estimates (for example a common scale of ranges and distances)."""
 LEAST_WINDOWS = 3
-"""Fewer windows do not tell their scatter."""
+"""With fewer windows their scatter is not estimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class BiasKind:
-    """One way in which a robot may be miscalibrated.
+    """One type of calibration error.
 
     Parameters
     ----------
     more, less : str
-        What a positive and a negative error look like, with a place for the amount.
+        Message for a positive and for a negative error, with a placeholder for the amount.
     unit : str
-        In which the amount is said: ``m``, ``°``, ``°/m``, or ``%`` for a factor.
+        Unit of the amount in the message: ``m``, ``°``, ``°/m``, or ``%`` for a factor.
     careful : float
-        What measuring by hand leaves; a larger error makes the line a bad one.
+        Error that remains after a calibration by hand; a larger error makes the finding ``bad``.
     mend : str
         What to do.
     """
@@ -129,10 +129,10 @@ class BiasTest:
     error, sigma : (p,)
         Each error of :data:`KINDS` as if it were the only one, and its σ.
     reduction : (p,)
-        χ² that correcting it takes away.
+        Reduction of χ² if it is corrected.
     drift, drift_dof : (p,)
-        Mean of ``g² / S`` over the windows, weighted by S: 1 where noise is white in a window, more where an error
-        lasts for as long; and its degrees of freedom ``(Σ S)² / Σ S²``.
+        Mean of ``g² / S`` over the windows, weighted by S: 1 if the noise is white within a window, more if it is
+        time-correlated; and its degrees of freedom ``(Σ S)² / Σ S²``.
     """
 
     windows: int
@@ -151,7 +151,7 @@ class BiasTest:
 
     @property
     def bound(self) -> float:
-        """What an honest run exceeds once in a thousand."""
+        """χ²/dof that a consistent run exceeds once in a thousand."""
         return float(np.divide(chi2_quantile(CERTAIN, self.dof), self.dof))
 
 
@@ -165,15 +165,14 @@ ESTIMATED = {
     "mount_x": "mount-x",
     "mount_y": "mount-y",
 }
-"""Constant errors that a graph may estimate with the map (:mod:`graphslam.core.sensor_biases`), as they are called
-here."""
+"""Constant errors that a graph may estimate (:mod:`graphslam.core.sensor_biases`) → their name in :data:`KINDS`."""
 
 
 def sum_bias_windows(reports: Sequence[Mapping[str, Any]]) -> BiasTest | None:
-    """What the submaps' reports say together; None where none says anything.
+    """Sum over the reports of all submaps; None if no report has bias sums.
 
-    Errors that the graph estimates are left free: what they explain is no finding, and of the others counts what is not
-    explained by them.
+    Errors that the graph estimates are marginalised out: they are not reported, and the other errors are tested with
+    the part that they do not explain.
     """
     found = [r["systematic"] for r in reports if r.get("systematic")]
     if not found:
@@ -203,12 +202,12 @@ def sum_bias_windows(reports: Sequence[Mapping[str, Any]]) -> BiasTest | None:
 
 
 def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Lines of the verdict.
+    """Findings on misfit and calibration errors for the verdict.
 
     Parameters
     ----------
     reports : sequence of mapping
-        Of all submaps of a run.
+        Reports of all submaps of a run.
     """
     found = sum_bias_windows(reports)
     if found is None:

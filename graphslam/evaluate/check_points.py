@@ -1,9 +1,9 @@
-"""Check points: rows of a table that were held back, against a solved map, with the power of the test.
+"""Check points: withheld surveyed points or distances, compared with a solved map, with the power of the test.
 
-An innovation is a row less its prediction. Its covariance is that of the map at the place, of the datum where the map
-has one in the frame of the row, and of the row itself. Rows in a frame that the map does not know are moved onto the
-map by the rigid motion that makes the sum least, with as many degrees of freedom less as the motion has
-(:func:`graphslam.evaluate.gauge.aligned_nees` is the same for whole maps).
+An innovation is a table row minus its prediction. Its covariance includes the map at this place, the datum if the map
+has one in the frame of the row, and the row. Rows in an unknown frame are aligned with the map by the rigid motion of
+least NIS; its parameters are subtracted from the degrees of freedom (:func:`graphslam.evaluate.gauge.aligned_nees` is
+the same for whole maps).
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ from graphslam.refine.result import Refinement
 Word = Literal["consistent", "conservative", "overconfident", "wrong", "not tested"]
 CONFIDENCE = 0.95
 WRONG = 9.0
-"""NIS by degree of freedom from which errors are no matter of covariances: three standard deviations on average."""
+"""NIS per degree of freedom above which errors are not explained by a covariance that is too small: 3 σ on average."""
 
 
 @dataclass(frozen=True)
 class CheckPoints:
-    """The test.
+    """Result of the test.
 
     Parameters
     ----------
     rows : list of dict
         ``line``, ``name``, ``place``, ``frame``, ``error`` and its predicted ``sigma`` [m], ``nis``, ``dof``.
     nis, dof : float
-        Of all rows together, correlations included.
+        NIS and degrees of freedom of all rows together, with their correlations.
     power : float
         Probability that the test fails if the true covariance of the map is twice the reported one.
     aligned : int
-        Degrees of freedom of rigid motions that were fitted.
+        Degrees of freedom of the fitted rigid motions.
     """
 
     source: str
@@ -65,12 +65,12 @@ class CheckPoints:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Two-sided, of the NIS by degree of freedom."""
+        """Two-sided bounds of NIS/dof."""
         return two_sided_bounds(1.0, self.dof, CONFIDENCE)[:2] if self.dof > 0 else (0.0, float("inf"))
 
     @property
     def word(self) -> Word:
-        """One of the five words of a verdict."""
+        """Verdict."""
         ratio, (low, high) = self.nis / max(self.dof, 1.0), self.bounds
         if ratio > high:
             return "wrong" if ratio > max(WRONG, high) else "overconfident"
@@ -84,7 +84,7 @@ class CheckPoints:
         return float(np.sqrt(np.mean([r["error"] ** 2 for r in self.rows]))) if self.rows else float("nan")
 
     def facts(self) -> dict[str, Any]:
-        """What ``run.json`` holds."""
+        """Entries of ``run.json``."""
         low, high = self.bounds
         refused = [{"line": line, "why": why} for line, why in self.refused]
         out: dict[str, Any] = {"source": self.source, "rows": self.rows, "refused": refused, "word": self.word}
@@ -103,7 +103,7 @@ def power_of_test(eigenvalues: Array, confidence: float = CONFIDENCE) -> float:
     Parameters
     ----------
     eigenvalues : (n,)
-        1 or larger; all equal to 2: every covariance is twice as large as reported.
+        Each at least 1. All equal to 2: every true covariance is twice the reported one.
     """
     n = len(eigenvalues)
     if not n:
@@ -126,16 +126,16 @@ def power_of_test(eigenvalues: Array, confidence: float = CONFIDENCE) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Predicted:
-    """Places of a map.
+    """Predicted places of a map.
 
     Parameters
     ----------
     positions : (k, dim)
-        In its frame.
+        In the map frame [m].
     covariance : (dim k + c, dim k + c)
-        Of the places and then of what lies between map and datum, ``c`` numbers.
+        Joint covariance of the places and of the ``c`` parameters of datum and tilt.
     level : (3, 3) or None
-        From the level frame at the first base; None: where up is is not known, or the map is in the plane.
+        Rotation from the level frame to the map frame at the first base; None if the vertical is unknown, or in 2-D.
     """
 
     positions: Array
@@ -146,14 +146,14 @@ class _Predicted:
 def check_points(
     graph: FactorGraph, table: ControlTable, refined: tuple[Refinement, Trajectory] | None = None
 ) -> CheckPoints:
-    """Hold rows of a table against a solved map.
+    """Compare the rows of a table with a solved map.
 
     Parameters
     ----------
     graph : FactorGraph
         At its optimum.
     refined : (Refinement, Trajectory), optional
-        The refined path that is the result in its place; it has no datum and no landmarks.
+        Refined path that replaces the graph as the result; it has no datum and no landmarks.
     """
     refused, rows = list(table.refused), []
     for row in table.rows:
@@ -174,7 +174,7 @@ def check_points(
 
 
 def _datum_frame(graph: FactorGraph) -> str:
-    """Frame of the datum; empty: the graph has none."""
+    """Frame of the datum; empty if the graph has none."""
     if graph.values.datum is None:
         return ""
     return "gps" if graph.gps_origin is not None else ControlFactors.of(graph).frame
@@ -194,7 +194,7 @@ def _find(graph: FactorGraph, place: MeasuredPlace | None, refined: tuple[Refine
 
 
 def _of_graph(graph: FactorGraph, places: Sequence[MeasuredPlace]) -> _Predicted:
-    """Places of a graph, jointly with its datum."""
+    """Places of a graph with their joint covariance, including the datum."""
     d, n, values, lay = graph.dim, len(places), graph.values, graph.flat().layout
     positions, left = np.zeros((n, d)), np.zeros((d * n, d * n))
     parts: list[tuple[Any, Any, Array]] = []  # rows, columns, Jacobian
@@ -232,7 +232,7 @@ def _of_graph(graph: FactorGraph, places: Sequence[MeasuredPlace]) -> _Predicted
 
 
 def _of_path(r: Refinement, path: Trajectory, places: Sequence[MeasuredPlace]) -> _Predicted:
-    """Places of a refined path, at the step that is nearest in time."""
+    """Places of a refined path. The covariance is that of the step nearest in time."""
     times = np.array([p.time for p in places], dtype=np.float64)
     poses, g = path.interpolate(times), group_of(path.poses)
     after = np.clip(np.searchsorted(r.times, times), 1, len(r.times) - 1)
@@ -246,12 +246,12 @@ def _of_path(r: Refinement, path: Trajectory, places: Sequence[MeasuredPlace]) -
 
 
 class _Innovations:
-    """Rows against predicted places: ``e = z - h``, by blocks of rows.
+    """Innovations ``e = z - h`` of the rows, in blocks.
 
     Parameters
     ----------
     frame : str
-        Of the datum of the graph.
+        Frame of the graph's datum.
     """
 
     def __init__(
@@ -268,7 +268,7 @@ class _Innovations:
         self.motions = {f: self._first_motion(f) for f in dict.fromkeys(r.frame for r in rows) if f not in ("", frame)}
 
     def _first_motion(self, frame: str) -> tuple[Array, Array]:
-        """Rotation and shift from a frame into that of the map."""
+        """Initial rotation and translation from a frame to the map frame."""
         mine = [k for k, r in enumerate(self.rows) if r.frame == frame]
         z = np.array([self.rows[k].coordinates(self.dim)[0] for k in mine])
         p, level = self.found.positions[[self.at[k] for k in mine]], self.found.level
@@ -284,13 +284,13 @@ class _Innovations:
         return M, np.mean(p - z @ M.T, axis=0)
 
     def _axes(self) -> Array:
-        """Axes about which a frame may be turned against the map ``(a, 3)``."""
+        """Axes of free rotation between a frame and the map ``(a, 3)``."""
         if self.dim == 2:
             return np.array([[0.0, 0.0, 1.0]])
         return np.eye(3) if self.found.level is None else self.found.level[:, 2][None]
 
     def linearised(self) -> tuple[Array, Array, Array, Array]:
-        """Innovations ``(n,)``; their covariances by map and by rows ``(n, n)``; Jacobian on the motions ``(n, g)``."""
+        """Innovations ``(n,)``, covariances of map and of rows ``(n, n)``, Jacobian of the rigid motions ``(n, g)``."""
         d, P, n = self.dim, self.found.covariance, len(self.found.positions)
         e, B, R = np.zeros(self.size), np.zeros((self.size, len(P))), np.zeros((self.size, self.size))
         axes = self._axes()
@@ -345,14 +345,14 @@ class _Innovations:
             if not np.max(np.abs(step), initial=0.0) > 1e-10:
                 break
             self._move(step)
-        N = U[:, rank:]  # what no motion takes up
+        N = U[:, rank:]  # orthogonal to all rigid motions
         r = N.T @ y
         K = sla.solve_triangular(L, N, lower=True, trans="T")
         eigenvalues = 1.0 + (HALF - 1.0) * np.clip(np.linalg.eigvalsh(K.T @ of_map @ K), 0.0, 1.0)
         return CheckPoints(source, rows, [], float(r @ r), float(len(r)), power_of_test(eigenvalues), rank)
 
     def _by_row(self, e: Array, of_map: Array, of_rows: Array, G: Array) -> list[dict[str, Any]]:
-        """Error, expected error and NIS of each row, frames that are not known moved by plain least squares."""
+        """Error, expected error and NIS of each row; unknown frames are aligned by unweighted least squares."""
         size, S = np.diag(of_map + of_rows), of_map + of_rows
         U, s, _ = np.linalg.svd(G, full_matrices=False)
         U = U[:, s > 1e-9 * s.max(initial=0.0)]

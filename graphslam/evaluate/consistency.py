@@ -1,11 +1,11 @@
-"""Is an estimator honest about its own error? NEES, consistency index, coverage: each with two-sided bounds.
+"""Consistency of an estimator: NEES with two-sided bounds, consistency index, coverage.
 
-Combined SLAM (2012): ``D² = (x - x̂)ᵀ P⁻¹ (x - x̂)`` (eq. 18), consistent if ``D² < χ²_{n,1-α}`` (eq. 19), index
-``CI = D²/χ²_{n,1-α}`` (eq. 20). ``CI < 1`` alone is a weak test: with three degrees of freedom it passes an
-estimator whose covariance is 2.6 times too small, and it never complains of a conservative one. The verdict here
-therefore rests on the *mean* NEES over independent runs and its two-sided χ² bounds; CI is reported beside it.
+Combined SLAM (2012): ``D² = (x - x̂)ᵀ P⁻¹ (x - x̂)`` (eq. 18), consistent if ``D² < χ²_{n,1-α}`` (eq. 19), index ``CI =
+D²/χ²_{n,1-α}`` (eq. 20). ``CI < 1`` alone is a weak test: with three degrees of freedom it passes an estimator whose
+covariance is 2.6 times too small, and it never detects a conservative one. The verdict therefore uses the *mean* NEES
+over independent runs with two-sided χ² bounds; CI is reported as well.
 
-Poses are judged by their right-tangent error ``ξ = Log(T_est⁻¹ T_true)`` in GTSAM's order.
+The error of a pose is the right tangent ``ξ = Log(T_est⁻¹ T_true)`` in GTSAM's order.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> Array:
     try:
         if np.any(asymmetric) or not np.all(np.isfinite(P)):
             raise np.linalg.LinAlgError
-        L = np.linalg.cholesky(0.5 * (P + turned))  # what check_covariance judges, so that it finds what failed here
+        L = np.linalg.cholesky(0.5 * (P + turned))  # the same matrix as in check_covariance
     except np.linalg.LinAlgError:
         for k, one in enumerate(P.reshape(-1, *P.shape[-2:])):
             check_covariance(one, what=f"covariance {k}")
@@ -87,12 +87,12 @@ def consistency_index(d2: ArrayLike, dof: ArrayLike, *, confidence: float = 0.95
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consistency:
-    """NEES values with everything that is needed to judge them.
+    """NEES values with all data needed for the verdict.
 
     Parameters
     ----------
     quantity : str
-        What was judged: "pose", "landmark", "joint" …
+        What is tested: "pose", "landmark", "joint" …
     nees : (runs, k)
         One row per independent run; nan where a value is missing.
     dof : (runs, k)
@@ -102,8 +102,8 @@ class Consistency:
     confidence : float
         Of the two-sided bounds, and 1 - α of CI and coverage.
     unit : {"run", "value"}
-        What is independent. ``run`` (default): values of one run may be correlated in any way (all features of a
-        map turn with its heading), so a run counts once. ``value``: all values are independent (local maps).
+        What is independent. ``run`` (default): values of one run may have any correlation (all landmarks of a map
+        depend on its heading), so a run counts once. ``value``: all values are independent (local maps).
     """
 
     quantity: str
@@ -145,7 +145,7 @@ class Consistency:
 
     @property
     def dimension(self) -> float:
-        """Degrees of freedom of a value; their mean where they differ."""
+        """Degrees of freedom of a value; their mean if they differ."""
         return float(np.mean(self.dof[np.isfinite(self.nees)]))
 
     @property
@@ -160,8 +160,8 @@ class Consistency:
     def bounds(self) -> tuple[float, float]:
         """Two-sided bounds of :attr:`mean_normalised` for a consistent estimator.
 
-        Values inside a run are assumed fully correlated with ``unit="run"``: then the mean over a run is
-        distributed as one ``χ²_n/n``. With any weaker correlation the bounds are wide, never narrow.
+        With ``unit="run"`` the values of a run are assumed fully correlated: the mean over a run is then distributed as
+        ``χ²_n/n``. If they are less correlated, the bounds are too wide, never too narrow.
         """
         known = np.isfinite(self.nees)
         if self.unit == "value":
@@ -193,7 +193,7 @@ class Consistency:
     def curve(self) -> tuple[Array, Array, Array]:
         """Mean over the runs of ``D²/n`` per column, with its lower and upper bounds, each ``(k,)``.
 
-        Columns are usually submaps: is the estimator still consistent there? Only runs that have a value count.
+        Columns are usually submaps. Only runs with a value in the column are used.
         """
         runs = np.sum(np.isfinite(self.nees), axis=0)
         if np.any(runs == 0):
@@ -205,7 +205,7 @@ class Consistency:
         return mean, low, high
 
     def as_row(self) -> dict[str, Any]:
-        """One row of a table: the figures and, always, gauge, dimension, runs and confidence."""
+        """One row of a table: metrics, gauge, dimension, number of runs, confidence."""
         low, high = self.bounds
         index = self.index[np.isfinite(self.nees)]
         return {

@@ -1,20 +1,20 @@
-"""Are the covariances of a map consistent, where no ground truth is known? One word, and the tests behind it.
+"""Verdict on the covariances of a map without ground truth, and the tests that it is based on.
 
-Each test that a run has made without ground truth is a `ConsistencyTest`: a statistic, its degrees of freedom, and the
-probability that a consistent run shows so large or so small a value. One word follows from all tests together:
+Each test is a `ConsistencyTest`: a statistic, its degrees of freedom, and the probabilities of such a large or such a
+small value in a consistent run. All tests together give one verdict:
 
 - *overconfident*: errors are too large in a test, by more than :data:`TOLERANCE` allows, or they are correlated: from
   one residual to the next, from window to window, or as a constant calibration error. The tests share one significance
   level (Bonferroni): a consistent run is called overconfident in at most :data:`LEVEL` of the cases;
 - *not tested*: no test of motion and observations, or none of the fixes if the graph has any, had the power
   :data:`LEAST_POWER` to show covariances that are half as large as they should be, or could exclude variances that are
-  :data:`DETECTABLE_VARIANCE_RATIO` times as large as stated; or the posteriors of submaps are not Gaussian
+  :data:`DETECTABLE_VARIANCE_RATIO` times as large as reported; or the posteriors of submaps are not Gaussian
   (:data:`MAX_NONLINEARITY`), which all tests assume;
-- *conservative*: errors are too small in a test, by as much as matters, and none of the above;
+- *conservative*: errors are too small in a test, by a factor :data:`DETECTABLE_VARIANCE_RATIO`, and none of the above;
 - *consistent*: otherwise.
 
-Small residuals alone never make a map conservative, because a map follows errors that are correlated: the first rule
-comes before the third.
+The first rule has priority over the third: a map follows correlated errors, so its residuals can be small although it
+is wrong.
 """
 
 from __future__ import annotations
@@ -34,42 +34,43 @@ Of = Literal["map", "fixes", "other"]
 LEVEL = 0.05
 """Largest share of consistent runs that are called overconfident."""
 TOLERANCE = 1.1
-"""Ratio of true to stated variances that is called consistent: 5 % of σ. Linearised covariances are no better, and a
-test with a thousand degrees of freedom detects less."""
+"""Ratio of true to reported variances that counts as consistent: 5 % in σ. Linearised covariances are not more
+accurate, and a test with a thousand degrees of freedom does not detect less."""
 HALF = 2.0
-"""Ratio of true to stated variances at which the power of a test is computed: covariances half as large as the true."""
+"""Ratio of true to reported variances at which the power of a test is computed."""
 LEAST_POWER = 0.8
-"""Power against covariances that are too small by :data:`HALF`, below which a test cannot carry *consistent*."""
+"""Least power against covariances that are too small by :data:`HALF` for the verdict *consistent*."""
 DETECTABLE_VARIANCE_RATIO = 1.5
-"""Ratio of true to stated variances that a decision must exclude."""
+"""Ratio of true to reported variances that a test must exclude."""
 SURE = 0.975
 """Confidence with which it is excluded."""
 MAX_NONLINEARITY = 0.006
-"""Squared shift by curvature per unknown, mean over submaps, from which on nothing is promised. In 80 drawn worlds that
-were as stated NEES/n of all nodes was 1.06 on average below 0.001, 1.20 from there to 0.006, and 1.37 above."""
+"""Squared shift by curvature per unknown, mean over submaps, above which the verdict is *not tested*. In 80 simulated
+worlds with correct noise models NEES/n of all nodes was 1.06 on average below 0.001, 1.20 from there to 0.006, and 1.37
+above."""
 LEAST_DOF = 4.0
-"""Fewer degrees of freedom are no evidence."""
+"""Tests with fewer degrees of freedom are ignored."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyTest:
-    """One test without truth.
+    """One test without ground truth.
 
     Parameters
     ----------
     name : str
-        What is said of it: “χ² of gps”.
+        Name in the report: “χ² of gps”.
     of : "map", "fixes" or "other"
-        What it covers: motion and sightings, fixes, or something else that a decision need not rest on.
+        What it covers: motion and observations, fixes, or something else that the verdict does not require.
     value : float
-        1 if stated noise is right.
+        1 if the noise model is right.
     dof : float
-        Of independent residuals.
+        Number of independent residuals.
     too_large, too_small : float
-        Probability that a run whose variances are at most :data:`TOLERANCE` times as large as stated shows at least,
-        or that a consistent run shows at most, this value.
+        Probability of at least this value if variances are at most :data:`TOLERANCE` times the reported ones, and of at
+        most this value in a consistent run.
     lasting : bool
-        It looks for errors that last, not for their size.
+        The test is for time-correlated errors, not for their size.
     """
 
     name: str
@@ -82,11 +83,11 @@ class ConsistencyTest:
 
     @property
     def upper(self) -> float:
-        """Ratio of true to stated variances that is still possible."""
+        """Largest ratio of true to reported variances that the test does not exclude."""
         return self.value * self.dof / max(chi2_quantile(1.0 - SURE, self.dof), 1e-12)
 
     def power(self, tests: int) -> float:
-        """Probability that this test, one of so many, detects covariances that are too small by :data:`HALF`."""
+        """Probability that this test, one of ``tests``, detects covariances that are too small by :data:`HALF`."""
         if self.lasting:
             return 0.0
         return detection_power(self.dof, TOLERANCE * chi2_quantile(1.0 - LEVEL / tests, self.dof))
@@ -98,7 +99,7 @@ def detection_power(dof: float, limit: float) -> float:
 
 
 def chi_square_ratio_test(name: str, of: Of, value: float, dof: float) -> list[ConsistencyTest]:
-    """A statistic χ²/dof; none where it has hardly any degrees of freedom."""
+    """A test of χ²/dof; empty if it has fewer than :data:`LEAST_DOF` degrees of freedom."""
     if not (np.isfinite(value) and np.isfinite(dof) and dof >= LEAST_DOF):
         return []
     chi2 = value * dof
@@ -107,13 +108,13 @@ def chi_square_ratio_test(name: str, of: Of, value: float, dof: float) -> list[C
 
 
 def largest_score_test(name: str, of: Of, score: float, *, tests: int = 1) -> ConsistencyTest:
-    """A score that is N(0, 1) if nothing lasts, the largest of so many."""
+    """Test of the largest of ``tests`` scores, each N(0, 1) if there is no systematic error."""
     p = min(1.0, tests * float(special.ndtr(-score)))
     return ConsistencyTest(name, of, float(score), 1.0, p, 1.0, lasting=True)
 
 
 def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
-    """What the short windows of landmark front ends say: of the size of all noise, of lasting errors and of drifts."""
+    """Tests on the short windows of landmark front ends: total noise, calibration errors, time correlation."""
     if found is None:
         return []
     out = chi_square_ratio_test("χ² of odometry and observations in short windows", "map", found.ratio, found.dof)
@@ -132,21 +133,21 @@ def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
 
 @dataclass(frozen=True, slots=True)
 class CovarianceAssessment:
-    """The word, and the tests behind it.
+    """The verdict, and the tests that it is based on.
 
     Parameters
     ----------
     word : str
     speaking : tuple of ConsistencyTest
-        Tests that decided it: those that are too large or too small; for the other words those with enough power.
+        Tests that decided it: those that are too large or too small; for the other verdicts those with enough power.
     chance : float
         Probability that a consistent run has a test like the worst, all tests counted.
     missing : tuple of str
-        What no test in this log could have shown.
+        What could not be tested with this log.
     bent : bool
         Posteriors of submaps are not Gaussian.
     power : float
-        Of the tests behind the word, against covariances that are too small by :data:`HALF`.
+        Least power of the required tests against covariances that are too small by :data:`HALF`.
     """
 
     word: Word
@@ -160,14 +161,14 @@ class CovarianceAssessment:
 def assess_covariances(
     rows: Sequence[ConsistencyTest], *, fixes: bool, nonlinearity: float = 0.0
 ) -> CovarianceAssessment:
-    """The word on all rows.
+    """Verdict of all tests.
 
     Parameters
     ----------
     fixes : bool
-        Fixes are in the graph: a decision must rest on a row of them, too.
+        The graph has fixes: a test of them is required, too.
     nonlinearity : float
-        See :func:`pooled_nonlinearity`; of submaps that are not smoothed nothing is known, and it is 0.
+        See :func:`pooled_nonlinearity`; 0 if submaps are not smoothed.
     """
     m = max(1, sum(1 if r.lasting else 2 for r in rows))
     large = sorted((r for r in rows if m * r.too_large < LEVEL), key=lambda r: r.too_large)
@@ -195,17 +196,16 @@ def assess_covariances(
 
 
 def pooled_nonlinearity(reports: Sequence[Mapping[str, Any]]) -> float:
-    """Squared shift by which curvature moves the optima of submaps from their means, per unknown.
+    """Squared shift between optimum and mean of submaps, caused by curvature, per unknown.
 
-    See :meth:`graphslam_frontends.landmarks.summarise.SmoothingResult.nonlinearity`; 0 where no submap's report says
-    it.
+    See :meth:`graphslam_frontends.landmarks.summarise.SmoothingResult.nonlinearity`; 0 if no report contains it.
     """
     said = [(float(r["nonlinearity"]), float(r["unknowns"])) for r in reports if "nonlinearity" in r]
     return sum(v * n for v, n in said) / sum(n for _, n in said) if said else 0.0
 
 
 def consistency_tests_of_json(value: Any) -> list[ConsistencyTest]:
-    """Rows as a report holds them; what is none of ours is left out."""
+    """Tests from the list in a report; entries of another form are ignored."""
     out = []
     for row in value if isinstance(value, list) else []:
         if isinstance(row, Mapping) and set(row) == set(ConsistencyTest.__slots__):

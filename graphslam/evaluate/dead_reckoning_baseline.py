@@ -1,4 +1,4 @@
-"""The path that a log's motion stream alone gives, to hold a solved one against."""
+"""Dead-reckoned path of a log, the baseline for a solved path."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from graphslam_frontends.odometry import motion
 
 
 def dead_reckoned_path(log: SensorLog, path: Trajectory | Array) -> Trajectory | None:
-    """Path from the log's motion stream alone, in the frame of the first base; None without one.
+    """Path from the motion stream only, in the frame of the first base; None without a motion stream.
 
     Parameters
     ----------
     path : Trajectory, or times (n,)
-        The solved path: its times, its dimension, and in space its first pose, since a base need not be the body.
-        Times alone: in the plane.
+        The solved path: gives times, dimension, and in 3-D the first pose, because a base can differ from the body
+        pose. If only times are given, the result is 2-D.
     """
     if not isinstance(path, Trajectory):
         path = Trajectory(path, np.zeros((len(path), 3)))

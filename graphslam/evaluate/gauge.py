@@ -1,8 +1,8 @@
-"""NEES of a map whose frame does not matter: the rigid motion between map and truth is fitted, not trusted.
+"""NEES of a map up to a rigid motion, which is fitted between map and ground truth.
 
-A map is known in the frame of its first base. Truth from outside knows that base only as well as it measures it, and a
-small error of its heading moves everything that is far away. Judged *up to a rigid motion*, a map answers for its
-shape alone: ``min_T e(T)ᵀ P⁻¹ e(T)`` over the rigid motions ``T`` of the truth, with three degrees of freedom less.
+A map is estimated in the frame of its first base. External ground truth measures the pose of that base with an error,
+and a small heading error moves all distant points. *Up to a rigid motion* only the shape of the map is tested: ``min_T
+e(T)ᵀ P⁻¹ e(T)`` over the rigid motions ``T`` of the truth, with three fewer degrees of freedom.
 """
 
 from __future__ import annotations
@@ -17,12 +17,9 @@ from graphslam.evaluate.consistency import vector_pose_error
 
 
 def gauge_directions(poses: ArrayLike, points: ArrayLike) -> Array:
-    """How the vector ``[poses (x, y, θ) …, points (x, y) …]`` changes when everything is moved rigidly.
+    """Derivative of the vector ``[poses (x, y, θ) …, points (x, y) …]`` with respect to a rigid motion of the map.
 
-    Parameters
-    ----------
-    poses : (m, 3)
-    points : (n, 2)
+    Parameters ---------- poses : (m, 3) points : (n, 2)
 
     Returns
     -------
@@ -43,9 +40,9 @@ def gauge_directions(poses: ArrayLike, points: ArrayLike) -> Array:
 def aligned_nees(
     poses: ArrayLike, points: ArrayLike, truth: tuple[ArrayLike, ArrayLike], covariance: ArrayLike
 ) -> float:
-    """Least NEES over all rigid motions of the truth, however large; ``3m + 2n - 3`` degrees of freedom.
+    """Least NEES over all rigid motions of the ground truth; ``3m + 2n - 3`` degrees of freedom.
 
-    Gauss-Newton on the motion, from that which brings the true positions onto the estimated ones by least squares.
+    Gauss-Newton on the motion, started at the least-squares alignment of true with estimated positions.
 
     Parameters
     ----------
@@ -79,7 +76,7 @@ def aligned_nees(
         if scale.min() < 1e-9 * scale.max():
             raise CovarianceError("a rigid motion is not determined", got=f"{size} scalars", wanted="two points apart")
         step = -sla.solve_triangular(R, Q.T @ y)
-        for _ in range(30):  # a step that is too long is halved
+        for _ in range(30):  # halve the step until the sum decreases
             tried = whitened(se2_compose(step, T))
             if tried[0] @ tried[0] <= y @ y:
                 break
@@ -92,17 +89,17 @@ def aligned_nees(
 
 
 def inner_covariance(covariance: ArrayLike, directions: ArrayLike) -> Array:
-    """Covariance of a map's shape: what is left when the best rigid motion of it is taken out (inner constraints).
+    """Covariance of a map's shape, without rigid motions (inner constraints).
 
-    The frame of the first base makes everything far from it look uncertain by the base's own heading. This is the
-    covariance in the frame in which the map as a whole neither moves nor turns: ``S P Sᵀ`` with the projection
-    ``S = 1 - G (GᵀG)⁻¹ Gᵀ`` (Meissl, 1962). It is singular by three.
+    In the frame of the first base the variance of distant points contains that of the base's heading. Here the gauge is
+    that the map as a whole neither translates nor rotates: ``S P Sᵀ`` with the projection ``S = 1 - G (GᵀG)⁻¹ Gᵀ``
+    (Meissl, 1962). Its rank is n - 3 at most.
 
     Parameters
     ----------
     covariance : (n, n)
     directions : (n, 3)
-        :func:`gauge_directions`, counted from the middle of the map for a well-conditioned projection.
+        :func:`gauge_directions`, with the origin at the centre of the map, for a well-conditioned projection.
     """
     P, G = np.asarray(covariance, dtype=np.float64), np.asarray(directions, dtype=np.float64)
     if G.shape != (len(P), 3):

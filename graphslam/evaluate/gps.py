@@ -1,7 +1,7 @@
-"""Residuals of a trajectory against GPS: the only judge where no truth exists.
+"""Residuals of a trajectory against GPS, for logs without ground truth.
 
-A map's frame and the GPS frame have nothing in common until they are fitted: one rigid 2-D transform, no scale, no
-clock offset. The body point matters (metres on a car): it is the antenna's lever, stated, never fitted.
+The map frame is aligned with the GPS frame by one rigid 2-D transform, without scale and clock offset. The compared
+body point is the antenna; its lever arm (metres on a car) is given, not fitted.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from graphslam.evaluate.statistics import ErrorStatistics
 
 Mask = npt.NDArray[np.bool_]
 FEWEST = 8
-"""Fewer fixes are no test of a path: a frame that is moved onto them takes up three numbers of what they say."""
+"""Fewer fixes do not test a path: the alignment alone has three parameters."""
 ROUNDS = 30
-"""Of weights, until distances are those of the least sum."""
+"""Iterations of reweighting (IRLS) for the least sum of distances."""
 NEAR = 1e-4
-"""Square of a distance over its variance from which on a fix is as good as on the path."""
+"""Lower limit of the squared normalised distance in the IRLS weights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,16 +40,16 @@ class GpsResiduals:
     residuals : (n, 2)
         [m].
     points : (n, 2)
-        The trajectory's body point at the stamps, in the GPS frame [m].
+        Antenna on the trajectory at the stamps, in the GPS frame [m].
     T_gps_map : (3,)
     lever : (2,)
-        The body point that was compared [m].
+        Antenna in the base frame [m].
     fitted : int
         Fixes that determined the alignment; 0 if it was given.
     outside : int
         Fixes before the start or after the end of the trajectory: not scored.
     in_gap : int
-        Fixes inside a gap of the trajectory longer than ``max_gap``: not scored.
+        Fixes in a gap of the trajectory longer than ``max_gap``: not scored.
     """
 
     times: Array
@@ -96,13 +96,13 @@ def gps_residuals(
     gps : Gps
         Only x and y are used.
     lever : (2,), optional
-        Body point to compare [m]; default is the stream's own lever.
+        Antenna in the base frame [m]; default is the lever of the stream.
     T_gps_map : (3,), optional
         Known alignment; default is the rigid least-squares fit, unweighted, without scale.
     fit, score : (n,) bool, optional
         Fixes that determine the alignment and fixes that are scored; default all. Withheld fixes: disjoint masks.
     max_gap : float, optional
-        A fix between two poses farther apart than this is counted, not scored [s].
+        Fixes between two poses farther apart than this are counted in ``in_gap``, not scored [s].
     """
     if trajectory.dim != 2:
         raise DataError("GPS residuals need a 2-D trajectory", got=f"{trajectory.dim}-D")
@@ -146,14 +146,14 @@ def gps_residuals(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixDistances:
-    """Distances of fixes from a path that was made without them, against what path and fixes say of themselves.
+    """Distances of unused fixes from a path, with the distances expected from the covariances of path and fixes.
 
     Parameters
     ----------
     median : float
         Median distance in the plane [m].
     expected : float
-        Square root of the median variance of such a distance: of the path, there, and of the fix [m].
+        Square root of the median variance of such a distance, of path and fix [m].
     ratio : float
         Median of the squared distances over their variances.
     """
@@ -165,32 +165,32 @@ class FixDistances:
 
     @property
     def chance(self) -> float:
-        """How probable so large a ratio is at most, if what is stated is right, however errors are correlated.
+        """Upper bound of the probability of at least this ratio if the covariances are right, for any correlation.
 
-        The least favourable case is that all errors are one and the same along one axis; the median then is one draw of
-        χ² with one degree of freedom.
+        The worst case is that all errors are equal along one axis; the median is then one sample of χ² with one degree
+        of freedom.
         """
         return float(special.chdtrc(1, self.ratio))
 
 
 def fix_distances(trajectory: Trajectory, gps: Gps, *, sigma: float | None = None) -> FixDistances | None:
-    """Hold a path against fixes that had no part in it.
+    """Compare a path with fixes that were not used for it.
 
-    Its frame is moved onto the fixes first, by the least sum of distances over their standard deviations, which half of
-    the fixes could be wild without moving much. The right frame is among those that are tried, so that no correlation
-    between poses, which nobody states, makes the distances larger than the variances say: the test is one-sided.
+    The path is first aligned with the fixes by the least sum of normalised distances, which is robust against outliers.
+    The alignment only reduces distances, so unknown correlations between poses cannot make them larger than the
+    variances predict: the test is one-sided.
 
     Parameters
     ----------
     trajectory : Trajectory
-        With covariances; of a path in space, what is seen from above.
+        With covariances; a 3-D path is projected to the horizontal plane.
     sigma : float, optional
-        σ of each coordinate [m] in place of the stream's own.
+        σ of each coordinate [m] in place of the noise of the stream.
 
     Returns
     -------
     FixDistances or None
-        None where fewer than :data:`FEWEST` fixes lie on the path, or it has no covariances.
+        None if fewer than :data:`FEWEST` fixes lie on the path, or it has no covariances.
     """
     path = plan_path(trajectory) if trajectory.dim == 3 else trajectory
     if path.covariances is None or not len(path):

@@ -1,8 +1,8 @@
-"""How well a graph foretells the GPS fixes that it was not given: normalised innovations squared (NIS).
+"""Normalised innovations squared (NIS) of withheld GPS fixes, predicted by a graph.
 
-The prediction of a fix has a covariance of its own: of the path where the submap begins, of the local path inside the
-submap, of the datum that ties the map to the GPS frame, of the bias of the segment where the graph knows biases.
-Neighbouring fixes share most of it, so their innovations are correlated and must be judged together.
+The covariance of a prediction includes the pose of the submap base, the local path inside the submap, the datum between
+map and GPS frame, and the bias of the fix segment if the graph estimates biases. Neighbouring fixes share most of it,
+so their innovations are correlated and are tested jointly.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsInnovations:
-    """Fixes that the graph did not use, against where it predicts them; everything in the GPS frame.
+    """Innovations of fixes that the graph did not use, in the GPS frame.
 
     Parameters
     ----------
     times : (n,)
     innovations : (n, dim)
-        Fix less prediction [m].
+        Fix minus prediction [m].
     covariance : (dim n, dim n)
-        Joint covariance of all innovations: path, datum, local path of the submap (lever), bias of the segment, and
-        the fix itself.
+        Joint covariance of all innovations: path, datum, local path of the submap (lever), bias of the segment, and the
+        fix itself.
     unpredicted : int
-        Fixes outside every submap's path.
+        Fixes outside the paths of all submaps.
     """
 
     times: Array
@@ -60,7 +60,7 @@ class GpsInnovations:
 
     @property
     def blocks(self) -> Array:
-        """Covariance of every innovation by itself ``(n, dim, dim)``."""
+        """Covariance of each innovation ``(n, dim, dim)``."""
         n, d = len(self.times), self.dim
         return self.covariance.reshape(n, d, n, d)[np.arange(n), :, np.arange(n), :]
 
@@ -71,13 +71,13 @@ class GpsInnovations:
 
     @property
     def whitened(self) -> Array:
-        """Innovations given all earlier ones ``(n, dim)``: independent N(0, 1) if everything stated is right."""
+        """Innovations given all earlier ones ``(n, dim)``: independent N(0, 1) if all covariances are right."""
         L = np.linalg.cholesky(self.covariance)
         return np.asarray(np.linalg.solve(L, self.innovations.ravel()).reshape(-1, self.dim))
 
     @property
     def nis(self) -> Array:
-        """Normalised innovation squared of every fix ``(n,)``, as many degrees of freedom as it has coordinates."""
+        """Normalised innovation squared of every fix ``(n,)``, with ``dim`` degrees of freedom."""
         return np.asarray(np.sum(self.normalised**2, axis=1))
 
     @property
@@ -86,7 +86,7 @@ class GpsInnovations:
         return float(np.sqrt(np.mean(np.sum(self.innovations**2, axis=1))))
 
     def facts(self) -> dict[str, list[Any]]:
-        """What ``run.json`` holds of every fix: time, innovation and its σ along each axis, NIS; six digits."""
+        """Entries of ``run.json`` per fix: time, innovation and its σ along each axis, NIS; six digits."""
         sigmas = np.sqrt(np.diagonal(self.blocks, axis1=1, axis2=2))
         return {
             "times": self.times.tolist(),
@@ -96,12 +96,12 @@ class GpsInnovations:
         }
 
     def tests(self) -> pd.DataFrame:
-        """Two tests, one row each: ``value`` is 1 if the prediction is honest, ``low … high`` its two-sided bounds.
+        """Two tests, one row each: ``value`` is 1 if the prediction is consistent, ``low … high`` its two-sided bounds.
 
-        ``each`` is the mean NIS by dimension of the fixes by themselves, bounds by :func:`correlated_dof`: are the
-        predicted covariances of the right size? ``joint`` is the NIS of all of them together over dim n, bounds by χ²:
-        are they also correlated as the model says? ``autocorrelation`` is the lag-1 correlation of what stands in the
-        row, over neighbours in time; ``white`` the 95 % limit of its absolute value for independent ones.
+        ``each``: mean of NIS/dim of the single fixes, bounds by :func:`correlated_dof`; tests the size of the predicted
+        covariances. ``joint``: NIS of all fixes together over dim n, bounds by χ²; also tests their correlations.
+        ``autocorrelation``: lag-1 correlation of the row's residuals over neighbours in time; ``white``: 95 % limit of
+        its absolute value for independent residuals.
         """
         n, d = len(self.times), self.dim
         rows = []
@@ -142,21 +142,21 @@ def gps_innovations(
     segment_gap: float = 2.0,
     confidence: float = 0.95,
 ) -> GpsInnovations:
-    """Predict fixes that the graph does not hold.
+    """Predict fixes that are not in the graph.
 
     Parameters
     ----------
     graph : FactorGraph
-        At its optimum, with GPS of its own: without it there is no datum to predict from.
+        At its optimum, with other GPS fixes: without them there is no datum.
     gps : Gps
         The withheld fixes.
     sigma : float, optional
-        σ of each coordinate [m] in place of the stream's own.
+        σ of each coordinate [m] in place of the noise of the stream.
     bias_sigma : float, optional
-        The graph's prior of a segment's bias [m], where it has biases. A fix within ``segment_gap`` of a used one has
-        its bias; the others share a new one per segment.
+        Prior σ of a segment's bias in the graph [m], if it has biases. A fix within ``segment_gap`` of a used one gets
+        its bias; the others get a new bias per segment.
     segment_gap : float
-        [s]
+        Pause that starts a new segment [s].
     """
     values, lay = graph.values, graph.flat().layout
     if values.datum is None or graph.gps_origin is None:
@@ -177,8 +177,8 @@ def gps_innovations(
     predicted[own] += values.biases[bias[own]]
     each = gps.noise[found][:, :d, :d] if sigma is None else np.tile(sigma**2 * np.eye(d), (n, 1, 1))
 
-    # everything the innovations depend on: nodes, datum, tilt, biases, and what holds the points of a landmark submap's
-    # path; the first base is fixed and has no column
+    # everything the innovations depend on: nodes, datum, tilt, biases, and the variables of a landmark submap; the
+    # first base is fixed and has no column
     base = datum_columns(graph, node)
     columns = np.concatenate([base, lay.at("bias", np.where(own, bias, -1))], axis=1)
     J = np.concatenate([by[:, :, : base.shape[1]], np.tile(np.eye(d), (n, 1, 1))], axis=2)
@@ -193,7 +193,7 @@ def gps_innovations(
     needed = needed[needed >= 0]
     A = np.zeros((d * n, len(needed)))
     between = np.zeros((n, d, n, d))
-    if fitted is not None and lasting:  # what is known of a bias between those of the used fixes
+    if fitted is not None and lasting:  # bias interpolated between those of the used fixes
         known, numbers = _used_biases(graph)
         gain, left = _bridged(times, known, fitted)
         U = np.linalg.cholesky(each / (0.5 * np.trace(each[:, :2, :2], axis1=1, axis2=2))[:, None, None])
@@ -233,19 +233,19 @@ def gps_innovations(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnerAntennas:
-    """Fixes at points of the path of a landmark submap, given what the graph solves for.
+    """Fixes on the path of a landmark submap, conditioned on the variables of the graph.
 
     Parameters
     ----------
     fixes : (k,)
-        Numbers of the fixes.
+        Indices of the fixes.
     places : (k, 2)
-        Antennas in the submap's base frame.
+        Antennas in the submap's base frame [m].
     columns : (c,)
     jacobian : (2k, c)
-        Of the antennas in the base frame, the base held.
+        Of the antennas in the base frame, with a fixed base.
     left : (2k, 2k)
-        Covariance that is left.
+        Conditional covariance [m²].
     """
 
     fixes: Ints
@@ -256,7 +256,7 @@ class InnerAntennas:
 
 
 def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> InnerAntennas:
-    """Points of a path given exit, landmarks, and those of its points that the graph solves for."""
+    """Path points, conditioned on exit, landmarks, and the path points that are variables of the graph."""
     inner, values, lay = s.inner_points, graph.values, graph.flat().layout
     assert inner is not None
     ids = graph.landmark_ids_of(s.key)
@@ -267,7 +267,7 @@ def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> Inne
     cross = np.hstack([path.cross[ix], path.covariance[np.ix_(ix, own)]])
     gain = np.linalg.solve(joint, cross.T).T
     z = np.concatenate([inner.mean, path.positions[used].ravel()])
-    if inner.lasting is not None:  # as they are with the constant errors that the graph found
+    if inner.lasting is not None:  # shifted by the sensor biases that the graph estimated
         g = sensor_biases_at(values, s.robot)
         z = z + np.concatenate([inner.lasting.response, inner.lasting.points[own]]) @ g
         path = replace(path, positions=path.positions + (inner.lasting.points @ g).reshape(-1, 2))
@@ -276,7 +276,7 @@ def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> Inne
     record = graph.records[s.factor_id]
     chart = str(getattr(record, "chart", "cartesian"))
     u, J = submap_jacobian((values.poses[s.node], values.poses[s.exit_node]), places, z, chart)
-    V = np.linalg.inv(-J[:2, :2])  # V⁻¹: the chart's residual of a difference in the base frame
+    V = np.linalg.inv(-J[:2, :2])  # V⁻¹: maps a residual of the parametrisation to a difference in the base frame
     off = (gain @ u).reshape(-1, 2) @ V.T
     columns = np.concatenate(
         [
@@ -293,8 +293,8 @@ def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> Inne
 def antenna_places(graph: FactorGraph, times: Array, lever: Array) -> tuple[Ints, Array, Array, list[InnerAntennas]]:
     """Node at each time (-1: none), antenna in its frame, joint covariance of these points ``(dim n, dim n)``.
 
-    Fixes of one stretch of path, from a node to the next, share what the path has lost since the node. Those at points
-    of a landmark submap's path come by the joint rows of its Gaussian.
+    Fixes between two nodes share the path error since the first node. Fixes on the path of a landmark submap use the
+    joint Gaussian of that submap.
     """
     n, d = len(times), graph.dim
     node, arm, cov = np.full(n, -1, dtype=np.int64), np.zeros((n, d)), np.zeros((d * n, d * n))
@@ -331,10 +331,10 @@ def antenna_places(graph: FactorGraph, times: Array, lever: Array) -> tuple[Ints
 
 
 def _arm_covariance(T: Array, P: Array | None, lever: Array) -> Array:
-    """Joint covariance ``(dim q, dim q)`` of the antenna at several poses ``(q, 3|7)`` of one stretch of path.
+    """Joint covariance ``(dim q, dim q)`` of the antenna at poses ``(q, 3|7)`` between two nodes.
 
-    The path is told by its marginals; between them it is taken as a process whose error is carried along and grows,
-    ``ξ_j = Ad(T_ij⁻¹) ξ_i + w``, as that of dead reckoning does.
+    Only marginals of the path are stored. The correlations are those of dead reckoning, ``ξ_j = Ad(T_ij⁻¹) ξ_i + w``
+    with independent w.
     """
     q, group = len(T), group_of(T)
     d, dof = group.dim, group.dof
@@ -349,33 +349,33 @@ def _arm_covariance(T: Array, P: Array | None, lever: Array) -> Array:
         ad = group.adjoint(group.inverse(group.between(T[j - 1], T[j])))
         carried = ad @ joint[j - 1, :, j - 1] @ ad.T
         values, vectors = np.linalg.eigh(P[j] - carried)
-        joint[j, :, j] = carried + (vectors * np.maximum(values, 0.0)) @ vectors.T  # an error never shrinks by itself
+        joint[j, :, j] = carried + (vectors * np.maximum(values, 0.0)) @ vectors.T  # w has no negative variance
         joint[j, :, :j] = np.einsum("ij,jkl->ikl", ad, joint[j - 1, :, :j])
         joint[:j, :, j] = joint[j, :, :j].transpose(1, 2, 0)
     return np.asarray(np.einsum("aij,ajbk,bmk->aibm", G, joint, G, optimize=True).reshape(d * q, d * q))
 
 
 def _used_biases(graph: FactorGraph) -> tuple[Array, Ints]:
-    """Times of the used fixes that have a bias, in order, and the numbers of the biases."""
+    """Times of the used fixes with a bias, in order, and the indices of the biases."""
     used = sorted((r.time, r.bias) for r in graph.records.values() if isinstance(r, GpsRecord) and r.bias is not None)
     return np.array([t for t, _ in used]), np.array([b for _, b in used], dtype=np.int64)
 
 
 def _bridged(times: Array, known: Array, errors: FixErrors) -> tuple[Array, Array]:
-    """A Gauss–Markov process at instants ``(n,)`` given its values at others ``(m,)``: gain, and covariance left."""
+    """A Gauss–Markov process at times ``(n,)``, given its values at times ``(m,)``: gain and conditional covariance."""
 
     def alike(a: Array, b: Array) -> Array:
         return np.asarray(errors.bias_sigma**2 * np.exp(-np.abs(a[:, None] - b) / errors.bias_time))
 
     own = alike(known, known) + 1e-9 * errors.bias_sigma**2 * np.eye(len(known))
     gain = np.linalg.solve(own, alike(known, times)).T
-    gain[np.abs(gain) < 1e-6] = 0.0  # only the neighbours tell
+    gain[np.abs(gain) < 1e-6] = 0.0  # keep neighbours only
     left = alike(times, times) - gain @ alike(known, times)
     return np.asarray(gain), 0.5 * (left + left.T)
 
 
 def _biases(graph: FactorGraph, times: Array, bias_sigma: float | None, gap: float) -> Ints:
-    """Bias of every fix: one of the graph's, a new one (numbered on from the graph's), or -1."""
+    """Index of the bias of every fix: one of the graph's, a new one (numbered after them), or -1."""
     used = sorted((r.time, r.bias) for r in graph.records.values() if isinstance(r, GpsRecord) and r.bias is not None)
     if bias_sigma is None:
         if used:

@@ -1,10 +1,4 @@
-"""How good the GPS is by itself: the floor under every residual against it.
-
-A residual is the error of the map minus that of the fix, and one pass cannot tell them apart. Two passes over one
-place can: there the map is the same point of the same ground, known to centimetres *relative to itself*, so the
-difference of the two residuals is the difference of two fixes of different times. Its size, over √2, is the error of
-one fix that no map can go below.
-"""
+"""Segments of GPS fixes: runs of fixes without a pause."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a landmark front end made of the sightings: how many it used, and what its particles can say."""
+"""Findings on a landmark front end: observations used, particle depletion, gaps of the odometry."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import LandmarkObservations
 
 HALF = 0.5
-"""If most of the sightings are not used, those that are used are the exception."""
+"""A share of used observations below this is reported as ``bad``."""
 LEAST_ANCESTORS = 10
-"""Independent samples below which a variance made of them is off by a factor of two more often than once in ten
-(χ²₉ / 9 is below 0.46 or above 1.88 in one case of ten)."""
+"""Independent samples below which their variance is off by a factor of two with more than 10 % probability (χ²₉ / 9 is
+below 0.46 or above 1.88 in one case of ten)."""
 
 
 def sighting_findings(
     log: SensorLog, reports: Sequence[Mapping[str, Any]], dropped: Mapping[str, int]
 ) -> list[Finding]:
-    """Lines on the sightings offered and used, and on the particles.
+    """Findings on observations offered and used, on particles and on gaps.
 
     Parameters
     ----------
     reports : sequence of mapping
-        Of all submaps.
+        Reports of all submaps.
     dropped : mapping of str to int
-        Per ``"stream: reason"``.
+        Count per ``"stream: reason"``.
     """
     if not all("used" in r and "observations" in r for r in reports):
         return []
@@ -37,7 +37,7 @@ def sighting_findings(
     offered = len(log[name].ranges) if name is not None else seen
     used = sum(int(r["used"]) for r in reports)
     trimmed = sum(int(r.get("trimmed", 0)) for r in reports)
-    # a reason counts records or sightings; those of sightings say so
+    # of the landmark stream only
     lost = {k.partition(": ")[2]: n for k, n in dropped.items() if name is not None and k.startswith(f"{name}: ")}
     reasons = [f"{n} {k}" for k, n in lost.items()]
     if seen - used - trimmed > 0:
@@ -61,7 +61,7 @@ def sighting_findings(
 
 
 def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """One particle, or covariances made of particles that have few independent ones left."""
+    """A single particle with unknown data association, or covariances from too few independent particles."""
     if any(r.get("particles") == 1 and r.get("association") != "known" for r in reports):
         text = (
             "particles: 1 — its data association cannot be compared with another one. Set frontend.particles to 20 or "
@@ -81,7 +81,7 @@ def _particles(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
 
 
 def _gaps(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Gaps of the motion that were bridged."""
+    """Gaps in the odometry that were bridged."""
     out = []
     for r in reports:
         for g in r.get("gaps", ()):

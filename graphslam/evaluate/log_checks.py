@@ -1,7 +1,7 @@
-"""Checks of a whole log before a run, as ``graphslam data check`` makes them.
+"""Checks of a whole log before a run, for ``graphslam data check``.
 
-:func:`~graphslam.evaluate.stream_checks.check_streams` is part of every run. What is here besides takes some seconds:
-odometry against the motion that neighbouring scans show.
+:func:`~graphslam.evaluate.stream_checks.check_streams` is part of every run. The check of odometry by scan matching
+takes some seconds.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from graphslam_frontends.odometry.motion_check import check_motion, motion_findi
 from graphslam_frontends.odometry.step_config import StepConfig
 
 MOST_SCANS = 1500
-"""Scans of a planar laser that are held against the motion, from the middle of a log; …"""
+"""Scans of a planar laser, from the middle of a log, that are compared with the odometry; …"""
 MOST_CLOUDS = 300
 """… and of a 3-D lidar."""
 POINTS, REACH = 400, 30.0
-"""Points of a scan, and how far they may be [m]."""
+"""Points per scan, and their maximum range [m]."""
 
 
 def check_log(log: SensorLog) -> list[StreamFinding]:
-    """Everything that can be checked in a log before a run.
+    """Run all checks on a log.
 
     Returns
     -------
     list of StreamFinding
-        Faults of the clocks first: they are the cause of many others.
+        Clock faults first, because they cause many others.
     """
     out = check_streams(log, refusals=False)
     if not any(n.finding.level == "bad" and n.finding.code in CLOCK_CODES for n in out):
-        out += _scans_and_motion(log)  # scans and motion of different times differ for that reason
+        out += _scans_and_motion(log)  # with a clock fault this comparison is meaningless
     return _once(out)
 
 
@@ -52,10 +52,10 @@ def _once(found: list[StreamFinding]) -> list[StreamFinding]:
 
 
 def _scans_and_motion(log: SensorLog) -> list[StreamFinding]:
-    """Lines on what neighbouring scans say of the motion."""
+    """Findings from the comparison of odometry with the motion between neighbouring scans."""
     scanner = next((n for n, s in log.streams.items() if isinstance(s, PointClouds | RangeScans)), None)
     scanner = scanner or log.of_type(LaserScans)
-    moves = (Odometry, VelocityControls)  # a steered car drives among trees, where scans are hardly alike
+    moves = (Odometry, VelocityControls)  # not for steered cars: their scans, among trees, match badly
     motion = [n for n, s in log.streams.items() if isinstance(s, moves) and len(s.times) > 1]
     if scanner is None or not motion:
         return []

@@ -1,20 +1,20 @@
-"""Do the loops of a map agree with each other? Pairwise consistency of re-observations (Mangelson et al. 2018, PCM).
+"""Pairwise consistency of the loop closures of a landmark map (PCM, Mangelson et al. 2018).
 
-Two submaps that share at least two landmarks measure their relative pose, ``T_ab``, by their landmarks alone. The chain
-of submap exits measures it too. The *cycle* a → b by the loop, b → a by the chain must close within its predicted
-covariance; so must the cycle a → b by one loop, b → d by the chain, d → c by another loop, c → a by the chain.
+Two submaps that share at least two landmarks give a measurement of their relative pose ``T_ab``. The chain of submap
+exits gives another one. The *cycle* a → b by the loop, b → a by the chain must close within its predicted covariance;
+so must the cycle a → b by one loop, b → d by the chain, d → c by another loop, c → a by the chain.
 
-Everything is linear in the measurements about the solved poses ``X``: an exit k leaves the residual
-``ρ_k = Log(T̂_k⁻¹ T_k)``, a loop ``ρ_ab = Log(T̂_ab⁻¹ T_ab)``, ``T̂`` from the poses, and in world coordinates
+Everything is linear in the measurements about the solved poses ``X``: an exit k has the residual ``ρ_k = Log(T̂_k⁻¹
+T_k)``, a loop ``ρ_ab = Log(T̂_ab⁻¹ T_ab)``, ``T̂`` from the poses, and in world coordinates
 
     ``e_ab = Ad(X_b) ρ_ab - Σ_{a ≤ k < b} Ad(X_{k+1}) ρ_k``
 
-is the error of the cycle of one loop, and ``e_ab - e_cd`` that of two: the poses cancel, what the chains share cancels.
-A submap's exit and landmarks are correlated, and a submap may take part in many loops; both are in the joint covariance
-of all ``e``, because every one of them is a known linear function of the submaps' Gaussians, which are independent.
+is the error of the cycle of one loop, and ``e_ab - e_cd`` that of two: the poses and the common part of the chains
+cancel. A submap's exit and landmarks are correlated, and a submap may take part in many loops; both are in the joint
+covariance of all ``e``, because each ``e`` is a linear function of the independent Gaussians of the submaps.
 
-What it cannot see: landmarks were paired by gates that looked at much the same errors, so a wrong pairing that made it
-into the map already passed one test, and the map's honest loops are truncated where the gate cut (a little).
+Limit: the data association was gated by similar errors. A false association in the map has already passed one test, and
+the errors of true loops are slightly truncated by the gate.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ class LandmarkLoops:
     a, b : (l,) int64
         Indices of the submaps in the chain, a < b.
     shared : (l,) int64
-        Landmarks that the two share; 0 for a front end's match.
+        Number of shared landmarks; 0 for a match of the front end.
     errors : (l, 3)
         ``e`` of every loop: x, y [m], heading [rad], in the frame of the first base.
     covariance : (3l, 3l)
-        Of all errors together.
+        Joint covariance of all errors.
     shape_chi2, shape_dof : (l,)
-        How well the shared landmarks fit onto each other once the best relative pose is taken out.
+        χ² of the shared landmarks after the best relative pose, and its degrees of freedom.
     skipped : int
-        Pairs of submaps whose shared landmarks do not fix a relative pose (they coincide).
+        Pairs of submaps whose shared landmarks do not determine a relative pose (they coincide).
     left_out : int
-        Pairs of submaps that the selection of at most ``max_loops`` passed over.
+        Pairs of submaps that were not used because of ``max_loops``.
     """
 
     a: Ints
@@ -86,22 +86,22 @@ def find_landmark_loops(
     max_loops: int = 500,
     covariance_scale: float = 1.0,
 ) -> LandmarkLoops:
-    """Loops of a chain of landmark submaps by the landmarks they share, and by their front ends' matches.
+    """Loops of a chain of landmark submaps: shared landmarks, and matches of the front end.
 
     Parameters
     ----------
     submaps : sequence of Submap
         In order, 2-D.
     poses : (m + 1, 3)
-        Solved bases and the last end: where everything is linearised.
+        Solved bases and the last end pose: the linearisation point.
     ids : sequence of (n_k,) int, optional
-        Landmark of every entry of every submap; default the ids that they bear. Negative = unknown.
+        Landmark id of every entry of every submap; default: the ids in the submap. Negative: unknown.
     min_shared : int
         Landmarks that two submaps must share, at least 2.
     min_gap : int
-        Submaps between which the loop runs are at least so far apart in the chain; 1 takes neighbours too.
+        Least difference of the submaps' indices in the chain; 1 includes neighbours.
     max_loops : int
-        Of more pairs of submaps an even selection is taken: memory and time grow with the square.
+        If there are more pairs of submaps, every n-th is used: memory and time grow with the square.
     covariance_scale : float
         Factor on every submap's covariance, as in the graph.
     """
@@ -182,7 +182,7 @@ def _identified(submap: Submap, ids: npt.ArrayLike | None) -> LandmarkMap:
 
 
 class _Chain:
-    """The measurements of a chain as one vector of independent blocks, and residuals as linear functions of it."""
+    """The measurements of a chain as one vector of independent blocks, and residuals as its linear functions."""
 
     def __init__(self, X: Array, maps: Sequence[LandmarkMap], scale: float) -> None:
         self.X, self.maps = X, maps
@@ -194,7 +194,7 @@ class _Chain:
         rho = se2_log(se2_between(hops, exits))
         self.ad = se2_adjoint(X)
         self.world = np.einsum("kij,kj->ki", self.ad[1:], rho)
-        # ρ_k over the submap's own vector (x, y, θ): a step of the position turns into the frame of the end
+        # ρ_k over the submap's own vector (x, y, θ): a change of the position is rotated into the frame of the exit
         turn = np.zeros((len(maps), 3, 3))
         turn[:, :2, :2] = np.swapaxes(rotation2(exits[:, 2]), 1, 2)
         turn[:, 2, 2] = 1.0
@@ -202,7 +202,7 @@ class _Chain:
         self.exit_root = self.ad[1:] @ turn @ np.array([r[:3, :3] for r in self.root])
 
     def align(self, a: int, b: int, in_a: list[int], in_b: list[int]) -> tuple[Array, Array, Array, float] | None:
-        """Residual ``ρ_ab`` of the relative pose that shared landmarks give, its gains on both maps, and χ² left.
+        """Residual ``ρ_ab`` of the relative pose from shared landmarks, its gains on both maps, and the remaining χ².
 
         ``r_j = z_a,j - T_ab z_b,j`` with covariance ``S = P_a + R P_b Rᵀ`` over all shared landmarks; one weighted
         least-squares step about the solved ``T̂_ab``, ``ρ = G r``.
@@ -236,7 +236,7 @@ class _Chain:
     def cycle(
         self, a: int, b: int, rho: Array, gain_a: Array | None, gain_b: Array | None
     ) -> tuple[Array, sp.csr_matrix]:
-        """``e_ab`` and its derivative over the measurements of all submaps times the root of their covariance."""
+        """``e_ab`` and its derivative with respect to the whitened measurements of all submaps."""
         error = self.ad[b] @ rho - self.world[a:b].sum(axis=0)
         error[2] = wrap_angle(error[2])
         columns = [(self.offset[a:b, None] + np.arange(3)).ravel()]
@@ -258,8 +258,8 @@ class LoopConsistency:
     ----------
     d2 : (l, l)
         Off the diagonal ``D²_ij = (e_i - e_j)ᵀ (Σ_ii + Σ_jj - Σ_ij - Σ_ji)⁻¹ (e_i - e_j)``, on it ``e_iᵀ Σ_ii⁻¹ e_i``;
-        each χ² of three degrees of freedom if the submaps are honest and the landmarks rightly paired. ``nan`` where
-        two loops are the same measurement.
+        each χ² of three degrees of freedom if the submaps are consistent and the data association is right. ``nan``
+        where two loops are the same measurement.
     confidence : float
         Of the two-sided bounds.
     """
@@ -274,9 +274,9 @@ class LoopConsistency:
         return np.asarray(np.diag(self.d2))
 
     def test(self) -> dict[str, Any]:
-        """Mean ``D²/3`` of the single loops with two-sided bounds that know how correlated they are.
+        """Mean ``D²/3`` of the single loops, with two-sided bounds that include their correlation.
 
-        Loops over one stretch of the chain share its error, so many loops can be worth few: ``dof`` says how many
+        Loops over the same part of the chain share its error; ``dof`` is the effective number of degrees of freedom
         (:func:`~graphslam.evaluate.residual_consistency.correlated_dof`). ``inside`` is the share of pairs within the
         confidence region of one pair, ``shape`` the χ²/dof of the shared landmarks against each other.
         """
@@ -304,7 +304,7 @@ class LoopConsistency:
     def blame(self) -> Array:
         """Share of the other loops with which each loop disagrees beyond the confidence region ``(l,)``.
 
-        One false loop disagrees with nearly all others and they with it alone.
+        A single false loop disagrees with nearly all others; each of these disagrees with it only.
         """
         other = self.d2.copy()
         np.fill_diagonal(other, np.nan)
@@ -313,7 +313,7 @@ class LoopConsistency:
         return np.asarray(bad.sum(axis=1) / np.maximum(known.sum(axis=1), 1))
 
     def table(self) -> pd.DataFrame:
-        """One row a loop: submaps, shared landmarks, error of its cycle, D², blame."""
+        """One row per loop: submaps, shared landmarks, error of its cycle, D², blame."""
         e = self.loops.errors
         return pd.DataFrame(
             {
@@ -339,7 +339,7 @@ def loop_consistency(loops: LandmarkLoops, *, confidence: float = 0.95) -> LoopC
     for i in range(n):
         e = loops.errors[i] - loops.errors[i + 1 :]
         C = own[i] + own[i + 1 :] - S[i, i + 1 :] - np.swapaxes(S[i, i + 1 :], 1, 2)
-        # units of the two loops' own σ: a variance that is nothing beside them is rounding, not knowledge
+        # units of the two loops' own σ: a relatively tiny variance is only rounding
         u = np.maximum(scale[i], scale[i + 1 :])
         C = C / (u[:, :, None] * u[:, None, :])
         values, vectors = np.linalg.eigh(C)

@@ -1,4 +1,4 @@
-"""Metric error of a map against its truth, with the gauge stated."""
+"""Errors of landmarks against ground truth, with a given gauge."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class MapError:
     errors : (n,)
         Distances [m].
     unmatched : int
-        Estimates without a truth.
+        Estimates without a true landmark.
     """
 
     quantity: str
@@ -42,7 +42,7 @@ class MapError:
 
     @property
     def statistics(self) -> ErrorStatistics:
-        """Of the distances [m]."""
+        """Statistics of the distances [m]."""
         return ErrorStatistics.of(self.errors)
 
     def as_row(self) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class MapError:
 def match_ids(ids: ArrayLike, truth_ids: ArrayLike) -> tuple[Index, Index]:
     """Indices ``(i, j)`` with ``ids[i] == truth_ids[j]``; negative ids match nothing.
 
-    An id may stand more than once among the estimates, not among the truth.
+    Estimates may repeat an id, the ground truth may not.
     """
     a, b = np.asarray(ids, dtype=np.int64), np.asarray(truth_ids, dtype=np.int64)
     order = np.argsort(b, kind="stable")

@@ -1,4 +1,4 @@
-"""The figures of a run: front end, join, time, GPS, truth. Every figure is measured in this run."""
+"""Metrics of a run: front end, map joining, time, GPS, ground truth."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from graphslam.solve.solution import Solution
 logger = logging.getLogger(__name__)
 
 TRUTH_GAP = 0.5
-"""Between records of truth farther apart than this the true pose is unknown [s]."""
+"""Longest interval between ground-truth records over which the true pose is interpolated [s]."""
 
 
 TIMES = re.compile(r"^seconds_|_seconds$|^times_real_time$|^frontend_ms_per_scan$|^frontend_last_to_first_quarter$")
-"""Metrics that are measured with a clock: no run repeats them, and they have a file of their own."""
+"""Metrics that are measured with a clock: they differ between runs and are stored in a separate file."""
 
 
 def is_time(key: object) -> bool:
@@ -49,9 +49,9 @@ def is_time(key: object) -> bool:
 
 
 class FigureTable(pd.DataFrame):
-    """A table of figures of all sizes, each shown with six digits: 7, not 7.000000e+00 because another one is small.
+    """A table of values that shows each with six digits: 7, not 7.000000e+00 because another one is small.
 
-    What is made of it is a plain DataFrame.
+    Operations on it return a plain DataFrame.
     """
 
     @property
@@ -72,7 +72,7 @@ class Metrics:
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, key: str, value: float, unit: str = "", direction: str = "none") -> None:
-        """One figure; ``direction`` says which way is better: lower, higher, one (nearer to 1) or none."""
+        """Add one metric; ``direction`` is what is better: lower, higher, one (nearer to 1) or none."""
         self.rows.append({"key": key, "value": float(value), "unit": unit, "direction": direction})
 
     def table(self) -> pd.DataFrame:
@@ -81,7 +81,7 @@ class Metrics:
 
 
 def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:
-    """Counts and χ²/dof summed over the submaps, and how far particle maps are from smoothed ones."""
+    """Counts, χ²/dof summed over the submaps, effective sample size, number of flagged submaps."""
     out.add("submaps", len(submaps))
     reports = [s.report for s in submaps]
     for key, unit in (("scans", ""), ("observations", ""), ("used", ""), ("not_associated", ""), ("trimmed", "")):
@@ -104,14 +104,14 @@ def front_end_metrics(out: Metrics, submaps: Sequence[Submap]) -> None:
 
 
 def flag_counts(submaps: Sequence[Submap]) -> dict[str, int]:
-    """Submaps flagged by the front end for each reason, and for ``any``."""
+    """Number of submaps that the front end flagged, for each reason and for ``any``."""
     flags = [s.report.get("flag", []) for s in submaps]
     reasons = sorted({reason for f in flags for reason in f})
     return {"any": sum(bool(f) for f in flags)} | {r: sum(r in f for f in flags) for r in reasons}
 
 
 def solution_metrics(out: Metrics, solution: Solution, confirmed: int) -> None:
-    """Objective per class, gap, landmarks."""
+    """Objective, χ² and dof per class of factors, gap, number of landmarks."""
     out.add("objective", solution.objective, "", "lower")
     classes: dict[str, tuple[float, float]] = {}
     for name, c in solution.score.classes.items():
@@ -133,7 +133,7 @@ def solution_metrics(out: Metrics, solution: Solution, confirmed: int) -> None:
 def gps_metrics(
     out: Metrics, trajectory: Trajectory, gps: Gps, withheld: np.ndarray, T_gps_world: Array | None
 ) -> dict[str, GpsResiduals]:
-    """RMSE, median and p95 at the antenna: rigid alignment to the fixes scored, or the graph's own datum."""
+    """RMSE, median and p95 at the antenna, with the graph's datum or after rigid alignment to the scored fixes."""
     results: dict[str, GpsResiduals] = {}
     if len(gps.times) < 2:
         return results
@@ -147,7 +147,7 @@ def gps_metrics(
             results["all"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world)
             if np.any(withheld):
                 results["withheld"] = gps_residuals(trajectory, gps, T_gps_map=T_gps_world, score=withheld)
-    except DataError:  # no fix on the path: nothing to score, and the counts say so
+    except DataError:  # no fix on the path
         return results
     for name, r in results.items():
         s = r.statistics
@@ -160,7 +160,7 @@ def gps_metrics(
 
 
 def dead_reckoning_metrics(out: Metrics, path: Trajectory | None, gps: Gps) -> None:
-    """What the wheels alone would have given, scored like the map: the figure to compare it with."""
+    """GPS error of pure dead reckoning, as a baseline for that of the map."""
     if path is None or len(gps.times) < 2:
         return
     try:
@@ -172,9 +172,9 @@ def dead_reckoning_metrics(out: Metrics, path: Trajectory | None, gps: Gps) -> N
 
 
 def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
-    """Truth at the ends of the submaps, in the frame of the first base; None where the log knows no truth there.
+    """True poses at the ends of the submaps and true landmarks, in the frame of the first base; None if unknown.
 
-    Submaps that end where the truth has a gap (:data:`TRUTH_GAP`) or beyond its last record have none.
+    Submaps that end in a gap of the ground truth (:data:`TRUTH_GAP`) or after its last record are left out.
     """
     if log.truth is None or not submaps:
         return None
@@ -187,7 +187,7 @@ def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
     times = np.array([s.interval[1] for s in submaps])
     known = _covered(path, times)
     ends = path.interpolate(times[known])
-    if g.dim == 3:  # the frame at an exit need not be the body's: bases in space stand level
+    if g.dim == 3:  # in 3-D the frame at an exit can differ from the body's: bases are level
         ends = g.compose(ends, np.array([_exit_of_body(s) for s in submaps])[known])
     return MapTruth(
         keys=np.array([s.key for s in submaps], dtype=np.int64)[known],
@@ -200,9 +200,10 @@ def map_truth(log: SensorLog, submaps: Sequence[Submap]) -> MapTruth | None:
 
 
 def true_base(path: Trajectory, first: Submap) -> Array:
-    """Where the base of the first submap really stands, in the frame of the true ``path``.
+    """True pose of the first submap's base, in the frame of the true ``path``.
 
-    In space a base may stand level beside the body (SegSLAM's do); the submap's own path says where the body is in it.
+    In 3-D a base can be a level frame that differs from the body (as in SegSLAM); the submap's own path gives the pose
+    of the body in it.
     """
     at = path.interpolate(np.array([first.interval[0]]))[0]
     own = first.trajectory
@@ -212,25 +213,25 @@ def true_base(path: Trajectory, first: Submap) -> Array:
 
 
 def _exit_of_body(submap: Submap) -> Array:
-    """``T_body_exit`` at the end of a submap's own path."""
+    """``T_body_exit`` at the end of a submap's path."""
     g, own = group_of(submap.exit_pose), submap.trajectory
     return g.identity if own is None or not len(own) else g.between(own.poses[-1], submap.exit_pose)
 
 
 def _covered(path: Trajectory, times: Array) -> np.ndarray:
-    """Which of ``times`` lie inside the path and in no gap of it."""
+    """Mask of ``times`` inside the path and outside its gaps."""
     inside = (times >= path.times[0]) & (times <= path.times[-1])
     j = np.clip(np.searchsorted(path.times, times), 1, len(path) - 1)
     return np.asarray(inside & (path.times[j] - path.times[j - 1] <= TRUTH_GAP))
 
 
 def truth_path(log: SensorLog, times: Array, first: Submap | None = None) -> Trajectory | None:
-    """True path at ``times`` where it is known, in the frame of the base at the first of them.
+    """True path at those of ``times`` where it is known, in the frame of the base at the first of them.
 
     Parameters
     ----------
     first : Submap, optional
-        The first submap, whose base in space need not be the body (:func:`true_base`).
+        The first submap, whose base can differ from the body in 3-D (:func:`true_base`).
     """
     if log.truth is None:
         return None
@@ -246,10 +247,9 @@ def truth_path(log: SensorLog, times: Array, first: Submap | None = None) -> Tra
 
 
 def true_first_base(log: SensorLog, first: Submap) -> list[float] | None:
-    """Where the first base truly was in the world of the log, which several logs may share; None where not known.
+    """True pose of the first base in the world frame of the log, which several logs may share; None if unknown.
 
-    Logs of one simulated world share its frame (``meta["T_world_frame"]``); what is said of others is in the frame of
-    their truth.
+    Logs of one simulated world share a frame (``meta["T_world_frame"]``); the others use the ground-truth frame.
     """
     if log.truth is None or not _covered(log.truth.trajectory, np.array([first.interval[0]]))[0]:
         return None
@@ -263,12 +263,12 @@ def true_first_base(log: SensorLog, first: Submap) -> list[float] | None:
 def truth_metrics(
     out: Metrics, solution: Solution, truth: MapTruth, *, identities: bool, path: Trajectory | None = None
 ) -> None:
-    """RMSE and NEES with the first base fixed, and after a rigid alignment; landmarks only with the truth's identities.
+    """RMSE and NEES with the first base fixed, and after a rigid alignment; landmarks only with true identities.
 
-    The first gauge trusts the true pose of the first base, heading included: over metres a degree of it is centimetres.
-    Its NEES is taken in the chart of the map (:mod:`graphslam.core.charts`), ``nees_plain`` of the plain vector.
-    In the second the map is moved onto the truth as a whole (three scalars less in the NEES): landmarks by themselves,
-    the path by itself, and the NEES by generalised least squares over all that is judged.
+    The first gauge uses the true pose of the first base; an error of its heading adds to all errors. Its NEES uses the
+    parametrisation of the map (:mod:`graphslam.core.charts`), ``nees_plain`` that of plain vectors. In the second gauge
+    the map is aligned with the ground truth (three degrees of freedom less in the NEES): separately for landmarks and
+    path, and by generalised least squares over all for the NEES.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def truth_metrics(
     error, points = e_pose.ravel(), np.zeros((0, 2))
     ix = (3 * (node - 1)[:, None] + np.arange(3)).ravel()
     n_pose = len(error)
-    turned = np.zeros(len(solution.poses))  # what the headings differ by
+    turned = np.zeros(len(solution.poses))  # heading errors
     turned[node] = e_pose[:, 2]
     charted = np.column_stack([apply_inverse_left_jacobian(e_pose[:, :2], e_pose[:, 2]), e_pose[:, 2]]).ravel()
     if identities:
@@ -322,7 +322,7 @@ def truth_metrics(
 
 
 def add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:
-    """A NEES, its dimension, the two by each other, and the consistency index (eq. 20)."""
+    """A NEES, its dimension, their ratio, and the consistency index (eq. 20)."""
     out.add(key, nees)
     out.add(f"{key}_dof", dof)
     out.add(f"{key}_per_dof", nees / dof, "", "one")
@@ -330,9 +330,9 @@ def add_nees(out: Metrics, key: str, nees: float, dof: int) -> None:
 
 
 def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, scans: float, cost: Array) -> None:
-    """Seconds per stage, how much faster than the recording, and whether cost per scan grows over the log.
+    """Seconds per stage, speed relative to real time, and whether the cost per scan grows over the log.
 
-    Compilation is no part of the speed, and ``duration`` is that of the records used now, not in a run that is resumed.
+    The speed excludes compilation. ``duration`` is that of the records processed in this run, not before a resume.
     """
     for stage, value in seconds.items():
         out.add(f"seconds_{stage}", value, "s", "lower")
@@ -349,7 +349,7 @@ def time_metrics(out: Metrics, seconds: Mapping[str, float], duration: float, sc
 
 
 def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
-    """Biases as they are at the end, factors, and what was left out; also into the events and the counts."""
+    """Final biases, number of nodes, and dropped readings; also as events and drop counts."""
     said: list[dict[str, Any]] = [e for e in graph.events if e["event"] == "imu"]
     imus = ImuFactors.of(graph)
     for stream in imus.used:
@@ -373,7 +373,7 @@ def imu_metrics(out: Metrics, graph: FactorGraph, drops: DropCounter) -> None:
 
 
 def _contradiction(graph: FactorGraph) -> None:
-    """Say so if the χ² of the ways is larger than it is by chance once in two thousand runs."""
+    """Log a warning if the χ² of the preintegrated IMU factors exceeds the upper bound at 99.9 % (two-sided)."""
     ways = class_consistency(graph).get("imu") if ImuFactors.of(graph).used else None
     if ways is None or not np.isfinite(ways.ratio):
         return
@@ -389,7 +389,7 @@ def _contradiction(graph: FactorGraph) -> None:
 
 
 BLOCKS = {"position": slice(3, 6), "heading": slice(2, 3), "level": slice(0, 2)}
-"""Tangent components of the blocks that honesty is told by: position, heading, roll and pitch."""
+"""Tangent components of the NEES blocks: position, heading, roll and pitch."""
 
 
 def truth_metrics_in_space(
@@ -397,8 +397,8 @@ def truth_metrics_in_space(
 ) -> None:
     """RMSE and NEES of the ends of the submaps with the first base fixed, and errors of the path after an alignment.
 
-    Errors are right tangents, ``Log(T_est⁻¹ T_true)``. The NEES of a block is the mean over the submaps of that of its
-    marginal; ``nees`` itself is that of all ends jointly.
+    Errors are right tangents, ``Log(T_est⁻¹ T_true)``. The NEES of a block is the mean over the submaps from their
+    marginals; ``nees`` is that of all ends jointly.
 
     Parameters
     ----------
@@ -452,7 +452,7 @@ AXES = {2: ("x", "y", "heading"), 3: ("roll", "pitch", "heading", "x", "y", "z")
 
 
 def add_axis_nees(out: Metrics, errors: Array, P: Array, axes: Sequence[str]) -> None:
-    """NEES of all nodes axis by axis: one axis may be overconfident where the sum over all is not.
+    """NEES of all nodes per axis: a single axis can be overconfident although the total is not.
 
     Parameters
     ----------
@@ -473,7 +473,7 @@ def rms(errors: np.ndarray) -> float:
 
 
 def base_metrics(out: Metrics, name: str, T_estimate: Array, T_true: Array, covariance: Array) -> None:
-    """Error of the first base of a session in a common frame, and its NEES."""
+    """Position error of the first base of a session in a common frame, and the NEES of its pose."""
     g = group_of(T_estimate)
     e = g.log(g.between(T_estimate, T_true))
     out.add(f"{name}_base_error", float(np.linalg.norm(e[g.position])), "m", "lower")

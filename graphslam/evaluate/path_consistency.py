@@ -1,4 +1,4 @@
-"""Errors and NEES of every pose of a path against the truth, in the chart of the NEES of the whole run."""
+"""Errors and NEES of every pose of a path against ground truth."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from graphslam.evaluate.consistency import nees, pose_error, vector_pose_error
 from graphslam.evaluate.trajectory_error import match_stamps
 
 SAME_INSTANT = 1e-6
-"""Stamps of truth and path that differ by no more are one [s]: truth is written at the stamps of the path."""
+"""Stamps of ground truth and path that differ by at most this are equal [s]."""
 SINGULAR = 1e-12
-"""Least eigenvalue of the correlations of a pose that is judged: below it some direction of the pose is certain."""
+"""Least eigenvalue of the correlation matrix of a tested pose; below it the covariance is singular."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,15 +28,15 @@ class PathConsistency:
     Parameters
     ----------
     rows : (k,)
-        Which poses of the path.
+        Indices of the tested poses in the path.
     errors, sigmas : (k, 3) or (k, 4)
-        True less estimated ``x, y, heading`` or ``x, y, z, heading``, along the axes of the map, and their σ [m, rad].
+        True minus estimated ``x, y, heading`` or ``x, y, z, heading``, along the axes of the map, and their σ [m, rad].
     nees : (k,)
-        Of the whole pose.
+        NEES of the whole pose.
     dof : int
-        Of each NEES: 3 or 6.
+        Degrees of freedom of each NEES: 3 or 6.
     certain : int
-        Poses with truth that are left out because their covariance is singular, as that of the first base is.
+        Poses that are left out because their covariance is singular, as that of the first base is.
     """
 
     rows: npt.NDArray[np.intp]
@@ -48,24 +48,24 @@ class PathConsistency:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the columns of :attr:`errors`."""
+        """Names of the columns of :attr:`errors`."""
         return ("x", "y", "heading") if self.dof == 3 else ("x", "y", "z", "heading")
 
 
 def map_errors(poses: Array, covariances: Array, true_poses: Array, chart: str) -> tuple[Array, Array]:
     """Errors ``(n, d)`` of poses along the axes of the map, and their covariances ``(n, d, d)``.
 
-    In the group chart, and in space, the error is the right tangent ``Log(T_est⁻¹ T_true)``; in the Cartesian one the
-    difference of the vectors (x, y, θ). Turned to the axes of the map, which changes no NEES, both are
-    ``(x, y, heading)``; in space ``(rotation about x, y, z; x, y, z)``.
+    With ``chart="group"``, and always in 3-D, the error is the right tangent ``Log(T_est⁻¹ T_true)``, rotated to the
+    axes of the map (NEES unchanged); with ``"cartesian"`` the difference of the vectors (x, y, θ). Order: ``(x, y,
+    heading)``, in 3-D ``(rotation about x, y, z; x, y, z)``.
 
     Parameters
     ----------
     poses, true_poses : (n, 3) or (n, 7)
     covariances : (n, 3, 3) or (n, 6, 6)
-        Right tangents.
+        Of right tangents.
     chart : {"group", "cartesian"}
-        Of poses in the plane.
+        Parametrisation of 2-D poses.
     """
     check_chart(chart)
     if poses.shape[-1] == 3:
@@ -82,7 +82,7 @@ def map_errors(poses: Array, covariances: Array, true_poses: Array, chart: str) 
 
 
 def path_consistency(path: Trajectory, truth: Trajectory, *, chart: str) -> PathConsistency:
-    """Every pose of a path whose truth is known.
+    """Errors and NEES of every pose of a path with known ground truth.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def path_consistency(path: Trajectory, truth: Trajectory, *, chart: str) -> Path
 
 
 def _uncertain(P: Array) -> npt.NDArray[np.bool_]:
-    """Which covariances leave no direction certain."""
+    """Mask of the covariances that are not singular."""
     sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
     some = np.all(sigma > 0.0, axis=1)
     scale = np.where(some[:, None], sigma, 1.0)

@@ -1,4 +1,4 @@
-"""Errors and consistency of a refined path against the truth."""
+"""Errors and consistency of a refined path against ground truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graphslam.refine.result import Refinement
 def level_truth(
     truth: MapTruth, path: Trajectory | None, true_base: Array, refined: Trajectory
 ) -> tuple[MapTruth, Trajectory | None]:
-    """Truth in the frame of a refined path: level, and with the first position and heading of that path.
+    """Ground truth in the frame of a refined path: level, with the first position and heading of that path.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def level_truth(
     true_base : (7,) or (3,)
         Of the first submap, in a gravity-aligned frame.
     refined : Trajectory
-        Its first position and heading are fixed. Where their truth is not known, those of the first base are equal.
+        Its first position and heading are fixed. If their true values are unknown, those of the first base are aligned.
     """
     g = group_of(true_base)
     if g.dim == 2:
@@ -72,7 +72,7 @@ def refined_truth_metrics(
     poses = m.base_poses[1:][i]
     steps = steps_at(refinement, m.base_times[1:][i])
     g = group_of(poses)
-    ad = g.adjoint(g.between(poses, refinement.poses[steps]))  # tangent of the body → of the node beside it
+    ad = g.adjoint(g.between(poses, refinement.poses[steps]))  # tangent of the body → of the step's pose
     # several submaps that end at one step share its covariance
     P = refinement.joint(steps).reshape(len(steps), g.dof, len(steps), g.dof)
     P = np.einsum("iab,ibjc,jdc->iajd", ad, P, ad).reshape(len(steps) * g.dof, -1)
@@ -88,7 +88,7 @@ def heading_error(estimate: Trajectory, truth: Trajectory) -> float:
 
 
 def refinement_metrics(out: Metrics, r: Refinement) -> None:
-    """What a refinement found, in figures."""
+    """Metrics of a refinement."""
     last = r.rounds[-1]
     out.add("refine_pairs", last.pairs)
     out.add("refine_pairs_passes", last.passes)
@@ -111,7 +111,7 @@ def refinement_metrics(out: Metrics, r: Refinement) -> None:
 
 
 def refinement_facts(r: Refinement) -> dict[str, Any]:
-    """What ``run.json`` holds of a refinement, JSON-serialisable: rounds, constants with σ, yaw bias by time."""
+    """Entries of a refinement in ``run.json``: rounds, constants with σ, yaw bias over time."""
     return {
         "rounds": [asdict(x) for x in r.rounds],
         "agreement": list(r.agreement),

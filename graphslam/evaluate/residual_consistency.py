@@ -1,11 +1,11 @@
-"""Is a solved graph honest where no truth is known? χ² per class of factor, and the tools of such tests.
+"""Consistency of a solved graph without ground truth: χ² per class of factors.
 
 Residuals at the optimum are smaller than the noise, because the unknowns were fitted to them: a class of factors keeps
-``rows - leverage`` degrees of freedom, its leverage being the share of the unknowns that it determined. Withheld GPS
-(:mod:`graphslam.evaluate.gps_innovation`) and loops against each other
-(:mod:`graphslam.evaluate.loop_consistency`) are the other two tests that need nothing but the data.
+``rows - leverage`` degrees of freedom, its leverage is the number of unknowns that it determines. Related tests without
+ground truth: withheld GPS (:mod:`graphslam.evaluate.gps_innovation`) and pairs of loops
+(:mod:`graphslam.evaluate.loop_consistency`).
 
-All are two-sided: below the bounds an estimate is conservative, and its gates let in what they should keep out.
+All are two-sided: below the bounds an estimate is conservative, and its gates accept outliers.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from graphslam.graph.factors.gps import GpsBatch
 from graphslam.graph.noise import robust_terms
 
 LASTING = "correlated: overconfident"
-"""Verdict on residuals that are alike from one to the next, whatever their size."""
+"""Verdict on residuals that are time-correlated, whatever their size."""
 JUDGED_WITH = {"path": ("gps", "control", "distance")}
-"""Factors that measure nothing by themselves: points of a path are there for the fixes or control points, and share
-their residuals; the first class that a graph has."""
+"""Factors that measure nothing alone: points of a path exist for fixes or control points, and share their residuals.
+They are counted with the first of these classes that the graph has."""
 NOT_TESTED = {"tie": 0, "levelled": 2}
-"""Classes made of poses or of gravity that other factors hold already: their residuals are small whatever the
-covariances are. With each the number of unknowns that it alone determines: levelled bases the tilt of the frame."""
+"""Classes of pseudo-measurements of poses or gravity that other factors contain already: their residuals are always
+small. The value is the number of unknowns that only the class determines: for levelled bases the tilt of the frame."""
 LONGEST_SERIES = 1200
-"""Scalars of a class whose joint covariance is looked at; of a longer series the middle."""
+"""Scalars of a class whose joint covariance is computed; of a longer series the middle."""
 
 
 def two_sided_bounds(ratio: float, dof: float, confidence: float) -> tuple[float, float, Verdict]:
@@ -46,10 +46,10 @@ def two_sided_bounds(ratio: float, dof: float, confidence: float) -> tuple[float
 
 
 def correlated_dof(covariance: Array, d: int) -> float:
-    """Degrees of freedom of a sum of ``n / d`` normalised squares that are correlated with each other.
+    """Effective degrees of freedom of a sum of ``n / d`` normalised squares that are correlated with each other.
 
-    ``Σ eᵢᵀ Pᵢ⁻¹ eᵢ`` has the mean n and the variance ``2 ‖C‖²`` (Frobenius), C being the covariance with every d × d
-    diagonal block whitened; a ``χ²_ν`` scaled to the same two moments has ``ν = n² / ‖C‖²`` (Satterthwaite).
+    ``Σ eᵢᵀ Pᵢ⁻¹ eᵢ`` has the mean n and the variance ``2 ‖C‖²`` (Frobenius), where C is the covariance with whitened d
+    × d diagonal blocks; a scaled ``χ²_ν`` with the same two moments has ``ν = n² / ‖C‖²`` (Satterthwaite).
 
     Parameters
     ----------
@@ -69,22 +69,22 @@ def correlated_dof(covariance: Array, d: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassConsistency:
-    """χ² of one class of factors against what it should be at the optimum.
+    """χ² of one class of factors, with its expectation at the optimum.
 
     Parameters
     ----------
     factors, rows : int
         Factors, and scalars that they measure.
     leverage : float
-        Unknowns that this class determined: ``Σ w tr(J P Jᵀ Λ)``. Summed over the classes it is the number of
+        Number of unknowns that this class determines: ``Σ w tr(J P Jᵀ Λ)``. The sum over all classes is the number of
         unknowns.
     dof : float
-        Expectation of :attr:`chi2` if the stated noise is right: ``rows - leverage`` without kernels; with them (their
-        weights taken as given) ``Σ tr(I - 2 w H + J P M P Jᵀ Λ)``, ``M = Σ w² Jᵀ Λ J``.
+        Expectation of :attr:`chi2` if the noise model is right: ``rows - leverage`` without kernels; with them (weights
+        assumed constant) ``Σ tr(I - 2 w H + J P M P Jᵀ Λ)``, ``M = Σ w² Jᵀ Λ J``.
     chi2 : float
         ``Σ rᵀ Λ r``, without kernels.
     mean_weight, least_weight : float
-        Weights that the kernels gave; 1 where there are none.
+        Weights of the robust kernels; 1 without kernels.
     """
 
     name: str
@@ -100,20 +100,20 @@ class ClassConsistency:
 
     @property
     def independent(self) -> float:
-        """Degrees of freedom that independent residuals would have: :attr:`dof` over their correlation time."""
+        """Effective number of independent degrees of freedom: :attr:`dof` over the correlation time."""
         return self.dof / (1.0 if self.whiteness is None else self.whiteness.tau)
 
     @property
     def ratio(self) -> float:
-        """χ²/dof; ``nan`` for a class whose every row went into the unknowns."""
+        """χ²/dof; ``nan`` for a class without redundancy."""
         return self.chi2 / self.dof if self.dof > 1e-6 * self.rows else float("nan")
 
     def as_row(self) -> dict[str, Any]:
         """One row of a table, with the two-sided bounds of the ratio and the verdict.
 
-        The bounds are those of ``χ²_dof``. One class of several is a part of a projection and varies less, so they are
-        wide rather than narrow. Residuals that are alike from one to the next are overconfident whatever their size:
-        a map that follows errors that last has small residuals.
+        The bounds are those of ``χ²_dof``. One class of several is part of a projection and varies less, so the bounds
+        are too wide rather than too narrow. If the residuals are time-correlated, the verdict is overconfident whatever
+        their size: a map that follows such errors has small residuals.
         """
         low = high = float("nan")
         w, verdict = self.whiteness, "not tested" if self.name in NOT_TESTED else "no redundancy"
@@ -140,12 +140,12 @@ class ClassConsistency:
 
 
 def class_consistency(graph: FactorGraph, *, confidence: float = 0.95) -> dict[str, ClassConsistency]:
-    """χ² and effective degrees of freedom of every class of factors, at the graph's present values.
+    """χ² and effective degrees of freedom of every class of factors, at the current values of the graph.
 
     Parameters
     ----------
     graph : FactorGraph
-        At its optimum: elsewhere residuals are larger than the leverages say.
+        At its optimum; elsewhere the residuals are larger.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def class_consistency(graph: FactorGraph, *, confidence: float = 0.95) -> dict[s
 
 
 def _series(graph: FactorGraph, covariance: JointCovariance) -> dict[str, Whiteness]:
-    """Whiteness of every class whose factors have an order of time: fixes and readings, and chains of increments."""
+    """Whiteness of every class with factors in time order: fixes, readings, and chains of increments."""
     values = graph.values
     found: dict[str, list[tuple[float, Array, Array, Array]]] = {}
     for batch in graph.flat().batches:
@@ -195,7 +195,7 @@ def _series(graph: FactorGraph, covariance: JointCovariance) -> dict[str, Whiten
         if all(t is None for t in at):
             continue
         r, J = batch.whitened(values)
-        if isinstance(batch, GpsBatch):  # errors that last do so in the frame of the fixes
+        if isinstance(batch, GpsBatch):  # errors are correlated in the frame of the fixes
             turn = batch.turns(values)
             r, J = np.einsum("kij,kj->ki", turn, r), turn @ J
         root = np.sqrt(robust_terms(np.sum(r**2, axis=1), batch.code, batch.k)[1])
@@ -219,7 +219,7 @@ def _series(graph: FactorGraph, covariance: JointCovariance) -> dict[str, Whiten
 
 
 def _order(record: Any) -> float | None:
-    """What puts a factor into a series: its time, or its place in a chain of increments."""
+    """Sort key of a factor in a series: its time, or its index in a chain of increments."""
     if isinstance(record, BetweenRecord):
         return float(record.i) if record.j == record.i + 1 and record.group == "dense-submap" else None
     time = getattr(record, "time", None)
@@ -233,7 +233,7 @@ def _whiteness_of(rows: list[tuple[float, Array, Array, Array]], covariance: Joi
     held = int(needed[0] < 0)
     A = np.zeros((n, d, len(needed)))
     J = np.stack([row[2] for row in rows])
-    for c in range(at.shape[1]):  # a column may stand twice in a factor
+    for c in range(at.shape[1]):  # a column can be twice in a factor
         A[np.arange(n), :, at[:, c]] += J[:, :, c]
     flat = A[:, :, held:].reshape(n * d, -1)
     C = np.eye(n * d) - flat @ covariance.columns(needed[held:]) @ flat.T
@@ -243,12 +243,12 @@ def _whiteness_of(rows: list[tuple[float, Array, Array, Array]], covariance: Joi
 
 
 def _sandwich(covariance: JointCovariance, blocks: Any) -> Array:
-    """``P (Σ w² Jᵀ Λ J) P``: covariance of the estimate itself where kernels weigh the factors."""
+    """``P (Σ w² Jᵀ Λ J) P``: sandwich covariance of the estimate with kernel weights."""
     n = covariance.layout.size
     M = np.zeros((n, n))
     for columns, H, w in zip(blocks.columns, blocks.H, blocks.weight):
         free = columns >= 0
         c = columns[free]
-        np.add.at(M, (c[:, None], c[None, :]), w**2 * H[np.ix_(free, free)])  # a column may stand twice
+        np.add.at(M, (c[:, None], c[None, :]), w**2 * H[np.ix_(free, free)])  # a column can be repeated
     P = covariance.full()
     return np.asarray(P @ M @ P)

@@ -1,4 +1,4 @@
-"""One summary of a set of errors, the same for every metric."""
+"""Summary statistics of a set of errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphslam.core.geometry import ArrayLike
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Figures of ``count`` non-negative errors, in the unit of the errors."""
+    """Statistics of ``count`` non-negative errors, in the unit of the errors."""
 
     rmse: float
     mean: float

@@ -1,7 +1,7 @@
-"""Raw streams looked at before a run: what cannot be right in them whatever the map.
+"""Checks of the raw streams before a run: errors that can be found without a map.
 
-Every check rests on what a stream says of itself, on physics, or on two streams that must agree. What is found is a
-line of the verdict, or ends the run (:data:`STOPPING`); nothing is changed and nothing is dropped here.
+A check uses one stream, physical limits, or two streams that must agree. Its findings are lines of the verdict, or end
+the run (:data:`STOPPING`); no record is changed or dropped.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from graphslam.evaluate.stream_checks_sightings import check_sightings, check_st
 from graphslam.io.clock import CLOCK_SET_BACK
 
 GYRO = 40.0
-"""No IMU of a robot measures faster turns [rad/s]: 2000 °/s are 35 rad/s."""
+"""Highest plausible yaw rate of a robot's IMU [rad/s]: 2000 °/s are 35 rad/s."""
 BENT = 0.1
-"""Motion within a scan that bends it visibly [m]."""
+"""Motion during a scan above which its distortion is reported [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class StreamFinding:
     Parameters
     ----------
     stream : str
-        Its name: what is wrong with a stream that a run does not use does not spoil its map.
+        Name of the stream: errors of unused streams do not affect the map.
     """
 
     stream: str
@@ -56,7 +56,7 @@ class StreamFinding:
 
 
 def check_speeds(wheels: VelocityControls, name: str, log: SensorLog) -> list[Finding]:
-    """Wheels that never turn: a robot that is to map something moves."""
+    """Wheels that never turn."""
     if len(wheels.times) < 2 or wheels.speed.any():
         return []
     text = f"speed of {name}: 0 in all {len(wheels.times)} records — the robot never moves. Check that it is connected."
@@ -74,7 +74,7 @@ def _gyro(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
         )
         return [Finding("bad", "gyro-unit", text)]
     if any(isinstance(s, VelocityControls) for s in log.streams.values()):
-        return []  # compared with wheels by every run
+        return []  # check_turns compares it with the wheels
     odometry = next((s for s in log.streams.values() if isinstance(s, Odometry) and len(s.times) > 2), None)
     if odometry is None:
         return []
@@ -86,11 +86,11 @@ def _gyro(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
 
 
 def _point_times(clouds: PointClouds, name: str, log: SensorLog) -> list[Finding]:
-    """Points without times, or with one time for all, on a robot that moves while it scans."""
+    """Points without times, or with equal times, on a robot that moves during a scan."""
     state = log.meta.get("point_times")
     k = next((k for k in range(len(clouds)) if len(clouds.cloud(k))), None)
     if k is None or state in ("used", "unclear") or clouds.ages(k) is not None:
-        return []  # what is unclear is among the assumptions of the reader
+        return []  # "unclear" is reported as an assumption of the reader
     odometry = next((s for s in log.streams.values() if isinstance(s, Odometry) and len(s.times) > 2), None)
     moved = float("nan")
     if odometry is not None:
@@ -128,21 +128,21 @@ STREAM_CHECKS: tuple[tuple[tuple[type, ...], Callable[[Any, str, SensorLog], lis
     ((Imu,), _gyro),
     ((PointClouds,), _point_times),
 )
-"""Kinds of streams, and what is checked in each of them: ``check(stream, name, log)``."""
+"""Stream types, and their check: ``check(stream, name, log)``."""
 
 
 def check_streams(log: SensorLog, *, refusals: bool = True) -> list[StreamFinding]:
-    """Check every stream of a log, its clocks, and what its reader left out.
+    """Check every stream of a log, its clocks, and the records that the reader dropped.
 
     Parameters
     ----------
     refusals : bool
-        Raise for a stream that cannot be used at all; otherwise that is a finding like the others.
+        Raise for an unusable stream; otherwise it is a finding.
 
     Returns
     -------
     list of StreamFinding
-        Faults of the clocks first: they are the cause of many others. Then in the order of the streams.
+        Clock faults first, because they cause many others; then in the order of the streams.
     """
     out = [StreamFinding(name, f) for name, f in check_clocks(log)]
     for name, stream in log.streams.items():
@@ -160,25 +160,25 @@ def check_streams(log: SensorLog, *, refusals: bool = True) -> list[StreamFindin
 
 
 STOPPING = ("stamps-unit",)
-"""Codes of faults with which no map can be made: a run ends with their text."""
+"""Codes of errors that make a map impossible: the run ends with their text."""
 CLOCK_CODES = ("stamps-unit", "clock-jump", "clock-set-back", "no-common-time", "stamps-order")
 
 
 def refuse_faulty(found: list[StreamFinding], log: SensorLog) -> None:
-    """Raise :class:`~graphslam.core.errors.DataError` for the first fault with which no map can be made."""
+    """Raise :class:`~graphslam.core.errors.DataError` for the first error that makes a map impossible."""
     for f in found:
         if f.finding.code in STOPPING:
             raise DataError(f.finding.text, where=f"{log.name}, {f.stream}")
 
 
 LOST = 0.05
-"""Share of the records of a stream that a reader leaves out above which it is a line of the verdict."""
+"""Share of dropped records of a stream above which they are reported."""
 EXPECTED_LOSSES = ("no fix (status)", "observations of other robots", CLOCK_SET_BACK, *ORDER)
-"""Reasons that are no fault of a log, or that :func:`check_clocks` names."""
+"""Reasons that are no error of the log, or that :func:`check_clocks` reports."""
 
 
 def _losses(log: SensorLog) -> list[StreamFinding]:
-    """Records that the reader left out: any fix that is far from the others, and much of any stream."""
+    """Records that the reader dropped: any outlying fix, and more than :data:`LOST` of a stream."""
     lost: dict[str, dict[str, int]] = {}
     for key, n in log.dropped.items():
         name, _, reason = key.partition(": ")

@@ -1,4 +1,4 @@
-"""Scans that cannot be right: without returns, the same in all beams, repeated, or in another unit."""
+"""Checks of scans: without returns, equal ranges in all beams, repeated scans, wrong unit."""
 
 from __future__ import annotations
 
@@ -17,29 +17,27 @@ Scanner = LaserScans | RangeScans | PointClouds
 Mask = npt.NDArray[np.bool_]
 
 SILENT = 5.0
-"""Scans without any return for so long are worth a look [s]: a robot that drives among things sees some of them."""
+"""Time without any return that is reported [s]."""
 CONSTANT = 1e-3
-"""Ranges of one scan that all lie within so much of each other are no measurement [m]: σ of a range finder is above it,
-and no room is a sphere about the scanner."""
+"""Ranges of one scan within this interval are not a measurement [m]: the noise of a range finder is larger."""
 LEAST_BEAMS = 8
-"""Beams with a return that a scan needs to be called constant."""
+"""Least number of beams with a return in a scan that is called constant."""
 NEAREST, FARTHEST = 0.1, 1000.0
-"""Half of all things are neither nearer nor farther [m]: a body is larger than the one, and no scanner of a robot
-reaches the other."""
+"""Plausible limits of the median range [m]."""
 MOST_CLOUDS = 100
-"""Clouds that are decoded for these checks, evenly over the stream: a recording may hold 10⁷ points."""
+"""Clouds that are decoded for these checks, evenly over the stream: a recording can have 10⁷ points."""
 SOME = 0.01
-"""Share of the scans above which a fault that no sound scanner has is said."""
+"""Share of faulty scans above which the fault is reported."""
 
 
 def check_beams(stream: Scanner, name: str, log: SensorLog) -> list[Finding]:
-    """Look at the scans of one scanner.
+    """Check the scans of one scanner.
 
     Parameters
     ----------
     stream : LaserScans, RangeScans or PointClouds
     name : str
-        For the sentences.
+        Name of the stream in the messages.
     """
     if len(stream.times) == 0:
         return [Finding("bad", "scans-missing", f"{name}: no scans.")]

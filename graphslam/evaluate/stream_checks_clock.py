@@ -1,4 +1,4 @@
-"""Stamps of streams looked at before a run: unit, jumps, and whether streams were recorded at the same time."""
+"""Checks of stamps before a run: unit, jumps, order, and overlap in time of the streams."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import CLOCK_SET_BACK
 
 STEADY = (Imu, LaserScans, Odometry, PointClouds, RangeScans, SteeringControls, VelocityControls)
-"""Streams that bring records all the time; landmarks and fixes come when there are some."""
+"""Streams with regular records; landmarks and fixes can pause."""
 SLOWEST, FASTEST = 30.0, 2e-5
-"""Usual time between records of a sensor [s]: no scanner takes half a minute, no IMU gives 50 000 readings a second."""
+"""Plausible limits of the usual interval between records [s]."""
 JUMP, JUMP_TIMES = 20.0, 50.0
-"""A pause this long [s], and this many times the usual one, is one that somebody should know of."""
+"""A pause is reported if it is longer than this [s], and than this multiple of the usual interval."""
 TOGETHER = 0.5
-"""Share of the shorter of two streams that the other covers: below it they hardly tell of the same drive."""
+"""Least share of the shorter of two streams that the other must cover."""
 ORDER = ("stamp out of order", "repeated stamp", "stamp is not finite")
 REORDERED = 0.001
-"""Share of stamps that fall back or stand twice above which it is said."""
+"""Share of stamps out of order or repeated above which they are reported."""
 
 
 def check_clocks(log: SensorLog) -> list[tuple[str, Finding]]:
-    """Lines on the stamps of a log, each with the name of its stream."""
+    """Findings on the stamps of a log, each with the name of its stream."""
     out: list[tuple[str, Finding]] = []
     for name, stream in log.streams.items():
         if isinstance(stream, STEADY) and len(stream.times) > 2:

@@ -1,8 +1,7 @@
-"""GPS fixes looked at before a run: against themselves, and against what the wheels say over short times.
+"""Checks of GPS fixes before a run, against wheel odometry over short distances.
 
-Dead reckoning drifts, but over some ten metres it tells how far the robot went and which way it turned. Chords between
-fixes must be as long and turn as much: that needs no map and no alignment. Chords are taken as long as ten times the
-stated σ of a fix, so that noise turns them by less than 10°.
+Dead reckoning is accurate over about ten metres. The chords between fixes must have the same lengths and turns; no map
+and no alignment is needed. A chord is at least ten times σ of a fix long, so noise turns it by less than 10°.
 """
 
 from __future__ import annotations
@@ -17,28 +16,27 @@ from graphslam.core.records import Gps, Odometry
 from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments, motion_stream
 
 CHORD = 10.0
-"""Length of the chords that are compared, in σ of a fix."""
+"""Least length of the compared chords, in σ of a fix, …"""
 SHORTEST_CHORD = 5.0
-"""And at least this [m]."""
+"""… and in metres."""
 LEAST_CHORDS = 3
 MOVED = 20.0
-"""Way of the wheels below which standing fixes say nothing [m]."""
+"""Wheel path length above which equal fixes are reported as a stuck receiver [m]."""
 TWICE = 2.0
-"""Chords that are longer or shorter than those of the wheels by more than this factor are not in metres: no wheel is
-wrong by so much."""
+"""A ratio of chord lengths above this factor, or below its inverse, is a wrong unit, not a wheel error."""
 TURNED = np.deg2rad(60.0)
-"""Turns of the wheels, summed in absolute value, from which on their sign can be compared with that of the fixes."""
+"""Sum of absolute turns of the wheels above which their sign is compared with that of the fixes."""
 
 
 def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
-    """Lines on the fixes of a log.
+    """Findings on the fixes of a log.
 
     Parameters
     ----------
     name : str
-        Of the stream.
+        Name of the stream.
     log : SensorLog
-        Its motion stream, if it has a planar one, is what the fixes are compared with.
+        The fixes are compared with its motion stream if that is planar.
     """
     if len(gps.times) == 0:
         return [Finding("look", "gps-empty", f"{name}: no fixes.")]
@@ -68,7 +66,7 @@ def check_gps(gps: Gps, name: str, log: SensorLog) -> list[Finding]:
 
 
 def _reckoned(log: SensorLog, t: Array, lever: Array) -> Array | None:
-    """Antenna ``(n, 2)`` at the fixes by the wheels alone."""
+    """Antenna positions ``(n, 2)`` at the fixes from dead reckoning."""
     try:
         steps = dead_reckoned_increments(log, t, MotionNoise(), hold=1.0)[0].increments
     except DataError:

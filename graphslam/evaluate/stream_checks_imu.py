@@ -1,4 +1,4 @@
-"""IMUs whose readings cannot be right: wrong units, at their limit, stuck, or against the turns of the wheels."""
+"""Checks of IMUs: units, saturation, stuck readings, and yaw rates compared with the wheels."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from graphslam.core.log import SensorLog
 from graphslam.core.records import VelocityControls
 
 GRAVITY_OFF = 0.1
-"""Share by which the median specific force may be off gravity: biases and scales of accelerometers are far below it."""
+"""Largest relative deviation of the median specific force from gravity."""
 AT_LIMIT = 5
-"""Records in a row at one axis' greatest value that are no accident: noise never repeats a number."""
+"""Consecutive records at an axis' extreme value that count as saturation."""
 STUCK = 20
-"""Records in a row whose six numbers are all the same."""
+"""Consecutive records with six equal values that count as stuck."""
 WINDOW = 0.5
-"""Turns of gyro and wheels are compared over so long [s] …"""
+"""Averaging window for yaw rates of gyro and wheels [s] …"""
 LEAST_TURN = 0.1
-"""… where their RMS is at least this [rad/s]: who does not turn, says nothing of turning."""
+"""… and least standard deviation of the rates for a comparison [rad/s]."""
 SLIP = 2.5
-"""Skid-steered wheels tell up to twice the turn or half of it, since they slide sideways; more is another unit."""
+"""Ratio of yaw rates above which the unit is wrong; skid-steered wheels slip by up to a factor of two."""
 LEAST_ALIKE = 0.5
-"""Correlation of the two below which they do not tell the same turns; wheels that slide keep above 0.9."""
+"""Least correlation of the two yaw rates; wheels that slip stay above 0.9."""
 LATE = 0.2
-"""Lag between the turns of gyro and wheels beyond which the clocks differ [s]: a step of 0.4 s is then half off."""
+"""Lag between the yaw rates of gyro and wheels above which the clocks differ [s]: half of a 0.4 s step."""
 MOST_LAG = 2.0
-"""Lags that are looked for [s]."""
+"""Largest lag in the search [s]."""
 
 
 def check_imu(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
-    """Look at the readings of one IMU by themselves.
+    """Check the readings of one IMU.
 
     Parameters
     ----------
     name : str
-        For the sentences.
+        Name of the stream in the messages.
     """
     if len(imu.times) == 0:
         return [Finding("bad", "imu-missing", f"{name}: no records.")]
@@ -64,7 +64,7 @@ def _gravity(imu: Imu, name: str) -> list[Finding]:
 
 
 def _longest_runs(values: Array) -> tuple[int, int]:
-    """Records that belong to runs of at least :data:`AT_LIMIT` equal extremes of ``values`` ``(n,)``, and runs."""
+    """Number of records in runs of at least :data:`AT_LIMIT` equal extremes of ``values (n,)``, and of runs."""
     total = runs = 0
     for extreme in (values.max(), values.min()):
         at = np.concatenate([[False], values == extreme, [False]]).astype(np.int8)
@@ -81,7 +81,7 @@ def _limits(imu: Imu, name: str) -> list[Finding]:
         for axis in range(3):
             v = values[:, axis]
             if np.ptp(v) == 0.0:
-                continue  # an axis that is not there
+                continue  # no data on this axis
             count, runs = _longest_runs(v)
             if count:
                 text = (
@@ -109,14 +109,14 @@ def _stuck(imu: Imu, name: str) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True)
 class TurnAgreement:
-    """Turns of a gyro against those of wheels.
+    """Yaw rates of a gyro compared with those of the wheels.
 
     Parameters
     ----------
     slope, sigma : float
         Gyro over wheels, by total least squares, and its σ.
     lag : float
-        By which the gyro is later than the wheels [s].
+        Delay of the gyro relative to the wheels [s].
     correlation : float
         At that lag.
     """
@@ -129,10 +129,10 @@ class TurnAgreement:
 
 
 def turn_agreement(times_a: Array, a: Array, times_b: Array, b: Array) -> TurnAgreement | None:
-    """Compare two rates of turn ``(n,)`` and ``(m,)`` [rad/s] on their own stamps; None where there is too little turn.
+    """Compare two yaw rates ``(n,)`` and ``(m,)`` [rad/s] on their own stamps; None without enough turns.
 
-    Means over :data:`WINDOW`; the slope is the ratio of their spreads with the sign of the correlation, which favours
-    neither, and its σ that of a ratio of so many windows.
+    Both are averaged over :data:`WINDOW`. The slope is the ratio of the standard deviations with the sign of the
+    correlation, which is symmetric in both; its σ is that of a ratio of n windows.
     """
     begin, end = max(times_a[0], times_b[0]), min(times_a[-1], times_b[-1])
     n = int((end - begin) // WINDOW)
@@ -174,18 +174,18 @@ def _correlation(x: Array, y: Array) -> float:
 
 
 def check_turns(imu: Imu, name: str, log: SensorLog) -> list[Finding]:
-    """Compare the turns of the gyro with those of the wheels, where the log has any."""
+    """Compare the yaw rates of the gyro with those of the wheels, if the log has any."""
     wheels = next((s for s in log.streams.values() if isinstance(s, VelocityControls)), None)
     return [] if wheels is None else compare_turns(imu, wheels, name)
 
 
 def compare_turns(imu: Imu, wheels: VelocityControls, name: str) -> list[Finding]:
-    """Compare the turns of the gyro about the base's z axis with those of the wheels.
+    """Compare the yaw rate of the gyro about the base's z axis with that of the wheels.
 
     Parameters
     ----------
     name : str
-        Of the IMU, for the sentences.
+        Name of the IMU in the messages.
     """
     if len(imu.times) < 2 or len(wheels.times) < 2:
         return []

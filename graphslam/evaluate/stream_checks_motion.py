@@ -1,4 +1,4 @@
-"""Odometry and wheels looked at before a run: by themselves, and against what the robot saw from place to place."""
+"""Checks of odometry and wheels before a run: limits, jumps, and comparison with landmark observations."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from graphslam_frontends.odometry.recorded import chain_odometry
 Ints = npt.NDArray[np.int64]
 
 FASTEST, FASTEST_TURN = 70.0, 10.0
-"""No robot or car drives faster [m/s] for a quarter of the time, or turns faster [rad/s] for a hundredth of it."""
+"""Speed limit [m/s] for the fastest quarter of the records, and yaw rate limit [rad/s] for the fastest hundredth."""
 LEAP, LEAP_TIMES = 1.0, 30.0
-"""A step this long [m] and this many times as fast as the robot usually drives is a leap of the pose, not a drive."""
+"""A step longer than this [m] and this multiple of the usual speed is a jump of the odometry."""
 SIDEWAYS = 0.6
-"""Way to the side as a share of that ahead above which a heading is not that of the motion."""
+"""Ratio of sideways to forward motion above which the heading is reported as wrong."""
 APART = (0.5, 6.0)
-"""Two sightings of a landmark that are compared are so far apart in time [s]."""
+"""Limits of the time between the two compared observations of a landmark [s]."""
 MOST_PAIRS, LEAST_PAIRS = 4000, 30
 BETTER = 0.5
-"""Under the right hypothesis the landmarks move less than this share of what they do as the log stands, …"""
+"""A hypothesis is reported if the landmarks move less than this share of what they move without a change, …"""
 NOISY = 2.0
-"""… which is this many times what the stated noise explains."""
+"""… and that is at least this multiple of the noise."""
 
 
 def check_odometry(motion: Odometry | VelocityControls, name: str) -> list[Finding]:
-    """Lines on a stream of motion by itself."""
+    """Findings on one motion stream."""
     if len(motion.times) < 3:
         return []
     dt = np.diff(motion.times)
@@ -43,7 +43,7 @@ def check_odometry(motion: Odometry | VelocityControls, name: str) -> list[Findi
     g = group_of(motion.increments)
     xi = np.asarray(g.log(motion.increments))[1:]
     way, turn = np.linalg.norm(xi[:, g.position], axis=1), np.abs(xi[:, g.heading])
-    # records that came late and together have stamps that say nothing of a speed
+    # bursts of delayed records have stamps without use for speeds
     usual_steps = (dt > 0.5 * np.median(dt)) & (dt <= 5.0 * np.median(dt))
     speed, rate = way / dt, turn / dt
     out = _too_fast(speed[usual_steps], rate[usual_steps], name)
@@ -89,7 +89,7 @@ def _too_fast(speed: Array, rate: Array, name: str) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True)
 class MotionFault:
-    """One thing that may be wrong: factors on what the log says, and the line for the user.
+    """One hypothesis on a wrong unit or sign: factors on the data, and the message.
 
     Parameters
     ----------
@@ -128,10 +128,10 @@ HYPOTHESES = (
 
 
 def check_sighted_motion(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
-    """Does a landmark stay where it is while the robot moves as the log says? If not, what would make it stay.
+    """Test whether landmarks stay in place under the motion in the log; if not, which unit or sign error explains it.
 
-    Two sightings of the same landmark some seconds apart are put into one frame by the motion between them. Units and
-    signs that may be wrong are tried one after the other: the one under which landmarks stay is named.
+    Two observations of a landmark are transformed into one frame with the motion between them. The hypotheses are tried
+    one by one; that with the smallest shift of the landmarks is reported.
     """
     pairs = _sighted_twice(z)
     if pairs is None:
@@ -163,7 +163,7 @@ def check_sighted_motion(z: LandmarkObservations, name: str, log: SensorLog) -> 
 
 
 def _sighted_twice(z: LandmarkObservations) -> tuple[Ints, Ints] | None:
-    """Rows of pairs of sightings of one landmark, each row with the last one that is near enough in time."""
+    """Rows of pairs of observations of one landmark: each row with the last one inside :data:`APART`."""
     if z.ids is None or not len(z.ranges) or not np.all(z.has_bearing) or not np.all(z.ranges > 0):
         return None
     scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
@@ -183,7 +183,7 @@ def _sighted_twice(z: LandmarkObservations) -> tuple[Ints, Ints] | None:
 
 
 def _path(log: SensorLog, times: Array, speed: float, turn: float) -> Array | None:
-    """Poses ``(n, 3)`` by the motion of a log, its distances and turns multiplied; None where there is none."""
+    """Poses ``(n, 3)`` from dead reckoning with scaled distances and turns; None if there is no planar motion."""
     streams = dict(log.streams)
     for name, s in log.streams.items():
         if isinstance(s, VelocityControls):

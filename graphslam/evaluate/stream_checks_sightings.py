@@ -1,7 +1,7 @@
-"""Sightings of landmarks and the controls of wheels looked at before a run, by what is physically possible.
+"""Checks of landmark observations and steering before a run, by physical limits.
 
-Nothing here needs a map: angles have ranges, copies of a scan are exact copies, and between two sightings of the same
-landmark its range changes by no more than the robot moves, and by a good part of that as it passes.
+No map is needed: angles are limited, repeated scans are exact copies, and between two observations of a landmark its
+range changes by at most the path length, but not by much less over a whole drive.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from graphslam.core.records import LandmarkObservations, SteeringControls
 from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_increments
 
 APART = 1.0
-"""Sightings of a landmark are compared over at least this time [s], in which a robot moves by more than the noise."""
+"""Least time between two compared observations of a landmark [s]."""
 LEAST_PAIRS = 20
 LEAST_WAY = 10.0
-"""Way over all pairs below which their ranges say nothing [m]."""
+"""Path length over all pairs below which the ranges are not tested [m]."""
 HARDLY = 0.01
-"""Ranges that change by less than this part of the way are in no unit near a metre: passing a landmark they change by
-half of the way on the average, and only circles about all landmarks at once keep them."""
+"""Ranges that change by less than this share of the path length are in a wrong unit. When a robot passes a landmark,
+the range changes by half of the path on average."""
 COPIES = 0.5
-"""Share of scans that are exact copies of the one before from which on a scan is not a measurement of its own."""
+"""Share of exact copies of the previous scan above which they are reported."""
 FEW = 0.25
-"""Share of pairs that wrong identities or slips of the wheels may explain."""
+"""Share of implausible pairs that wrong identities or wheel slip may explain."""
 
 
 def check_sightings(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
-    """Lines on a stream of sightings.
+    """Findings on a stream of landmark observations.
 
     Parameters
     ----------
     name : str
-        Of the stream.
+        Name of the stream.
     log : SensorLog
-        Its motion tells the way between sightings.
+        Its motion gives the path length between observations.
     """
     if len(z.ranges) == 0:
         return []
@@ -63,7 +63,7 @@ def check_sightings(z: LandmarkObservations, name: str, log: SensorLog) -> list[
 
 
 def check_steering(controls: SteeringControls, name: str, log: SensorLog) -> list[Finding]:
-    """Lines on the steering of a car."""
+    """Findings on steering angles."""
     beyond = int(np.sum(np.abs(controls.steering) > 0.5 * np.pi))
     if not beyond:
         return []
@@ -112,7 +112,7 @@ def _ranges_and_way(z: LandmarkObservations, name: str, log: SensorLog) -> list[
 
 
 def _pairs(z: LandmarkObservations) -> tuple[Array, Array] | None:
-    """Rows of sightings of the same landmark, the next one at least :data:`APART` later, not twice as late."""
+    """Rows of pairs of observations of the same landmark, :data:`APART` to twice :data:`APART` apart in time."""
     if z.ids is None:
         return None
     scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
@@ -131,7 +131,7 @@ def _pairs(z: LandmarkObservations) -> tuple[Array, Array] | None:
 
 
 def _way(log: SensorLog, times: Array) -> Array | None:
-    """Metres driven until each of ``times``, by the wheels."""
+    """Path length [m] up to each of ``times``, from wheel odometry."""
     try:
         steps = dead_reckoned_increments(log, times, MotionNoise(), hold=np.inf)[0].increments
     except (DataError, MissingDataError):

@@ -1,7 +1,7 @@
 """Absolute and relative error of a trajectory (Sturm et al. 2012), in two and three dimensions.
 
-ATE: distance between corresponding positions after a stated alignment. RPE: error of the motion over a stated
-distance or time, ``E_ij = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j)`` with R the reference and P the estimate; it needs no alignment.
+ATE: distance between corresponding positions after a given alignment. RPE: error of the motion over a given distance or
+time, ``E_ij = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j)`` with R the reference and P the estimate; it needs no alignment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Index = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryError:
-    """ATE or RPE with what is needed to repeat it.
+    """ATE or RPE with the parameters to reproduce it.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class TrajectoryError:
 def match_stamps(reference_times: ArrayLike, times: ArrayLike, *, max_diff: float = 0.01) -> tuple[Index, Index]:
     """Pairs ``(i, j)`` of stamps that are each other's nearest, not more than ``max_diff`` [s] apart.
 
-    Mutual, so no pose is used twice; in order of time.
+    No pose is used twice. Sorted by time.
     """
     r, t = check_times(reference_times, where="reference"), check_times(times, where="estimate")
     if not len(r) or not len(t):
@@ -99,10 +99,10 @@ def _nearest(sorted_times: Array, query: Array) -> Index:
 
 
 def fit_alignment(reference: Array, estimate: Array, alignment: Alignment) -> tuple[Array, float]:
-    """``T_ref_est`` and scale that take estimated poses onto reference poses, row by row.
+    """``T_ref_est`` and scale that align estimated poses with reference poses, row by row.
 
-    ``none``; ``origin``: the first poses coincide, heading included; ``se``: rigid least squares on positions;
-    ``sim``: with scale (Umeyama 1991).
+    ``none``; ``origin``: the first poses coincide, heading included; ``se``: rigid least squares on positions; ``sim``:
+    with scale (Umeyama 1991).
     """
     planar = reference.shape[1] == 3
     if alignment == "none":
@@ -171,7 +171,7 @@ def ate(
     alignment : {"none", "origin", "se", "sim"}
         See :func:`fit_alignment`.
     max_diff : float
-        Stamps farther apart than this are no pair [s].
+        Largest difference of associated stamps [s].
     """
     times, ref, est, T, scale = _pair(reference, estimate, alignment, max_diff)
     between = se2_between if reference.dim == 2 else se3.se3_between
@@ -200,7 +200,7 @@ def delta_pairs(progress: Array, delta: float, *, tolerance: float, all_pairs: b
     after = np.clip(np.searchsorted(progress, want), i + 1, n - 1)
     before = np.maximum(after - 1, i + 1)
     j = np.where(np.abs(progress[before] - want) <= np.abs(progress[after] - want), before, after)
-    # a vehicle that stands makes no progress: of equal candidates the first counts
+    # at standstill the progress is constant: use the first of equal candidates
     j = np.maximum(np.searchsorted(progress, progress[j], side="left"), i + 1)
     good = np.abs(progress[j] - want) <= tolerance
     if all_pairs:

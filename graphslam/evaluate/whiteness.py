@@ -1,14 +1,12 @@
-"""Are residuals independent from one to the next? What errors that last do to a series, and what it is still worth.
+"""Whiteness test of residuals, and the effective number of independent residuals.
 
-A map follows errors that last, so their residuals are *small*, and a test of size alone calls such a map conservative
-while it is wrong by several of its own σ. What is left of them is alike from one to the next. So the sign of a verdict
-comes from the correlation first, and the size is judged by as many degrees of freedom as independent residuals there
-are.
+A map follows time-correlated errors, so their residuals are *small*, and a test of size alone would call such a map
+conservative although it is wrong by several σ. The remaining residuals are correlated. Therefore the correlation is
+tested first, and the size with the effective number of degrees of freedom.
 
-Residuals at an optimum are not quite independent even where the noise is: their covariance is ``C = I - H``, H being
-the hat matrix of their class. A sum of products over neighbours, ``rᵀ A r``, then has the mean ``tr(A C)`` and the
-variance ``2 tr(A C A C)``; both are taken from C, so that a chain that was bent by one loop is not called correlated
-for it.
+Residuals at an optimum are not independent even if the noise is: their covariance is ``C = I - H``, where H is the hat
+matrix of their class. A sum of products over neighbours, ``rᵀ A r``, then has the mean ``tr(A C)`` and the variance ``2
+tr(A C A C)``; both are computed from C, so that the correlation caused by the fit is not counted.
 """
 
 from __future__ import annotations
@@ -21,25 +19,25 @@ from scipy import special
 from graphslam.core.geometry import Array
 
 LAST = 1.5
-"""Integrated correlation time, in residuals, from which on errors last; below it is a matter of the bounds."""
+"""Integrated correlation time, in residuals, above which errors count as time-correlated."""
 LEAST = 12
-"""Fewer residuals in a row do not tell their correlation."""
+"""A shorter series is not tested."""
 LONGEST = 60
-"""Lags that are looked at, at most."""
+"""Largest lag."""
 
 
 @dataclass(frozen=True, slots=True)
 class Whiteness:
-    """Correlation of standardised residuals in the order of time.
+    """Correlation of standardised residuals in time order.
 
     Parameters
     ----------
     pairs : int
-        Neighbours that were compared.
+        Number of pairs of neighbours.
     lag1 : float
-        Correlation from one to the next, less what the fit to the unknowns makes of white noise.
+        Correlation at lag 1, minus its mean for white noise after the fit.
     score : float
-        The same in units of its σ for white noise: N(0, 1) where the noise is white.
+        The same in units of its σ for white noise: N(0, 1) if the noise is white.
     tau : float
         Integrated correlation time ``1 + 2 Σ ρ_k``, in residuals, up to the first ``ρ_k`` within its noise; at least 1.
     """
@@ -51,16 +49,16 @@ class Whiteness:
 
     @property
     def p_value(self) -> float:
-        """Probability that white residuals are so much alike."""
+        """Probability of at least this correlation for white residuals."""
         return float(special.ndtr(-self.score))
 
     def lasting(self, level: float = 0.005) -> bool:
-        """Do errors last for longer than from one residual to the next?"""
+        """Whether the errors are time-correlated beyond neighbouring residuals."""
         return self.p_value < level and self.tau > LAST
 
 
 def residual_whiteness(times: Array, residuals: Array, covariance: Array | None = None) -> Whiteness | None:
-    """Correlation of a series; None where it is too short to tell.
+    """Correlation of a series; None if it is too short.
 
     Parameters
     ----------
@@ -85,7 +83,7 @@ def residual_whiteness(times: Array, residuals: Array, covariance: Array | None 
         if len(near) < LEAST // 2:
             break
         products = float(np.sum(residuals[near] * residuals[near + lag]))
-        # scaled by the size that was found, so that the test is one of correlation alone
+        # normalised by the observed variance, so that only correlation is tested
         mean, variance = 0.0, float(len(near) * d)
         if C is not None:
             at = ((near[:, None] * d) + np.arange(d)).ravel()
@@ -95,7 +93,7 @@ def residual_whiteness(times: Array, residuals: Array, covariance: Array | None 
                 A = np.zeros_like(C)
                 A[at, behind] += 0.5
                 A[behind, at] += 0.5
-                A[np.arange(n * d), np.arange(n * d)] -= mean / (size * n * d)  # in units of the size that was found
+                A[np.arange(n * d), np.arange(n * d)] -= mean / (size * n * d)  # in units of the observed variance
                 AC = A @ C
                 variance = 2.0 * float(np.sum(AC * AC.T)) / expected**2
         scale = len(near) * d * size
