@@ -19,7 +19,10 @@ from graphslam.evaluate.consistency import vector_pose_error
 def gauge_directions(poses: ArrayLike, points: ArrayLike) -> Array:
     """Derivative of the vector ``[poses (x, y, θ) …, points (x, y) …]`` with respect to a rigid motion of the map.
 
-    Parameters ---------- poses : (m, 3) points : (n, 2)
+    Parameters
+    ----------
+    poses : (m, 3)
+    points : (n, 2)
 
     Returns
     -------

@@ -1,9 +1,9 @@
-"""Which landmarks of the next map are known already (Combined SLAM B7, Algorithm 1).
+"""Data association of the next map's landmarks with those of the map (Combined SLAM B7, Algorithm 1).
 
 Candidates are found by geometry: earlier submaps whose start is near, then their landmarks that are near. Only the
-covariance of the last pose and the candidates is recovered, by sparse solves. Two rules decide: the nearest neighbour
-by Mahalanobis distance, or the largest jointly compatible set, searched from many starts with every accepted pair
-conditioning the rest. Both are exclusive: one landmark, one entry.
+covariance of the last pose and the candidates is recovered, by sparse solves. There are two rules: the nearest
+neighbour by Mahalanobis distance, or the largest jointly compatible set, searched from many starts; every accepted pair
+conditions the rest. Both are exclusive: one landmark, one entry.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ from graphslam.join.joined_map import JoinedMapView, landmark_scalars, pose_scal
 logger = logging.getLogger(__name__)
 Index = npt.NDArray[np.intp]
 
-# Where a dead-reckoned lap meets an old one, everything may be anything: the joint covariance of 2,000 pairs takes
-# 128 MB, and a search among more would be a lottery anyway.
+# Limit of candidate pairs after a long drift: the joint covariance of 2,000 pairs takes 128 MB, and a search among more
+# would be unreliable.
 _MOST_PAIRS = 2_000
 
 
 @dataclass(frozen=True)
 class MapAssociationConfig:
-    """How landmarks are recognised.
+    """Configuration of the data association.
 
     Parameters
     ----------
     rule : "nearest" or "joint"
         Nearest neighbour, or joint compatibility.
     sensor_range : float
-        TH1 of Algorithm 1 [m]: submaps whose starts are within twice this may have seen the same landmarks.
+        TH1 of Algorithm 1 [m]: submaps whose starts are within twice this can share landmarks.
     radius : float
-        TH2 of Algorithm 1 [m]: how far a candidate may be from where it is expected, beyond ``margin`` standard
-        deviations of that expectation.
+        TH2 of Algorithm 1 [m]: largest distance of a candidate from its prediction, in addition to ``margin`` standard
+        deviations of the prediction.
     margin : float
-        Standard deviations of the pose added to both radii, so that a loop is found again after a long drift.
+        Standard deviations of the pose added to both radii, so that a loop is found after a long drift.
     confidence : float
         Probability of the chi-square gates.
     starts : int
-        Beams of the joint search.
+        Number of starts of the joint search.
     """
 
     rule: Literal["nearest", "joint"] = "joint"
@@ -101,7 +101,7 @@ def match_landmarks(a: JoinedMapView, b: JoinedMapView, options: MapAssociationC
 
 
 def _candidate_pairs(a: JoinedMapView, b: JoinedMapView, options: MapAssociationConfig) -> tuple[Index, Index]:
-    """Pairs (landmark of B, landmark of A) that geometry allows: Algorithm 1, TH1 and TH2."""
+    """Pairs (landmark of B, landmark of A) that are close enough: Algorithm 1, TH1 and TH2."""
     none = np.zeros(0, dtype=np.intp)
     if len(a.landmark_at) == 0 or len(b.landmark_at) == 0:
         return none, none
@@ -142,12 +142,12 @@ def _candidate_pairs(a: JoinedMapView, b: JoinedMapView, options: MapAssociation
 
 @dataclass(frozen=True)
 class CandidatePairs:
-    """Innovations of candidate pairs with their joint covariance, kept as its parts.
+    """Innovations of candidate pairs with the parts of their joint covariance.
 
     Parameters
     ----------
     i, j : (p,)
-        Which observation and which known landmark each pair joins.
+        Observation and known landmark of each pair.
     innovation : (p, 2)
         ``z_i - R(θ)ᵀ (f_j - p)``.
     jacobian : (p, 2, 5)
@@ -188,7 +188,7 @@ class CandidatePairs:
         return state, landmark_scalars(2 * self.i)
 
     def covariances(self) -> Array:
-        """Innovation covariance of every pair by itself ``(p, 2, 2)``."""
+        """Innovation covariance of each pair ``(p, 2, 2)``."""
         state, obs = self._own_scalars()
         P = self.P[state[:, :, None], state[:, None, :]]
         return self.jacobian @ P @ self.jacobian.swapaxes(1, 2) + self.Q[obs[:, :, None], obs[:, None, :]]
@@ -203,22 +203,22 @@ class CandidatePairs:
         return J @ self.P @ J.T + self.Q[np.ix_(obs.ravel(), obs.ravel())]
 
     def mahalanobis2(self) -> Array:
-        """Squared distance of every pair by itself ``(p,)``."""
+        """Squared Mahalanobis distance of each pair ``(p,)``."""
         return mahalanobis2(self.innovation, self.covariances())
 
     def nearest(self) -> Index:
-        """Exclusive nearest neighbours: the smallest Mahalanobis distance of all is taken first, and so on."""
+        """Exclusive nearest neighbours: pairs are accepted in the order of their Mahalanobis distance."""
         return nearest_neighbour_pairs(self.mahalanobis2(), self.i, self.j)
 
     def joint(self, confidence: float, starts: int) -> Index:
         """Largest jointly compatible set that a search from ``starts`` pairs finds.
 
-        Every start takes, again and again, the likeliest pair that is compatible *given* those taken, as long as the
-        whole set stays inside its chi-square gate. Of two sets of the same size the likelier one wins.
+        From every start, the likeliest pair that is compatible *given* the accepted ones is added repeatedly, as long
+        as the whole set is inside its chi-square gate. Of two sets of the same size the likelier one is used.
         """
         if len(self.i) == 0:
             return np.zeros(0, dtype=np.intp)
-        # The best pairs of every observation come first, so that no cluttered corner eats all the starts.
+        # The best pairs of every observation come first, so that a cluttered area does not use all starts.
         d2 = self.mahalanobis2()
         order = np.lexsort((d2, self.i))
         rank = np.empty(len(order), dtype=np.intp)

@@ -1,17 +1,17 @@
 """Join two maps in information form (Combined SLAM B6, eq. 13–16): exactly sparse, linearised once.
 
 Map B is one measurement of the global quantities, seen from the last pose of map A: ``x_B = H(X) + v``,
-``v ~ N(0, I_B⁻¹)``. The end poses and new landmarks of B enter A with rows and columns of zeros (zero information), at
-the values B gives them, and then
+``v ~ N(0, I_B⁻¹)``. The end poses and new landmarks of B are added to A with zero information, at their values from B,
+and then
 
     I ← I + ∇Hᵀ I_B ∇H,        X ← X + I⁻¹ ∇Hᵀ I_B (x_B - H(X)),
 
 which is eq. 16 with ``i = I X`` (eq. 13) subtracted on both sides: in this residual form a heading can be wrapped.
-Nothing is marginalised out, so ``I`` keeps only the couplings that submaps made.
+Nothing is marginalised out, so ``I`` has only the couplings from the submaps.
 
-Maps that are Gaussian in the group chart (:mod:`graphslam.core.charts`) are joined in it: every landmark hangs on the
-end of the submap that saw it first, and B's observation is linearised again, inside the join, where A and B together
-put it. The inner Gaussians of A and B stay summarised, so it is an information filter still, an iterated one.
+Maps that are Gaussian in the group chart (:mod:`graphslam.core.charts`) are joined in it: every landmark is expressed
+in the frame of the end pose of the submap that observed it first, and B's observation is relinearised at the joint
+estimate of A and B. This is an iterated information filter.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from graphslam.linear.symmetric_factor import elimination_order
 
 Index = npt.NDArray[np.intp]
 
-# A kept order is given up when the factor has this much more fill-in than under the last fresh one.
+# The elimination order is recomputed when the fill-in exceeds that of the last new order by this factor.
 _STALE = 1.3
-# Below this a difference between B and its own prediction is arithmetic, not news.
+# Smaller relative differences between B and its prediction are rounding errors.
 _ROUNDING = 1e-12
 
 
 def match_by_id(a: JoinedMap, b: JoinedMap) -> Index:
-    """For every landmark of B the landmark of A with the same id, or -1 ``(L_b,)``."""
+    """Landmark of A with the same id as each landmark of B, or -1 ``(L_b,)``."""
     if len(a.ids) == 0:
         return np.full(len(b.ids), -1, dtype=np.intp)
     order = np.argsort(a.ids)
@@ -43,7 +43,7 @@ def match_by_id(a: JoinedMap, b: JoinedMap) -> Index:
 
 
 _PASSES = 3
-# … and no more of them once a step is a thousandth of a standard deviation, on the average over the map.
+# … or until a step is below this many standard deviations, on average over the map.
 _STEP = 1e-3
 
 
@@ -53,9 +53,9 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
     Parameters
     ----------
     match : (L_b,)
-        Landmark of A that each landmark of B is, or -1 for a new one. Several of B may not be one of A.
+        Landmark of A for each landmark of B, or -1 for a new one; no landmark of A twice.
     times : JoinTimes, optional
-        Where to add the time spent.
+        The run time is added to it.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
         return _join_along_arcs(a, b, match, times)
     with times.measure("update"):
         joined, gradient, news = _assemble(a, b, match, block_map_of(a), block_map_of(b), np.zeros(len(b.x)))
-    if not news:  # nothing in B was known before: the mean stays, and no factorisation is needed
+    if not news:  # no common landmarks: the mean is unchanged, and no factorisation is needed
         return joined
     with times.measure("recovery"):
         _keep_order_sparse(joined)
@@ -76,10 +76,10 @@ def join_maps(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes | None 
 
 
 def _join_along_arcs(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes) -> JoinedMap:
-    """The same in the group chart.
+    """Join in the group chart.
 
-    A and B stay the Gaussians they are, each along its own arcs. The values at which they meet are found by a few
-    Gauss–Newton passes, and what both say together is carried to where the passes end.
+    A and B are Gaussian in their own charts. A few Gauss–Newton passes find the joint mean, and the joint information
+    is evaluated there.
     """
     assert a.anchor is not None
     assert b.anchor is not None
@@ -90,12 +90,12 @@ def _join_along_arcs(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes)
         with times.measure("update"):
             seen = kernels.predict_nodes(first, second, image, start, x)
             if joined is None and np.all(np.abs(seen - b.x) < _ROUNDING * (1.0 + np.abs(b.x))):
-                return _assemble(a, b, match, first, second, np.zeros(len(b.x)))[0]  # no news
+                return _assemble(a, b, match, first, second, np.zeros(len(b.x)))[0]  # no new information
             ours, g_a = kernels.relinearise_in_chart(first, a.anchor, x[: len(a.x)])
             theirs, g_b = kernels.relinearise_in_chart(second, b.anchor, seen)
             if joined is None:
                 joined, gradient, _ = _assemble(a, b, match, ours, theirs, -g_b)
-            else:  # all passes have one pattern
+            else:  # all passes have the same pattern
                 system = kernels.join_blocks(ours, theirs, image, start, _ROUNDING, -g_b)
                 gradient = system[6]
                 joined.take_values(system[0], system[5])
@@ -111,7 +111,7 @@ def _join_along_arcs(a: JoinedMap, b: JoinedMap, match: Index, times: JoinTimes)
 
 
 def _along_arcs(m: JoinedMap, step: Array) -> Array:
-    """Values ``(n,)`` of a map after a step: headings by what it says, positions along the arcs of their anchors."""
+    """Values ``(n,)`` of a map after a step: headings are added, positions move along the arcs of their anchors."""
     assert m.anchor is not None
     at = np.cumsum(m.width) - m.width
     pose = m.width == 3
@@ -130,7 +130,7 @@ def _along_arcs(m: JoinedMap, step: Array) -> Array:
 def _assemble(
     a: JoinedMap, b: JoinedMap, match: Index, ours: kernels.BlockMap, theirs: kernels.BlockMap, pull: Array
 ) -> tuple[JoinedMap, Array, bool]:
-    """The joined map before the update of its mean, ``∇Hᵀ (I_B (x_B - H(X)) + pull)`` there, and whether B has news."""
+    """The joined map before the update of its mean, ``∇Hᵀ (I_B (x_B - H(X)) + pull)``, and whether that is not zero."""
     N = len(a.width)
     new = np.flatnonzero(match < 0)
     image, pose_node, landmark_node = _image(a, b, match)
@@ -164,7 +164,7 @@ def _assemble(
 
 
 def _image(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[Index, Index, Index]:
-    """Node of the joined map that each node of B ``(N_b,)``, each of its poses, and each of its landmarks is."""
+    """Node of the joined map for each node of B ``(N_b,)``, each of its poses, and each of its landmarks."""
     N, m_b = len(a.width), len(b.pose_node)
     new = np.flatnonzero(match < 0)
     image = np.empty(len(b.width), dtype=np.int64)
@@ -177,7 +177,7 @@ def _image(a: JoinedMap, b: JoinedMap, match: Index) -> tuple[Index, Index, Inde
 
 
 def _anchors(a: JoinedMap, b: JoinedMap, image: Index, nodes: int) -> Index | None:
-    """What each node of the joined map hangs on: as in A, and what is new as in B."""
+    """Anchor of each node of the joined map: as in A, for new nodes as in B."""
     if a.anchor is None or b.anchor is None:
         return None
     anchor = np.empty(nodes, dtype=np.int64)
@@ -187,7 +187,7 @@ def _anchors(a: JoinedMap, b: JoinedMap, image: Index, nodes: int) -> Index | No
 
 
 def _keep_order_sparse(joined: JoinedMap) -> None:
-    """Keep the elimination order as long as it does not cost much more fill-in than the last fresh one did."""
+    """Keep the elimination order unless its fill-in is much larger than that of the last new order."""
     if joined.rank is None and joined.symbolic().nnz / len(joined.values) > _STALE * joined.fill:
         owner = np.repeat(np.arange(len(joined.width)), np.diff(joined.ptr))
         joined.reorder(elimination_order(owner, joined.neighbours, len(joined.width)).astype(np.int64))

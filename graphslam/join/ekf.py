@@ -1,6 +1,6 @@
-"""The dense baseline: an extended Kalman filter over all poses and landmarks, submap by submap.
+"""Dense baseline: an extended Kalman filter over all poses and landmarks, submap by submap.
 
-The same model and the same single linearisation as the information filter, so the two agree to rounding. The covariance
+The model and the single linearisation are those of the information filter, so both agree up to rounding. The covariance
 is kept symmetric and positive definite by the square-root form of the update: with ``S = L Lᵀ`` and ``W = L⁻¹ H P`` it
 is ``P ← P - Wᵀ W``. (``P - K (P Hᵀ)ᵀ`` loses definiteness after a loop closure.)
 
@@ -8,9 +8,8 @@ Known landmarks are an ordinary measurement ``z_o`` with noise ``Q_oo``. The end
 noise that is correlated with it; given the known part, ``v_n = G v_o + w`` with ``G = Q_no Q_oo⁻¹`` and
 ``w ~ N(0, Q_nn - G Q_on)``, so they are appended with their exact covariance.
 
-The square-root form costs O(n²) a join. The textbook form ``P ← (I - K H) P``, a product of two dense ``n × n``
-matrices, costs O(n³); it is here (``form="naive"``) because published times of the Kalman filter can only be understood
-with it.
+The square-root form costs O(n²) per join. The textbook form ``P ← (I - K H) P``, a product of two dense ``n × n``
+matrices, costs O(n³); it is included (``form="naive"``) to reproduce published run times of the Kalman filter.
 """
 
 from __future__ import annotations
@@ -52,14 +51,14 @@ class DenseMap:
     Parameters
     ----------
     first : LandmarkMap
-        Each landmark once; -1 where it is nobody's.
+        Each landmark once; id -1 if unknown.
     entries : (n,)
-        Which landmark each entry of the submap became.
+        Landmark of each entry of the submap.
     capacity : int
-        Scalars to make room for.
+        Number of scalars to allocate.
     form : "square" or "naive"
-        How the covariance is updated: ``P - Wᵀ W``, or ``(I - K H) P``. The latter is for timing only: it does not keep
-        the covariance symmetric, and loses definiteness after a long loop.
+        Covariance update: ``P - Wᵀ W``, or ``(I - K H) P``. The latter is for timing only: the covariance does not stay
+        symmetric, and is not positive definite after a long loop.
     """
 
     def __init__(self, first: LandmarkMap, entries: Index, capacity: int, form: Form = "square") -> None:
@@ -104,7 +103,7 @@ class DenseMap:
         return self.covariance_block(self.pose_at[-1] + np.arange(3))
 
     def landmark_marginals(self) -> Array:
-        """Covariance ``(L, 2, 2)`` of every landmark by itself."""
+        """Covariance ``(L, 2, 2)`` of each landmark."""
         at = landmark_scalars(self.landmark_at)
         return self._P[at[:, :, None], at[:, None, :]]
 
@@ -116,9 +115,9 @@ class DenseMap:
         submap : LandmarkMap
             Each landmark once.
         entries : (n,)
-            Which of its landmarks each entry of the original submap became.
+            Landmark of each entry of the original submap.
         match : (L,)
-            Landmark of the map that each is, or -1.
+            Landmark of the map for each of them, or -1.
         """
         n, Q, z = self._n, submap.dense_covariance(), submap.mean
         old, new = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
@@ -130,7 +129,7 @@ class DenseMap:
         rows_o = (3 + landmark_scalars(2 * old)).ravel()
         rows_n = np.concatenate([np.arange(3), (3 + landmark_scalars(2 * new)).ravel()])
 
-        # What is new: z_n = A δ_start + B δ_new + v_n with B orthogonal, about the values B's map gives it.
+        # New variables: z_n = A δ_start + B δ_new + v_n with B orthogonal, linearised at their values from the submap.
         seen = np.concatenate([z[None, :2], z[3 + landmark_scalars(2 * new)]])  # end position, new landmarks
         positions = seen @ Rt + p_s
         x_new = np.concatenate([positions[0], [heading + z[2]], positions[1:].ravel()])
@@ -204,14 +203,14 @@ def join_ekf(
     on_join: OnJoin | None = None,
     progress: bool = False,
 ) -> JoinResult:
-    """Join submaps one after the other with a dense extended Kalman filter.
+    """Join submaps in sequence with a dense extended Kalman filter.
 
     Parameters
     ----------
     association : MapAssociationConfig, optional
-        Recognise landmarks; default: by the ids they bear.
+        Data association; default: by the landmark ids.
     form : "square" or "naive"
-        Covariance update ``P - Wᵀ W``, O(n²) a join; or ``(I - K H) P`` with dense products, O(n³), for timing only.
+        Covariance update ``P - Wᵀ W``, O(n²) per join; or ``(I - K H) P`` with dense products, O(n³), for timing only.
     on_join : callable, optional
         See :func:`~graphslam.join.order.join_sequential`.
     progress : bool
@@ -251,6 +250,6 @@ def join_ekf(
 
 
 def _scalars(submaps: Sequence[Submap]) -> int:
-    """Scalars of the whole map when ids are given."""
+    """Number of scalars of the whole map if ids are given."""
     ids = np.concatenate([landmark_map_of(s).ids for s in submaps])
     return 3 * len(submaps) + 2 * len(np.unique(ids))

@@ -1,4 +1,4 @@
-"""How the values of each kind of variable change with the frame in which a map is stated."""
+"""Change of frame for the values of each variable type."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ RULES: dict[str, Rule] = {
     "tilt": "tilt", "compass": "heading", "wheels": "constant", "sensor": "constant", "mount": "constant",
     "bias": "constant", "imubias": "constant", "deviation": "constant",
 }  # fmt: skip
-"""How the values of a kind of variable change with the frame; a kind that is missing waits for the first base."""
+"""Transformation rule of each variable type; types without an entry wait for the frame of the first base."""
 
 
 def rule_of(word: str, dim: int) -> Rule:
-    """How values of a kind change with the frame, in the plane or in space."""
+    """Transformation rule of a variable type, in 2-D or 3-D."""
     rule = RULES.get(word, "first-base")
     return "first-base" if dim == 3 and rule in ("datum", "heading") else rule
 
 
 def tilt_direction(tilt: Array) -> Array:
-    """Unit vector ``(3,)`` that points up, of a tilt ``(2,)``."""
+    """Upward unit vector ``(3,)`` of a tilt ``(2,)``."""
     return quat_rotate(so3_exp(np.append(tilt, 0.0)), np.array([0.0, 0.0, 1.0]))
 
 
@@ -47,13 +47,13 @@ def rotation_of(group: Group, pose: Array) -> Array:
 
 
 def rows_in_frame(rule: Rule, group: Group, T: Array, rows: Array) -> tuple[Array, Array | None]:
-    """Values ``(n, size)`` of one kind, known in a frame b, in the frame a, with ``T`` = ``T_a_b``.
+    """Transform values ``(n, size)`` of one type from frame b to frame a, with ``T`` = ``T_a_b``.
 
     Returns
     -------
     rows : (n, size)
     J : (dof, dof), (n, dof, dof) or None
-        Derivative of a step in frame a by a step in frame b; None for the identity.
+        Derivative of a step in frame a with respect to one in frame b; None for the identity.
     """
     if not len(rows) or rule in ("constant", "first-base"):
         return rows, None
@@ -80,7 +80,7 @@ def rows_in_frame(rule: Rule, group: Group, T: Array, rows: Array) -> tuple[Arra
 
 
 def lever_matrix(group: Group, m: Array) -> Array:
-    """How points ``(n, d)`` of a body move with a right tangent of its pose ``(n, d, dof)``, in the body frame."""
+    """Jacobian ``(n, d, dof)`` of points ``(n, d)`` in the body frame with respect to a right tangent of the pose."""
     if group.dim == 2:
         turn = np.stack([-m[:, 1], m[:, 0]], axis=1)[:, :, None]
         return np.concatenate([np.broadcast_to(np.eye(2), (len(m), 2, 2)), turn], axis=2)

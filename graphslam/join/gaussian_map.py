@@ -1,17 +1,17 @@
 """Gaussian maps over the variables of a graph, in information form, joined by adding their matrices.
 
 A pose is perturbed on the right, ``X Exp(ξ)``, and a landmark in the frame of its *anchor*, the end ``X_a`` of the
-submap that saw it first: ``l = X_a m``, ``m + δ``. An error of a heading then turns a submap and its landmarks
-together. A factor between poses and landmarks is linear in relative quantities, so that the matrix of a map is the same
-in every frame. Therefore the base of a map is kept *in* its matrix, which the gauge makes singular.
+submap that observed it first: ``l = X_a m``, ``m + δ``. A heading error then rotates a submap with its landmarks. A
+factor between poses and landmarks is linear in relative quantities, so the matrix of a map is the same in every frame.
+Therefore the base of a map is *in* its matrix, which is singular because of the gauge.
 
-To join B, whose base is the end of A, is to move B into the frame of A and to add the two matrices on their common
-variables. Then the factors enter that need both, by a Gauss-Newton step with the base held,
+To join B, whose base is the end of A, B is transformed to the frame of A, and the two matrices are added. The factors
+between both enter by a Gauss-Newton step with the base fixed,
 
     ξ = -(I + Jᵀ J)⁻¹ (g + Jᵀ r),   X ← X ⊕ ξ,   I ← Tᵀ (I + Jᵀ J) T,   T = blkdiag(J_r⁻¹(ξ_i)).
 
-The map keeps the gradient g too: it is zero but in maps with constants whose prior is in another map.
-Nothing is marginalised out, so the matrix is exactly sparse.
+The gradient g is stored, too: it is zero except in maps with constants whose prior is in another map. Nothing is
+marginalised out, so the matrix is exactly sparse.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from graphslam.linear.symmetric_factor import SymmetricFactor
 DENSE = 200
 """Scalars up to which a dense Cholesky factorisation is faster than a sparse one (measured)."""
 LARGEST_NAMED = 3000
-"""Scalars of a singular map up to which the variables that it leaves open are searched for."""
+"""Scalars of a singular map up to which its undetermined variables are searched."""
 PASSES = 3
-"""How often a join of maps with common variables is linearised at most."""
+"""Most linearisations in a join of maps with common variables …"""
 _STEP = 1e-6
-"""… and no more once a step is a thousandth of a standard deviation, on the average over the map."""
+"""… which also ends when a step is below a thousandth of a standard deviation, on average over the map."""
 ANCHORED = ("l", "point")
-"""Kinds of variables that hang on the end of the submap that saw them first."""
+"""Variable types that are expressed in the frame of the end of the submap that observed them first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +51,15 @@ class GaussianMap:
     Parameters
     ----------
     values : Values
-        Of all variables of the graph; only those of the map mean anything.
+        Of all variables of the graph; only those of the map are valid.
     variables : (v,)
-        Numbers of the variables of the map, rising, its base among them.
+        Numbers of the variables of the map, ascending, including its base.
     anchors : (v,)
-        Node that each variable hangs on; -1: none, it is perturbed by itself.
+        Anchor node of each variable; -1: none, it is perturbed directly.
     information : (n, n) csc_matrix
         Over the columns of ``variables``.
     gradient : (n,)
-        Half the gradient of what the map measures, at ``values``.
+        Half the gradient of the map's objective at ``values``.
     waiting : (w,)
         Factors of these submaps that cannot be linearised yet.
     """
@@ -76,7 +76,7 @@ class GaussianMap:
 
     @classmethod
     def start(cls, problem: JoinProblem, k: int, factors: Index) -> GaussianMap:
-        """The values of submap k as it states them; nothing is measured yet."""
+        """The start values of submap k, without information."""
         values = problem.graph.structure.copy()
         variables = problem.submap_values(k, factors, values)
         anchors = np.full(len(variables), -1, dtype=np.int64)
@@ -89,27 +89,27 @@ class GaussianMap:
 
     @classmethod
     def leaf(cls, problem: JoinProblem, k: int, factors: Index) -> GaussianMap:
-        """Submap k with all factors inside, near its own optimum if it has several."""
+        """Submap k with all its internal factors, near its optimum if there are several."""
         return cls.start(problem, k, factors).updated(factors, passes=PASSES)
 
     @property
     def base(self) -> int:
-        """Variable of the base, which is held."""
+        """Variable of the base, which is fixed."""
         return int(self.problem.bases[self.first])
 
     @property
     def end(self) -> Array:
-        """Pose ``(3|7,)`` of the end of the map in the frame of its base."""
+        """End pose ``(3|7,)`` of the map in the frame of its base."""
         return self.values["x"][self.problem.bases[self.stop]].copy()
 
     @property
     def columns(self) -> Index:
-        """Columns of the graph that the map has."""
+        """Columns of the map's variables in the graph."""
         return self.problem.columns(self.variables)
 
     @property
     def free(self) -> npt.NDArray[np.bool_]:
-        """Which columns move: not the base; not constants of which nothing is known."""
+        """Mask of the columns that move: not the base, not constants without prior information."""
         problem, known = self.problem, self.problem.constant_priors
         held = [
             v == self.base or (v in self.without_prior and split_name(problem.names[v])[0].word not in known)
@@ -127,7 +127,7 @@ class GaussianMap:
         return frozenset(v for v in constants if not problem.has_prior(v, self.first, self.stop))
 
     def _guided(self, H: sp.csc_matrix, g: Array) -> tuple[sp.csc_matrix, Array]:
-        """Information and gradient with the priors of constants whose own is in another map: for a step alone."""
+        """Information and gradient with priors of constants that have theirs in another map; for a step only."""
         problem, blocks, slope = self.problem, [], g.copy()
         for word, _, places, rows, columns in self.kinds():
             prior = problem.constant_priors.get(word)
@@ -147,7 +147,8 @@ class GaussianMap:
         return np.cumsum(width) - width
 
     def kinds(self) -> Iterator[tuple[str, VariableKind, Index, Index, Index]]:
-        """Word, kind, places in :attr:`variables`, rows of the values, and local columns ``(n, dof)`` of every kind."""
+        """Name, type, indices in :attr:`variables`, rows of values, local columns ``(n, dof)`` of each variable
+        type."""
         at, dim = self._at, self.problem.dim
         for word in self.problem.words:
             a, b = self.problem.range_of[word]
@@ -191,7 +192,8 @@ class GaussianMap:
         return step
 
     def tangents(self, step: Array, *, inverse: bool = False) -> sp.csc_matrix | None:
-        """``T``: how a small step after ``step`` changes it, or the inverse of it; None for the identity."""
+        """``T``, the derivative of the total step with respect to a small additional step, or its inverse; None:
+        identity."""
         blocks: list[tuple[Index, Array]] = []
         for _, kind, _, _, columns in self.kinds():
             g = kind.pose_group(self.problem.dim)
@@ -201,7 +203,7 @@ class GaussianMap:
         return self._identity_but(blocks) if blocks else None
 
     def _identity_but(self, blocks: list[tuple[Index, Array]], more: sp.csc_matrix | None = None) -> sp.csc_matrix:
-        """The identity with other diagonal blocks ``(n, d, d)`` at columns ``(n, d)``, and more entries added."""
+        """The identity with given diagonal blocks ``(n, d, d)`` at columns ``(n, d)``, plus the entries ``more``."""
         n = len(self.gradient)
         diagonal = np.ones(n)
         rows, columns, data = [], [], []
@@ -218,7 +220,7 @@ class GaussianMap:
     # ---------------------------------------------------------------- frames
 
     def moved(self, T: Array) -> GaussianMap:
-        """The same map in another frame, in which its base is ``T``."""
+        """The map in another frame, in which its base is ``T``."""
         problem, values = self.problem, self.values.copy()
         blocks: list[tuple[Index, Array]] = []
         for word, kind, places, rows, columns in self.kinds():
@@ -231,7 +233,7 @@ class GaussianMap:
         return self._changed(values, self._identity_but(blocks) if blocks else None, None)
 
     def carried(self, step: Array) -> GaussianMap:
-        """The same Gaussian seen from values that lie a step away: its matrix and gradient there."""
+        """The Gaussian relinearised at values a step away: its matrix and gradient there."""
         return self._changed(self.moved_by(step), self.tangents(step), step)
 
     def _changed(self, values: Values, T: sp.csc_matrix | None, step: Array | None) -> GaussianMap:
@@ -244,9 +246,9 @@ class GaussianMap:
         return replace(self, values=values, information=information, gradient=gradient)
 
     def _arms(self, places: Index, rows: Index, word: str) -> tuple[Array, Array]:
-        """Rotation ``(n, d, d)`` of the anchors of variables, and how a position moves with its anchor ``(n, d, dof)``.
+        """Rotation ``(n, d, d)`` of anchors, and Jacobian ``(n, d, dof)`` of positions with respect to them.
 
-        The second in the frame of the anchor: a shift is itself, a turn acts on the lever ``m``.
+        The Jacobian is in the frame of the anchor, with lever arm ``m``.
         """
         g, hang = self.problem.group, self.anchors[places]
         X = self.values["x"][hang]
@@ -255,7 +257,7 @@ class GaussianMap:
         return R, lever_matrix(g, m)
 
     def anchor_matrix(self, *, inverse: bool = False) -> sp.csc_matrix | None:
-        """Steps of positions by steps in the frames of their anchors, ``δl = R (δm + D ξ_a)``, or the inverse of it."""
+        """Steps of positions from steps in the frames of their anchors, ``δl = R (δm + D ξ_a)``, or the inverse."""
         at, d = self._at, self.problem.group.dof
         blocks, entries = [], []
         for word, _, places, rows, columns in self.kinds():
@@ -275,7 +277,7 @@ class GaussianMap:
         return sp.csc_matrix((blocks.ravel(), at), shape=(n, n))
 
     def hung_as(self, other: GaussianMap) -> GaussianMap:
-        """The same Gaussian with the anchors of another map over the same variables, at the values of both."""
+        """The Gaussian with the anchors of another map over the same variables, at the values of both."""
         at, d = self._at, self.problem.group.dof
         T = None
         for word, _, places, rows, columns in self.kinds():
@@ -294,7 +296,7 @@ class GaussianMap:
     # ---------------------------------------------------------------- joining
 
     def measured(self, factors: Index) -> tuple[sp.csc_matrix, Array]:
-        """Information and gradient of factors at the values here, over the columns of the map."""
+        """Information and gradient of factors at the current values, over the columns of the map."""
         system = self.problem.arrays(factors).evaluate(self.values, dense=False)
         columns = self.columns
         A, g = sp.csc_matrix(sp.csc_matrix(system.A)[:, columns][columns]), system.g[columns]
@@ -302,7 +304,7 @@ class GaussianMap:
         return (A, g) if C is None else (sp.csc_matrix(C.T @ A @ C), np.asarray(C.T @ g))
 
     def admitted(self, factors: Index, *, force: bool = False) -> tuple[GaussianMap, Index]:
-        """The map with the variables that factors bring in, and the factors that can be linearised now."""
+        """The map with the new variables of given factors, and the factors that can be linearised now."""
         values = self.values.copy()
         known = np.zeros(len(self.problem.names), dtype=bool)
         known[self.variables] = True
@@ -311,25 +313,25 @@ class GaussianMap:
         return replace(self.widened(np.flatnonzero(known), values), waiting=later), enter
 
     def updated(self, factors: Index, *, passes: int = 1, force: bool = False) -> GaussianMap:
-        """The map after factors between its variables, and those that waited.
+        """The map after adding factors between its variables, and the waiting ones.
 
         Parameters
         ----------
         passes : int
-            How often everything that meets here is linearised.
+            Number of linearisations.
         force : bool
-            Nothing more will come: no factor may wait.
+            Last call: no factor may wait.
         """
         begin, enter = self.admitted(factors, force=force)
         return begin.solved(enter, lambda values: self.carried(self.step_to(values)), passes) if len(enter) else begin
 
     def solved(self, factors: Index, prior: Callable[[Values], GaussianMap], passes: int) -> GaussianMap:
-        """Gauss-Newton steps on the map and factors, from the values here.
+        """Gauss-Newton steps on the map and factors, from the current values.
 
         Parameters
         ----------
         prior : callable
-            What the map says without the factors, linearised at other values.
+            The map without the factors, relinearised at given values.
         """
         at, done, free = self, self, self.free
         for k in range(passes):
@@ -365,7 +367,7 @@ class GaussianMap:
         return found
 
     def _indeterminate(self, A: sp.csc_matrix, at: Index) -> IndeterminateError:
-        """Which variables of the map a singular matrix leaves open, and what would determine them."""
+        """Error with the names of the undetermined variables of a singular matrix, and what would determine them."""
         problem, keys = self.problem, self.problem.keys
         where = f"submaps {keys[self.first]} to {keys[self.stop - 1]}"
         if A.shape[0] > LARGEST_NAMED or not np.all(np.isfinite(A.data)):
@@ -379,10 +381,10 @@ class GaussianMap:
         return IndeterminateError(": ".join([text, *sorted(advice)]), tuple(names))
 
     def widened(self, variables: Index, values: Values, anchors: Index | None = None) -> GaussianMap:
-        """With more variables, of which nothing is known, at other values."""
+        """The map with additional variables without information, at given values."""
         where = np.searchsorted(variables, self.variables)
         hang = np.full(len(variables), -1, dtype=np.int64) if anchors is None else anchors.copy()
-        hang[where] = self.anchors  # those of its own variables stay
+        hang[where] = self.anchors  # existing anchors are unchanged
         if len(variables) == len(self.variables):
             return replace(self, values=values, anchors=hang)
         width, own = self.problem.width[variables], self.problem.width[self.variables]
@@ -397,12 +399,12 @@ class GaussianMap:
 
 
 def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tuple[GaussianMap, bool]:
-    """What A and B, whose base is the end of A, say together; and whether B has news of variables of A.
+    """Sum of A and B, whose base is the end of A; and whether B has information on variables of A.
 
     Parameters
     ----------
     values : Values, optional
-        Where both are linearised; by default at the values of A, and at those of B of what is new.
+        Linearisation point; by default the values of A, and those of B for new variables.
     """
     seen = b.moved(a.end if values is None else values["x"][a.problem.bases[a.stop]])
     common = np.intersect1d(a.variables, b.variables, assume_unique=True)
@@ -429,15 +431,14 @@ def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tu
 
 
 def join_gaussian_maps(a: GaussianMap, b: GaussianMap, factors: Index, *, passes: int | None = None) -> GaussianMap:
-    """Join B, whose base is the end of A, and the factors that need both.
+    """Join B, whose base is the end of A, and the factors between both.
 
     Parameters
     ----------
     factors : (f,)
-        Numbers of the factors that enter here.
+        Numbers of the factors to add.
     passes : int, optional
-        How often the two Gaussians and the factors are linearised where they meet. By default up to :data:`PASSES`
-        times where the maps have common variables, and once where relative poses alone enter.
+        Number of linearisations. By default up to :data:`PASSES` if the maps have common variables, otherwise one.
     """
     joined, news = add_maps(a, b)
     begin, enter = joined.admitted(factors)

@@ -1,7 +1,7 @@
-"""A graph of submaps as an archive of arrays: values of all variables, and the fields of all factors, kind by kind.
+"""File format of a graph of submaps: an archive of arrays with all values and the fields of all factors, by type.
 
-Every field of a kind of factor is a column. Its type is stated in ``columns``, and the names of the kinds are those of
-registered factors: nothing of the file is executed or imported.
+Every field of a factor type is a column. ``columns`` lists their types. Only registered factor types are read; no code
+of the file is executed or imported.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from graphslam.linear.space_maps import SpaceMap
 GRAPH_FORMAT = "graphslam.graph/1"
 PARTS = ("keys", "bases", "times", "chains", "offset")
 _NESTED: dict[str, type] = {"SpaceMap": SpaceMap}
-"""Types of fields that are records themselves."""
+"""Field types that are records."""
 
 
 def graph_arrays(graph: FactorGraph, parts: Mapping[str, Any]) -> dict[str, Any]:
@@ -57,7 +57,7 @@ def _write_fields(name: str, records: Sequence[Any], out: dict[str, Any], column
 
 
 def _write(name: str, values: list[Any], out: dict[str, Any], columns: list[str]) -> None:
-    """One column; which values are None stands beside it."""
+    """Write one column; ``NAME.have`` marks the values that are not None."""
     have = np.array([v is not None for v in values], dtype=bool)
     some = [v for v in values if v is not None]
     if not have.all():

@@ -1,7 +1,7 @@
-"""Every way of solving a graph of submaps: information filters by tree or in sequence, EKF, batch, iSAM2.
+"""All methods for a graph of submaps: information filters by tree or in sequence, EKF, batch, iSAM2.
 
-All of them take all factors of the graph, so that their maps differ by their linearisation alone
-(:mod:`graphslam.join.graph_problem` says when a factor enters).
+All use all factors of the graph, so their maps differ only by linearisation (:mod:`graphslam.join.graph_problem`
+defines when a factor is added).
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from graphslam.solve.sparse import SparseProblem
 
 POLISH = LevenbergConfig(max_iterations=200, tolerance=1e-12)
 MOST_STATES = 8000
-"""States up to which there is a dense filter: its covariance takes half a gigabyte then."""
+"""Most states for the dense filter: its covariance then takes half a gigabyte."""
 
 
 @dataclass(frozen=True, eq=False)
 class GraphEstimate:
-    """A map of a graph by one method: a value for every variable, and the information of all of them.
+    """Result of one method: values of all variables and their joint information.
 
     The state vector holds the free columns of the graph in their order
     (:class:`~graphslam.graph.variables.VariableLayout`): right tangents of poses, then landmarks, then the rest.
@@ -48,13 +48,13 @@ class GraphEstimate:
     values : Values
         In the frame of the first base.
     information : (n, n) csc_matrix or None
-        None where the method carries a dense covariance instead (the EKF).
+        None if the method has a dense covariance instead (the EKF).
     covariance : (n, n) or None
         Exactly one of the two is given.
     objective : float
-        ``Σ rᵀ Λ r`` (``2 ρ`` where a kernel acts) of this map, before relinearisation where there is one.
+        ``Σ rᵀ Λ r`` (``2 ρ`` for robust kernels) of this map, before a relinearisation.
     objective_polished : float or None
-        The same at the least-squares optimum, where that was asked for.
+        The same at the least-squares optimum, if computed.
     converged : bool
         Whether the map is at its least-squares optimum.
     seconds : float
@@ -75,7 +75,7 @@ class GraphEstimate:
 
     @property
     def poses(self) -> Array:
-        """Nodes ``(n, 3|7)`` in the frame of the first, which is held."""
+        """Nodes ``(n, 3|7)`` in the frame of the first, which is fixed."""
         return self.values.poses
 
     @property
@@ -100,7 +100,7 @@ class GraphEstimate:
 
     @property
     def nnz(self) -> int:
-        """Stored entries of the matrix that carries the uncertainty, both triangles."""
+        """Stored entries of the information or covariance matrix, both triangles."""
         return self.states**2 if self.information is None else int(self.information.nnz)
 
     @cached_property
@@ -114,17 +114,17 @@ class GraphEstimate:
         return self.covariance[np.ix_(at, at)] if self.covariance is not None else self._factor.inverse_block(at)
 
     def anchored_errors(self, rows: Index, true: Array, known: Mapping[int, Array]) -> Array:
-        """Errors ``(n, dim)`` of landmarks ``rows``: an error of a heading turns a submap as a whole.
+        """Errors ``(n, dim)`` of landmarks ``rows`` in the parametrisation of the maps.
 
-        A landmark hangs on the exit of the submap that saw it first, ``m = X_a⁻¹ l``, and its error is
-        ``δl = R (δm + D ξ_a)``, the form in which the joiners carry it (:mod:`graphslam.join.gaussian_map`).
+        A landmark is expressed in the frame of its anchor, ``m = X_a⁻¹ l``, and its error is ``δl = R (δm + D ξ_a)``,
+        as in :mod:`graphslam.join.gaussian_map`.
 
         Parameters
         ----------
         true : (n, dim)
-            Where the landmarks are.
+            True positions.
         known : mapping of int to (3|7,)
-            True poses of nodes; a landmark whose anchor has none keeps its plain error.
+            True poses of nodes; a landmark without a true anchor pose gets its plain position error.
         """
         g, error = group_of(self.poses), true - self.landmarks[rows]
         for k, anchor in enumerate(self.problem.landmark_anchors[rows].tolist()):
@@ -138,7 +138,7 @@ class GraphEstimate:
         return error
 
     def map_information(self) -> sp.csc_matrix | None:
-        """Information of poses and landmarks alone; everything else is marginalised out."""
+        """Information of poses and landmarks; all other variables are marginalised out."""
         if self.information is None:
             return None
         layout = self.problem.graph.flat().layout
@@ -155,7 +155,7 @@ class GraphEstimate:
         return sp.csc_matrix(A[:k, :k] - fill)
 
     def map_covariance(self) -> Array | None:
-        """Covariance of poses and landmarks, of a method in covariance form."""
+        """Covariance of poses and landmarks, for methods in covariance form."""
         k = self.problem.graph.flat().layout.stop("l")
         return None if self.covariance is None else self.covariance[:k, :k]
 
@@ -196,7 +196,7 @@ def _estimate(
 
 
 class JoinSchedule:
-    """When each factor enters: inside one submap, or where two submaps meet."""
+    """When each factor is added: inside one submap, or when two submaps are joined."""
 
     def __init__(self, problem: JoinProblem) -> None:
         low, high = problem.spans
@@ -214,7 +214,7 @@ def _by_step(factors: Index, step: Index, m: int) -> list[Index]:
 
 
 def _finished(joined: GaussianMap) -> GaussianMap:
-    """The root of a join; factors that still wait must enter now."""
+    """The result of the last join; all waiting factors are added."""
     return joined.updated(np.zeros(0, dtype=np.int64), force=True)
 
 
@@ -226,12 +226,12 @@ def _of_root(problem: JoinProblem, root: GaussianMap, method: str, start: float)
 
 
 def join_graph_sequential(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
-    """Extended information filter, submap after submap (Combined SLAM eq. 13-16).
+    """Extended information filter, submap by submap (Combined SLAM eq. 13-16).
 
     Parameters
     ----------
     passes : int, optional
-        How often a join is linearised (:func:`~graphslam.join.gaussian_map.join_gaussian_maps`).
+        Number of linearisations per join (:func:`~graphslam.join.gaussian_map.join_gaussian_maps`).
     progress : bool
         Show a progress bar.
     """
@@ -245,7 +245,7 @@ def join_graph_sequential(problem: JoinProblem, *, passes: int | None = None, pr
 
 
 def join_graph_tree(problem: JoinProblem, *, passes: int | None = None, progress: bool = False) -> GraphEstimate:
-    """Extended information filter by binary tree: submaps pairwise, then the pairs, and so on.
+    """Extended information filter by binary tree: submaps are joined pairwise, then the pairs, and so on.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def join_graph_tree(problem: JoinProblem, *, passes: int | None = None, progress
     with Bar(total=len(problem.keys) - 1, name="join", unit="join", shown=progress) as bar:
 
         def joined(a: int, b: int, factors: Index) -> GaussianMap:
-            """Submaps a … b - 1, with the factors between different ones of them."""
+            """Submaps a … b - 1, with the factors between them."""
             if b == a + 1:
                 return GaussianMap.leaf(problem, a, plan.inside[a])
             middle = a + (1 << (b - a - 1).bit_length() - 1)
@@ -273,10 +273,10 @@ def join_graph_tree(problem: JoinProblem, *, passes: int | None = None, progress
 
 
 def join_graph_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEstimate:
-    """Extended Kalman filter, submap after submap, in covariance form: the plain twin of :func:`join_graph_sequential`.
+    """Extended Kalman filter, submap by submap, in covariance form; the counterpart of :func:`join_graph_sequential`.
 
-    A submap and the factors that enter with it measure old and new variables together. What they say of the old ones
-    alone is a measurement update; the new ones follow, with their correlations.
+    A submap and its factors measure old and new variables. Their marginal on the old ones is a measurement update; the
+    new ones are then appended with their correlations.
     """
     if problem.states > MOST_STATES:
         raise DataError("the dense filter has no room for so many states", got=problem.states, wanted=MOST_STATES)
@@ -312,16 +312,16 @@ def join_graph_ekf(problem: JoinProblem, *, progress: bool = False) -> GraphEsti
 
 
 def _update_covariance(P: Array, S: sp.csc_matrix, G: Array, columns: Index, old: Index, d: int) -> Array:
-    """One step of the filter in place: returns the step ``(k,)`` of ``columns``.
+    """One filter step, in place; returns the step ``(k,)`` of ``columns``.
 
     Parameters
     ----------
     P : (n, n)
         Covariance of all columns; those of new variables are zero.
     S, G
-        Information and gradient of what is measured now, over ``columns``.
+        Information and gradient of the current measurements, over ``columns``.
     old : (o,)
-        Columns that had values before, the ``d`` of the first base first: they are held.
+        Columns that had values before; the first ``d`` are those of the first base, which is fixed.
     """
     touched = np.asarray(np.abs(S).sum(axis=0)).ravel() > 0
     is_old = np.isin(columns, old)
@@ -362,7 +362,7 @@ def _update_covariance(P: Array, S: sp.csc_matrix, G: Array, columns: Index, old
 
 
 def _start_values(problem: JoinProblem) -> Values:
-    """The chain of submaps alone: nodes end to end, landmarks where they were seen first."""
+    """Initial values from the chain of submaps: nodes end to end, landmarks at their first observation."""
     plan = JoinSchedule(problem)
     values = problem.graph.structure.copy()
     known = np.zeros(len(problem.names), dtype=bool)
@@ -385,7 +385,7 @@ def _place_submap(problem: JoinProblem, values: Values, known: npt.NDArray[np.bo
 
 
 def optimise_estimate(problem: JoinProblem, joined: GraphEstimate) -> GraphEstimate:
-    """Linearise all factors again at the joined map until the objective is at its minimum.
+    """Relinearise all factors, starting at the joined map, until the objective is at its minimum.
 
     Returns
     -------
@@ -404,7 +404,7 @@ def optimise_estimate(problem: JoinProblem, joined: GraphEstimate) -> GraphEstim
 
 
 def solve_graph_batch(problem: JoinProblem, *, polish: bool = True, progress: bool = False) -> GraphEstimate:
-    """Least squares of everything at once, from the chain alone: at its optimum whatever ``polish`` is."""
+    """Least squares over all factors, starting from the chain; always at the optimum, whatever ``polish`` is."""
     start = time.perf_counter()
     begun = _estimate(problem, _start_values(problem), "batch", 0.0)
     begun = replace(begun, seconds=time.perf_counter() - start)
@@ -414,12 +414,12 @@ def solve_graph_batch(problem: JoinProblem, *, polish: bool = True, progress: bo
 
 
 def solve_graph_isam2(problem: JoinProblem, *, polish: bool = True, progress: bool = False) -> GraphEstimate:
-    """Add submap after submap with its factors, updating iSAM2 after each, then go to the optimum.
+    """Add the submaps with their factors one by one, update iSAM2 after each, then solve to the optimum.
 
     Returns
     -------
     GraphEstimate
-        ``objective`` is that of iSAM2 before; ``iterations`` are its updates.
+        ``objective`` is that of iSAM2 before this last step; ``iterations`` are its updates.
     """
     from graphslam.solve.isam2 import Isam2Solver
 

@@ -1,14 +1,14 @@
-"""A factor graph cut into steps, one for each submap: which variables and factors a joiner adds when.
+"""A factor graph divided into steps, one per submap: when a map-joining method adds which variables and factors.
 
-A factor belongs to the submaps of its nodes. It enters a join at the lowest node of the tree that holds all of them
-and can linearise it. Three kinds of variables need care there (:data:`~graphslam.join.frames.RULES`):
+A factor belongs to the submaps of its nodes. It is added at the lowest node of the join tree that contains all of them
+and can linearise it. Three groups of variables need special treatment (:data:`~graphslam.join.frames.RULES`):
 
-* A *small constant* (scale of wheels, bias of an IMU or of GPS fixes) is about zero. Its factors enter at once. A map
-  without its prior, or the walk that leads to it, is linearised where the prior of the kind puts it. That prior is not
-  kept as information.
+* A *small constant* (scale of wheels, bias of an IMU or of GPS fixes) is near zero. Its factors are added at once. A
+  map without its prior (or random walk) is linearised with the prior of this variable type, which is not kept as
+  information.
 * The datum, gravity, velocities, beacons and the zero of a compass can be anywhere. Their factors wait until they
   determine the variable, given the nodes. It then starts at the least-squares optimum of these factors alone.
-* A kind whose values in another frame are not known here waits for the frame of the first base.
+* Variable types without a transformation rule wait for the frame of the first base.
 """
 
 from __future__ import annotations
@@ -45,32 +45,31 @@ from graphslam.join.submap_blocks import check_identified
 
 Index = npt.NDArray[np.int64]
 VAGUE_ANGLE = 0.3
-"""A direction whose standard deviation is larger [rad] is not determined: its factors cannot be linearised yet."""
+"""A direction with a larger standard deviation [rad] is not determined: its factors cannot be linearised yet."""
 UNDETERMINED = 1e-9
-"""Smallest eigenvalue of a scaled information matrix at which its variables count as determined."""
+"""Smallest eigenvalue of a scaled information matrix for determined variables."""
 _STARTS = 20
-"""Gauss-Newton steps at most for the start of variables, given the nodes."""
+"""Most Gauss-Newton steps for the initial values of variables, given the nodes."""
 
 
 @dataclass(frozen=True, eq=False)
 class JoinProblem:
-    """A factor graph of submaps in one chain, as the joiners take it.
+    """A factor graph of submaps in one chain, the input of the map-joining methods.
 
     Parameters
     ----------
     graph : FactorGraph
-        It is not changed. Its values are the start of variables that no pose gives.
+        It is not changed. Its values are the initial values of variables other than poses.
     keys : (m,) int64
-        Of the submaps.
+        Keys of the submaps.
     bases : (m + 1,) int64
-        Node at the base of each submap, then the exit of the last: submap k holds the nodes
-        ``bases[k] … bases[k + 1]``.
+        Node at the base of each submap, then the exit of the last: submap k has the nodes ``bases[k] … bases[k + 1]``.
     times : (n,)
-        Of the nodes [s]; their numbers where there is no clock.
+        Times of the nodes [s]; their indices if there is no clock.
     chains : (n + m - 1, 3|7)
-        Nodes of every submap in the frame of its base, from base to exit, as the submap states them.
+        Nodes of every submap in the frame of its base, from base to exit, as measured by the submap.
     offset : float
-        To be added to the sum of squares: what robust kernels take off it (:meth:`of_graph`).
+        Added to the sum of squares to get the robust objective (:meth:`of_graph`).
     """
 
     graph: FactorGraph
@@ -86,9 +85,9 @@ class JoinProblem:
     def of_graph(cls, graph: FactorGraph) -> JoinProblem:
         """All factors of a graph of submaps.
 
-        Filters carry Gaussians, so a factor with a robust kernel has the weight that the kernel gives it at the values
-        of the graph. The weighted sum and a constant (:attr:`offset`) have the value and the gradient of the robust
-        sum there: its optimum is that of the graph.
+        Filters need Gaussians, so a factor with a robust kernel is replaced by a weighted one, with the kernel's weight
+        at the values of the graph. There, the weighted sum plus a constant (:attr:`offset`) has the value and the
+        gradient of the robust sum, so both have the same optimum.
         """
         chain = graph.submaps
         if not chain:
@@ -109,12 +108,12 @@ class JoinProblem:
     def of_submaps(
         cls, submaps: Sequence[Submap], *, covariance_scale: float = 1.0, match_support: float = 0.5
     ) -> JoinProblem:
-        """Submaps by themselves, landmark submaps and dense ones, with the matches that they carry.
+        """A graph of submaps (landmark and dense ones) and their matches.
 
         Parameters
         ----------
         match_support : float
-            A match counts if so large a share of the particles supports it.
+            Least share of the particles that must support a match.
         """
         check_identified(submaps)
         chain = [replace(s, matches=tuple(m for m in s.matches if m.support >= match_support)) for s in submaps]
@@ -122,7 +121,7 @@ class JoinProblem:
 
     @classmethod
     def of_network(cls, network: PoseNetwork, poses: int) -> JoinProblem:
-        """A pose-graph file, cut into submaps of so many steps along the numbers of its vertices."""
+        """A pose-graph file, divided into submaps of ``poses`` steps along its vertex numbers."""
         name, n = network.source, len(network)
         if poses < 1:
             raise DataError("a submap has no step", where=name, got=poses, wanted="at least 1 pose")
@@ -143,7 +142,7 @@ class JoinProblem:
         return cls(graph, np.arange(len(bases) - 1), bases, np.arange(n, dtype=np.float64), chains)
 
     def first_submaps(self, count: int) -> JoinProblem:
-        """The problem of the first submaps alone, for kernels to be compiled on."""
+        """The problem of the first ``count`` submaps, for compiling kernels."""
         m = min(count, len(self.keys))
         if m == len(self.keys):
             return self
@@ -162,7 +161,7 @@ class JoinProblem:
         return JoinProblem(graph, self.keys[:m], self.bases[: m + 1], self.times[:stop], self.chains[: stop + m - 1])
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the graph, all values and factors, as an archive of arrays."""
+        """Write the graph with all values and factors as an archive of arrays."""
         write_npz(path, graph_arrays(self.graph, {name: getattr(self, name) for name in PARTS}))
 
     @classmethod
@@ -175,7 +174,7 @@ class JoinProblem:
         return cls(graph, **parts)
 
     def objective(self, values: Values) -> float:
-        """``Σ rᵀ Λ r`` of all factors (``2 ρ`` at the values of the graph where a kernel acts)."""
+        """``Σ rᵀ Λ r`` of all factors (``2 ρ`` for those with robust kernels, at the values of the graph)."""
         return self.graph.flat().objective(values) + self.offset
 
     # ---------------------------------------------------------------- what it is
@@ -192,12 +191,12 @@ class JoinProblem:
 
     @property
     def states(self) -> int:
-        """Free scalars."""
+        """Number of free scalars."""
         return self.graph.flat().layout.size
 
     @property
     def dof(self) -> int:
-        """Scalars measured, less free ones."""
+        """Number of measured scalars minus free ones."""
         return self.graph.flat().measurements - self.states
 
     @cached_property
@@ -206,18 +205,18 @@ class JoinProblem:
         return list(self.graph.records.values())
 
     def factor_counts(self) -> dict[str, int]:
-        """Number of factors by class, in the order of the classes' names."""
+        """Number of factors by class, sorted by class."""
         return dict(sorted(Counter(r.group for r in self.factors).items()))
 
     @cached_property
     def layout(self) -> VariableLayout:
-        """Columns of all variables, the first base included."""
+        """Columns of all variables, including the first base."""
         free = self.graph.structure.layout()
         return VariableLayout(free.dim, free.counts, free.landmark_ids, fixed=())
 
     @cached_property
     def names(self) -> list[str]:
-        """Of the variables, in the order of their numbers and of their columns."""
+        """Names of the variables, in the order of their numbers and columns."""
         return self.layout.names()
 
     @cached_property
@@ -237,12 +236,12 @@ class JoinProblem:
 
     @cached_property
     def words(self) -> list[str]:
-        """Kinds of variables that the graph has, in the order of the numbers."""
+        """Variable types of the graph, in the order of their numbers."""
         return [w for w, n in zip(KINDS, self.layout.counts) if n]
 
     @cached_property
     def range_of(self) -> dict[str, tuple[int, int]]:
-        """First number of the variables of each kind, and the number behind the last."""
+        """First number of the variables of each type, and one after the last."""
         out, n = {}, 0
         for word, count in zip(KINDS, self.layout.counts):
             out[word] = (n, n + count)
@@ -251,7 +250,7 @@ class JoinProblem:
 
     @cached_property
     def rules(self) -> list[Rule]:
-        """Rule of each variable."""
+        """Transformation rule of each variable."""
         rules: list[Rule] = []
         for word in self.words:
             a, b = self.range_of[word]
@@ -266,7 +265,7 @@ class JoinProblem:
 
     @cached_property
     def spans(self) -> tuple[Index, Index]:
-        """First and last submap of each factor: it enters where both have been joined."""
+        """First and last submap of each factor; it is added when both have been joined."""
         n, (x0, x1) = len(self.factors), self.range_of["x"]
         local = np.zeros(len(self.names), dtype=bool)
         local[x0:x1] = True
@@ -281,7 +280,7 @@ class JoinProblem:
                     if home[other] < 0 or high[f] < home[other]:
                         home[other] = high[f]
         p0, p1 = self.range_of["point"]
-        for f in np.flatnonzero(high < 0).tolist():  # points of a path stand for nodes
+        for f in np.flatnonzero(high < 0).tolist():  # points of a path take the place of nodes
             v = self.variables[f]
             points = v[(v >= p0) & (v < p1)]
             if len(points):
@@ -296,7 +295,7 @@ class JoinProblem:
 
     @cached_property
     def priors(self) -> dict[int, list[tuple[int, int]]]:
-        """First and last submap of the factors that give a small constant from others before it, or by itself."""
+        """First and last submap of the factors that determine a small constant from previous ones, or alone."""
         low, high = self.spans
         out: dict[int, list[tuple[int, int]]] = {}
         for f, v in enumerate(self.variables):
@@ -310,7 +309,7 @@ class JoinProblem:
 
     @cached_property
     def constant_priors(self) -> dict[str, Array]:
-        """By kind of small constant, the information ``(dof, dof)`` that the graph has of the first one beforehand."""
+        """Prior information ``(dof, dof)`` of the first constant of each type of small constants."""
         out: dict[str, Array] = {}
         for f, v in enumerate(self.variables):
             if not all(self.rules[k] == "constant" for k in v.tolist()):
@@ -326,7 +325,7 @@ class JoinProblem:
 
     @cached_property
     def landmark_anchors(self) -> Index:
-        """Exit of the submap that saw each landmark first ``(L,)``; -1 of one that no submap has."""
+        """Exit node of the submap that observed each landmark first ``(L,)``; -1 if no submap did."""
         first, count = self.range_of["l"][0], self.layout.count("l")
         anchors = np.full(count, -1, dtype=np.int64)
         high = self.spans[1]
@@ -337,16 +336,16 @@ class JoinProblem:
         return anchors
 
     def chain(self, k: int) -> Array:
-        """Nodes of submap k in the frame of its base ``(n, 3|7)``, as the submap states them."""
+        """Nodes of submap k in the frame of its base ``(n, 3|7)``, as measured by the submap."""
         return self.chains[self.bases[k] + k : self.bases[k + 1] + k + 1]
 
     def submap_values(self, k: int, factors: npt.ArrayLike, values: Values) -> Index:
-        """Write the start of submap k, in the frame of its base, into ``values``; returns its variables.
+        """Write the initial values of submap k, in the frame of its base, into ``values``; returns its variables.
 
         Parameters
         ----------
         factors : (f,)
-            Numbers of the factors of submap k alone.
+            Numbers of the internal factors of submap k.
         """
         a, b = int(self.bases[k]), int(self.bases[k + 1])
         values["x"][a : b + 1] = self.chain(k)
@@ -356,7 +355,7 @@ class JoinProblem:
             r = self.factors[f]
             if isinstance(r, LANDMARK_SUBMAPS):
                 rows = [row_of[i] for i in r.landmark_ids.tolist()]
-                values["l"][rows[::-1]] = r.landmark_positions()[::-1]  # the first observation stands
+                values["l"][rows[::-1]] = r.landmark_positions()[::-1]  # keep the first observation
                 found |= {l0 + i for i in rows}
             elif isinstance(r, PathRecord):
                 first = 3 + 2 * len(r.landmark_ids)
@@ -367,7 +366,7 @@ class JoinProblem:
     # ---------------------------------------------------------------- factors that enter
 
     def arrays(self, factors: npt.ArrayLike) -> FactorArrays:
-        """Some factors as a least-squares problem over :attr:`layout`."""
+        """Given factors as a least-squares problem over :attr:`layout`."""
         return FactorArrays([self.factors[f] for f in np.asarray(factors).tolist()], self.layout)
 
     def columns(self, variables: Index) -> Index:
@@ -379,18 +378,18 @@ class JoinProblem:
     def admit(
         self, values: Values, known: npt.NDArray[np.bool_], waiting: Index, *, base: int = 0, force: bool = False
     ) -> tuple[Index, Index]:
-        """Which of the waiting factors can be linearised at ``values``; variables that they bring in get a start there.
+        """Select the waiting factors that can be linearised at ``values``; their new variables get initial values.
 
         Parameters
         ----------
         values : Values
             In the frame of node ``base``; rows of new variables are written.
         known : (v,) bool
-            Variables that have values; new ones are entered.
+            Variables with values; updated in place.
         waiting : (f,)
             Numbers of factors.
         force : bool
-            Nothing more will come: all of them enter.
+            Last call: all factors are added.
 
         Returns
         -------
@@ -439,7 +438,8 @@ class JoinProblem:
         return values[word][variable - self.range_of[word][0]]
 
     def _start(self, values: Values, new: Index, factors: Index, known: npt.NDArray[np.bool_], base: int) -> bool:
-        """Bring new variables to the optimum of factors, all else held; whether these factors determine them."""
+        """Set new variables to the optimum of given factors, all others fixed; returns whether these factors determine
+        them."""
         given, T = self.graph.values, self.group.inverse(self.graph.values.poses[base])
         for v in new.tolist():
             word = split_name(self.names[v])[0].word

@@ -1,4 +1,4 @@
-"""What a joiner carries along, how it ends, and what it hands over."""
+"""The joined map in information form, its construction from submaps, and the result of a join."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ Nodes = npt.NDArray[np.int64]
 
 @dataclass
 class JoinTimes:
-    """CPU seconds of this process, split as in Table 1 of the paper; ``recovery`` is factorisation and mean."""
+    """CPU seconds of this process, as in Table 1 of Combined SLAM; ``recovery`` is factorisation and mean."""
 
     parts: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("association", "update", "recovery"), 0.0))
     wall: float = 0.0
 
     @contextmanager
     def measure(self, part: str) -> Iterator[None]:
-        """Add the time spent inside to ``part``, and to the wall time."""
+        """Add the run time of the block to ``part``, and to the wall time."""
         cpu, start = time.process_time(), time.perf_counter()
         try:
             yield
@@ -52,12 +52,12 @@ class JoinTimes:
 
 
 class JoinedMapView(Protocol):
-    """What association and scoring need of a map, in information or in covariance form.
+    """Interface of a map for association and evaluation, in information or covariance form.
 
     The state ``x`` ``(n,)`` is in the frame of the map's first base, headings not wrapped. ``pose_at`` ``(m,)`` and
-    ``landmark_at`` ``(L,)`` say where each end pose (x, y, θ) and landmark (x, y) begins in it; landmarks stand in the
-    order of first sighting. ``ids`` ``(L,)`` int64 are the ids they were joined by, -1 where they were recognised
-    instead.
+    ``landmark_at`` ``(L,)`` are the offsets of each end pose (x, y, θ) and landmark (x, y) in ``x``; landmarks are in
+    the order of first observation. ``ids`` ``(L,)`` int64 are the given ids, -1 if landmarks are associated by the
+    filter.
     """
 
     x: Array
@@ -67,7 +67,7 @@ class JoinedMapView(Protocol):
 
     @property
     def entries(self) -> tuple[Index, ...]:
-        """For every submap inside, the landmark ``(n_k,)`` each of its entries became."""
+        """For every submap, the landmark ``(n_k,)`` of each of its entries."""
         ...
 
     def covariance_block(self, indices: Index) -> Array:
@@ -83,12 +83,12 @@ class JoinedMapView(Protocol):
         ...
 
     def landmark_marginals(self) -> Array:
-        """Covariance ``(L, 2, 2)`` of every landmark by itself."""
+        """Covariance ``(L, 2, 2)`` of each landmark."""
         ...
 
 
 class DenseJoinedView(JoinedMapView, Protocol):
-    """A map that carries its whole covariance ``(n, n)``."""
+    """A map with its whole covariance ``(n, n)``."""
 
     @property
     def covariance(self) -> Array:
@@ -97,7 +97,7 @@ class DenseJoinedView(JoinedMapView, Protocol):
 
 
 OnJoin = Callable[[int, JoinedMapView], None]
-"""Called with k and the map once submap k (from 0) is in. The view is valid during the call only."""
+"""Called with k and the map after submap k (from 0) was joined. The view is valid only during the call."""
 
 
 def last_pose(view: JoinedMapView) -> Array:
@@ -118,7 +118,7 @@ def landmark_scalars(at: Index) -> Index:
 
 
 def check_chain(submaps: Sequence[Submap], *, identified: bool) -> None:
-    """Refuse an empty chain, and landmarks without an id where ids are to be trusted."""
+    """Refuse an empty chain, and landmarks without an id if ids are used."""
     if identified:
         check_identified(submaps)
     elif not submaps:
@@ -131,9 +131,9 @@ def in_group_chart(submaps: Sequence[Submap]) -> bool:
 
 
 def distinct_landmarks(submap: Submap, *, identified: bool) -> tuple[LandmarkMap, Index]:
-    """The landmark map of a submap with each landmark once, and which of them each entry became.
+    """The landmark map of a submap with each landmark once, and the landmark of each entry.
 
-    With ``identified``, entries of one id are fused; otherwise ids are ignored and every entry is a landmark.
+    With ``identified``, entries with the same id are fused; otherwise ids are ignored and every entry is a landmark.
     """
     original = landmark_map_of(submap)
     if not identified:
@@ -147,38 +147,38 @@ def distinct_landmarks(submap: Submap, *, identified: bool) -> tuple[LandmarkMap
 class JoinedMap:
     """A map in sparse information form, in the frame of its first base, which is not part of the state.
 
-    The information matrix is made of node blocks: poses of 3 scalars, landmarks of 2.
+    The information matrix consists of node blocks: poses with 3 scalars, landmarks with 2.
 
     Parameters
     ----------
     x : (n,)
-        Mean: the nodes' scalars, one node after the other.
+        Mean: the scalars of all nodes in order.
     width : (N,)
         Scalars of each node.
     ptr : (N + 1,)
     neighbours : (nb,)
-        Neighbours of every node, itself included; every pair stands in both lists.
+        Neighbours of every node, including itself; every pair is in both lists.
     block : (nb,)
-        Where the block of each pair begins in ``values``: rows of the node whose list it is in, row-major.
+        Offset of the block of each pair in ``values``: rows of the list's node, row-major.
     values : (k,)
     pose_node : (m,)
         Node of end pose k.
     landmark_node : (L,)
-        Node of landmark j, landmarks in the order of first sighting.
+        Node of landmark j, in the order of first observation.
     ids : (L,) int64
     entry_landmark : (E,)
-        Which landmark each entry of the submaps inside became, submap by submap.
+        Landmark of each entry of the joined submaps, submap by submap.
     entry_count : (m,)
         Entries of each submap.
     order : (N,)
         Elimination order of the nodes.
     fill : float
-        Entries of the factor per entry of the matrix under the last fresh order.
+        Entries of the factor per entry of the matrix with the last new order.
     anchor : (N,), optional
-        In the group chart (:mod:`graphslam.core.charts`): the pose that each node hangs on, the end of the submap that
-        saw it first; of a pose itself. None: the chart is Cartesian.
+        In the group chart (:mod:`graphslam.core.charts`): anchor of each node, the end pose of the submap that observed
+        it first; of a pose itself. None: the chart is Cartesian.
     rank : (N,), optional
-        When each node is eliminated under an order of all that will ever be joined; then no other is looked for.
+        Elimination rank of each node in an order for the complete map; then no new order is computed.
     """
 
     x: Array
@@ -205,35 +205,35 @@ class JoinedMap:
         self.landmark_at: Index = at[self.landmark_node]
 
     def __getstate__(self) -> dict[str, Any]:
-        # Factors are cheap to make again and dear to send.
+        # Factors are cheap to recompute and expensive to send.
         kept = {k: v for k, v in self.__dict__.items() if k != "entries"}
         return {**kept, "_symbolic": None, "_factor": None}
 
     @cached_property
     def entries(self) -> tuple[Index, ...]:
-        """For every submap inside, the landmark each of its entries became."""
+        """For every submap, the landmark of each of its entries."""
         return tuple(np.split(self.entry_landmark, np.cumsum(self.entry_count)[:-1]))
 
     def symbolic(self) -> BlockSymbolic:
-        """Symbolic factorisation under the present order, made once."""
+        """Symbolic factorisation with the current order, cached."""
         if self._symbolic is None:
             self._symbolic = BlockSymbolic(self.order, self.width, self.ptr, self.neighbours)
         return self._symbolic
 
     def factor(self) -> BlockFactor:
-        """Factorisation of the information matrix, made once."""
+        """Factorisation of the information matrix, cached."""
         if self._factor is None:
             self._factor = self.symbolic().factor(self.block, self.values)
         return self._factor
 
     def reorder(self, order: Nodes) -> None:
-        """Take a fresh elimination order ``(N,)``."""
+        """Use a new elimination order ``(N,)``."""
         self.order = order
         self._symbolic = self._factor = None
         self.fill = self.symbolic().nnz / len(self.values)
 
     def take_values(self, x: Array, values: Array) -> None:
-        """Take another mean and other blocks of the same pattern."""
+        """Set another mean and other blocks with the same pattern."""
         self.x, self.values, self._factor = x, values, None
 
     def covariance_block(self, indices: Index) -> Array:
@@ -249,7 +249,7 @@ class JoinedMap:
         return self.covariance_block(self.pose_at[-1] + np.arange(3))
 
     def landmark_marginals(self) -> Array:
-        """Covariance ``(L, 2, 2)`` of every landmark by itself."""
+        """Covariance ``(L, 2, 2)`` of each landmark."""
         return self.factor().inverse_diagonal_blocks(self.landmark_at, 2)
 
     def information(self, nodes: Nodes | None = None) -> sp.csc_matrix:
@@ -266,7 +266,7 @@ class JoinedMap:
         Parameters
         ----------
         identified : bool
-            Entries of one id are fused. Otherwise ids are ignored and every entry is a landmark of its own.
+            Entries with the same id are fused. Otherwise ids are ignored and every entry is a separate landmark.
         """
         return cls.leaves([submap], identified=identified)[0][0]
 
@@ -274,10 +274,10 @@ class JoinedMap:
     def leaves(
         cls, submaps: Sequence[Submap], *, identified: bool, classical: bool = False
     ) -> tuple[list[JoinedMap], list[Array] | None]:
-        """Every submap as a joined map, and the information matrices of all of them as they stand in the submaps.
+        """Every submap as a joined map, and the original information matrices of all submaps.
 
-        The latter is None where entries of one id had to be fused. Maps are joined in the group chart where all
-        submaps with landmarks are of that chart, unless a ``classical`` filter is asked for.
+        The latter is None if entries with the same id were fused. The group chart is used if all submaps with landmarks
+        use it, except for a ``classical`` filter.
         """
         group = not classical and in_group_chart(submaps)
         maps: list[JoinedMap] = []
@@ -296,12 +296,12 @@ class JoinedMap:
     def of_landmarks(
         cls, landmarks: LandmarkMap, entries: Index, information: Array, *, identified: bool, group: bool = False
     ) -> JoinedMap:
-        """A landmark map, each landmark once, its information matrix, and which landmark each entry became."""
+        """A map from landmarks (each once), the landmark of each entry, and the information matrix."""
         n = len(landmarks)
         width = np.full(n + 1, 2, dtype=np.int64)
         width[0] = 3
         nodes = np.arange(n + 1)
-        # All blocks of one row of nodes stand one after the other, so the matrix is cut by rows, then by columns.
+        # The blocks of one row of nodes are consecutive: the matrix is divided by rows, then by columns.
         size = np.outer(width, width).ravel()
         return cls(
             x=landmarks.mean,
@@ -323,20 +323,20 @@ class JoinedMap:
 
 @dataclass(frozen=True)
 class JoinResult(SubmapEstimate):
-    """The map a joiner hands over.
+    """Result of a map-joining method.
 
-    ``objective`` is that of the joined map before polishing; poses, landmarks and uncertainty are those of the
-    polished map where there was a polish.
+    ``objective`` is that of the joined map before polishing; poses, landmarks and uncertainty are those of the polished
+    map if there is one.
 
     Parameters
     ----------
     times : mapping of str to float
-        CPU seconds: association, update, recovery, and polish where there was one. (``seconds`` is wall time.)
-        Evaluating the objective of the unpolished map is in neither.
+        CPU seconds: association, update, recovery, and polish, if done. (``seconds`` is wall time.) Neither includes
+        the evaluation of the unpolished objective.
     submap_ids : tuple of (n_k,) int64
-        The landmark ids of every submap as joined: those given, or those association found.
+        The landmark ids of every submap: given, or from association.
     problem : SubmapProblem or None
-        The least-squares problem of the same submaps, which a polish goes on with; not pickled.
+        The least-squares problem of the same submaps, for a polish; not pickled.
     """
 
     method: str = ""
@@ -349,7 +349,7 @@ class JoinResult(SubmapEstimate):
 
 
 def landmark_labels(view: JoinedMapView, ids: Ids, *, identified: bool) -> Ids:
-    """Ids ``(L,)`` of the landmarks of a finished map: those given, or their rank by first sighting."""
+    """Ids ``(L,)`` of the landmarks of a finished map: the given ones, or their rank by first observation."""
     return ids if identified else np.arange(len(view.landmark_at), dtype=np.int64)
 
 
@@ -362,10 +362,9 @@ def finish_map(
     times: JoinTimes,
     information: Sequence[Array] | None = None,
 ) -> JoinResult:
-    """Bring a joined map into the common layout ``[poses, landmarks by first sighting]`` and evaluate its objective.
+    """Convert a joined map to the common layout ``[poses, landmarks by first observation]``, evaluate its objective.
 
-    ``information`` are the information matrices of the submaps, where the joiner has made them and no submap has an id
-    twice.
+    ``information``: information matrices of the submaps, if available and no submap repeats an id.
     """
     labels = landmark_labels(view, view.ids, identified=identified)
     submap_ids = tuple(labels[e] for e in view.entries)

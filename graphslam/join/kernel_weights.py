@@ -1,4 +1,4 @@
-"""Weights in the place of robust kernels: what a method that carries Gaussians can solve."""
+"""Replacement of robust kernels by weights, for methods that need Gaussians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graphslam.graph.noise import NO_KERNEL
 
 
 def without_kernels(graph: FactorGraph) -> tuple[FactorGraph, float]:
-    """The graph with weights in the place of robust kernels, and what the sum of squares then lacks."""
+    """The graph with weights in place of robust kernels, and the constant to add to its sum of squares."""
     records = list(graph.records.values())
     flat, values = graph.flat(), graph.values
     out = FactorGraph.with_values(values.copy())
@@ -29,7 +29,7 @@ def without_kernels(graph: FactorGraph) -> tuple[FactorGraph, float]:
 
 
 def _weighted(record: Any, weight: float) -> FactorRecord:
-    """A factor without its kernel, its information multiplied by a weight."""
+    """A factor without its kernel; its information is multiplied by a weight."""
     root = math.sqrt(weight)
     if hasattr(record, "whitener"):
         return cast(FactorRecord, replace(record, whitener=root * record.whitener, robust=NO_KERNEL))

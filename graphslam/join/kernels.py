@@ -1,7 +1,7 @@
-"""Numba kernel: one join of two maps in information form. Plain arrays only.
+"""Numba kernels: join of two maps in information form. Plain arrays only.
 
-Maps are block matrices over nodes: a pose is (x, y, θ), a landmark (x, y); a pose node is 3 wide, a landmark 2. Every
-pair of neighbours is stored both ways, each with the rows of the node whose list it is in.
+Maps are block matrices over nodes: a pose is (x, y, θ), a landmark (x, y); Every pair of neighbours is stored twice,
+each block with the rows of the list's node.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ class BlockMap(NamedTuple):
     x: Array
     """(n,): mean."""
     width: Index
-    """(N,): of the nodes."""
+    """(N,): scalars per node."""
     ptr: Index
     """(N + 1,): neighbour lists."""
     idx: Index
     block: Index
-    """Where the blocks of each list begin in ``value``; they stand one after the other."""
+    """Offsets of the blocks of each list in ``value``; they are consecutive."""
     value: Array
 
 
 @njit
 def _begin_of(width: Index) -> Index:
-    """Where each node begins among the scalars, and their number ``(N + 1,)``."""
+    """Offset of each node among the scalars, and their total ``(N + 1,)``."""
     at = np.zeros(len(width) + 1, np.int64)
     at[1:] = np.cumsum(width)
     return at
@@ -52,14 +52,13 @@ def join_blocks(
     known, new : BlockMap
         A, and B in the frame of ``start``.
     image : (N_b,)
-        Node of the joined map that each node of B is: a landmark of A, or N and above for what is new.
+        Node of the joined map for each node of B: a landmark of A, or at least N for new nodes.
     start : int
-        The pose of A where B begins.
+        The pose of A that is the base of B.
     rounding : float
-        Innovations smaller than this, relative to 1 + the value, are arithmetic and count as zero.
+        Innovations smaller than this, relative to 1 + the value, are rounding errors and count as zero.
     pull : (n_b,)
-        What is added to ``I_B ν``: the gradient of a map that was pulled back (:func:`relinearise_in_chart`), less its
-        sign.
+        Added to ``I_B ν``: the negative gradient of a relinearised map (:func:`relinearise_in_chart`).
 
     Returns
     -------
@@ -68,7 +67,7 @@ def join_blocks(
     gradient : (n,)
         ``∇Hᵀ (I_B (z - H(X)) + pull)`` there.
     news : bool
-        Whether it differs from zero.
+        Whether an innovation differs from zero.
     """
     x, width, ptr, idx, block, value = known
     z, b_width, b_ptr, b_idx, b_block, b_value = new
@@ -89,7 +88,7 @@ def join_blocks(
     sx, sy, st = x[at[start]], x[at[start] + 1], x[at[start] + 2]
     c, s = np.cos(st), np.sin(st)
 
-    # What is new takes its first value from B; what is known gives an innovation. M is the Jacobian of the start.
+    # New nodes get their value from B; known ones give an innovation. M is the Jacobian with respect to the start.
     n = b_at[NB]
     nu = np.zeros(n)
     M = np.zeros((n, 3))
@@ -116,7 +115,7 @@ def join_blocks(
         if b_width[b] == 3:
             M[v + 2, 2] = -1.0
 
-    # I_B (ν, M), turned into the frame of A
+    # I_B (ν, M), rotated into the frame of A
     gradient = np.zeros(at[total])
     V = np.zeros((n, 3))
     own = np.zeros((3, 3))
@@ -150,14 +149,14 @@ def join_blocks(
     for d in range(3):
         gradient[at[start] + d] += gs[d]
 
-    # Lists and blocks of the joined map, row by row. Rows of A that B does not touch are copied whole, and in rows of
-    # new nodes every neighbour is new; only rows that both have a part in must look up what stands there already.
+    # Lists and blocks of the joined map, row by row. Rows of A without part of B are copied, and in rows of new nodes
+    # every neighbour is new; only rows of both need a lookup of existing entries.
     room = len(idx) + len(b_idx) + 2 * NB + 1
     new_ptr = np.zeros(total + 1, np.int64)
     new_idx = np.empty(room, np.int64)
     new_block = np.empty(room, np.int64)
     new_value = np.empty(len(value) + len(b_value) + 6 * n + 9)
-    where = np.full(total, -1, np.int64)  # entry of each neighbour in the list of the row at hand
+    where = np.full(total, -1, np.int64)  # entry of each neighbour in the current row's list
     e, k = 0, 0
     T = np.empty((3, 3))
     for i in range(total):
@@ -243,7 +242,7 @@ def join_blocks(
 def predict_nodes(known: BlockMap, new: BlockMap, image: Index, start: int, values: Array) -> Array:
     """``H(X)``: the nodes of map B ``(n_b,)`` as seen from node ``start`` of the joined map at its ``values`` ``(n,)``.
 
-    Values end where those of A do on the first call; what is new is then where B has it.
+    On the first call ``values`` has only the nodes of A; new nodes then have their values of B.
     """
     N = len(known.width)
     at = np.zeros(len(image) + N + 1, np.int64)
@@ -275,7 +274,7 @@ def predict_nodes(known: BlockMap, new: BlockMap, image: Index, start: int, valu
 
 @njit
 def _arcs(m: BlockMap, anchor: Index, x: Array) -> tuple[Array, Array]:
-    """``a, b`` of V⁻¹ and the column of the anchor's heading ``(N, 4)`` of each node at x; the gradient ``Jᵀ I u``."""
+    """``a, b`` of V⁻¹ and the column of the anchor's heading ``(N, 4)`` of each node at x; gradient ``Jᵀ I u``."""
     mean, width, ptr, idx, block, value = m
     N = len(width)
     at = _begin_of(width)
@@ -313,7 +312,7 @@ def _arcs(m: BlockMap, anchor: Index, x: Array) -> tuple[Array, Array]:
 
 @njit
 def _nodes_on_poses(anchor: Index) -> tuple[Index, Index]:
-    """Nodes that hang on pose i: ``hanging[begin[i] : begin[i + 1]]``."""
+    """Nodes with anchor i: ``hanging[begin[i] : begin[i + 1]]``."""
     N = len(anchor)
     begin = np.zeros(N + 1, np.int64)
     for i in range(N):
@@ -332,16 +331,16 @@ def _nodes_on_poses(anchor: Index) -> tuple[Index, Index]:
 
 @njit
 def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap, Array]:
-    """A map that is Gaussian in the group chart about its mean, as a Gauss–Newton system at other values.
+    """Gauss–Newton system, at other values, of a map that is Gaussian in the group chart about its mean.
 
-    With u the chart's difference of ``x`` from the mean (:mod:`graphslam.core.charts`) and J its derivative, the map
-    says ``uᵀ I u``: its matrix at x is ``Jᵀ I J`` and its gradient ``Jᵀ I u``. A node moves along the arc of its
-    anchor's heading, so the anchor's column couples with all that the node is coupled with.
+    With u the chart's difference of ``x`` from the mean (:mod:`graphslam.core.charts`) and J its derivative, the
+    objective is ``uᵀ I u``: its matrix at x is ``Jᵀ I J`` and its gradient ``Jᵀ I u``. A node moves along the arc of
+    its anchor's heading, so the anchor's column couples with all neighbours of the node.
 
     Parameters
     ----------
     anchor : (N,)
-        Pose in whose frame each node is; of a pose itself.
+        Anchor pose of each node; of a pose itself.
     x : (n,)
 
     Returns
@@ -369,7 +368,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
         for r in range(N):
             first = e
             wr = width[r]
-            base = e if sweep else 0  # when counting, one row at a time is kept
+            base = e if sweep else 0  # while counting, only one row is stored
             count = 0
             for part in range(-1, begin[r + 1] - begin[r]):
                 i = r if part < 0 else hanging[begin[r] + part]
@@ -395,7 +394,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
             for c in range(first, e):
                 new_block[c] = k
                 k += wr * width[new_idx[c]]
-            # Jᵀ I: rows of the node itself, then the heading row by all that hangs on it
+            # Jᵀ I: rows of the node, then the heading row from all nodes with this anchor
             a, b, hx, hy = arc[r]
             for f in range(ptr[r], ptr[r + 1]):
                 wj, v, t = width[idx[f]], block[f], new_block[seen[idx[f]]]
@@ -426,7 +425,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
 
 @njit
 def cut_into_blocks(A: Array, width: Index) -> Array:
-    """A dense matrix ``(n, n)`` as row-major blocks, one row of nodes after the other ``(n²,)``."""
+    """Convert a dense matrix ``(n, n)`` to row-major blocks, by rows of nodes ``(n²,)``."""
     out = np.empty(A.size)
     k, r = 0, 0
     for i in range(len(width)):

@@ -1,4 +1,4 @@
-"""From a once-linearised joined map to the least-squares optimum of the same submaps."""
+"""Least-squares optimum of the submaps, starting from a joined map."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphslam.join.submap_solver import minimise_submaps
 
 
 def optimise_from_join(submaps: Sequence[Submap], joined: JoinResult) -> JoinResult:
-    """Relinearise all submaps at the joined map, again and again, until the objective is at its minimum.
+    """Relinearise all submaps, starting at the joined map, until the objective is at its minimum.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def optimise_from_join(submaps: Sequence[Submap], joined: JoinResult) -> JoinRes
     problem = joined.problem
     if problem is None or not problem.is_of(submaps):
         problem = SubmapProblem(submaps, ids=joined.submap_ids)
-    x = problem.initial(joined.poses[1:], joined.landmarks)  # both in the order of first sighting
+    x = problem.initial(joined.poses[1:], joined.landmarks)  # both in the order of first observation
     best = minimise_submaps(problem, x)
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     return replace(

@@ -1,4 +1,4 @@
-"""Two orders of joining (Combined SLAM B6, B9): one after the other, or pairwise up a binary tree."""
+"""Orders of joining (Combined SLAM B6, B9): in sequence, or pairwise in a binary tree."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def join_sequential(
     classical: bool = False,
     progress: bool = False,
 ) -> JoinResult:
-    """Join submaps one after the other: every submap is a measurement of the map so far.
+    """Join submaps in sequence: every submap is a measurement of the current map.
 
     Submaps that are Gaussian in the group chart are joined in it (:mod:`graphslam.join.eif`).
 
     Parameters
     ----------
     association : MapAssociationConfig, optional
-        Recognise landmarks; default: by the ids they bear.
+        Data association; default: by the landmark ids.
     on_join : callable, optional
-        ``on_join(k, view)`` is called after submap k (from 0, the first included) is in, outside the clock; the
-        :class:`~graphslam.join.joined_map.JoinedMapView` is valid during the call only.
+        ``on_join(k, view)`` is called after submap k (from 0) was joined, and is not timed; the
+        :class:`~graphslam.join.joined_map.JoinedMapView` is valid only during the call.
     classical : bool
-        Join as the paper does, whatever the chart of the submaps: Cartesian, each join linearised once.
+        Join as in the paper, for any chart of the submaps: Cartesian, each join linearised once.
     progress : bool
         Show a progress bar.
     """
@@ -76,26 +76,26 @@ def join_tree(
     classical: bool = False,
     progress: bool = False,
 ) -> JoinResult:
-    """Join submaps pairwise, then the pairs, and so on: the joined map of B9 is a submap for the next level.
+    """Join submaps pairwise, then the pairs, and so on: a joined map (B9) is a submap for the next level.
 
-    An odd one out goes up a level by itself. The result is the same to the last bit whatever the executor.
+    An unpaired map moves up one level. The result is bitwise equal with all executors.
 
     Parameters
     ----------
     submaps, association, classical, progress
         As in :func:`join_sequential`.
     executor : optional
-        Where the joins are made: in this process (default); ``"processes"``, a pool of spawned processes that lives for
-        this tree; a ``concurrent.futures`` executor or a Dask client to share; or the address of a Dask scheduler, to
-        which the tree goes as one graph of tasks. In one process a few thousand submaps take about a second: others pay
-        where pools are kept, or where landmarks are to be recognised (see :mod:`graphslam.join.parallel`).
+        Where the joins run: in this process (default); ``"processes"``, a pool of spawned processes for this tree; a
+        shared ``concurrent.futures`` executor or Dask client; or the address of a Dask scheduler, which gets the tree
+        as one task graph. In one process a few thousand submaps take about a second: the others are faster only if a
+        pool is reused, or with data association (see :mod:`graphslam.join.parallel`).
     workers : int, optional
-        Processes of a pool made here; alone it means ``"processes"``. Default: as many as there are processors.
+        Processes of a new pool; without ``executor`` it implies ``"processes"``. Default: number of processors.
 
     Returns
     -------
     JoinResult
-        ``times`` are CPU seconds of all that took part, ``seconds`` the longest way up the tree.
+        ``times`` are CPU seconds of all processes, ``seconds`` the longest path in the tree.
     """
     identified = association is None
     check_chain(submaps, identified=identified)
@@ -122,7 +122,7 @@ Ids = npt.NDArray[np.int64]
 
 
 def tree_ranks(ids: Sequence[Ids]) -> list[npt.NDArray[np.int64]]:
-    """When each node of every submap is eliminated.
+    """Elimination rank of each node of every submap.
 
     Parameters
     ----------
@@ -146,9 +146,9 @@ def tree_ranks(ids: Sequence[Ids]) -> list[npt.NDArray[np.int64]]:
     node[is_landmark] = m + landmark.ravel()
     list_ptr, neighbours = adjacency(N, ptr, node)
     rows, columns = [np.repeat(np.arange(N), np.diff(list_ptr))], [neighbours]
-    half = 2  # submaps in a full half; a half of one couples with its start in any case
+    half = 2  # submaps in a full half; a half of one is coupled with its start anyway
     while half < m:
-        # The right halves of this level begin at half, 3 half, …; their start is the end pose before.
+        # The right halves of this level begin at half, 3 half, …; their start is the previous end pose.
         begins = np.arange(half, m, 2 * half)
         which = np.searchsorted(begins, owner, side="right") - 1
         inside = (which >= 0) & (owner < begins[which] + half)

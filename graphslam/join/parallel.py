@@ -1,12 +1,11 @@
-"""A binary tree of joins by several hands: the joins of a level do not depend on each other.
+"""Parallel binary tree of joins: the joins of a level are independent.
 
-The tree is cut into subtrees of 2^h submaps; each is one task, and so is every join above them. The tree is the same
-however it is cut, and every task does the same arithmetic on one BLAS thread, so the result is the same to the last bit
-whoever does it.
+The tree is divided into subtrees of 2^h submaps; each is one task, and so is every join above them. The division does
+not change the tree, and every task uses one BLAS thread, so the result is always bitwise equal.
 
-What pays, measured on two cores with 2,048 submaps (1.3 s in one process): threads gain nothing, because half of a join
-is Python; a pool of spawned processes takes longer to start than to join unless it is kept for many trees, or has
-landmarks to recognise.
+Measured on two cores with 2,048 submaps (1.3 s in one process): threads are not faster, because half of a join is
+Python; a pool of spawned processes takes longer to start than the join, unless it is reused for many trees, or for data
+association.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     Pool = Executor | Client
 
-# Tasks a worker: enough to even out, few enough to send little about. And no task smaller than this many submaps.
+# Tasks per worker: enough for balanced loads, few enough for little communication. And least submaps per task.
 _TASKS = 4
 _LEAST = 8
 
@@ -46,14 +45,14 @@ def _blas() -> ThreadpoolController:
 
 
 def join_two(a: JoinedMap, b: JoinedMap, association: MapAssociationConfig | None, times: JoinTimes) -> JoinedMap:
-    """Join B to A; landmarks are one by id, or recognised where there is an ``association``."""
+    """Join B to A; landmarks are matched by id, or with ``association``."""
     with times.measure("association"):
         match = match_by_id(a, b) if association is None else match_landmarks(a, b, association)
     return join_maps(a, b, match, times)
 
 
 def join_subtree(level: Sequence[JoinedMap], association: MapAssociationConfig | None, progress: bool = False) -> _Done:
-    """Join maps pairwise, then the pairs, and so on; an odd one out goes up a level by itself."""
+    """Join maps pairwise, then the pairs, and so on; an unpaired map moves up one level."""
     times = JoinTimes()
     with (
         _blas().limit(limits=1, user_api="blas"),
@@ -67,7 +66,7 @@ def join_subtree(level: Sequence[JoinedMap], association: MapAssociationConfig |
 
 
 def _join_done(a: _Done, b: _Done, association: MapAssociationConfig | None) -> _Done:
-    """The join of two subtrees; their times add up."""
+    """Join of two subtrees; their times are added."""
     joined, times = join_subtree([a[0], b[0]], association)
     for part in (a[1], b[1]):
         for name, seconds in part.parts.items():
@@ -83,7 +82,7 @@ def join_leaves(
     workers: int | None,
     progress: bool,
 ) -> _Done:
-    """Join the leaves of a tree where ``executor`` wants it (see :func:`~graphslam.join.order.join_tree`)."""
+    """Join the leaves of a tree with ``executor`` (see :func:`~graphslam.join.order.join_tree`)."""
     if workers is not None and workers < 1:
         raise ConfigError(f"{workers} workers; wanted at least 1")
     if executor is None:
@@ -96,10 +95,10 @@ def join_leaves(
 
 @contextmanager
 def _pool(executor: str | Pool, workers: int | None) -> Iterator[tuple[Pool, int]]:
-    """A pool to submit to and how many work in it; one that was made here is closed again."""
+    """A pool and its number of workers; a new pool is closed at the end."""
     if executor == "processes":
         count = workers or os.cpu_count() or 1
-        # spawned, never forked: a forked child of a threaded library hangs or dies
+        # spawn, not fork: forked processes of threaded libraries can hang
         with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
             yield pool, count
     elif isinstance(executor, str):
@@ -122,8 +121,8 @@ def _submit(
     while size * _TASKS * hands < len(leaves):
         size *= 2
     here = isinstance(pool, Executor)
-    # A Dask future stands for its result in the arguments of the next task: the whole tree is one graph, and maps go
-    # from worker to worker. A process pool has them come back for each level.
+    # Dask accepts futures as arguments of the next task: the whole tree is one graph, and maps are sent from worker to
+    # worker. With a process pool they return for each level.
     level: list[Any] = [
         pool.submit(join_subtree, leaves[i : i + size], association) for i in range(0, len(leaves), size)
     ]

@@ -1,4 +1,4 @@
-"""Every way of joining submaps into one map, by name."""
+"""Registry of the methods for joining submaps into one map."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ SOLVERS: dict[str, Callable[..., SubmapEstimate]] = {"isam2": _isam2, "batch": _
 
 
 Material: TypeAlias = Union[Sequence[Submap], "JoinProblem"]
-"""What is joined: landmark submaps in the plane alone, for which there are compiled joiners; or any factor graph.
+"""Input of a join: 2-D landmark submaps, for which there are compiled methods, or any factor graph.
 
-(The module of a :class:`~graphslam.join.graph_problem.JoinProblem` loads gtsam, which landmark submaps do not need.)
+(The module of :class:`~graphslam.join.graph_problem.JoinProblem` loads gtsam, which landmark submaps do not need.)
 """
 
 
 class JoinMethods(NamedTuple):
-    """The methods of one kind of material: those that filter, those that solve, and the way on to the optimum."""
+    """The methods for one type of input: filters, solvers, and the function for the polish."""
 
     joiners: dict[str, Callable[..., Any]]
     solvers: dict[str, Callable[..., Any]]
@@ -64,12 +64,12 @@ class JoinMethods(NamedTuple):
 
 
 def are_landmark_submaps(submaps: Sequence[Submap]) -> bool:
-    """Whether the compiled joiners take these submaps: landmarks in the plane, and no matches between submaps."""
+    """Whether the compiled methods support these submaps: 2-D, with landmarks, without matches between submaps."""
     return any(s.landmarks is not None for s in submaps) and all(s.dim == 2 and not s.matches for s in submaps)
 
 
 def methods_for(material: Material) -> JoinMethods:
-    """The methods that take this material."""
+    """The methods for this input."""
     if isinstance(material, Sequence):
         return JoinMethods(JOINERS, SOLVERS, polish_join)
     from graphslam.join.graph_join import GRAPH_JOINERS, GRAPH_SOLVERS, optimise_estimate
@@ -80,7 +80,7 @@ def methods_for(material: Material) -> JoinMethods:
 def prepare_submaps(
     submaps: Material, *, associate: str | MapAssociationConfig = "given", covariance_scale: float = 1.0
 ) -> Material:
-    """Landmark submaps in the plane with their covariances scaled; everything else as a graph with all its factors."""
+    """2-D landmark submaps with scaled covariances; everything else as a graph with all its factors."""
     association = association_of(associate)
     if isinstance(submaps, Sequence) and are_landmark_submaps(submaps):
         return list(submaps) if covariance_scale == 1.0 else scale_covariances(submaps, covariance_scale)
@@ -121,28 +121,27 @@ def join_by_method(
     Parameters
     ----------
     submaps : sequence of Submap, or JoinProblem
-        In order; submap k+1 starts where submap k ends. Matches that submaps carry are factors too. A
+        In order; submap k+1 starts where submap k ends. Matches in the submaps are factors, too. A
         :class:`~graphslam.join.graph_problem.JoinProblem` has all factors of a graph.
     method : str
         ``eif-tree``, ``eif-sequential``: extended information filters, in the chart of the submaps; with ``-classical``
-        as the paper has them, Cartesian and linearised once. ``ekf``: once linearised. ``batch``,
-        ``isam2``: least squares.
+        as in the paper, Cartesian and linearised once. ``ekf``: linearised once. ``batch``, ``isam2``: least squares.
     polish : bool
-        Go on to the least-squares optimum from there.
+        Continue to the least-squares optimum.
     associate : "given", "nearest", "joint" or Association
-        Landmarks are one if they bear the same id; or are recognised while joining, whatever ids they bear. The solvers
-        take ids that were recognised by joining in sequence.
+        Landmarks are matched by id, or associated while joining, ignoring their ids. The solvers use the association of
+        a sequential join.
     covariance_scale : float
         Factor on every submap's covariance.
     workers, cluster : optional
-        Number of processes, or address of a Dask scheduler, that share the joins of ``eif-tree``.
+        Number of processes, or address of a Dask scheduler, for the joins of ``eif-tree``.
     progress : bool
         Show a progress bar.
 
     Returns
     -------
     SubmapEstimate
-        A :class:`~graphslam.join.joined_map.JoinResult` for landmark submaps in the plane, else a
+        A :class:`~graphslam.join.joined_map.JoinResult` for 2-D landmark submaps, otherwise a
         :class:`~graphslam.join.graph_join.GraphEstimate`.
     """
     submaps = prepare_submaps(submaps, associate=associate, covariance_scale=covariance_scale)
@@ -170,9 +169,9 @@ def join_by_method(
 
 
 def compile_method(submaps: Material, method: str, *, polish: bool = False) -> None:
-    """Join the first submaps alone: kernels are compiled and modules loaded, and neither is timed or measured later.
+    """Join the first submaps only, to compile kernels and load modules before a timed join.
 
-    What is wrong with the submaps is left to the join of all of them to report.
+    Errors of the submaps are ignored here; the complete join reports them.
     """
     with contextlib.suppress(GraphSlamError):
         if isinstance(submaps, Sequence):
@@ -184,5 +183,5 @@ def compile_method(submaps: Material, method: str, *, polish: bool = False) -> N
 def identify_landmarks(
     submaps: Sequence[Submap], association: MapAssociationConfig, *, progress: bool = False
 ) -> list[Submap]:
-    """The same submaps with the landmark ids that joining them in sequence finds."""
+    """The submaps with the landmark ids from the data association of a sequential join."""
     return relabel(submaps, join_sequential(submaps, association=association, progress=progress).submap_ids)

@@ -1,12 +1,12 @@
-"""Many landmark submaps as one sparse least-squares problem, assembled without a Python loop per factor.
+"""Sparse least-squares problem of many landmark submaps, assembled without a Python loop per factor.
 
 The unknowns are ``[x_1 … x_m, l_1 … l_L]``: the end poses (x, y, θ) of the submaps, then the landmarks (x, y), all in
 the frame of the first base, which is fixed. Submap k measures ``x_{k+1}`` and its landmarks from ``x_k`` (Combined SLAM
 eq. 15) with its full joint covariance, and the objective is ``Σ rᵀ P⁻¹ r`` (no half).
 
-Why it is fast: the Jacobian of a landmark is a rotation ``Rᵀ`` (in the group chart a scaled one), so a 2×2 block ``W``
-of a submap's information enters the normal equations as ``R W Rᵀ``. Refreshing the matrix is one pass over the
-information matrices in compiled code, instead of two dense products a submap.
+It is fast because the Jacobian of a landmark is a rotation ``Rᵀ`` (in the group chart a scaled one), so a 2×2 block
+``W`` of a submap's information enters the normal equations as ``R W Rᵀ``. The matrix is updated by one compiled pass
+over the information matrices, without dense products.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Index = npt.NDArray[np.int64]
 
 
 def landmark_map_of(submap: Submap) -> LandmarkMap:
-    """The landmark map of a 2-D submap; one without landmarks measures its end pose alone."""
+    """The landmark map of a 2-D submap; without landmarks it measures only its end pose."""
     if submap.dim != 2:
         raise DataError(f"submap {submap.key} has the wrong dimension", got=submap.dim, wanted="2 (landmark joining)")
     if submap.landmarks is not None:
@@ -39,12 +39,12 @@ def landmark_map_of(submap: Submap) -> LandmarkMap:
         exit_pose=submap.exit_pose,
         positions=np.zeros((0, 2)),
         covariance=tangent_to_vector_covariance(submap.exit_pose, submap.exit_covariance),
-        chart="group",  # of an exit alone that is its right tangent
+        chart="group",  # for an exit only, this is its right tangent
     )
 
 
 def dense_information(landmarks: LandmarkMap, *, what: str) -> Array:
-    """Information matrix ``(3 + 2n, 3 + 2n)``, proven positive definite on the way."""
+    """Information matrix ``(3 + 2n, 3 + 2n)``, checked for positive definiteness."""
     P = landmarks.covariance
     M = landmarks.dense_information() if P is None else P
     factor, info = lapack.dpotrf(M, lower=1)
@@ -60,11 +60,11 @@ def dense_information(landmarks: LandmarkMap, *, what: str) -> Array:
 
 
 def fuse_repeated(landmarks: LandmarkMap, *, what: str = "submap") -> LandmarkMap:
-    """One entry per landmark: entries of a submap that bear the same id are fused.
+    """Fuse the entries of a submap that have the same id.
 
     Entries of one landmark measure the same quantity in the same frame, so fusing them is linear and exact: every
-    least-squares problem keeps its minimum, and its objective falls by a constant. A map without repetitions comes
-    back as it is; ids of -1 are never fused.
+    least-squares problem keeps its minimum, and its objective falls by a constant. A map without repetitions is
+    returned unchanged; ids of -1 are never fused.
     """
     ids = landmarks.ids
     known = ids[ids >= 0]
@@ -77,7 +77,7 @@ def fuse_repeated(landmarks: LandmarkMap, *, what: str = "submap") -> LandmarkMa
         if j >= 0:
             group[i] = first.setdefault(int(j), len(first))
         else:
-            first[-2 - i] = len(first)  # an id that is nobody's
+            first[-2 - i] = len(first)  # a unique dummy id
     n = len(first)
     columns = np.concatenate([np.arange(3), (3 + 2 * group[:, None] + np.arange(2)).ravel()])
     C = np.zeros((3 + 2 * len(ids), 3 + 2 * n))
@@ -99,7 +99,7 @@ def fuse_repeated(landmarks: LandmarkMap, *, what: str = "submap") -> LandmarkMa
 
 
 def check_identified(submaps: Sequence[Submap]) -> None:
-    """Refuse an empty chain and landmarks that nobody has identified."""
+    """Refuse an empty chain, and landmarks without an id."""
     if not submaps:
         raise DataError("there are no submaps", got=0, wanted="at least one")
     for s in submaps:
@@ -118,22 +118,22 @@ class SubmapProblem:
     Parameters
     ----------
     submaps : sequence of Submap
-        In order: submap k+1 starts where submap k ends. Landmarks carry global ids; an id may stand twice in a submap.
+        In order: submap k+1 starts where submap k ends. Landmarks have global ids; a submap may repeat an id.
     scale : (m,) or float, optional
         Factor on the covariance of each submap (default 1).
     ids : sequence of (n_k,), optional
-        Global ids of the entries of every submap, instead of those they carry.
+        Global ids of the entries of every submap, in place of those in the submaps.
     information : sequence of (3 + 2 n_k, 3 + 2 n_k), optional
-        Their information matrices (before ``scale``) where they are known already.
+        Their information matrices (before ``scale``), if known.
 
     Attributes
     ----------
     ids : (L,) int64
-        Global ids in the order of first sighting.
+        Global ids in the order of first observation.
     size : int
         Free scalars, ``3 m + 2 L``.
     chart : str
-        Of all submaps; "cartesian" where they differ.
+        Of all submaps; "cartesian" if they differ.
     measurements : int
         Rows of the residual; ``measurements - size`` are the degrees of freedom of the objective.
     """
@@ -160,7 +160,7 @@ class SubmapProblem:
         self.ids = unique[by_sighting]
         self.size = 3 * m + 2 * len(self.ids)
 
-        # Entries: of every submap its end, then its landmarks. Nodes: pose k is node k, landmark j node m + j.
+        # Entries: the end of every submap, then its landmarks. Nodes: pose k is node k, landmark j node m + j.
         counts = np.array([1 + len(a) for a in maps], dtype=np.int64)
         self._entry_ptr = _offsets(counts)
         owner = np.repeat(np.arange(m), counts)
@@ -188,22 +188,22 @@ class SubmapProblem:
 
     @property
     def anchors(self) -> Index:
-        """For every landmark ``(L,)`` which end pose it hangs on: k is the end of submap k, the first that saw it."""
+        """Anchor of every landmark ``(L,)``: k is the end of submap k, the first that observed it."""
         return np.asarray(self._first_owner, dtype=np.int64)
 
     def is_of(self, submaps: Sequence[Submap]) -> bool:
-        """Whether it was made of these very submaps."""
+        """Whether it was made from these submap objects."""
         return len(submaps) == self.m and all(a is b for a, b in zip(submaps, self._submaps))
 
     @cached_property
     def pattern(self) -> BlockPattern:
-        """Pattern of ``JᵀΩJ`` and its factorisation; made when it is first needed."""
+        """Pattern of ``JᵀΩJ`` and its factorisation; cached."""
         ptr, neighbours = kernels.adjacency(len(self._width), self._entry_ptr, self._node)
         return BlockPattern(self._width, ptr, neighbours)
 
     @cached_property
     def _slots(self) -> tuple[Index, Index]:
-        """Where the block of every two entries of a submap goes, its start counted in."""
+        """Offset of the block of every two entries of a submap, including its start."""
         p = self.pattern
         pair_ptr = _offsets((1 + np.diff(self._entry_ptr)) ** 2)
         slots = kernels.entry_slots(
@@ -218,14 +218,14 @@ class SubmapProblem:
         return np.vstack([np.zeros((1, 3)), x[: 3 * self.m - 3].reshape(-1, 3)])
 
     def initial(self, poses: ArrayLike | None = None, landmarks: ArrayLike | None = None) -> Array:
-        """Values to start from: the chain of end poses, each landmark where it was first sighted.
+        """Initial values: the chain of end poses, each landmark at its first observation.
 
         Parameters
         ----------
         poses : (m, 3), optional
-            End poses in the frame of the first base, instead of the chain.
+            End poses in the frame of the first base, in place of the chain.
         landmarks : (L, 2), optional
-            In the order of :attr:`ids`, instead of the first sighting.
+            In the order of :attr:`ids`, in place of the first observation.
         """
         if poses is None:
             z = self._z[self._row_ptr[:-1, None] + np.arange(3)]
@@ -257,12 +257,12 @@ class SubmapProblem:
         return x[: 3 * self.m].reshape(-1, 3), x[3 * self.m :].reshape(-1, 2)
 
     def bent(self, x: Array, step: Array) -> Array:
-        """Take a step along the chain instead of along a straight line ``(size,)``.
+        """Apply a step along the chain, not along a straight line ``(size,)``.
 
-        ``x + step`` moves everything behind a corrected heading along a tangent, which over kilometres leaves the
-        valley of the objective. Here the step is taken in what the submaps measure: every end pose as seen from its
-        start and every landmark as seen from the start of the submap that saw it first change by what ``step`` means
-        to first order, and the chain is laid out again. To first order both are the same point.
+        ``x + step`` moves everything after a corrected heading along a tangent, which is wrong over kilometres. Here
+        the step is applied to relative quantities: every end pose relative to its start, and every landmark relative to
+        the start of the submap that observed it first, change by ``step`` to first order, and the chain is composed
+        again. Both results agree to first order.
         """
         ends, marks = self._split(x)
         d_ends, d_marks = self._split(step)
@@ -279,7 +279,7 @@ class SubmapProblem:
         return bent
 
     def residual(self, x: Array) -> Array:
-        """``H(X) - z``, submap by submap in the order of its mean ``(measurements,)`` (eq. 15), each in its chart."""
+        """``H(X) - z``, submap by submap ``(measurements,)`` (eq. 15), each in its chart."""
         r = self._difference(x)
         kernels.chart_residuals(self._row_ptr, self._group, r)
         return r
@@ -291,7 +291,7 @@ class SubmapProblem:
         return r
 
     def objective_per_submap(self, x: Array) -> Array:
-        """The share ``(m,)`` of every submap in the objective: which of them disagrees with the rest."""
+        """Contribution ``(m,)`` of every submap to the objective."""
         out = np.empty(self.m)
         kernels.submap_chi2(self._row_ptr, self._omega, self._omega_ptr, self.residual(x), out)
         return out
@@ -314,13 +314,13 @@ class SubmapProblem:
 
 
 def _turn(heading: Array, q: Array) -> Array:
-    """Points ``q`` ``(n, 2)`` turned by ``heading`` ``(n,)``."""
+    """Rotate points ``q`` ``(n, 2)`` by ``heading`` ``(n,)``."""
     c, s = np.cos(heading), np.sin(heading)
     return np.stack([c * q[:, 0] - s * q[:, 1], s * q[:, 0] + c * q[:, 1]], -1)
 
 
 def _seen(starts: Array, d_starts: Array, points: Array, d_points: Array) -> Array:
-    """Points ``(n, 2)`` as seen from poses ``(n, 3)``, plus their change to first order."""
+    """Points ``(n, 2)`` in the frames of poses ``(n, 3)``, plus their change to first order."""
     q = _turn(-starts[:, 2], points - starts[:, :2])
     dq = _turn(-starts[:, 2], d_points - d_starts[:, :2])
     return q + dq + d_starts[:, 2:] * np.stack([q[:, 1], -q[:, 0]], -1)
@@ -332,7 +332,7 @@ def _offsets(counts: npt.NDArray[np.int64]) -> Index:
 
 
 def relabel(submaps: Sequence[Submap], ids: Sequence[npt.ArrayLike]) -> list[Submap]:
-    """The same submaps with other landmark ids; those without landmarks stay as they are."""
+    """The submaps with other landmark ids; those without landmarks are unchanged."""
     return [
         s if s.landmarks is None else replace(s, landmarks=replace(s.landmarks, ids=np.asarray(i, dtype=np.int64)))
         for s, i in zip(submaps, ids, strict=True)
@@ -347,7 +347,7 @@ def _check_scale(scale: ArrayLike, m: int) -> Array:
 
 
 def scale_covariances(submaps: Sequence[Submap], factor: ArrayLike) -> list[Submap]:
-    """The same submaps with their covariances multiplied by ``factor`` (one number, or one a submap)."""
+    """The submaps with covariances multiplied by ``factor`` (one number, or one per submap)."""
     factors = _check_scale(factor, len(submaps))
     scaled = []
     for s, f in zip(submaps, factors):

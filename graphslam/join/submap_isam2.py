@@ -1,4 +1,4 @@
-"""A chain of identified submaps through iSAM2, in the form that joiners return, so that all stand in one table."""
+"""iSAM2 on a chain of submaps with landmark ids, with the result type of the map-joining methods."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ def solve_submaps_isam2(
     polish: bool = True,
     progress: bool = False,
 ) -> SubmapEstimate:
-    """Add the submaps one by one, updating iSAM2 after each; then go to the optimum.
+    """Add the submaps one by one, update iSAM2 after each; then solve to the optimum.
 
     Parameters
     ----------
     submaps : sequence of Submap
-        In order, every landmark identified.
+        In order, all landmarks with ids.
     polish : bool
-        End at the batch optimum; ``objective`` is always that of iSAM2 before, so the difference is its gap.
+        Continue to the batch optimum; ``objective`` is always that of iSAM2 before, so the difference is its gap.
     progress : bool
         Show a progress bar.
 
     Returns
     -------
     SubmapEstimate
-        ``seconds`` counts everything, ``iterations`` the updates.
+        ``seconds`` is the total time, ``iterations`` the number of updates.
     """
     check_identified(submaps)
     start = time.perf_counter()
@@ -71,7 +71,7 @@ def solve_submaps_isam2(
 
 
 def _first_seen(submaps: Sequence[Submap], landmark_ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The submap that saw each landmark first."""
+    """Index of the submap that observed each landmark first."""
     first: dict[int, int] = {}
     for k, s in enumerate(submaps):
         for i in landmark_map_of(s).ids.tolist():

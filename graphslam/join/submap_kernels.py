@@ -1,8 +1,8 @@
 """Numba kernels: the pattern of landmark submaps, their Gauss–Newton blocks, and block matrices as CSC. Plain arrays.
 
-Every submap is a list of *entries*: its end pose (3 scalars), then its landmarks (2 each), in the order of its mean
-and information matrix. Nodes: end pose of submap k is node k, landmark j node m + j. Submap k starts at node k - 1;
-the first starts at the fixed base, which is no node.
+Every submap is a list of *entries*: its end pose (3 scalars), then its landmarks (2 each), in the order of its mean and
+information matrix. Nodes: end pose of submap k is node k, landmark j node m + j. Submap k starts at node k - 1; the
+first starts at the fixed base, which is not a node.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Flags = npt.NDArray[np.bool_]
 
 @njit
 def adjacency(N: int, entry_ptr: Index, entry_node: Index) -> tuple[Index, Index]:
-    """Neighbours ``(N + 1,), (nb,)`` of every node, itself first: all that stands in one submap or starts it."""
+    """Neighbours ``(N + 1,), (nb,)`` of every node, itself first: all nodes of its submaps, and their starts."""
     m = len(entry_ptr) - 1
     count = np.zeros(N + 1, np.int64)
     for k in range(m):
@@ -74,14 +74,14 @@ def adjacency(N: int, entry_ptr: Index, entry_node: Index) -> tuple[Index, Index
 
 @njit
 def half_blocks(position: Index, width: Index, ptr: Index, idx: Index) -> tuple[Index, Index, int]:
-    """Room for the block of every pair, stored once, with the rows of the node that is eliminated first.
+    """Layout of the blocks: every pair is stored once, with the rows of the node that is eliminated first.
 
     Returns
     -------
     block : (nb,)
         Offset of the block of each listed pair; both directions of a pair share it.
     flip : (nb,)
-        1 where the block is stored the other way round (rows of the neighbour).
+        1 if the block is stored with the rows of the neighbour.
     """
     block = np.empty(len(idx), np.int64)
     flip = np.zeros(len(idx), np.int64)
@@ -107,7 +107,7 @@ def half_blocks(position: Index, width: Index, ptr: Index, idx: Index) -> tuple[
 def entry_slots(
     N: int, entry_ptr: Index, entry_node: Index, pair_ptr: Index, ptr: Index, idx: Index, block: Index, flip: Index
 ) -> Index:
-    """Offset ``(pair_ptr[-1],)`` of the block of every two entries of a submap, -1 where it is stored flipped.
+    """Offset ``(pair_ptr[-1],)`` of the block of every two entries of a submap, -1 if it is stored flipped.
 
     The list of submap k is a square over ``[start, entries…]``.
     """
@@ -133,7 +133,7 @@ def entry_slots(
 def predict_submaps(
     poses: Array, points: Array, m: int, entry_ptr: Index, entry_node: Index, z: Array, r: Array
 ) -> None:
-    """Residual ``H(X) - z`` of all submaps, one after the other in the order of their means (eq. 15)."""
+    """Residual ``H(X) - z`` of all submaps, in the order of their means (eq. 15)."""
     at = 0
     for k in range(m):
         sx, sy, st = 0.0, 0.0, 0.0
@@ -157,7 +157,7 @@ def predict_submaps(
 
 @njit
 def chart_residuals(row_ptr: Index, group: Flags, r: Array) -> None:
-    """Differences ``H(X) - z`` of all submaps, in the group chart where ``group`` ``(m,)``; in place."""
+    """Convert the differences ``H(X) - z`` of the submaps with ``group`` ``(m,)`` to the group chart, in place."""
     for k in range(len(row_ptr) - 1):
         if not group[k]:
             continue
@@ -185,7 +185,7 @@ def submap_chi2(row_ptr: Index, omega: Array, omega_ptr: Index, r: Array, out: A
 
 
 class SubmapChainArrays(NamedTuple):
-    """Submaps one after the other."""
+    """Arrays of a chain of submaps."""
 
     entry_ptr: Index
     entry_node: Index
@@ -194,15 +194,15 @@ class SubmapChainArrays(NamedTuple):
     z: Array
     """(rows,): measurements."""
     omega: Array
-    """Information matrices, row-major …"""
+    """… and their offsets."""
     omega_ptr: Index
     """… and where they begin."""
     group: Flags
-    """(m,): in the group chart."""
+    """(m,): uses the group chart."""
 
 
 class SystemSlots(NamedTuple):
-    """Where nodes and pairs stand in the system."""
+    """Offsets of nodes and pairs in the system."""
 
     node_at: Index
     """(N,): first scalar of each node."""
@@ -212,8 +212,8 @@ class SystemSlots(NamedTuple):
 
 
 U, D, H, WU, WD, WH = range(6)
-"""Rows of a submap's room: residual in its chart (0, 1 end position, 2 end heading, then landmarks), the Jacobian's
-columns of the start's and the end's heading, and the products of the three with Ω."""
+"""Rows of a submap's work array: residual in its chart (0, 1 end position, 2 end heading, then landmarks), the
+Jacobian's columns of the start's and the end's heading, and the products of the three with Ω."""
 
 
 @njit
@@ -236,7 +236,7 @@ def _fill_columns(r: Array, z: Array, group: bool, rows: Array) -> tuple[float, 
 
 @njit
 def _weigh_columns(W: Array, c: float, s: float, rows: Array, turned: Array) -> tuple[float, float, float]:
-    """Products with Ω, turned by ``T = [c, -s; s, c]``: ``T Ω Tᵀ`` and ``T Ω`` times the columns; rᵀΩr, dᵀΩr, dᵀΩd."""
+    """Products with Ω, rotated by ``T = [c, -s; s, c]``: ``T Ω Tᵀ`` and ``T Ω`` times the columns; rᵀΩr, dᵀΩr, dᵀΩd."""
     n = len(W)
     rr, dd, dr, hh, hd, hr = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
@@ -276,7 +276,7 @@ def _weigh_columns(W: Array, c: float, s: float, rows: Array, turned: Array) -> 
 
 @njit
 def _add_entries(slots: Index, at: Index, rows: Array, turned: Array, g: Array, value: Array) -> tuple[float, float]:
-    """Add gradient and blocks of a submap's entries, whose scalars begin at ``at``; the sum of their gradients."""
+    """Add gradient and blocks of a submap's entries, with offsets ``at``; returns the sum of their gradients."""
     gx, gy = 0.0, 0.0
     for e in range(len(at)):
         i = 0 if e == 0 else 1 + 2 * e
@@ -298,7 +298,7 @@ def _add_entries(slots: Index, at: Index, rows: Array, turned: Array, g: Array, 
 
 @njit
 def _add_start(slots: Index, rows: Array, turned: Array, dd: float, value: Array) -> None:
-    """Add the block of a submap's start, and those that couple it with every entry: translation, then heading."""
+    """Add the block of a submap's start, and its blocks with every entry: translation, then heading."""
     entries = len(slots) - 1
     sxx, sxy, syy, sxt, syt = 0.0, 0.0, 0.0, 0.0, 0.0
     for e in range(entries):
@@ -337,9 +337,9 @@ def linearise_submaps(
 ) -> float:
     """Objective; adds ``JᵀΩr`` to ``g`` and the blocks of ``JᵀΩJ`` to ``value``.
 
-    A position is measured through ``V(d)⁻¹ Rᵀ``, d being the residual of the end heading (V = I in a Cartesian chart),
-    so a block ``W`` of Ω enters as ``T W Tᵀ`` with ``T = R V⁻ᵀ``; the end heading through its own row and through V.
-    The start moves all positions the other way: its translation columns are minus the sum of theirs.
+    The Jacobian of a position is ``V(d)⁻¹ Rᵀ``, where d is the residual of the end heading (V = I in a Cartesian
+    chart), so a block ``W`` of Ω enters as ``T W Tᵀ`` with ``T = R V⁻ᵀ``; the end heading enters by its own row and by
+    V. The translation columns of the start are minus the sum of those of all positions.
 
     Parameters
     ----------
@@ -347,7 +347,7 @@ def linearise_submaps(
     r : (rows,)
         ``H(X) - z`` of every submap in Cartesian coordinates.
     g, value
-        Out.
+        Output.
     """
     entry_ptr, entry_node, row_ptr, z, omega, omega_ptr, group = submaps
     node_at, pair_ptr, slot = where
@@ -383,7 +383,7 @@ def to_csc(
 ) -> tuple[Index, Index, Array]:
     """``indptr, indices, data`` of a block matrix with its nodes in the order ``nodes`` ``(N,)``; indices ascend.
 
-    Every pair is listed both ways; ``flip`` ``(nb,)`` is 1 where the block has the neighbour's rows.
+    Every pair is in both lists; ``flip`` ``(nb,)`` is 1 if the block has the neighbour's rows.
     """
     N = len(nodes)
     first = np.empty(N, np.int64)

@@ -1,7 +1,7 @@
-"""Where the entries of a block-sparse symmetric matrix go: worked out once, refreshed many times.
+"""Storage pattern of a block-sparse symmetric matrix: computed once, used for many sets of values.
 
-The matrix is made of node blocks (poses of 3 scalars, landmarks of 2). The block of a pair of nodes is stored once; the
-elimination order is found when the pattern is made and kept, and so is the symbolic factorisation.
+The matrix consists of node blocks (poses with 3 scalars, landmarks with 2). The block of a pair of nodes is stored
+once. The elimination order and the symbolic factorisation are computed once.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class BlockPattern:
         Scalars per node; node i begins at ``sum(width[:i])`` in vectors.
     ptr : (N + 1,)
     neighbours : (nb,)
-        Neighbours of every node, itself included, every pair listed both ways.
+        Neighbours of every node, including itself; every pair is in both lists.
 
     Attributes
     ----------
     block, flip : (nb,)
-        Where the block of each listed pair begins in the values, and whether it is stored with the neighbour's rows.
+        Offset of the block of each listed pair in the values, and whether it has the neighbour's rows.
     entries : int
         Length of the values.
     nnz : int
@@ -42,7 +42,7 @@ class BlockPattern:
     order : (N,)
         Elimination order of the nodes.
     size : int
-        Scalars.
+        Number of scalars.
     """
 
     def __init__(self, width: Index, ptr: Index, neighbours: Index) -> None:

@@ -1,7 +1,6 @@
-"""Gauss–Newton over submaps, with damping when a step does not pay: the least-squares optimum every method is held to.
+"""Damped Gauss–Newton over submaps: the least-squares optimum, the reference of all methods.
 
-Used by the batch solver from the chain of submaps, and by the joiners as the polish that turns a once-linearised map
-into the optimum.
+The batch solver starts it from the chain of submaps; map-joining methods use it for the polish of a joined map.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ Index = npt.NDArray[np.intp]
 
 
 def dense_inverse(matrix: sp.csc_matrix) -> Array:
-    """Whole inverse of a sparse symmetric positive-definite matrix, dense and symmetric."""
+    """Dense inverse of a sparse symmetric positive-definite matrix."""
     A = matrix.toarray()
     factor, info = la.lapack.dpotrf(A, lower=1, overwrite_a=1)
     if info == 0:
@@ -43,7 +42,7 @@ def dense_inverse(matrix: sp.csc_matrix) -> Array:
 
 @dataclass(frozen=True)
 class SubmapEstimate:
-    """A joined map: poses, landmarks, and the information of all of them in the gauge "first base fixed".
+    """A joined map: poses, landmarks, and their joint information, with the first base fixed.
 
     The state vector is ``[x_1 … x_m, l_1 … l_L]``, poses as (x, y, θ) *vectors* in the frame of the first base (not
     right tangents), landmarks as (x, y).
@@ -55,21 +54,21 @@ class SubmapEstimate:
     landmark_ids : (L,) int64
     landmarks : (L, 2)
     information : csc_matrix (3m + 2L, 3m + 2L) or None
-        None where the method carries a dense covariance instead (the EKF).
+        None if the method has a dense covariance instead (the EKF).
     objective : float
-        ``Σ rᵀ P⁻¹ r`` of this map (before polishing, where there is a polish).
+        ``Σ rᵀ P⁻¹ r`` of this map, before a polish.
     objective_polished : float or None
-        The same at the least-squares optimum, where that was asked for.
+        The same at the least-squares optimum, if computed.
     converged : bool
-        Whether the map stands at its least-squares optimum.
+        Whether the map is at its least-squares optimum.
     seconds : float
         Wall time of the solution, polish included.
     covariance : (3m + 2L, 3m + 2L) or None
         Exactly one of ``information`` and ``covariance`` is given.
     chart : str
-        In which it is Gaussian about its mean (:mod:`graphslam.core.charts`).
+        Parametrisation in which it is Gaussian about its mean (:mod:`graphslam.core.charts`).
     anchors : (L,) or None
-        End pose (0 for ``poses[1]``) of the submap that saw each landmark first: what it hangs on in the group chart.
+        End pose (0 for ``poses[1]``) of the submap that observed each landmark first: its anchor in the group chart.
     """
 
     poses: Array
@@ -86,7 +85,7 @@ class SubmapEstimate:
     anchors: npt.NDArray[np.int64] | None = None
 
     def difference(self, poses: Array, landmarks: Array, *, chart: str | None = None) -> Array:
-        """What other values differ from these by ``(states,)``, in the chart of this map or in another.
+        """Difference of other values from these ``(states,)``, in the chart of this map or in another.
 
         Parameters
         ----------
@@ -107,12 +106,12 @@ class SubmapEstimate:
 
     @property
     def states(self) -> int:
-        """Free scalars; the fixed first base is not among them."""
+        """Number of free scalars, without the fixed first base."""
         return 3 * (len(self.poses) - 1) + 2 * len(self.landmark_ids)
 
     @property
     def nnz(self) -> int:
-        """Stored entries of the matrix that carries the uncertainty, both triangles."""
+        """Stored entries of the information or covariance matrix, both triangles."""
         return self.states**2 if self.information is None else int(self.information.nnz)
 
     @property
@@ -126,21 +125,21 @@ class SubmapEstimate:
         return SymmetricFactor(self.information)
 
     def map_information(self) -> sp.csc_matrix | None:
-        """Information of poses and landmarks: there is nothing else."""
+        """Information of poses and landmarks, which are all variables."""
         return self.information
 
     def map_covariance(self) -> Array | None:
-        """Covariance of poses and landmarks, of a method in covariance form."""
+        """Covariance of poses and landmarks, for methods in covariance form."""
         return self.covariance
 
     def pose_indices(self, k: int) -> Index:
-        """Where ``poses[k]`` stands in the state vector (k ≥ 1)."""
+        """Indices of ``poses[k]`` in the state vector (k ≥ 1)."""
         if not 1 <= k < len(self.poses):
             raise UnknownNameError("pose", str(k), (f"1 … {len(self.poses) - 1} (pose 0 is fixed)",))
         return 3 * (k - 1) + np.arange(3)
 
     def landmark_indices(self, landmark_id: int) -> Index:
-        """Where the landmark of that id stands in the state vector."""
+        """Indices of the landmark with this id in the state vector."""
         at = np.flatnonzero(self.landmark_ids == landmark_id)
         if len(at) == 0:
             raise UnknownNameError("landmark", str(landmark_id), (f"{len(self.landmark_ids)} ids",))
@@ -176,25 +175,24 @@ class SubmapEstimate:
         return join_parts([html_element("b", "Joined map"), said])
 
 
-# A step is halved no further than this before its direction is given up and damped.
+# Shortest fraction of a step before damping is used.
 _SHORTEST = 0.05
 
 
 @dataclass(frozen=True)
 class MinimisationResult:
-    """What :func:`minimise_submaps` found.
+    """Result of :func:`minimise_submaps`.
 
     Parameters
     ----------
     x : (n,)
         Values in the order of :class:`~graphslam.join.submap_blocks.SubmapProblem`.
     iterations : int
-        Linearisations whose step was tried.
+        Number of linearisations with a tested step.
     data : (nnz,)
         Values of ``JᵀΩJ`` at ``x`` in the problem's pattern.
     history : list of float
-        Objective before every iteration, and at the end.
-    """
+        Objective before every iteration, and at the end."""
 
     x: Array
     objective: float
@@ -209,17 +207,16 @@ def minimise_submaps(
 ) -> MinimisationResult:
     """Damped Gauss–Newton.
 
-    A step is tried as a straight line and along the chain (:meth:`SubmapProblem.bent`), and the lower end is taken:
-    after a long loop the correction of one heading moves kilometres of map along a circle, not along its tangent.
-    A step that does not lower the objective is halved a few times; if that does not help, Levenberg–Marquardt damping
-    on the diagonal grows until one does. The search ends when the decrease that the linear model still promises,
-    ``gᵀ H⁻¹ g``, is below ``rtol · max(objective, 1)``: the objective is a χ², so 1 is its natural unit where it
-    vanishes.
+    A step is tried as a straight line and along the chain (:meth:`SubmapProblem.bent`), and the lower objective is
+    used: after a long loop, the correction of one heading moves kilometres of map along a circle, not along its
+    tangent. A step that does not lower the objective is halved a few times; if that does not help, Levenberg–Marquardt
+    damping on the diagonal grows until one does. The search ends when the predicted decrease of the linear model,
+    ``gᵀ H⁻¹ g``, is below ``rtol · max(objective, 1)``.
 
     Parameters
     ----------
     x : (n,)
-        Values to start from.
+        Initial values.
     """
     x = np.array(x, dtype=np.float64)
     headings = np.arange(2, 3 * problem.m, 3)
@@ -236,7 +233,7 @@ def minimise_submaps(
         small = promised <= rtol * max(f, 1.0)
         f_trial, trial = _lowest(problem, x, step)
         shorter = 0.5
-        while not small and f_trial > f and shorter > _SHORTEST:  # costs no factorisation
+        while not small and f_trial > f and shorter > _SHORTEST:  # needs no factorisation
             f_trial, trial = _lowest(problem, x, shorter * step)
             shorter *= 0.5
         trial[headings] = wrap_angle(trial[headings])
@@ -249,7 +246,7 @@ def minimise_submaps(
                 converged = True
                 break
         elif small and damping == 0.0:
-            converged = True  # rounding: the promised decrease is below what the objective resolves
+            converged = True  # the predicted decrease is below the rounding error of the objective
             break
         else:
             damping = max(10.0 * damping, 1e-5)
@@ -262,7 +259,7 @@ def minimise_submaps(
 
 
 def _lowest(problem: SubmapProblem, x: Array, step: Array) -> tuple[float, Array]:
-    """The better end of a step, straight or along the chain, and its objective (infinite where it has none)."""
+    """The better end of a step, straight or along the chain, and its objective (infinite if not finite)."""
     ends = [(problem.objective(t), t) for t in (x + step, problem.bent(x, step))]
     return min(((f if np.isfinite(f) else np.inf, t) for f, t in ends), key=lambda end: end[0])
 
@@ -280,7 +277,7 @@ def solve_submaps(
     submaps : sequence of Submap
         With global landmark ids.
     initial_poses : (m, 3), optional
-        End poses to start from; default the chain.
+        Initial end poses; default the chain.
     max_iterations : int
         See :func:`minimise_submaps`.
     """

@@ -1,4 +1,4 @@
-"""Layer 6: maps that follow the graph: pieces of submaps, fused at the estimated poses."""
+"""Layer 6: global maps: pieces of submaps, fused at the poses of the graph."""
 
 from graphslam.core.lazy_exports import lazy_exports
 

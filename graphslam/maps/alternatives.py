@@ -1,8 +1,9 @@
-"""Alternative graphs of one log, each at its optimum: the clearest of those that nothing contradicts is chosen.
+"""Selection among alternative graphs of one log, each at its optimum: least map entropy among those that pass a χ²
+test.
 
-SegSLAM's authors take the map sample of least entropy. Here each alternative is optimised first, for an unsolved sample
-is blurred by errors that its graph would have removed. The χ² of its graph comes before the entropy of its map: a map
-that is folded onto itself knows less, and has less entropy for that.
+SegSLAM selects the map sample of least entropy. Here each alternative is optimised first, because an unsolved sample is
+blurred by errors that its graph would remove. The χ² test has priority over the entropy: a map that is folded onto
+itself has less known volume, and therefore less entropy.
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ TIES = ("match", "loop", "tie")
 
 
 CONTRADICTION = 1e-4
-"""A graph whose χ² is greater than an honest one's with this probability contradicts itself."""
+"""A graph is contradicted if a χ² at least this large has a smaller probability than this."""
 
 
 MANY = 5
-"""With so many pairs of submaps tied the noise of the chain can be told from a wrong tie …"""
+"""Least number of submap pairs with loop constraints for an estimate of the noise scale …"""
 
 
 KEPT = 0.75
-"""… by the alternatives that keep this share of them: most are taken to be right."""
+"""… from the alternatives that keep at least this share of the largest number of pairs."""
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One graph, solved, and where it has the pieces of the map.
+    """A solved graph and its map pieces with poses.
 
     Parameters
     ----------
@@ -58,25 +59,25 @@ class Alternative:
 
     @property
     def ties(self) -> int:
-        """Pairs of submaps that matches and loops tie: constraints of one pair are accepted or rejected together."""
+        """Number of submap pairs with matches or loops; several constraints of one pair count once."""
         submap = {n: k for k, s in enumerate(self.graph.submaps) for n in s.nodes[:-1]}
         tied = [r for r in self.graph.records.values() if r.group in TIES and isinstance(r, BetweenRecord)]
-        last = len(self.graph.submaps) - 1  # whose exit is a node of its own
+        last = len(self.graph.submaps) - 1  # the last exit has its own node
         return len({frozenset((submap.get(r.i, last), submap.get(r.j, last))) for r in tied})
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredMap:
-    """An alternative's figures.
+    """Metrics of an alternative.
 
     Parameters
     ----------
     number : int
-        Of the alternative as given.
+        Index of the alternative in the input.
     chi2, dof : float, int
-        Of its graph; of matches and loops without their kernels, under which a wrong one hardly counts.
+        Of its graph; matches and loops without robust kernels, which would hide a false one.
     contradicted : bool
-        By that χ².
+        Whether that χ² is too large (:data:`CONTRADICTION`).
     clarity : MapEntropy
         Of its fused map.
     """
@@ -90,7 +91,7 @@ class ScoredMap:
 
     @property
     def chi2_per_dof(self) -> float:
-        """NaN where nothing is redundant."""
+        """χ²/dof; NaN without redundancy."""
         return self.chi2 / self.dof if self.dof > 0 else float("nan")
 
 
@@ -101,11 +102,11 @@ class RankedAlternatives:
     Parameters
     ----------
     order : tuple of ScoredMap
-        Those that nothing contradicts, by entropy; then the others, the least contradicted first.
+        Those that pass the χ² test, by entropy; then the others by χ²/dof, smallest first.
     best_map : FusedMap
-        Of the first.
+        Fused map of the first.
     scale : float
-        Variance of the chain by which every χ² was divided: 1, or what most ties say.
+        Variance factor by which every χ² was divided (:func:`noise_scale`).
     """
 
     order: tuple[ScoredMap, ...]
@@ -118,7 +119,7 @@ class RankedAlternatives:
         return self.order[0]
 
     def why(self) -> str:
-        """Why the first was chosen, in a sentence."""
+        """Reason for the choice, one sentence."""
         a = self.best
         if len(self.order) == 1:
             return f"{a.alternative.name} is the only one"
@@ -136,7 +137,7 @@ class RankedAlternatives:
         )
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row an alternative, the chosen one first; JSON-serialisable."""
+        """One row per alternative, the chosen one first; JSON-serialisable."""
         out = []
         for k, j in enumerate(self.order):
             why = self.why() if k == 0 else _contradiction(j) if j.contradicted else _dimmer(j, self.best)
@@ -164,14 +165,14 @@ def rank_alternatives(
     model: BeamModel | None = None,
     progress: bool = False,
 ) -> RankedAlternatives:
-    """Judge alternatives: by the χ² of their graphs, then by the entropy of their maps.
+    """Rank alternatives by the χ² of their graphs, then by the entropy of their maps.
 
     Parameters
     ----------
     alternatives : sequence of Alternative
         Of the same submaps, or of the same log.
     model : BeamModel, optional
-        Whose clamp bounds the fused maps.
+        Its clamp limits the log-odds of the fused maps.
     """
     if not alternatives:
         raise DataError("there are no graphs to choose from", wanted="one at least")
@@ -193,7 +194,7 @@ def rank_alternatives(
 
 
 def chi2_of(graph: FactorGraph) -> float:
-    """χ² of a graph where it is, with matches and loops as if they had no kernel."""
+    """χ² of a graph at its current values, with matches and loops without robust kernels."""
     score = graph.objective()
     blocks = graph.flat().factor_blocks(graph.values)
     bare = sum(float(d2) for r, d2 in zip(blocks.records, blocks.d2) if r.group in TIES)
@@ -201,20 +202,18 @@ def chi2_of(graph: FactorGraph) -> float:
 
 
 def noise_scale(ties: Sequence[int], fits: Sequence[tuple[float, int]]) -> float:
-    """Variance of what most ties have in common, at least 1: the chain of a recorded log may overstate what it knows.
+    """Common variance factor of the graphs, at least 1: the odometry chain of a recorded log can be overconfident.
 
     Parameters
     ----------
     ties : sequence of int
-        Pairs of submaps that are tied, of each alternative.
+        Number of submap pairs with loop constraints, per alternative.
     fits : sequence of (float, int)
         χ² and degrees of freedom.
 
-    Notes
-    -----
-    With less than :data:`MANY` ties a wrong one cannot be told from a chain that is worse than it says, and the scale
-    is 1. Else it is the least χ²/dof of the alternatives that keep :data:`KEPT` of the ties: one that is wrong makes
-    those worse that hold it, not the one without.
+    Notes ----- With fewer than :data:`MANY` pairs a false loop cannot be distinguished from an overconfident chain; the
+    scale is 1. Otherwise it is the least χ²/dof of the alternatives that keep :data:`KEPT` of the pairs: a false loop
+    increases χ² only in the alternatives that contain it.
     """
     most = max(ties)
     if most < MANY:

@@ -1,4 +1,4 @@
-"""The points of submaps' clouds in one cloud: each moves with the node whose stretch of the path is nearest."""
+"""One cloud from the clouds of all submaps: each point moves with the node of the nearest part of the path."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def fused_points(
     level_nodes: bool = False,
     config: DivisionConfig | None = None,
 ) -> Array | None:
-    """Points ``(n, dim)`` of all clouds in the world [m], thinned to the finest of their cells; None without clouds.
+    """Points ``(n, dim)`` of all clouds in the world [m], downsampled to their smallest cell; None without clouds.
 
     Parameters
     ----------
@@ -51,12 +51,12 @@ def fused_points(
 
 
 def _placed(cloud: CloudMap, s: Submap, times: Array, local: Array, T_world: Array, config: DivisionConfig) -> Array:
-    """The points of one cloud, each led by one of the nodes."""
+    """Points of one cloud in the world, each moved with its node."""
     g, p = group_of(T_world), cloud.points
     owner = np.zeros(len(p), np.int64)
     if len(times) > 1 and s.trajectory is not None:
         places, nodes = owning_places(s.trajectory, times, config)
         scale = np.array([1.0, 1.0, config.stretch])[: g.dim]
         owner = nodes[cKDTree(places * scale).query(p * scale)[1]]
-    T = g.compose(T_world, g.inverse(local))  # T_world_base as each node has it
+    T = g.compose(T_world, g.inverse(local))  # T_world_base according to each node
     return np.asarray(g.transform(T[owner], p))

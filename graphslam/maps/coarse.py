@@ -1,7 +1,7 @@
-"""Maps of a larger voxel: what a map that is too wide for its lattice, for a format or for a picture is made into.
+"""Coarser copies of maps that are too large for their lattice, a file format or an image.
 
-A voxel of the coarser map takes the largest of the values under it: occupied where one of them is, unknown where all
-are. So nothing solid is lost, and walls are thicker by up to a voxel.
+A coarse voxel gets the maximum of its fine voxels: occupied if one is, unknown if all are. No occupied voxel is lost,
+and walls become up to one voxel thicker.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Ints = npt.NDArray[np.int64]
 Steps = npt.NDArray[np.int16]
 
 PIXELS = 1 << 25
-"""Of a floor plan or a picture at most: about a square kilometre of 0.2 m voxels. One takes 20 bytes as it is drawn."""
+"""Most pixels of a floor plan or image: about a square kilometre of 0.2 m voxels. Drawing takes 20 bytes per pixel."""
 
 
 def pool_levels(reach: float) -> int:
-    """Levels of a pool that addresses voxels so far from its origin, at most those there are."""
+    """Levels of a pool that contains voxels up to ``reach`` from its origin, limited to the maximum."""
     return next((k for k in range(DEFAULT_LEVELS, MAX_LEVELS) if half_edge(k) > reach), MAX_LEVELS)
 
 
@@ -37,7 +37,7 @@ def coarse_bricks(coordinates: Ints, values: Steps, dim: int) -> tuple[Ints, Ste
         Signed; each once.
     values : (n, 512)
     dim : {2, 3}
-        In the plane the layer stays one.
+        In 2-D there is still one layer.
     """
     halved = np.array([1, 1, dim - 2])
     up, row = np.unique(coordinates >> halved, axis=0, return_inverse=True)
@@ -67,7 +67,7 @@ def coarse_grid(grid: EvidenceGrid) -> EvidenceGrid:
 
 
 def drawable_map(grid: EvidenceGrid) -> EvidenceGrid:
-    """The map, or a coarser one of which no picture from above or from the side has more than :data:`PIXELS`."""
+    """The map, or the first coarser one whose top and side views have at most :data:`PIXELS`."""
     while True:
         low, high = known_bounds(grid)
         edges = np.sort(high - low)
@@ -77,7 +77,7 @@ def drawable_map(grid: EvidenceGrid) -> EvidenceGrid:
 
 
 def fit_octomap(grid: EvidenceGrid) -> EvidenceGrid:
-    """The map, or a coarser one that the cube of OctoMap's files holds."""
+    """The map, or the first coarser one that fits into an OctoMap file."""
     while max(-int(known_bounds(grid)[0].min()), int(known_bounds(grid)[1].max())) > OCTOMAP_HALF:
         grid = coarse_grid(grid)
     return grid

@@ -1,9 +1,8 @@
-"""Do submaps that lie on each other show the same? Solid points of one where another one saw nothing.
+"""Contradictions between overlapping submaps: occupied voxels of one in free space of another.
 
-Scans of two passes may agree at every point that is compared, along the walls of a corridor, while the walls across it
-stand twice in the map. What a wrong map cannot hide is space: a wall of the second pass in the middle of a room that
-the first one looked through. So all solid voxels of a submap are looked for in the grids of those that came to the same
-place by another way.
+Two traversals of a corridor can match perfectly along its walls although the cross walls are doubled in the map. Free
+space reveals the error: a wall of the second traversal lies in space that the first one observed as free. Therefore all
+occupied voxels of a submap are compared with the grids of submaps that reached the same place along another path.
 """
 
 from __future__ import annotations
@@ -23,30 +22,31 @@ from graphslam.evidence.layout import BRICK_EDGE, UNKNOWN
 from graphslam.maps.pieces import Piece, PieceId
 
 POINTS, PAIRS = 1500, 400
-"""Points of a submap and pairs of submaps that are looked at, at most; of more, some spread evenly."""
+"""Most points per submap and pairs of submaps; of more, an even selection is used."""
 BESIDE = 2
-"""All voxels so far beside a point must deny it: what the path is off is no contradiction."""
+"""All voxels within this distance of a point [voxels] must be free to contradict it, so that small pose errors do not
+count."""
 SURE = 0.9
-"""Share of the surest log-odds of free space from which a voxel denies: what came back from no wall (glass, far rooms)
-is taken for free by some settings, and a few such beams say little."""
+"""Share of the lowest log-odds below which a voxel counts as free. Some settings treat beams without return (glass, far
+walls) as free; a few such beams are not enough."""
 FEW = 50
-"""Points of a pair below which nothing is said of it."""
+"""Least number of compared points for a result."""
 LOOK = 0.02
-"""Share of contradicted points of a map from which it is worth a look; right maps of recordings have up to 0.013."""
+"""Share of contradicted points of a map above which it is reported; correct maps of recordings have up to 0.013."""
 DOUBTED = 0.2
-"""Share of contradicted points from which a pair is counted."""
+"""Share of contradicted points above which a pair is contradictory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contradictions:
-    """What the passes of a map say of each other.
+    """Agreement of the traversals of a map with each other.
 
     Parameters
     ----------
     pairs : (n, 2) int
-        Keys of the submaps that came to a place by two ways; both orders.
+        Keys of submaps that reached a place along different paths; both orders.
     seen, denied : (n,) int
-        Solid points of the first that the second has, too; that lie where it saw nothing solid far around.
+        Occupied points of the first that are occupied in the second, and that are in its free space.
     """
 
     pairs: npt.NDArray[np.int64]
@@ -55,17 +55,17 @@ class Contradictions:
 
     @property
     def points(self) -> int:
-        """Points that were told of."""
+        """Number of points that were confirmed or contradicted."""
         return int(self.seen.sum() + self.denied.sum())
 
     @property
     def share(self) -> float | None:
-        """Share of denied points; none where too few were told of."""
+        """Share of contradicted points; None below :data:`FEW` points."""
         return float(self.denied.sum()) / self.points if self.points >= FEW else None
 
     @property
     def contradicted_submaps(self) -> npt.NDArray[np.int64]:
-        """Rows of the pairs that contradict each other, the worst first."""
+        """Rows of ``pairs`` that are contradictory, the worst first."""
         n = self.seen + self.denied
         share = self.denied / np.maximum(n, 1)
         rows = np.flatnonzero((n >= FEW) & (share > DOUBTED))
@@ -73,11 +73,11 @@ class Contradictions:
 
     @property
     def is_contradictory(self) -> bool:
-        """Do passes deny each other, so that another graph may show one place where this one shows two?"""
+        """Whether traversals contradict each other, so that the graph may have missed or false loops."""
         return (self.share is not None and self.share > LOOK) or len(self.contradicted_submaps) > 1
 
     def agrees_better(self, other: Contradictions) -> bool:
-        """Is a smaller share denied here, of at least half as many points that were told of?"""
+        """Whether the share is smaller here, with at least half as many compared points."""
         known = self.share is not None and other.share is not None
         return known and self.share < other.share and 2 * self.points >= other.points  # type: ignore[operator]
 
@@ -92,23 +92,23 @@ class Contradictions:
 
 
 NOTHING = Contradictions(np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
-"""No submap came to the place of another."""
+"""No overlapping submaps."""
 
 
 def find_contradictions(
     pieces: Mapping[PieceId, Piece], at: Mapping[PieceId, Array], model: BeamModel | None = None
 ) -> Contradictions:
-    """Look for the solid voxels of every piece in those that came to the same place by another way.
+    """Compare the occupied voxels of every piece with pieces that reached the same place along another path.
 
     Parameters
     ----------
     pieces : by name
-        In the order of the way; names begin with the key of the submap. Each holds what it saw itself: a segment that
-        entered an older map has left what it took over from there.
+        In path order; names begin with the key of the submap. Each must contain its own observations only, without the
+        copy of an older map that its segment entered.
     at : by name
         ``T_world_node``.
     model : BeamModel, optional
-        Of the voxels.
+        Sensor model of the voxels.
     """
     names = [n for n, p in pieces.items() if p.known]
     if not names:
@@ -140,7 +140,7 @@ def find_contradictions(
 
 
 def _solid(piece: Piece, threshold: int) -> Array:
-    """Centres of solid voxels ``(k, dim)`` in the base [m], not too many."""
+    """Centres of occupied voxels ``(k, dim)`` in the base frame [m], at most :data:`POINTS`."""
     brick, voxel = np.nonzero(piece.values >= threshold)
     keep = np.arange(min(len(brick), POINTS)) * len(brick) // max(min(len(brick), POINTS), 1)
     brick, voxel = brick[keep], voxel[keep]
@@ -150,7 +150,7 @@ def _solid(piece: Piece, threshold: int) -> Array:
 
 
 def _values(piece: Piece, voxels: npt.NDArray[np.int64]) -> npt.NDArray[np.int16]:
-    """Of voxels ``(k, 3)`` of the base's lattice."""
+    """Values of voxels ``(k, 3)`` of the base's lattice."""
     at = (voxels >> 3) - piece.first
     inside = np.all((at >= 0) & (at < piece.table.shape[::-1]), axis=1)
     at = np.where(inside[:, None], at, 0)
@@ -160,7 +160,7 @@ def _values(piece: Piece, voxels: npt.NDArray[np.int64]) -> npt.NDArray[np.int16
 
 
 def _compared(cloud: Array, T: Array, piece: Piece, model: BeamModel) -> tuple[int, int]:
-    """How many points of a cloud at ``T_base_cloud`` a piece has, and how many it denies."""
+    """Number of points of a cloud at ``T_base_cloud`` that are occupied in a piece, and that are in its free space."""
     points = group_of(T[None]).transform(np.broadcast_to(T, (len(cloud), len(T))), cloud)
     voxels = np.zeros((len(points), 3), np.int64)
     voxels[:, : piece.dim] = np.floor(points / piece.voxel_size)

@@ -1,8 +1,7 @@
-"""How clear a fused map is.
+"""Entropy and known volume of a fused map.
 
-Entropy is SegSLAM's (A11, eq. 20–22): of observed voxels only, times their volume; `FusedMap.entropy` follows it while
-pieces move. A map that is folded onto itself knows less of the world, and has less entropy for that: known volume
-always stands beside it.
+The entropy is that of SegSLAM (A11, eq. 20–22): over observed voxels only, times their volume. A map that is folded
+onto itself has less known volume, and therefore less entropy: always compare the known volume, too.
 """
 
 from __future__ import annotations
@@ -21,15 +20,14 @@ from graphslam.maps.fuse import FusedMap
 
 @dataclass(frozen=True, slots=True)
 class MapEntropy:
-    """How clear a map is.
+    """Entropy and known volume of a map.
 
     Parameters
     ----------
     entropy : float
         Mean over the placements [nat m³].
     volume : float
-        Volume of what was observed, likewise [m³]: a map that is folded onto itself knows less of the world, and has
-        less entropy for that.
+        Observed volume, mean over the placements [m³].
     """
 
     entropy: float
@@ -37,7 +35,7 @@ class MapEntropy:
 
 
 def mean_map_entropy(maps: Iterable[EvidenceGrid | FusedMap]) -> MapEntropy:
-    """Mean entropy and known volume of some maps."""
+    """Mean entropy and known volume of several maps."""
     found = [(m.entropy(), m.known_volume()) for m in maps]
     if not found:
         raise DataError("there is no map whose entropy could be taken", wanted="one at least")
@@ -46,10 +44,9 @@ def mean_map_entropy(maps: Iterable[EvidenceGrid | FusedMap]) -> MapEntropy:
 
 
 def grid_placements(count: int, voxel_size: float, dim: int) -> Array:
-    """Poses ``(count, 7)`` or ``(count, 3)`` of a path's frame in a grid, none of them favoured.
+    """Evenly distributed poses ``(count, 7)`` or ``(count, 3)`` of a path's frame in a grid.
 
-    Headings over a quarter turn, and positions, heights foremost, over a voxel, both spread evenly. A single one is the
-    identity.
+    Headings over a quarter turn, positions over one voxel. A single pose is the identity.
     """
     group = SE3 if dim == 3 else SE2
     tangents = np.zeros((count, group.dof))
@@ -58,7 +55,7 @@ def grid_placements(count: int, voxel_size: float, dim: int) -> Array:
         tangents[:, group.heading] = 0.5 * np.pi * share
     poses = group.exp(tangents)
     if count > 1:
-        # of a golden section the multiples fill a voxel evenly, whatever their number
+        # multiples of the golden ratio cover a voxel evenly for any count
         golden = 0.5 * (np.sqrt(5.0) - 1.0)
         shares = np.stack([golden * np.arange(1, count + 1) % 1.0, golden**2 * np.arange(1, count + 1) % 1.0, share], 1)
         poses[:, :dim] = voxel_size * shares[:, :dim]

@@ -1,4 +1,4 @@
-"""Fused maps as files that others read: points (PLY), OctoMap (``.bt``, ``.ot``), floor plans (PGM and YAML)."""
+"""Export of fused maps: points (PLY), OctoMap (``.bt``, ``.ot``), floor plans (PGM and YAML)."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from graphslam.evidence.pool import GridPool
 from graphslam.maps.coarse import drawable_map, fit_octomap
 
 STOREY_GAP = 1.5
-"""Heights of a path that lie farther apart than this are of different storeys [m]."""
+"""Least difference of heights between two floors of a path [m]."""
 LEVEL_SLOPE = 0.05
-"""A path that climbs less than this a metre runs on a storey, else on a ramp."""
+"""A path with a smaller slope is on a floor, otherwise on a ramp."""
 
 
 def save_ply(grid: EvidenceGrid, path: str | os.PathLike[str]) -> Path:
-    """Write the centres of the occupied voxels as points with their log-odds; of a 2-D grid at height 0.
+    """Write the centres of the occupied voxels as points with their log-odds; those of a 2-D grid have height 0.
 
     Binary PLY: float32 ``x``, ``y``, ``z``, ``log_odds``.
     """
@@ -37,7 +37,7 @@ def save_ply(grid: EvidenceGrid, path: str | os.PathLike[str]) -> Path:
 
 
 def save_points(points: Array, path: str | os.PathLike[str]) -> Path:
-    """Write points ``(n, 2 | 3)`` as binary PLY, float32 ``x``, ``y``, ``z``; those of a plane at height 0."""
+    """Write points ``(n, 2 | 3)`` as binary PLY, float32 ``x``, ``y``, ``z``; 2-D points have height 0."""
     return _write_ply(Path(path), points)
 
 
@@ -54,14 +54,14 @@ def _write_ply(target: Path, points: Array, **columns: Array) -> Path:
 
 
 def floor_plan(grid: EvidenceGrid, low: float, high: float) -> EvidenceGrid:
-    """A 2-D map of what stands in a band of heights: of each column the largest log-odds in it; unknown if all are.
+    """A 2-D map of a height band: the largest log-odds of each column in the band; unknown if all are.
 
     Parameters
     ----------
     grid : EvidenceGrid
         3-D.
     low, high : float
-        The band [m]: voxels whose centres lie in it.
+        The band [m]; voxels with centres inside it are used.
     """
     if grid.dim != 3:
         raise GridError("a 2-D grid is a floor plan already", got="2-D", wanted="3-D")
@@ -90,14 +90,14 @@ def floor_plan(grid: EvidenceGrid, low: float, high: float) -> EvidenceGrid:
 
 
 def storeys(positions: Array, *, shortest: float = 5.0) -> list[float]:
-    """Heights that a path runs at, from below [m]: of storeys that it keeps to for ``shortest`` metres at least.
+    """Heights of the floors of a path, ascending [m]: those with at least ``shortest`` metres of level path.
 
     Parameters
     ----------
     positions : (n, 3)
         Along the path [m].
     shortest : float
-        Of level way on a storey [m].
+        Level path length on a floor [m].
     """
     p = np.asarray(positions, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] != 3 or not np.all(np.isfinite(p)):
@@ -107,7 +107,7 @@ def storeys(positions: Array, *, shortest: float = 5.0) -> list[float]:
     arc = arc_length(p)
     if arc[-1] <= 0:
         return []
-    at = np.arange(0.0, arc[-1], 0.25)  # every so often, so that standing weighs nothing
+    at = np.arange(0.0, arc[-1], 0.25)  # even in distance, so that standstill has no weight
     z = np.interp(at, arc, p[:, 2])
     # the slope over two metres: wheels go over bumps
     slope = np.abs(np.interp(at + 1.0, arc, p[:, 2]) - np.interp(at - 1.0, arc, p[:, 2])) / 2.0
@@ -123,12 +123,12 @@ def save_maps(
     name: str = "map",
     bands: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Path]:
-    """Write a map in every form there is for it.
+    """Write a map in all available formats.
 
     Parameters
     ----------
     folder : path
-        Made if it is not there.
+        Created if it does not exist.
     name : str
         ``name.ply``, ``name.bt`` (3-D), and map_server pairs ``name.yaml``, ``name.pgm`` (2-D) or one for each band.
     bands : mapping of str to (low, high), optional
@@ -136,8 +136,8 @@ def save_maps(
 
     Returns
     -------
-    list of paths written; a band in which nothing is known is left out. Floor plans of too many pixels, and a map that
-    reaches beyond OctoMap's cube, are of larger voxels (:mod:`graphslam.maps.coarse`), as the files themselves say.
+    list of paths written; a band without known voxels is left out. Floor plans with too many pixels,
+    and a map larger than OctoMap's cube, get larger voxels (:mod:`graphslam.maps.coarse`), which the files contain.
     """
     target = Path(folder)
     if grid.voxel_counts().known == 0:

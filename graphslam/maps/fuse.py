@@ -1,11 +1,11 @@
-"""FusedMap: one evidence grid of many pieces, made anew only where pieces moved. No scan is read again.
+"""FusedMap: one evidence grid of many pieces, recomputed only where pieces moved, without reading scans again.
 
-Each piece (:mod:`graphslam.maps.pieces`) is posed on the lattice of the world once, and kept so: every voxel of the
-world takes the value of the voxel of the piece that its centre lies in, as `EvidenceGrid.merge` does. The map is the
-sum of the posed pieces (SegSLAM A12: maps are merged by adding their log-odds), **added up in full and clamped once at
-the end**. So the map does not depend on the order of the pieces, as it would if it were clamped after each, which is
-what merging one after another does; of two pieces both give the same. A clamped sum cannot be taken apart: when a piece
-moves, the bricks that it touched before or touches now are summed anew, from all pieces that touch them.
+Each piece (:mod:`graphslam.maps.pieces`) is resampled on the world lattice once per pose: every world voxel gets the
+value of the piece's voxel at its centre, as in `EvidenceGrid.merge`. The map is the sum of the resampled pieces
+(SegSLAM A12: maps are merged by adding their log-odds), **clamped once at the end**. Therefore the map does not depend
+on the order of the pieces; clamping after each piece, as repeated merging does, would. A piece cannot be subtracted
+from a clamped sum: if a piece moves, all bricks that it touched before or touches now are summed again from all their
+pieces.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ Ints = npt.NDArray[np.int64]
 Names = Iterable[PieceId]
 
 TOLERANCE = 0.25
-"""Default of :class:`FusedMap` [voxels]: half of what rounding to the lattice does to a point."""
+"""Default of :class:`FusedMap` [voxels]: half of the largest rounding error of the lattice along an axis."""
 _NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class MapChange:
-    """What a change of a fused map came to.
+    """Result of a change of a fused map.
 
     Parameters
     ----------
     added, removed, moved : int
-        Pieces.
+        Number of pieces.
     held : int
-        Pieces that were asked to move by less than the tolerance, and stay.
+        Pieces that stay because their move is smaller than the tolerance.
     summed : int
-        Bricks made anew.
+        Bricks that were summed again.
     written : int
-        Of these, bricks that are others now.
+        Of these, bricks that changed.
     """
 
     added: int
@@ -69,7 +69,7 @@ class MapChange:
 
 
 class FusedMap:
-    """Pieces, where they are, and the evidence grid they make together. Of one thread at a time.
+    """Pieces with their poses, and their fused evidence grid. Not thread-safe.
 
     Parameters
     ----------
@@ -77,15 +77,15 @@ class FusedMap:
         Of the pieces and of the map [m].
     dim : {3, 2}
     model : BeamModel, optional
-        Its clamp bounds the sums; its threshold says what is occupied.
+        Its clamp limits the sums; its threshold defines occupied voxels.
     tolerance : float
-        A piece stays where it is until some point of it would move by more than this [voxels]. Distances are from
-        where it *is*, so that many small moves do not add up. 0 follows every move.
+        A piece stays until a point of it would move by more than this [voxels]. The distance is from its pose in the
+        map, so small moves cannot accumulate. 0 follows every move.
     pool : GridPool, optional
-        Storage of the grid. Its levels say how far the map may reach; by default it has a pool of its own, to which
-        levels are added where pieces lie beyond it: ± 13 km of 0.2 m voxels.
+        Storage of the grid. Its levels limit the size of the map; the default is a new pool, which gets more levels
+        when pieces need them, up to ± 13 km with 0.2 m voxels.
     threads : int
-        That put pieces on the lattice; the map is the same with any number.
+        Threads for resampling; they do not change the map.
 
     Examples
     --------
@@ -122,7 +122,7 @@ class FusedMap:
         self._pieces: dict[PieceId, Piece] = {}
         self._posed: dict[PieceId, TransformedPiece] = {}
         self._wanted: dict[PieceId, Array] = {}
-        # voxels by value of the map as it was when they were last asked for, and what was written since
+        # histogram of voxel values at the last call, and the bricks written since then
         self._counts = np.zeros(65536, np.int64)
         self._counted = self._grid.copy()
         self._uncounted: list[Ints] = []
@@ -142,7 +142,7 @@ class FusedMap:
 
     @property
     def grid(self) -> EvidenceGrid:
-        """The map as it is now, in constant time: what comes later does not change what was given out."""
+        """The current map, in constant time; later changes do not affect it."""
         return self._grid.copy()
 
     @property
@@ -152,18 +152,18 @@ class FusedMap:
 
     @property
     def poses(self) -> dict[PieceId, Array]:
-        """``T_world_node`` of all pieces, where they *are* in the map."""
+        """``T_world_node`` of all pieces, as used in the map."""
         return {name: p.T_world_node.copy() for name, p in self._posed.items()}
 
     @property
     def wanted(self) -> dict[PieceId, Array]:
-        """``T_world_node`` of all pieces as last asked for: within the tolerance of where they are."""
+        """``T_world_node`` of all pieces as last requested; within the tolerance of :attr:`poses`."""
         return {name: T.copy() for name, T in self._wanted.items()}
 
     def entropy(self) -> float:
-        """Entropy of the map (A11) [nat m³; 2-D: nat m²], that of ``grid`` to the last bit.
+        """Entropy of the map (A11) [nat m³; 2-D: nat m²], bitwise equal to that of ``grid``.
 
-        Only bricks that changed since it was last asked for are looked at.
+        Only bricks that changed since the last call are evaluated.
         """
         return entropy_of_counts(self._count()) * self.voxel_size**self.dim
 
@@ -173,7 +173,7 @@ class FusedMap:
 
     @property
     def nbytes(self) -> int:
-        """Memory of pieces, posed bricks and the grid [bytes]; what copies share is in each."""
+        """Memory of pieces, resampled bricks and the grid [bytes]; memory shared by copies is counted in each."""
         held = sum(p.nbytes for p in self._pieces.values()) + sum(p.nbytes for p in self._posed.values())
         return held + 2 * BRICK_VOXELS * len(self._grid.brick_coordinates())
 
@@ -184,7 +184,7 @@ class FusedMap:
         return f"FusedMap({self.voxel_size:g} m, {self.dim}-D, {len(self)} pieces, {self.known_volume():.0f} known)"
 
     def copy(self) -> FusedMap:
-        """A second map of the same pieces, for another hypothesis: shares all that neither changes."""
+        """A copy for another hypothesis; it shares the unchanged data."""
         twin = FusedMap.__new__(FusedMap)
         twin._grid, twin._grows = self._grid.copy(), self._grows
         twin.tolerance = self.tolerance
@@ -195,7 +195,7 @@ class FusedMap:
         return twin
 
     def release_scratch(self) -> None:
-        """Let go of what only the making of the map needed; the next change makes it again."""
+        """Free the scratch memory; the next change allocates it again."""
         for poser in self._posers:
             poser.release()
 
@@ -206,11 +206,11 @@ class FusedMap:
         return self.update(add=pieces, poses=poses)
 
     def remove(self, names: Names) -> MapChange:
-        """Take pieces out; see :meth:`update`."""
+        """Remove pieces; see :meth:`update`."""
         return self.update(remove=names)
 
     def move(self, poses: Mapping[PieceId, Any], *, tolerance: float | None = None) -> MapChange:
-        """Move pieces to ``T_world_node``; see :meth:`update`. Pieces that are not named stay."""
+        """Move pieces to ``T_world_node``; see :meth:`update`. The other pieces stay."""
         return self.update(poses=poses, tolerance=tolerance)
 
     def update(
@@ -221,19 +221,18 @@ class FusedMap:
         poses: Mapping[PieceId, Any] | None = None,
         tolerance: float | None = None,
     ) -> MapChange:
-        """Add, remove and move pieces at once: the map is made anew once, or, after an error, not at all.
+        """Add, remove and move pieces in one step; after an error the map is unchanged.
 
         Parameters
         ----------
         add : mapping of name to Piece
         remove : names
-            A name may be removed and added in one change: a piece is replaced.
+            A name can be removed and added in one change, which replaces the piece.
         poses : mapping of name to (7,) or (3,)
-            ``T_world_node`` of all that are added, and of those that move. Names of the map that has no piece of that
-            name are refused.
+            ``T_world_node`` of all added and moved pieces. Unknown names are refused.
         tolerance : float, optional
-            Instead of the map's own [voxels]. ``move(map.wanted, tolerance=0)`` puts every piece where it was last
-            wanted, exactly.
+            In place of the map's tolerance [voxels]. ``move(map.wanted, tolerance=0)`` moves every piece exactly to its
+            last requested pose.
         """
         add, poses = dict(add or {}), dict(poses or {})
         limit = self.tolerance if tolerance is None else float(tolerance)
@@ -251,7 +250,7 @@ class FusedMap:
             left = set(gone)
             posed = {n: p for n, p in self._posed.items() if n not in left} | fresh
             keys = np.unique(np.concatenate([_NONE, *(p.keys for p in (*old, *fresh.values()))]))
-            work, written, empty = self._grid.copy(), [_NONE], 0  # the grid itself changes when all is done
+            work, written, empty = self._grid.copy(), [_NONE], 0  # the grid itself changes at the end
             for some, values, gone_empty in self._posers[0].sums(
                 keys, list(posed.values()), self._grid.root, self._grid.pool, self._grid.model.clamp_steps
             ):
@@ -294,7 +293,7 @@ class FusedMap:
                 raise DataError(f"there is no piece {name!r} to be moved in this map", wanted="the name of a piece")
 
     def _checked(self, poses: Mapping[PieceId, Any]) -> Array:
-        """Poses ``(n, 7)`` or ``(n, 3)`` in their order."""
+        """Validated poses ``(n, 7)`` or ``(n, 3)``, in order."""
         size = 7 if self.dim == 3 else 3
         for name, T in poses.items():
             if np.shape(T) != (size,):
@@ -302,9 +301,9 @@ class FusedMap:
         return checked_poses(np.array([np.asarray(T) for T in poses.values()]).reshape(-1, size), self.dim)
 
     def _beyond(self, names: list[PieceId], wanted: Mapping[PieceId, Array], limit: float) -> list[PieceId]:
-        """Those of the pieces of which some point would move by more than the limit [voxels].
+        """Names of the pieces with a point that would move by more than the limit [voxels].
 
-        How far a point moves is a convex function of the point, so a corner of the box moves farthest.
+        The displacement is a convex function of the point, so it is largest at a corner of the box.
         """
         names = [n for n in names if self._pieces[n].known]
         if not names:
@@ -318,7 +317,7 @@ class FusedMap:
         return [n for n, f in zip(names, far.tolist()) if f > limit * self.voxel_size]
 
     def _make_room(self, add: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]) -> None:
-        """Begin anew in a pool of more levels where pieces would reach out of this one."""
+        """Rebuild the map in a pool with more levels if pieces would exceed this one."""
         reach = max((reach_of(add.get(n) or self._pieces[n], T) for n, T in wanted.items()), default=0.0)
         levels = pool_levels(reach)
         if not self._grows or levels <= self._grid.pool.levels or reach > half_edge(MAX_LEVELS):
@@ -334,7 +333,7 @@ class FusedMap:
     def _pose(
         self, pieces: Mapping[PieceId, Piece], wanted: Mapping[PieceId, Array]
     ) -> dict[PieceId, TransformedPiece]:
-        """Pieces on the lattice of the world."""
+        """Resample pieces on the world lattice."""
         if not pieces:
             return {}
         group = SE3 if self.dim == 3 else SE2
@@ -344,7 +343,7 @@ class FusedMap:
         work = list(zip(pieces.items(), T, at))
         if len(self._posers) == 1 or len(work) < 2:
             return {n: self._posers[0].pose(piece, row, pose) for (n, piece), row, pose in work}
-        # like loads: every thread takes the next largest in turn; each has scratch memory of its own
+        # balanced loads: pieces sorted by size, dealt in turn; each thread has its own scratch memory
         by_size = sorted(range(len(work)), key=lambda k: -work[k][0][1].known)
         shares = [by_size[i :: len(self._posers)] for i in range(len(self._posers))]
 
@@ -357,7 +356,7 @@ class FusedMap:
         return {work[k][0][0]: made[k] for k in range(len(work))}
 
     def _tidy(self, empty: int) -> None:
-        """Now and then drop the bricks in which nothing is known any more, and what was noted of changes twice."""
+        """Occasionally remove bricks without known voxels, and duplicate notes of changes."""
         self._empty += empty
         if self._empty > 1000 and 2 * self._empty > len(self._grid.brick_coordinates()):
             compact_grids(self._grid)
@@ -366,7 +365,7 @@ class FusedMap:
             self._uncounted = [np.unique(np.concatenate(self._uncounted))]
 
     def _count(self) -> Ints:
-        """Voxels by value, brought up to date."""
+        """Updated histogram of voxel values."""
         if self._uncounted:
             keys = np.unique(np.concatenate(self._uncounted))
             pool = self._grid.pool
@@ -374,7 +373,7 @@ class FusedMap:
                 before, after = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
                 find_bricks(self._counted.root, keys, pool.levels, pool.children, before)
                 find_bricks(self._grid.root, keys, pool.levels, pool.children, after)
-                counts = self._counts.copy()  # another map may hold the same ones
+                counts = self._counts.copy()  # the array may be shared with a copy
                 count_changes(before, after, pool.bricks, counts)
             counts[0] = 0  # the unknown
             self._counts, self._counted, self._uncounted = counts, self._grid.copy(), []
@@ -382,7 +381,7 @@ class FusedMap:
 
 
 def reach_of(piece: Piece, T_world_node: Array) -> float:
-    """How far from the origin a piece reaches at most, wherever it is turned [voxels]."""
+    """Upper bound of the distance of a piece's voxels from the origin, for any rotation [voxels]."""
     if not piece.known:
         return 0.0
     far = np.linalg.norm(T_world_node[: piece.dim]) + np.linalg.norm(piece.corners, axis=1).max()
@@ -397,7 +396,7 @@ def fuse_pieces(
     tolerance: float = TOLERANCE,
     threads: int = 1,
 ) -> FusedMap:
-    """A fused map of pieces at ``T_world_node``, from scratch."""
+    """A new fused map of pieces at ``T_world_node``."""
     if not pieces:
         raise DataError("a fused map of no pieces has no voxel size", wanted="a FusedMap, and pieces later")
     first = next(iter(pieces.values()))

@@ -1,8 +1,8 @@
-"""Compiled posing of pieces on the lattice of the world, and their sum.
+"""Compiled kernels: resampling of pieces on the world lattice, and their sum.
 
-Keys are packed offset coordinates of bricks, ``z << 40 | y << 20 | x``, as :mod:`graphslam.evidence.tree_kernels` has
-them. A posed piece is a list of *entries*, its known voxels only: ``voxel << 16 | value`` as uint32, the voxel's place
-in its brick and the sixteen bits of its log-odds, brick by brick.
+Keys are packed offset coordinates of bricks, ``z << 40 | y << 20 | x``, as in :mod:`graphslam.evidence.tree_kernels`. A
+resampled piece is a list of *entries* of its known voxels, brick by brick: ``voxel << 16 | value`` as uint32, with the
+index of the voxel in its brick and the sixteen bits of its log-odds.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from graphslam.evidence.tree_kernels import find_node
 
 @kernel()
 def meet_bricks(coordinates, extents, R, t, flat, low, marks):
-    """Mark the world's bricks that the boxes around the turned known parts of a piece's bricks meet; returns how many.
+    """Mark the world bricks that overlap the bounding boxes of a piece's rotated bricks; returns their number.
 
     ``extents (n, 6)``: first known voxel of each brick and the one after the last [voxels of the brick]. ``R (3, 3)``,
-    ``t (3,)`` [voxels] take the piece's base frame to the world; ``marks (nz, ny, nx) uint8`` stands for bricks from
-    ``low (3,)`` on and is zero before; ``flat``: one layer only. A millionth of a voxel keeps bricks out that only
-    touch.
+    ``t (3,)`` [voxels] transform the piece's base frame to the world; ``marks (nz, ny, nx) uint8`` represents bricks
+    from ``low (3,)`` on and is initially zero; ``flat``: one layer only. A margin of 1e-6 voxel excludes bricks that
+    only touch.
     """
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     found = 0
@@ -46,7 +46,7 @@ def meet_bricks(coordinates, extents, R, t, flat, low, marks):
 
 @kernel()
 def list_marked(low, marks, keys):
-    """Keys of the marked bricks, ascending; ``low`` in offset coordinates here."""
+    """Keys of the marked bricks, ascending; here ``low`` is in offset coordinates."""
     n = 0
     for k in range(marks.shape[0]):
         for j in range(marks.shape[1]):
@@ -58,15 +58,15 @@ def list_marked(low, marks, keys):
 
 @kernel()
 def sample_piece(keys, T, half, layers, table, lookup, entries, starts):
-    """List the known voxels of a piece at the voxel centres of the bricks ``keys (n,)``.
+    """Sample a piece at the voxel centres of the bricks ``keys (n,)``; known voxels only.
 
-    The entries of brick k are ``entries[starts[k]:starts[k + 1]]``; there is room for all voxels of all bricks. ``T
-    (12,)``: rotation row by row, then translation, from the world's voxels to those of the box around the piece, which
-    ``table (nz, ny, nx) int32`` divides into bricks: rows of ``lookup``, of which row 0 is all unknown. The box has
-    room on each side for whatever the bricks reach (`pieces.MARGIN`), so that no bound is looked at.
+    The entries of brick k are ``entries[starts[k]:starts[k + 1]]``; ``entries`` has space for all voxels of all bricks.
+    ``T (12,)``: rotation row by row, then translation, from world voxels to voxels of the box around the piece.
+    ``table (nz, ny, nx) int32`` maps the bricks of this box to rows of ``lookup``; row 0 is all unknown. The margin of
+    the box (`pieces.MARGIN`) makes bounds checks unnecessary.
 
-    Coordinates are whole numbers of 2⁻³² voxel: steps along a line of eight voxels are sums of whole numbers, and
-    truncation is a shift.
+    Coordinates are integers in units of 2⁻³² voxel: steps along a line of eight voxels are integer sums, and truncation
+    is a shift.
     """
     ny, nx = table.shape[1], table.shape[2]
     cells, source = table.reshape(-1), lookup.reshape(-1)
@@ -86,7 +86,7 @@ def sample_piece(keys, T, half, layers, table, lookup, entries, starts):
             sz = np.int64((T[6] * x0 + T[7] * y + T[8] * z + T[11]) * one)
             for i in range(8):
                 u, v, w = sx >> 32, sy >> 32, sz >> 32
-                # unsigned: a signed index is looked at for being negative
+                # unsigned: avoids the check for negative indices
                 cell = np.uint64(((w >> 3) * ny + (v >> 3)) * nx + (u >> 3))
                 place = np.uint64((np.int64(cells[cell]) << 9) | ((w & 7) << 6) | ((v & 7) << 3) | (u & 7))
                 value = source[place]
@@ -100,7 +100,7 @@ def sample_piece(keys, T, half, layers, table, lookup, entries, starts):
 
 @kernel()
 def find_bricks(root, keys, levels, children, ids):
-    """Bricks of the keys ``(n,)`` in a tree, 0 (all unknown) where there is none."""
+    """Bricks of the keys ``(n,)`` in a tree; 0 (all unknown) if there is none."""
     for k in range(keys.shape[0]):
         key = keys[k]
         bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
@@ -115,10 +115,10 @@ def sum_bricks(ranges, entries, clamp, ids, bricks, out, changed):
     """Sum of the entries that touch each brick, clamped once at the end; returns how many bricks change.
 
     ``ranges`` are ``starts, begins, ends``: those of brick k are ``begins, ends [starts[k]:starts[k + 1]]``, in
-    ``entries``. Unknown is what no entry names. Where the sum is not what the map's brick ``ids[k]`` holds already,
-    ``changed`` gets k, or ~k where nothing is known any more, and ``out (n, 512)`` the values, from row 0 on.
+    ``entries``. A voxel without an entry is unknown. If the sum differs from the map's brick ``ids[k]``, ``changed``
+    gets k, or ~k if no voxel is known any more, and ``out (n, 512)`` the values, from row 0 on.
 
-    A total counts its entries above its 32nd bit, so that 0 is unknown.
+    The bits of a total above the 32nd count its entries, so that 0 means unknown.
     """
     starts, begins, ends = ranges
     low, high = clamp
@@ -148,8 +148,8 @@ def sum_bricks(ranges, entries, clamp, ids, bricks, out, changed):
 
 @kernel()
 def count_changes(before, after, bricks, counts):
-    """``counts (65536,)``, voxels by value + 32768, follows a map from its bricks ``before (n,)`` to ``after``. Unknown
-    voxels are counted too."""
+    """Update the histogram ``counts (65536,)`` of value + 32768 from a map's bricks ``before (n,)`` to ``after``,
+    including unknown voxels."""
     for k in range(before.shape[0]):
         if before[k] == after[k]:
             continue

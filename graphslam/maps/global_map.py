@@ -22,15 +22,15 @@ class GlobalMap:
     trajectory : Trajectory
         Full rate, ``T_world_base(t)`` with covariances.
     node_times, node_poses, node_covariances : (m + 1,), (m + 1, 3|7), (m + 1, d, d)
-        Bases of the submaps, their inner nodes, and the end of the last.
+        Bases of the submaps, their inner nodes, and the end pose of the last.
     landmark_ids, landmarks, landmark_covariances : (n,), (n, 2), (n, 2, 2)
         Confirmed landmarks.
     landmark_hits : (n,)
-        Sightings over all submaps.
+        Number of observations in all submaps.
     T_gps_world : (3,) or (7,) or None
-        Map → GPS frame, where GPS was in the graph.
+        Map → GPS frame, if the graph has GPS.
     base_nodes : (k + 1,) int or None
-        Which nodes are bases of submaps or the end of the last; None: all.
+        Indices of the nodes that are bases of submaps or the end of the last; None: all.
     """
 
     trajectory: Trajectory

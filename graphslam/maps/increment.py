@@ -1,8 +1,7 @@
-"""What a segment added to a map that it entered again: so that no scan counts twice in a fused map.
+"""Evidence that a segment added to an older map that it entered, so that no scan counts twice in a fused map.
 
-SegSLAM's segment that enters an older map begins with a copy of it and goes on in that. Fused beside the older submap,
-its grid would say everything of that submap a second time, and would carry far walls along with nodes that never saw
-them.
+In SegSLAM a segment that enters an older map starts with a copy of it. Without subtraction, the fused map would contain
+the evidence of the older submap twice, and would move distant walls with nodes that never observed them.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ from graphslam.evidence.views import dense_view
 from graphslam.maps.increment_kernels import subtract_bricks
 
 COPIED = 0.9
-"""A segment began with a copy of a map if it knows this share of what that map knows: 0.994 of a copy whose pose is
-known, 0.82 where it was 0.2 m and half a degree off (a simulated garage). All of it only if one particle made both."""
+"""Share of an older map's voxels that a segment must know to count as a copy: 0.994 for a copy with known pose, 0.82
+with a pose error of 0.2 m and half a degree (simulated garage). It is 1 only if one particle made both."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapIncrement:
-    """What is left of a grid without what it had from another.
+    """Difference of a grid and an earlier one.
 
     Parameters
     ----------
     grid : EvidenceGrid
-        Log-odds that came in since, in the grid's own frame; unknown where none did.
+        Log-odds that were added since, in the grid's frame; unknown if unchanged.
     known : int
-        Voxels in it.
+        Known voxels of the difference.
     copied : int
-        Voxels of which both say exactly the same.
+        Voxels with the same value in both.
     shared : int
-        Voxels that both know.
+        Voxels known in both.
     """
 
     grid: EvidenceGrid
@@ -53,19 +52,19 @@ class MapIncrement:
 def map_increment(
     grid: EvidenceGrid, earlier: EvidenceGrid, T_grid_earlier: Any = None, *, slack: int = 0
 ) -> MapIncrement:
-    """The log-odds of ``grid`` less those of ``earlier``; voxels that did not change are unknown.
+    """The log-odds of ``grid`` minus those of ``earlier``; unchanged voxels are unknown.
 
-    What came in while a voxel was saturated cannot be seen in the difference, and is lost: the earlier map has it.
+    Evidence that was added to a saturated voxel is not in the difference; the earlier map contains it.
 
     Parameters
     ----------
     grid, earlier : EvidenceGrid
-        Of one voxel size and dimension.
+        Of the same voxel size and dimension.
     T_grid_earlier : (7,) or (3,), optional
-        As it was when the copy was put on the grid's lattice; default the identity.
+        Pose at which the copy was made; default the identity.
     slack : {0, 1}
-        1: a voxel that both know did not change if one beside it has its value in the earlier map. For maps that were
-        put on lattices of their own, each, from a third one: rounding twice is not rounding once.
+        1: a voxel known in both is unchanged if a neighbour in the earlier map has its value. For two maps that were
+        each resampled from a third lattice, so that rounding differs.
     """
     if grid.voxel_size != earlier.voxel_size or grid.dim != earlier.dim:
         raise GridError(
@@ -92,10 +91,10 @@ def map_increment(
 
 
 def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Mapping[int, int]]:
-    """The grid of each submap without what it took over from an older one that it entered.
+    """The grid of each submap without the copy of an older one that it entered.
 
-    Of the matches of a submap that was entered by one, that is taken whose map it holds a copy of (`COPIED`); a submap
-    that goes on in the map of the one before holds a copy of that. Where the run that made them is at hand,
+    If a submap has matches, the target whose map it contains a copy of is used (`COPIED`); a submap that continues in
+    the previous map contains a copy of that. If the SegSLAM run is available,
     :func:`graphslam.maps.segslam_evidence.own_evidence_of` is exact.
 
     Parameters
@@ -107,7 +106,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
     -------
     grids : by key
     entered : by key
-        Key of the submap whose map was taken out, of those that had one.
+        Key of the submap whose map was subtracted, for those with a copy.
     """
     whole = {s.key: evidence_grid_of(s) for s in submaps}
     grids, entered = dict(whole), {}
@@ -122,7 +121,7 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
         for target, T_target_here in older:
             if target not in whole or target == s.key:
                 continue
-            # each was put on the lattice of its own base
+            # each was resampled on the lattice of its own base
             found = map_increment(whole[s.key], whole[target], group.inverse(T_target_here), slack=1)
             share = found.shared / max(whole[target].voxel_counts().known, 1)
             if share >= best:
@@ -132,6 +131,6 @@ def own_evidence(submaps: Sequence[Submap]) -> tuple[dict[int, EvidenceGrid], Ma
 
 
 def evidence_grid_of(submap: Submap) -> EvidenceGrid:
-    """The evidence of a submap's dense map."""
+    """Evidence grid of a submap's dense map."""
     grid: EvidenceGrid = dense_view(submap).evidence()
     return grid

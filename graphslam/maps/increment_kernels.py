@@ -1,4 +1,4 @@
-"""Compiled comparison of a map with one that it may have begun as a copy of."""
+"""Compiled difference of a map and an earlier map that it may be a copy of."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from graphslam.evidence.tree_kernels import find_node
 
 @kernel()
 def subtract_bricks(keys, new, tree, slack, flat, out, counts):
-    """``out (n, 512)``: ``new (n, 512)`` less what a tree says of the same voxels; unknown where nothing changed.
+    """``out (n, 512)``: ``new (n, 512)`` minus the values of a tree at the same voxels; unknown if unchanged.
 
-    ``tree`` is its root, its levels, and the children and bricks of its pool.
-    Nothing changed where the tree has the very value, or knows the voxel and has the value within ``slack`` (0 or 1)
-    voxels of it along each axis: ``new`` may have it from there. Adds to ``counts (3,)``: voxels with a difference,
-    unchanged ones, and those that both know.
+    ``tree`` is its root, its levels, and the children and bricks of its pool. A voxel is unchanged if the tree has the
+    same value, or knows the voxel and has this value within ``slack`` (0 or 1) voxels along each axis (rounding). Adds
+    to ``counts (3,)``: voxels with a difference, unchanged ones, and voxels known in both.
     """
     root, levels, children, bricks = tree
     near = np.zeros((3, 3, 3), np.int64)

@@ -1,9 +1,8 @@
-"""The clearest of several maps: candidates of poses, or of pieces and poses, in the order of their entropy.
+"""Ranking of map candidates (pieces and poses) by their entropy.
 
-SegSLAM takes the map sample of least entropy for its map. Here each candidate (a sample after its graph was optimised,
-a hypothesis of loops) is fused from pieces, and what candidates have in common is fused once: a map is made from that
-of another candidate that shares most with it, by moving, adding and removing what differs. The figures are those of
-maps made from scratch, to the last bit.
+SegSLAM selects the map sample of least entropy. Here each candidate (an optimised sample, or a set of loops) is fused
+from pieces. To save time, a map is made from that of a similar candidate by moving, adding and removing the pieces that
+differ. The results are bitwise equal to those of maps made from scratch.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ from graphslam.maps.pieces import Piece, PieceId, checked_poses
 
 @dataclass(frozen=True, slots=True)
 class MapHypothesis:
-    """A hypothesis of the map.
+    """A map candidate.
 
     Parameters
     ----------
     pieces : mapping of name to Piece
-        Pieces that candidates share are the very same objects.
+        Candidates share pieces as identical objects.
     poses : mapping of name to (7,) or (3,)
-        ``T_world_node`` of all of them. Candidates of one gauge (the first base fixed) share more, and differ by less
-        that means nothing: where the lattice lies makes a difference, too.
+        ``T_world_node`` of all of them. Candidates with the same gauge (first base fixed) share more, and the position
+        of the lattice does not add differences.
     """
 
     pieces: Mapping[PieceId, Piece]
@@ -44,18 +43,18 @@ class MapHypothesis:
 
 @dataclass(frozen=True, slots=True)
 class RankedMap:
-    """A candidate's figures.
+    """Metrics of a candidate.
 
     Parameters
     ----------
     index : int
-        Of the candidate as given.
+        Index of the candidate in the input.
     clarity : MapEntropy
-        Its entropy, by which the order is, and known volume beside it.
+        Its entropy, which gives the order, and known volume.
     changed : int
-        Pieces that were moved, added or removed to come to it, over all placements.
+        Pieces that were moved, added or removed, over all placements.
     summed : int
-        Bricks that were made anew for it, likewise.
+        Bricks that were summed again, over all placements.
     """
 
     index: int
@@ -72,7 +71,7 @@ class EntropyRanking:
     Parameters
     ----------
     order : tuple of RankedMap
-        The clearest first; of equal ones that which was given first.
+        Least entropy first; equal ones in input order.
     best : FusedMap
         The map of the first.
     """
@@ -88,12 +87,12 @@ def rank_by_entropy(
     count: int = 1,
     progress: bool = False,
 ) -> EntropyRanking:
-    """Fuse every candidate, and put them in the order of their entropy.
+    """Fuse every candidate, and sort by entropy.
 
     Parameters
     ----------
     count : int
-        Ways in which the grid stands; entropy is the mean over them (`entropy.placements`).
+        Placements of the lattice; the entropy is the mean over them (`entropy.grid_placements`).
     progress : bool
         Show a progress bar.
     """
@@ -142,7 +141,7 @@ def rank_by_entropy(
 
 
 def visiting_order(signatures: Sequence[frozenset[Any]]) -> list[int]:
-    """An order of sets in which each differs little from the one before: always the nearest of those left."""
+    """Greedy order of sets: the next is always that with the fewest differences."""
     left = list(range(1, len(signatures)))
     way = [0]
     while left:
@@ -157,7 +156,7 @@ def _signature(c: MapHypothesis, poses: Mapping[PieceId, Array]) -> frozenset[An
 
 
 def _placed(poses: Mapping[PieceId, Array], T: Array, dim: int, count: int) -> Mapping[PieceId, Array]:
-    """Poses in a grid that stands in another way; the very same where there is one way only."""
+    """Poses in another placement of the lattice; unchanged if there is only one."""
     group = SE3 if dim == 3 else SE2
     return poses if count == 1 else {name: group.compose(T, pose) for name, pose in poses.items()}
 
@@ -165,7 +164,7 @@ def _placed(poses: Mapping[PieceId, Array], T: Array, dim: int, count: int) -> M
 def _follow(
     fused: FusedMap | None, c: MapHypothesis, poses: Mapping[PieceId, Array], model: BeamModel | None, work: Any
 ) -> FusedMap:
-    """The map of a candidate, made from that of another."""
+    """Map of a candidate, made by changing that of another."""
     if fused is None:
         piece = next(iter(c.pieces.values()))
         fused = FusedMap(piece.voxel_size, dim=piece.dim, model=model)

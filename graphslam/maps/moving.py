@@ -1,9 +1,9 @@
-"""Things that moved: points where other submaps saw that space is free.
+"""Detection of moving objects: points in space that other submaps observed as free.
 
-A car leaves points in every scan that saw it, at another place each time. Where it was, submaps before and after see
-through. A point is on something that moved where at least two neighbours know its place as free, with nothing occupied
-beside, and more of them than support it; and where it has company. The ground is left alone: rows of it that are grazed
-by beams to farther ground look the same. What moves away and never lets its place be seen stays.
+A moving car leaves points at a different place in each scan. Submaps before and after observe these places as free. A
+point is dynamic if at least two neighbouring submaps know its place as free, without an occupied neighbour voxel, if
+more of them do so than support it, and if enough other dynamic points are near. Ground points are excluded: grazing
+beams make them look free. Objects whose place is never observed again stay.
 """
 
 from __future__ import annotations
@@ -29,36 +29,35 @@ Mask = npt.NDArray[np.bool_]
 
 
 NEIGHBOURS = 4
-"""Submaps before and after that are asked."""
+"""Submaps before and after that are compared."""
 FREE = -0.8
-"""Log-odds below which a voxel is known as free."""
+"""Log-odds below which a voxel is free."""
 LEAST_FREE = 2
-"""Neighbours that must know a place as free."""
+"""Least number of neighbours that know a place as free."""
 REACH = 30.0
-"""Points farther from their sensor are left alone [m]: beams lie too wide apart there."""
+"""Points farther from their sensor are not tested [m]: the beams are too sparse."""
 ABOVE_GROUND, GROUND_CELL = 0.3, 1.0
-"""… and those not so far above the lowest point around, in squares of this edge with the eight around [m]."""
+"""Points lower than this above the lowest point around them are not tested; edge of the ground cells (3 × 3) [m]."""
 COMPANY, COMPANY_RADIUS = 6, 0.6
-"""Points that moved must have so many others so near [m]."""
+"""A dynamic point needs this number of other dynamic points within this radius [m]."""
 THING = 2.5
-"""What belongs to a thing is looked for so far from points that moved [m]: half the length of a car."""
+"""Points within this distance of dynamic points can belong to the same object [m]: half the length of a car."""
 
 
 def moving_points(submaps: Sequence[Submap], bases: Array) -> list[Mask]:
-    """Which points of the clouds of submaps are on things that moved.
+    """Find the points of submap clouds that are on moving objects.
 
     Parameters
     ----------
     submaps : sequence of n Submap
-        In space, in the order of time; those without a grid, or without a cloud that says where points were seen from,
-        neither ask nor answer.
+        3-D, in time order; those without a grid, or without a cloud with sensor origins, are not tested.
     bases : (n, 7)
         ``T_world_base``, z up.
 
     Returns
     -------
     list of (m,) bool
-        Of the cloud of each submap; empty where it has none.
+        Mask of each submap's cloud; empty without a cloud.
     """
     clouds = [s.cloud if s.grid is not None and s.cloud is not None and s.cloud.dim == 3 else None for s in submaps]
     out = []
@@ -87,16 +86,16 @@ def moving_points(submaps: Sequence[Submap], bases: Array) -> list[Mask]:
 
 
 class MovedObjects:
-    """The things that points are on which are known to have moved, in other scans of the same time.
+    """Moving objects around known dynamic points, to remove them from other scans of the same time.
 
-    :func:`moving_points` knows some points of a thing, and not its foot, which looks like the ground. What belongs to
-    them is as near to one of them in the plane as company is. What stands together above the ground, most of it so
-    near, is one thing, and belongs to them as a whole, with what is so near to it.
+    :func:`moving_points` finds only some points of an object, and none near the ground. A point belongs to an object if
+    it is within :data:`COMPANY_RADIUS` of a dynamic point in the plane. A connected cluster above the ground that is
+    mostly so near belongs to it as a whole, with all points within that radius.
 
     Parameters
     ----------
     moved : (m, 3)
-        Points that moved, in a frame whose z axis points upwards [m].
+        Dynamic points, in a frame with the z axis upwards [m].
     """
 
     def __init__(self, moved: Array) -> None:
@@ -116,7 +115,7 @@ class MovedObjects:
         return len(self.moved)
 
     def parts(self, points: Array) -> Mask:
-        """Which points ``(n, 3)`` of a scan belong to these things; near to them means to within a quarter."""
+        """Mask of the points ``(n, 3)`` of a scan on moving objects; distances are rounded."""
         out = np.zeros(len(points), np.bool_)
         if not len(self) or not len(points):
             return out
@@ -142,7 +141,7 @@ class MovedObjects:
 
 
 def static_submaps(submaps: Sequence[Submap], bases: Array) -> tuple[list[Submap], tuple[int, int]]:
-    """Submaps without the points that are on things that moved.
+    """Submaps without the points on moving objects.
 
     Parameters
     ----------
@@ -162,7 +161,7 @@ def static_submaps(submaps: Sequence[Submap], bases: Array) -> tuple[list[Submap
 
 
 def without_moving(submaps: Sequence[Submap], moving: Sequence[Mask]) -> list[Submap]:
-    """The submaps with clouds and grids made without the points that moved; the others as they are."""
+    """Submaps with clouds and grids rebuilt without dynamic points; the others are unchanged."""
     out = []
     for s, gone in zip(submaps, moving):
         cloud, grid = s.cloud, s.grid
@@ -185,7 +184,7 @@ def _world(T: Array, points: Array) -> Array:
 
 
 def known_state(grid: EvidenceGrid, points: Array, free: float) -> npt.NDArray[np.int64]:
-    """Of points ``(n, 3)`` in a grid: -1 free with nothing occupied beside, 1 occupied there or beside, 0 neither."""
+    """State of points ``(n, 3)``: -1 free without occupied neighbours, 1 occupied or with such a neighbour, 0 other."""
     known = grid.log_odds_at(points)
     out = np.zeros(len(points), np.int64)
     asked = np.flatnonzero(np.isfinite(known))
@@ -198,7 +197,7 @@ def known_state(grid: EvidenceGrid, points: Array, free: float) -> npt.NDArray[n
 
 
 def near_ground(points: Array, around: Array) -> Mask:
-    """Which points lie little above the lowest one around them."""
+    """Mask of the points that are less than :data:`ABOVE_GROUND` above the lowest one around them."""
     cell = np.floor(around[:, :2] / GROUND_CELL).astype(np.int64)
     first = cell.min(axis=0) - 1
     size = cell.max(axis=0) - first + 2

@@ -1,7 +1,7 @@
 """Compiled division of a submap's voxels among the nodes of its path.
 
-Bricks are rows ``(n, 512) int16`` with signed coordinates ``(n, 3) int64``, as `evidence.layout` has them. Coordinates
-here are in voxels, heights stretched by the caller.
+Bricks are rows ``(n, 512) int16`` with signed coordinates ``(n, 3) int64``, as in `evidence.layout`. Coordinates are in
+voxels; the caller stretches the heights.
 """
 
 from __future__ import annotations

@@ -1,21 +1,19 @@
-"""Pieces of maps: what a submap knows, divided among the nodes of the graph that lie along its path.
+"""Pieces of maps: the voxels of a submap, divided among the graph nodes on its path.
 
-A submap is rigid only as long as the graph bends at its ends alone. With nodes inside, each known voxel goes with the
-node whose stretch of the path saw it most plausibly, and moves with that node.
+If the graph has nodes inside a submap, the submap is not rigid. Each known voxel moves with the node from whose part of
+the path it was most plausibly observed.
 
-**Whose voxel?** The nearest place of the path decides, with three amendments:
+The nearest place of the path decides, with three exceptions:
 
-* *Storeys.* Heights count more than distances along the floor (`DivisionConfig.stretch`): of two paths one above the
-  other, the floor slab between them goes with the upper one, which it carries, although the lower one may pass nearer.
-* *Out and back.* Where the path comes within `DivisionConfig.retrace` of a place where it was before, the earlier visit
-  owns. Voxels there hold the evidence of both visits, added up, and cannot be divided; the nearest place would deal a
-  wall out by centimetres, and the graph could then tear it into dust. So the whole wall goes with one.
-* *Maps that were entered again.* A segment that enters an older map begins with a copy of it. What lies farther from
-  its path than its sensor reaches (`DivisionConfig.reach`) it cannot have seen; :mod:`graphslam.maps.increment` takes
-  the rest of the older evidence out.
+* *Floors.* Vertical distances are multiplied by `DivisionConfig.stretch`: the slab between two floors moves with the
+  path on the upper floor, although the lower path can be nearer.
+* *Revisits.* If the path comes within `DivisionConfig.retrace` of an earlier place, the earlier visit owns the voxels.
+  They contain the sum of both visits, which cannot be divided; with the nearest place a wall would be split among both
+  and could fall apart when the graph moves.
+* *Entered maps.* A segment that enters an older map starts with a copy of it. Voxels farther from its path than the
+  sensor range (`DivisionConfig.reach`) are dropped; :mod:`graphslam.maps.increment` subtracts the rest.
 
-Stretches meet half-way between nodes, measured along the path, so that no voxel is led by a node that is farther along
-than another.
+The parts of the path meet half-way between nodes, measured along the path.
 """
 
 from __future__ import annotations
@@ -44,13 +42,13 @@ from graphslam.maps.piece_kernels import count_owned, distribute_voxels, known_e
 Ints = npt.NDArray[np.int64]
 Steps = npt.NDArray[np.int16]
 PieceId: TypeAlias = Hashable
-"""What a piece is called: anything that may be a key of a mapping; of submaps ``(key of the submap, node)``."""
+"""Name of a piece: any hashable; for submaps ``(key of the submap, node)``."""
 
 MARGIN = 3
-"""Bricks of nothing around the box of a piece. A brick of the world that meets the box around a turned brick of the
-piece reaches at most 1 + √3/2 bricks along each axis from its middle, √3 times as far in all: 3.23, less than 3.5."""
+"""Empty bricks around the box of a piece. A world brick that overlaps the box around a rotated brick of the piece
+extends at most 1 + √3/2 bricks along each axis from its centre, √3 times that in total: 3.23 < 3.5."""
 TABLE_LIMIT = 1 << 26
-"""Bricks of the box around a piece at most: what is wider than that is a stray beam, not a place."""
+"""Most bricks in the box around a piece: a larger box has a stray voxel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,13 +56,13 @@ class DivisionConfig:
     """How the voxels of a submap are divided among its nodes."""
 
     stretch: float = 4.0
-    """By how much more heights count than distances along the floor."""
+    """Factor of vertical distances relative to horizontal ones."""
     retrace: float = 1.0
-    """A place within this of one where the path was before owns nothing [m]; 0 turns it off."""
+    """A place within this distance of an earlier part of the path owns nothing [m]; 0 turns it off."""
     reach: float = float("inf")
-    """Voxels farther from the nearest place belong to nobody [m]."""
+    """Voxels farther from the nearest place are dropped [m]."""
     spacing: float = 0.25
-    """Places of the path nearer to the one before are left out [m]."""
+    """Places of the path nearer to the previous one are skipped [m]."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.stretch) and self.stretch > 0 and self.reach > 0 and self.spacing >= 0):
@@ -76,7 +74,7 @@ class DivisionConfig:
 
 
 class _Bricks:
-    """Arrays of a piece, as they are needed."""
+    """Arrays of a piece in memory."""
 
     __slots__ = ("__weakref__", "coordinates", "extents", "lookup", "table")
 
@@ -94,12 +92,12 @@ class _Bricks:
         return self.lookup.nbytes + self.table.nbytes + self.coordinates.nbytes
 
     def packed(self) -> Arrays:
-        """For the shelf: values of known voxels only."""
+        """Compressed form for the spill cache: values of known voxels only."""
         return [self.coordinates.astype(np.int32), *packed_values(self.lookup[1:]), self.extents]
 
     @classmethod
     def unpacked(cls, first: Ints, shape: tuple[int, ...], arrays: Arrays) -> _Bricks:
-        """From the shelf."""
+        """From the compressed form."""
         coordinates, where, known, extents = arrays
         lookup = np.empty((len(coordinates) + 1, BRICK_VOXELS), np.int16)
         lookup[0], lookup[1:] = UNKNOWN, unpacked_values(where, known)
@@ -107,10 +105,9 @@ class _Bricks:
 
 
 class Piece:
-    """Voxels that move with one node: a value that does not change, in the lattice of the frame of its submap's base.
+    """Voxels that move with one node, in the lattice of its submap's base frame. Immutable.
 
-    Its bricks lie on the shelf of the process (:mod:`graphslam.core.spill_cache`): take an array of them once, and use
-    it.
+    Its bricks are in the spill cache (:mod:`graphslam.core.spill_cache`): get an array once and reuse it.
 
     Parameters
     ----------
@@ -118,11 +115,11 @@ class Piece:
         [m].
     dim : {2, 3}
     coordinates : (n, 3) int64
-        Signed, of the bricks; each once.
+        Signed coordinates of the bricks; each once.
     values : (n, 512) int16
-        In units of `evidence.layout.STEP`, x fastest; `layout.UNKNOWN` where the piece knows nothing.
+        In units of `evidence.layout.STEP`, x fastest; `layout.UNKNOWN` for unknown voxels.
     T_base_node : (7,) or (3,)
-        Pose of the node in the base's frame; default the identity: a submap in one piece, led by its base.
+        Pose of the node in the base's frame; default the identity: a submap in one piece, which moves with its base.
     """
 
     __slots__ = ("T_base_node", "_bricks", "corners", "dim", "first", "known", "nbytes", "voxel_size")
@@ -130,11 +127,12 @@ class Piece:
     first: Ints
     """Coordinates ``(3,)`` of the first brick of the box around the piece, its `MARGIN` included."""
     corners: Array
-    """Of the box of the known voxels, in the node's frame ``(8, 3)`` or ``(4, 2)`` [m]; none of an empty piece."""
+    """Corners of the box of the known voxels in the node's frame ``(8, 3)`` or ``(4, 2)`` [m]; empty without known
+    voxels."""
     known: int
-    """Known voxels."""
+    """Number of known voxels."""
     nbytes: int
-    """Memory of the bricks, while they are in it [bytes]."""
+    """Memory of the bricks when they are loaded [bytes]."""
 
     def __init__(self, voxel_size: float, dim: int, coordinates: Any, values: Any, T_base_node: Any = None) -> None:
         c = np.ascontiguousarray(coordinates, dtype=np.int64)
@@ -177,27 +175,27 @@ class Piece:
 
     @property
     def coordinates(self) -> Ints:
-        """Of the bricks ``(n, 3)``."""
+        """Brick coordinates ``(n, 3)``."""
         return self._bricks.get().coordinates
 
     @property
     def values(self) -> Steps:
-        """``(n, 512)``."""
+        """Log-odds ``(n, 512)``."""
         return self._bricks.get().lookup[1:]
 
     @property
     def lookup(self) -> Steps:
-        """``values`` after a row that is all unknown ``(n + 1, 512)``."""
+        """``values`` after a row of unknown voxels ``(n + 1, 512)``."""
         return self._bricks.get().lookup
 
     @property
     def table(self) -> npt.NDArray[np.int32]:
-        """Rows of ``lookup`` of the bricks of the box around it ``(nz, ny, nx)``, 0 where there is none."""
+        """Row of ``lookup`` for each brick of the box ``(nz, ny, nx)``, 0 if there is none."""
         return self._bricks.get().table
 
     @property
     def extents(self) -> npt.NDArray[np.int8]:
-        """Of the known voxels of each brick: first one, and the one after the last ``(n, 6)``."""
+        """First known voxel of each brick and one after the last ``(n, 6)``."""
         return self._bricks.get().extents
 
     def __repr__(self) -> str:
@@ -205,7 +203,7 @@ class Piece:
 
 
 def checked_poses(poses: Any, dim: int) -> Array:
-    """Poses ``(..., 7)``, or ``(..., 3)`` in 2-D, as floats, quaternions of unit length."""
+    """Validated poses ``(..., 7)``, or ``(..., 3)`` in 2-D, with unit quaternions."""
     T = np.array(poses, dtype=np.float64)
     size = 7 if dim == 3 else 3
     if T.ndim < 1 or T.shape[-1] != size:
@@ -242,23 +240,23 @@ def divide_grid(
     T_base_nodes: Any = None,
     config: DivisionConfig | None = None,
 ) -> list[Piece]:
-    """A submap's grid, one piece for each node (see the module).
+    """Divide a submap's grid into one piece per node (see the module).
 
     Parameters
     ----------
     grid : EvidenceGrid
-        In the base's frame.
+        In the base frame.
     path : Trajectory
         ``T_base_body(t)``.
     node_times : (m,)
         Ascending, within the path [s].
     T_base_nodes : (m, 7) or (m, 3), optional
-        Poses of the nodes; default the body's at those times.
+        Poses of the nodes; default the body poses at these times.
 
     Returns
     -------
     list of Piece
-        As many as nodes, in their order; a node that owns nothing has an empty piece.
+        One per node, in order; empty if the node owns no voxel.
     """
     config = DivisionConfig() if config is None else config
     times = np.asarray(node_times, dtype=np.float64)
@@ -275,7 +273,7 @@ def divide_grid(
     points = np.zeros((len(places), 3))
     points[:, : grid.dim] = places / grid.voxel_size
     if grid.dim == 2:
-        points[:, 2] = 0.5  # the middle of the only layer
+        points[:, 2] = 0.5  # centre of the only layer
     points[:, 2] *= config.stretch
     own_voxels(
         coordinates, values, config.stretch, points, nodes, config.reach / grid.voxel_size,
@@ -294,13 +292,13 @@ def divide_grid(
 
 
 def owning_places(path: Trajectory, node_times: Array, config: DivisionConfig) -> tuple[Array, Ints]:
-    """Places ``(p, dim)`` of a path that own voxels, and their nodes ``(p,)``: thinned, first visits only.
+    """Places ``(p, dim)`` of a path that own voxels, and their nodes ``(p,)``: downsampled, first visits only.
 
-    Stretches meet half-way between nodes along the path; where the body stands, half-way in time.
+    The parts of two nodes meet half-way along the path; at standstill, half-way in time.
     """
     positions = path.positions
     arc = arc_length(positions)
-    clock = 1e-6 * (path.times - path.times[0]) / max(path.times[-1] - path.times[0], 1e-9)  # [m]: tells standing apart
+    clock = 1e-6 * (path.times - path.times[0]) / max(path.times[-1] - path.times[0], 1e-9)  # [m]: never constant
     along = arc + clock
     node_arc = np.interp(node_times, path.times, along)
     nodes = np.searchsorted(0.5 * (node_arc[:-1] + node_arc[1:]), along, side="right")
@@ -313,14 +311,14 @@ def owning_places(path: Trajectory, node_times: Array, config: DivisionConfig) -
     first = np.ones(len(p), bool)
     if config.retrace > 0:
         for k in range(len(p)):
-            # π·r of way within r is a turn and no more: the far side of a half circle of that radius
+            # within radius r up to π·r of path is a turn (half circle), not a revisit
             earlier = first[:k] & (s[:k] < s[k] - np.pi * config.retrace)
             first[k] = not np.any(np.linalg.norm(p[:k][earlier] - p[k], axis=1) < config.retrace)
     return p[first], owner[first]
 
 
 def node_times_every(path: Trajectory, distance: float) -> Array:
-    """Times ``(m,)`` along a path about every ``distance`` metres, beginning at its first."""
+    """Times ``(m,)`` along a path about every ``distance`` metres, from its start."""
     if not (np.isfinite(distance) and distance > 0):
         raise ConfigError(f"nodes every {distance} m; wanted > 0")
     arc = arc_length(path.positions)
@@ -337,14 +335,14 @@ def pieces_of_submap(
     names: Sequence[PieceId] | None = None,
     config: DivisionConfig | None = None,
 ) -> dict[PieceId, Piece]:
-    """The pieces of a submap by name; nodes that own nothing are left out.
+    """The pieces of a submap by name, without empty pieces.
 
     Parameters
     ----------
     submap : Submap
         With a dense map.
     node_times : (m,), optional
-        Without, the submap is one piece led by its base.
+        Without them the submap is one piece that moves with its base.
     T_base_nodes : (m, 7) or (m, 3), optional
     names : sequence, optional
         Default ``(key, 0)``, ``(key, 1)`` …

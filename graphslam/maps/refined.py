@@ -1,4 +1,4 @@
-"""A refined path as the map of a run: path, nodes, and the submaps' grids drawn anew along it."""
+"""Map of a run along a refined path: path, nodes, and submaps with rebuilt grids."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from graphslam.refine.scans import Scans
 Index = npt.NDArray[np.int64]
 
 KNOTS = 5
-"""Places along a submap at which the covariance of its path is computed; between them it is interpolated."""
+"""Places along a submap at which the covariance of its path is computed; it is interpolated between them."""
 SAME = 1e-3
-"""Stamps of a step and of a node that differ by less are one [s]."""
+"""Stamps of a step and a node that differ by less are equal [s]."""
 
 
 def steps_at(refinement: Refinement, times: Array) -> Index:
-    """Numbers ``(k,)`` of the steps at some times."""
+    """Indices ``(k,)`` of the steps at given times."""
     t = refinement.times
     j = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
     j = np.where(times - t[j - 1] < t[j] - times, j - 1, j)
@@ -44,9 +44,9 @@ def steps_at(refinement: Refinement, times: Array) -> Index:
 
 
 def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap]) -> GlobalMap:
-    """The solved map with the refined path in place of the graph's.
+    """The solved map with the refined path in place of the graph's path.
 
-    Nodes keep their places relative to the body: a base may stand level beside it.
+    Nodes keep their pose relative to the body: a base can be a level frame that differs from it.
     """
     g = group_of(refinement.poses)
     at = steps_at(refinement, m.node_times)
@@ -55,7 +55,7 @@ def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap])
     first = submaps[0].trajectory
     if first is not None and len(first):
         beside[rows[0]] = g.inverse(first.poses[0])
-    # A node is the frame of an exit. The next submap may begin with the body as a match placed it, leaning otherwise.
+    # A node is the frame of an exit. The next submap can begin with another tilt of the body after a match.
     for s, row in zip(submaps, rows[1:]):
         if s.trajectory is not None and len(s.trajectory):
             beside[row] = g.between(s.trajectory.poses[-1], s.exit_pose)
@@ -71,12 +71,12 @@ def refined_map(m: GlobalMap, refinement: Refinement, submaps: Sequence[Submap])
 
 
 def refined_submaps(submaps: Sequence[Submap], m: GlobalMap, refinement: Refinement, scans: Scans) -> list[Submap]:
-    """The same submaps along the refined path: exits, paths, grids and clouds, each with its own scans alone.
+    """The submaps along the refined path: exits, paths, grids and clouds, each from its own scans only.
 
     Parameters
     ----------
     submaps : sequence of Submap
-        With evidence grids, whose model is kept.
+        With evidence grids; their model is kept.
     m : GlobalMap
         Refined (:func:`refined_map`).
     """
@@ -109,7 +109,7 @@ def refined_submaps(submaps: Sequence[Submap], m: GlobalMap, refinement: Refinem
 
 
 def base_frames(m: GlobalMap) -> Array:
-    """Frames ``(k + 1, 7|3)`` of the refined submaps: their bases, level in space where those of the run are."""
+    """Base frames ``(k + 1, 7|3)`` of the refined submaps; levelled in 3-D if those of the run are nearly level."""
     bases = m.base_poses
     if m.dim == 2:
         return bases
@@ -119,7 +119,7 @@ def base_frames(m: GlobalMap) -> Array:
 
 
 def map_of_frames(m: GlobalMap) -> GlobalMap:
-    """The refined map with the frames of the refined submaps as its only nodes: each submap is one piece."""
+    """The refined map with the submap frames as its only nodes, so that each submap is one piece."""
     rows = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
     return replace(
         m,
@@ -131,7 +131,7 @@ def map_of_frames(m: GlobalMap) -> GlobalMap:
 
 
 MOST_TILT = 0.1
-"""Bases that lean by more are not meant to stand level [rad]."""
+"""Bases with a larger tilt are not levelled [rad]."""
 
 
 def _relative(refinement: Refinement, a: int, b: int) -> Array:
@@ -156,7 +156,7 @@ def _relative(refinement: Refinement, a: int, b: int) -> Array:
 
 
 def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> EvidenceGrid:
-    """A grid of the same kind with the beams of some steps, at ``T_grid_body`` ``(k, 7|3)``."""
+    """A grid of the same type with the scans of given steps, at ``T_grid_body`` ``(k, 7|3)``."""
     drawn = grid.empty(GridPool(grid.pool.levels))
     for k, T in zip(steps.tolist(), poses):
         points, origins, returns = scans.scan(k)
@@ -166,7 +166,7 @@ def _drawn(grid: EvidenceGrid, scans: Scans, steps: Index, poses: Array) -> Evid
 
 
 def _seen(cloud: CloudMap, scans: Scans, steps: Index, poses: Array) -> CloudMap | None:
-    """A cloud of the same cell with the returns of some steps, at ``T_base_body`` ``(k, 7|3)``; None without any."""
+    """A cloud with the returns of given steps, at ``T_base_body`` ``(k, 7|3)``; None without returns."""
     points, origins = [], []
     scan: list[Index] = []
     for k, T in zip(steps.tolist(), poses):

@@ -1,4 +1,4 @@
-"""The fused map of a run: pieces led by the graph's own nodes, at their solved poses. No scan is read."""
+"""The fused map of a run: pieces of submaps at the solved poses of the graph's nodes. No scan is read."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class MapConfig:
     """The fused map at the end of a run of dense submaps."""
 
     fuse: bool = True
-    """Make it."""
+    """Make the fused map."""
     low: float = 0.3
     """Floor plans begin this far above the path [m] …"""
     high: float = 1.8
     """… and end this far above it."""
     threads: int = 1
-    """That put pieces where they are; the map is the same with any number."""
+    """Threads for resampling the pieces; they do not change the map."""
 
     def __post_init__(self) -> None:
         if not self.high > self.low:
@@ -49,12 +49,11 @@ class MapConfig:
 
 
 REACH_MARGIN = 1.0
-"""Added to the range of the beams: a voxel farther from the path than that was seen by nobody [m]."""
+"""Added to the sensor range [m]; voxels farther from the path were not observed."""
 
 
 MOST_TILT = 0.1
-"""Bases that lean by more than this are not of a front end that knows where down is; its nodes are taken as they are
-[rad]."""
+"""If a base has a larger tilt [rad], the front end does not level its bases, and the nodes are used unchanged."""
 
 
 @dataclass(frozen=True)
@@ -66,24 +65,24 @@ class RunMap:
     fused : FusedMap
         Pieces at the solved poses.
     divided : DividedSubmaps
-        The pieces, and where the open chain of exits has them.
+        The pieces, and their poses along the open chain of exits.
     bands : mapping of str to (low, high)
-        Heights of the floor plans, one for each storey that the path keeps to [m]; empty in the plane.
+        Height bands of the floor plans, one per floor of the path [m]; empty in 2-D.
     open_entropy, open_volume : float
-        Of the same pieces along the open chain: the map that the front end alone would have given [nat m³, m³].
+        Of the same pieces along the open chain, i.e. the map of the front end only [nat m³, m³].
     divide_s, fuse_s, move_s : float
-        Seconds to cut the submaps into pieces, to fuse these along the open chain, and to move them to the solved
+        Seconds to divide the submaps into pieces, to fuse these along the open chain, and to move them to the solved
         poses.
     points : (n, dim) or None
-        Of the submaps' clouds at the solved poses [m]; None where they have none.
+        Of the submaps' clouds at the solved poses [m]; None without clouds.
     passes : Contradictions
-        What submaps say of others that came to the same place by another way.
+        Contradictions between submaps that reached the same place along different paths.
     moving : (int, int)
-        Points of the submaps' clouds on things that moved, which are left out, and points in all.
+        Removed cloud points on moving objects, and all points.
     coarsened : int
-        Of the voxels of the submaps so many make an edge of one of the map: 1 unless it would be too wide for any pool.
+        Edge of the map's voxels over that of the submaps: 1 unless the map is too large for a pool.
     knows_space : bool
-        False where some submap cannot tell free space: entropies and volumes are then of surfaces alone.
+        False if a submap has no free space: entropies and volumes are then of surfaces only.
     """
 
     fused: FusedMap
@@ -101,7 +100,7 @@ class RunMap:
     moving: tuple[int, int] = (0, 0)
 
     def said(self) -> str:
-        """What became of a map too wide for its voxels, in words; empty where nothing did."""
+        """Message if the map was coarsened; otherwise empty."""
         if self.coarsened == 1:
             return ""
         size = self.fused.voxel_size
@@ -110,7 +109,7 @@ class RunMap:
         )
 
     def facts(self) -> dict[str, Any]:
-        """What ``fused_map.json`` holds."""
+        """Entries of ``fused_map.json``."""
         f = self.fused
         clouds = {} if self.points is None else {"points": len(self.points), "free_space_known": self.knows_space}
         return {
@@ -130,7 +129,7 @@ class RunMap:
         }
 
     def metrics(self) -> list[tuple[str, float, str, str]]:
-        """Key, value, unit and better direction of its figures, for ``metrics.json``."""
+        """Key, value, unit and better direction of its metrics, for ``metrics.json``."""
         f = self.fused
         unit = "m³" if f.dim == 3 else "m²"
         seconds = (("divide", self.divide_s), ("fuse", self.fuse_s), ("move", self.move_s))
@@ -148,12 +147,12 @@ class RunMap:
 
 
 def has_maps(submaps: Sequence[Submap]) -> bool:
-    """Has any submap a dense map, an evidence grid or a cloud? In a mixed run some have landmarks instead."""
+    """Whether any submap has a dense map (evidence grid or cloud); in a mixed run some have landmarks only."""
     return any(has_dense_view(s) for s in submaps)
 
 
 def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[Array, Array]]:
-    """Times ``(k,)`` and solved poses ``(k, 3|7)`` of the nodes of each submap, its base first, its exit left out."""
+    """Times ``(k,)`` and solved poses ``(k, 3|7)`` of each submap's nodes, the base first, without the exit."""
     bases = np.arange(len(m.node_poses)) if m.base_nodes is None else m.base_nodes
     if len(bases) != len(submaps) + 1:
         raise DataError("the solved nodes are not those of the submaps", got=len(bases) - 1, wanted=len(submaps))
@@ -161,7 +160,7 @@ def nodes_by_submap(submaps: Sequence[Submap], m: GlobalMap) -> dict[int, tuple[
 
 
 def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array]]) -> dict[PieceId, Array]:
-    """``T_world_node`` of every piece, from the graph's nodes; standing level where the pieces do."""
+    """``T_world_node`` of every piece from the graph's nodes; levelled if the pieces are."""
     out: dict[PieceId, Array] = {}
     for name in divided.pieces:
         assert isinstance(name, tuple)
@@ -173,20 +172,20 @@ def solved_poses(divided: DividedSubmaps, nodes: Mapping[int, tuple[Array, Array
 def make_run_map(
     submaps: Sequence[Submap], m: GlobalMap, *, reach: float | None = None, config: MapConfig | None = None
 ) -> RunMap:
-    """Fuse the maps of a run's submaps: along the open chain first, then moved to where the graph has them.
+    """Fuse the maps of a run's submaps: first along the open chain, then moved to the solved poses.
 
-    What moved is left out (:func:`~graphslam.maps.moving.static_submaps`).
+    Moving objects are removed (:func:`~graphslam.maps.moving.static_submaps`).
 
     Parameters
     ----------
     submaps : sequence of Submap
-        With dense maps and paths; those with landmarks alone add nothing to the map.
+        With dense maps and paths; submaps with landmarks only are ignored.
     m : GlobalMap
         Solved.
     reach : float, optional
-        Of the sensor [m].
+        Sensor range [m].
     config : MapConfig, optional
-        Heights of the floor plans.
+        Heights of the floor plans, number of threads.
     """
     config = MapConfig() if config is None else config
     if not has_maps(submaps):
@@ -241,7 +240,7 @@ def make_run_map(
 
 
 def _held(divided: DividedSubmaps, at: Mapping[PieceId, Array]) -> tuple[DividedSubmaps, int]:
-    """Pieces that a pool of most levels holds, along the open chain and at ``at``, and by how much they are coarser."""
+    """Pieces coarsened until they fit into the largest pool, along the open chain and at ``at``, and the factor."""
     coarsened, pieces = 1, divided.pieces
     while max(reach_of(p, T[n]) for T in (divided.poses, at) for n, p in pieces.items()) > half_edge(MAX_LEVELS):
         coarsened, pieces = 2 * coarsened, {n: coarse_piece(p) for n, p in pieces.items()}
@@ -249,20 +248,20 @@ def _held(divided: DividedSubmaps, at: Mapping[PieceId, Array]) -> tuple[Divided
 
 
 def floor_bands(positions: Array, config: MapConfig) -> dict[str, tuple[float, float]]:
-    """Heights of the floor plan of every storey of a path ``(n, 3)`` [m]; of its middle where it keeps to none."""
+    """Height band of the floor plan of every floor of a path ``(n, 3)`` [m]; of its median height if it has none."""
     heights = storeys(positions) or [float(np.median(positions[:, 2]))]
     return {f"level{k}": (z + config.low, z + config.high) for k, z in enumerate(heights)}
 
 
 def _one_piece(s: Submap, nodes: Mapping[int, tuple[Array, Array]]) -> Submap:
-    """A submap with a path, where its nodes ask for one."""
+    """Check that a submap with several nodes has a path."""
     if s.trajectory is None and len(nodes[s.key][0]) > 1:
         raise DataError(f"submap {s.key} has nodes but no path", wanted="a trajectory")
     return s
 
 
 def _levelled(bases: Array) -> bool:
-    """Do all bases ``(k, 7)`` stand about level?"""
+    """Whether all bases ``(k, 7)`` are nearly level (:data:`MOST_TILT`)."""
     group = group_of(bases)
     lean = group.log(group.between(remove_roll_pitch(bases), bases))[:, :2]
     return bool(np.all(np.linalg.norm(lean, axis=1) < MOST_TILT))

@@ -1,8 +1,7 @@
-"""What each segment of a SegSLAM run saw itself, exactly: while the run that made it is at hand.
+"""Exact own evidence of each segment of a SegSLAM run, while its segment map is in memory.
 
-A segment's map and the map that it began as a copy of share one lattice in the run. Submaps that were handed over stand
-on the lattices of their own bases, each rounded once; of these `added.own_evidence` takes the difference as well as it
-can be told.
+A segment's map and the map that it started from share one lattice in the run, so their difference is exact. Output
+submaps are resampled on the lattices of their bases; for these `increment.own_evidence` is approximate.
 """
 
 from __future__ import annotations
@@ -24,17 +23,16 @@ from graphslam_frontends.segslam.submaps import segment_base
 def own_evidence_of(
     segmap: SegMap, chain: Sequence[int] | npt.NDArray[Any], submaps: Sequence[Submap]
 ) -> dict[int, EvidenceGrid]:
-    """Grids of a chain of submaps without what their segments took over, by key, in the frames of their bases.
+    """Grids of a chain of submaps without the copies of older maps, by key, in the frames of their bases.
 
-    A segment whose older map is gone, or was moved to another lattice by a merge, is treated as if the run were not at
-    hand.
+    If the older map was deleted, or moved to another lattice by a merge, :func:`own_evidence` is used.
 
     Parameters
     ----------
     chain : sequence of int
-        The segments, as `settle` got them.
+        The segments, as passed to `settle`.
     submaps : sequence of Submap
-        As `settle` gave them, with grids.
+        As returned by `settle`, with grids.
     """
     if len(chain) != len(submaps):
         raise DataError("segments and submaps differ in number", got=len(submaps), wanted=len(chain))

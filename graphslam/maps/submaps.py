@@ -1,4 +1,4 @@
-"""From a chain of submaps to pieces with a pose each: what a fused map of a run begins with."""
+"""Division of a chain of submaps into pieces with poses, the input of a fused map."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class DividedSubmaps:
     Parameters
     ----------
     pieces : by name
-        Nodes that own nothing are left out.
+        Without empty pieces.
     poses : by name
         ``T_world_node`` along the open chain, the first base at the identity.
     local : by name
         ``T_base_node``.
     times : by name
-        Of the nodes [s].
+        Times of the nodes [s].
     level_nodes : bool
-        Nodes stand level.
+        Nodes have no roll and pitch.
     """
 
     pieces: dict[PieceId, Piece]
@@ -43,7 +43,7 @@ class DividedSubmaps:
     level_nodes: bool
 
     def along(self, path: Trajectory) -> dict[PieceId, Array]:
-        """``T_world_node`` where a path ``T_world_body(t)`` has the body at the times of the nodes."""
+        """``T_world_node`` along a path ``T_world_body(t)``, at the times of the nodes."""
         poses = path.interpolate(np.array(list(self.times.values())))
         return dict(zip(self.times, remove_roll_pitch(poses) if self.level_nodes else poses))
 
@@ -58,26 +58,26 @@ def divide_submaps(
     level_nodes: bool = True,
     nodes: Mapping[int, Array] | None = None,
 ) -> DividedSubmaps:
-    """Pieces of a chain of submaps with dense maps, and where the chain has them.
+    """Pieces of a chain of submaps with dense maps, and their poses along the chain.
 
     Parameters
     ----------
     submaps : sequence of Submap
-        Each base is the exit of the one before; those without a dense map have no pieces.
+        Each base is the exit of the previous one; those without a dense map have no pieces.
     every : float, optional
-        Way between nodes, about [m]; None: one piece a submap, led by its base.
+        Approximate path length between nodes [m]; None: one piece per submap, which moves with its base.
     config : DivisionConfig, optional
-        Give its ``reach``: the sensor's.
+        Set its ``reach`` to the sensor range.
     own : bool
-        Take out of a submap that entered an older map what it had from there (:mod:`graphslam.maps.increment`).
+        Subtract the copy of an older map that a submap entered (:mod:`graphslam.maps.increment`).
     grids : mapping of key to EvidenceGrid, optional
-        What each submap saw itself, where that is known exactly (:mod:`graphslam.maps.segslam_evidence`).
+        Own evidence of each submap, if known exactly (:mod:`graphslam.maps.segslam_evidence`).
     level_nodes : bool
-        Nodes have the body's position and heading and stand level (3-D): otherwise what one instant says wrong of roll
-        and pitch tilts a piece whose far end may be 25 m off.
+        Nodes have the body's position and heading without roll and pitch (3-D): an error of the momentary tilt would
+        tilt a piece that can extend over 25 m.
     nodes : mapping of key to (m,), optional
-        Times of a graph's nodes in each submap [s], in place of ``every``. The first is the base itself, not the body.
-        A submap of one node is one piece.
+        Times of a graph's nodes in each submap [s], in place of ``every``. The first is the base, not the body. A
+        submap with one node is one piece.
     """
     if not submaps:
         raise DataError("there are no submaps to make a map of", wanted="one at least")
@@ -120,7 +120,7 @@ def divide_submaps(
 
 
 def local_nodes(s: Submap, times: Array, level_nodes: bool) -> Array:
-    """``T_base_node (m, 3|7)`` of a graph's nodes in a submap, of which the first is its base."""
+    """``T_base_node (m, 3|7)`` of a graph's nodes in a submap; the first is the base."""
     path = _path(s)
     out = _poses(path, _clipped(path, times), level_nodes)
     out[0] = group_of(out).identity
@@ -134,7 +134,7 @@ def _path(s: Submap) -> Trajectory:
 
 
 def _clipped(path: Trajectory, times: Array) -> Array:
-    """A path may begin a rounding error after its submap."""
+    """Times limited to the path, which may begin later than its submap by a rounding error."""
     return np.clip(times, path.times[0], path.times[-1])
 
 

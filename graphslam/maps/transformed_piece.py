@@ -1,4 +1,4 @@
-"""Pieces on the lattice of the world: what each knows of which brick, at the pose where it is."""
+"""Pieces resampled on the world lattice, and sums of their bricks."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Entries = npt.NDArray[np.uint32]
 
 
 PART = 1 << 24
-"""Entries that are summed at once [64 MB] …"""
+"""Most entries in one sum [64 MB] …"""
 PART_BRICKS = 1 << 16
-"""… and bricks [64 MB]."""
+"""… and most bricks [64 MB]."""
 
 
 class TransformedPiece:
-    """A piece at one pose; never changed, so that maps may share it. Its entries lie on the shelf of the process.
+    """A piece resampled at one pose; immutable, so that maps can share it. Its entries are in the spill cache.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class TransformedPiece:
     keys : (n,)
         Packed offset coordinates of bricks, ascending.
     starts : (n + 1,)
-        Of each brick in ``entries``.
+        Start of each brick in ``entries``.
     entries : (m,) uint32
         Known voxels: ``voxel << 16 | value`` (:mod:`fuse_kernels`).
     """
@@ -48,21 +48,21 @@ class TransformedPiece:
 
     @property
     def entries(self) -> Entries:
-        """All of them."""
+        """All entries."""
         return self._entries.get()
 
     def between(self, first: int, last: int) -> Entries:
-        """Those of bricks ``first … last - 1``."""
+        """Entries of bricks ``first … last - 1``."""
         return self._entries.rows(int(self.starts[first]), int(self.starts[last]))
 
     @property
     def nbytes(self) -> int:
-        """Memory, while the entries are in it [bytes]."""
+        """Memory when the entries are loaded [bytes]."""
         return self.keys.nbytes + self.starts.nbytes + self._entries.nbytes
 
 
 class PieceTransformer:
-    """Puts pieces on the lattice of one world. Holds scratch memory only.
+    """Resamples pieces on the lattice of one world. Contains scratch memory only.
 
     Parameters
     ----------
@@ -78,18 +78,18 @@ class PieceTransformer:
         self.release()
 
     def release(self) -> None:
-        """Let go of the scratch memory; it is made again when it is needed."""
+        """Free the scratch memory; it is allocated again when needed."""
         self._entries = np.empty(0, np.uint32)
         self._sources = np.empty(0, np.uint32)
         self._sums = np.empty((0, BRICK_VOXELS), np.int16)
 
     def pose(self, piece: Piece, T: Array, T_world_node: Array) -> TransformedPiece:
-        """A piece at ``T`` ``(12,)``, which is T_world_base: rotation row by row, then translation [m]."""
+        """Resample a piece at ``T`` ``(12,)``, which is T_world_base: rotation row by row, then translation [m]."""
         R, t = np.ascontiguousarray(T[:9].reshape(3, 3)), T[9:] / self.voxel_size
         keys = self._met(piece, R, t)
-        if len(self._entries) < BRICK_VOXELS * len(keys) + 1:  # one more: of a voxel that is not known, written over
+        if len(self._entries) < BRICK_VOXELS * len(keys) + 1:  # one extra entry, overwritten by unknown voxels
             self._entries = np.empty(BRICK_VOXELS * 5 * len(keys) // 4 + 1, np.uint32)
-        into = np.empty(12)  # from the world's voxels to those of the box around the piece
+        into = np.empty(12)  # from world voxels to voxels of the box around the piece
         into[:9] = R.T.ravel()
         into[9:] = -R.T @ t - BRICK_EDGE * piece.first
         starts = np.empty(len(keys) + 1, np.int64)
@@ -101,7 +101,7 @@ class PieceTransformer:
         )
 
     def _met(self, piece: Piece, R: Array, t: Array) -> Ints:
-        """Keys of the bricks that the turned bricks of a piece may meet, ascending; ``t`` in voxels."""
+        """Keys of the world bricks that the rotated bricks of a piece may overlap, ascending; ``t`` in voxels."""
         if not piece.known:
             return np.zeros(0, np.int64)
         half = self.half // BRICK_EDGE
@@ -125,7 +125,7 @@ class PieceTransformer:
     def sums(
         self, keys: Ints, posed: Sequence[TransformedPiece], root: int, pool: GridPool, clamp: tuple[int, int]
     ) -> Iterator[tuple[Ints, npt.NDArray[np.int16], int]]:
-        """:meth:`sum` of a part of the keys after the other, none of which takes much memory."""
+        """:meth:`sum` in parts of the keys, with limited memory."""
         ends = parts_of(keys, posed)
         for first, last in pairwise(ends):
             yield self.sum(keys[first:last], posed, root, pool, clamp)
@@ -133,10 +133,10 @@ class PieceTransformer:
     def sum(
         self, keys: Ints, posed: Sequence[TransformedPiece], root: int, pool: GridPool, clamp: tuple[int, int]
     ) -> tuple[Ints, npt.NDArray[np.int16], int]:
-        """Those of the bricks ``keys`` (ascending) that are others now than in the tree ``root``, their values, and in
-        how many of them nothing is known any more.
+        """Bricks of ``keys`` (ascending) that differ from the tree ``root``, their values, and how many have no known
+        voxel any more.
 
-        Values are in scratch memory: of use until the next sum. Hold the pool's lock.
+        The values are in scratch memory and valid until the next sum. The caller must hold the pool's lock.
         """
         nothing = np.zeros(0, np.int64)
         if not len(keys):
@@ -150,7 +150,7 @@ class PieceTransformer:
         hit = hit[np.argsort(at[hit], kind="stable")]
         starts = np.zeros(len(keys) + 1, np.int64)
         np.cumsum(np.bincount(at[hit], minlength=len(keys)), out=starts[1:])
-        # entries of the pieces that touch something, in one array
+        # entries of the pieces that touch one of the bricks, in one array
         used = np.bincount(whose[hit], minlength=len(near)) > 0
         sizes = np.array([p.starts[b] - p.starts[a] if u else 0 for (p, a, b), u in zip(near, used)], np.int64)
         total = int(sizes.sum())
@@ -174,7 +174,7 @@ class PieceTransformer:
 
 
 def parts_of(keys: Ints, posed: Sequence[TransformedPiece]) -> list[int]:
-    """Where to cut ``keys`` (ascending) so that no part is too large: 0 first, the end last."""
+    """Indices at which to split ``keys`` (ascending) so that no part is too large: 0 first, the end last."""
     entries = np.zeros(len(keys))
     for p in posed:
         at = np.minimum(np.searchsorted(keys, p.keys), len(keys) - 1)

@@ -1,4 +1,4 @@
-"""Batch solving of a graph, to the optimum at every update."""
+"""Batch solvers of a graph: each update solves to the optimum."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from graphslam.solve.sparse import PcgProblem, SparseProblem
 
 @dataclass(frozen=True, slots=True)
 class LevenbergConfig:
-    """When to stop.
+    """Stopping rule.
 
     Parameters
     ----------
     max_iterations : int
         Gauss-Newton and damped steps together.
     tolerance : float
-        Converged when the Newton decrement ``gᵀ A⁻¹ g``, the decrease that the quadratic model still promises, is at
-        most ``tolerance · (1 + objective)``.
+        Converged when the Newton decrement ``gᵀ A⁻¹ g``, the predicted decrease of the quadratic model, is at most
+        ``tolerance · (1 + objective)``.
     """
 
     max_iterations: int = 100
@@ -39,7 +39,7 @@ class BatchSolver:
     Parameters
     ----------
     graph : FactorGraph
-        Read at every call; its values are written back.
+        Read at every call; the result is written to its values.
     """
 
     name = "batch"
@@ -51,20 +51,20 @@ class BatchSolver:
         self.iterations = 0
 
     def update(self) -> None:
-        """Solve what the graph holds now, from its present values.
+        """Solve the graph from its current values.
 
-        Reweighting under robust kernels converges slowly, so with kernels it stops here when a step promises less than
-        1e-6 of the objective; :meth:`solve_to_optimum` goes all the way.
+        Reweighting with robust kernels converges slowly, so with kernels the update stops when the predicted decrease
+        is below 1e-6 of the objective; :meth:`solve_to_optimum` continues.
         """
         kernels = self.graph.flat().has_kernels
         self._solve(replace(self.config, tolerance=max(self.config.tolerance, 1e-6)) if kernels else self.config)
 
     def solve_to_optimum(self) -> None:
-        """Solve until nothing is left to gain."""
+        """Solve to the full tolerance."""
         self._solve(self.config)
 
     def problem(self) -> SparseProblem:
-        """What the graph holds now, with the way to make its steps."""
+        """Least-squares problem of the current graph, with the linear solver."""
         return SparseProblem(self.graph.flat())
 
     def _solve(self, config: LevenbergConfig) -> None:
@@ -75,15 +75,15 @@ class BatchSolver:
         self.seconds += time.perf_counter() - t0
 
     def gap(self) -> float:
-        """Objective now less the batch optimum reached from here."""
+        """Current objective minus the batch optimum reached from here."""
         return linearisation_gap(self.graph)
 
     def covariance(self) -> JointCovariance:
-        """Joint covariance at the present values."""
+        """Joint covariance at the current values."""
         return self.graph.covariance()
 
     def solution(self, *, gap: bool = True) -> Solution:
-        """Solution at the present values; says so if the graph changed since the last update."""
+        """Solution at the current values; not converged if the graph changed since the last update."""
         here = state_of(self.graph)
         return make_solution(
             self.name,
@@ -96,7 +96,7 @@ class BatchSolver:
 
 
 class PcgSolver(BatchSolver):
-    """Batch solving by preconditioned conjugate gradients: for graphs too large to factorise."""
+    """Batch solver with preconditioned conjugate gradients, for graphs too large to factorise."""
 
     name = "pcg"
 
@@ -106,7 +106,7 @@ class PcgSolver(BatchSolver):
 
 
 def optimise_problem(problem: SparseProblem, values: Values, config: LevenbergConfig | None = None) -> Optimum:
-    """Minimise a problem from ``values``: Gauss–Newton steps while they help, damped ones when they do not."""
+    """Minimise a problem from ``values``: Gauss–Newton steps while the objective decreases, otherwise damped steps."""
     cfg = config or LevenbergConfig()
     initial = problem.objective(values)
     if not np.isfinite(initial):
@@ -123,12 +123,12 @@ def optimise_problem(problem: SparseProblem, values: Values, config: LevenbergCo
 def optimise_graph(
     graph: FactorGraph, config: LevenbergConfig | None = None, problem: SparseProblem | None = None
 ) -> Optimum:
-    """Optimum of a graph from its present values; the graph is not changed.
+    """Optimum of a graph, starting at its current values; the graph is not changed.
 
     Parameters
     ----------
     problem : SparseProblem, optional
-        How its steps are made; by direct solves if not given.
+        The problem with its linear solver; default: direct solves.
     """
     try:
         return optimise_problem(problem or SparseProblem(graph.flat()), graph.values, config)
@@ -138,13 +138,13 @@ def optimise_graph(
 
 
 def linearisation_gap(graph: FactorGraph) -> float:
-    """Objective at the graph's values less the batch optimum reached from there."""
+    """Objective at the graph's values minus the batch optimum reached from there."""
     optimum = optimise_graph(graph)
     return optimum.objective_initial - optimum.objective
 
 
 def state_of(graph: FactorGraph) -> Optimum:
-    """The present values seen as an (unconverged) optimum: objective, and the decrease still promised."""
+    """The current values as an (unconverged) optimum: objective and predicted decrease."""
     problem = SparseProblem(graph.flat())
     objective, decrement = problem.objective(graph.values), 0.0
     if graph.flat().layout.size:

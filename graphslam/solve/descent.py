@@ -1,9 +1,8 @@
-"""Descent to a minimum of a least-squares problem: Gauss-Newton while it helps, damped steps where it does not.
+"""Minimisation of a least-squares problem: Gauss-Newton while the objective decreases, otherwise damped steps.
 
-Stopping rules that look at the fall of the objective say nothing where progress is merely slow. So an answer counts as
-converged only if the *predicted* remaining fall of a full Gauss-Newton step (the decrement
-``‖r‖² - min_δ ‖J δ + r‖²``, by exact sparse elimination) is negligible; or, after full steps that did what was
-predicted of them, if it will be by the rate at which the decrement falls.
+A small decrease of the objective can also mean slow progress. A result is therefore converged only if the *predicted*
+decrease of a full Gauss-Newton step (the decrement ``‖r‖² - min_δ ‖J δ + r‖²``, by exact sparse elimination) is
+negligible; or, after full steps with the predicted effect, if extrapolation of the decrements is.
 """
 
 from __future__ import annotations
@@ -17,23 +16,23 @@ from graphslam.graph.variables import Values
 from graphslam.solve.sparse import FAILED, RELATIVE, SparseProblem
 
 Status = Literal["converged", "rejected", "stalled", "out of iterations"]
-# Converged: the next step would lower the objective by less than RELATIVE of it, or by less than this per residual (a
-# network without noise has objective zero).
+# Converged: the predicted decrease is less than RELATIVE times the objective, or less than this per residual (a network
+# without noise has objective zero).
 ABSOLUTE = 1e-14
-# Two starts agree, and one beats another, at this relative difference of the objective.
+# Relative difference of the objective below which two starts agree.
 SAME = 1e-6
-# Gauss-Newton may climb to this multiple of the best objective, and for this many steps.
+# Gauss-Newton may increase the objective to this multiple of the best, for this many steps.
 CLIMB, PATIENCE = 1e4, 8
-# The decrement may be foretold if the last step changed the objective by what it predicted to this share of it, and if
-# each decrement is at most this share of the one before (a third of the limit is asked for then).
+# The decrement is extrapolated if the last step changed the objective as predicted, up to this relative error, and if
+# each decrement is at most this share of the previous one (with a third of the limit).
 TRUE_TO_WORD, FAST = 0.1, 0.02
-# A start that after so many steps is still above the best of the others is given up.
+# A start is rejected if after this number of steps it is above the best of the others.
 CHALLENGE = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """Where a local solver ended.
+    """Result of a local solver.
 
     Parameters
     ----------
@@ -41,9 +40,9 @@ class Optimum:
     objective_initial, objective : float
         ``Σ rᵀ Ω r`` before and after.
     decrement : float
-        Predicted further fall of the objective; infinite if the linear system could not be solved.
+        Predicted further decrease of the objective; infinite if the linear system could not be solved.
     iterations : int
-        Steps taken, Gauss-Newton and damped.
+        Number of steps, Gauss-Newton and damped.
     status : str
     """
 
@@ -56,20 +55,20 @@ class Optimum:
 
     @property
     def converged(self) -> bool:
-        """At a stationary point."""
+        """Whether it is a stationary point."""
         return self.status == "converged"
 
 
 @dataclass(frozen=True, slots=True)
 class DescentLimits:
-    """When a descent has converged, and how long Gauss-Newton may climb.
+    """Convergence limits, and how long Gauss-Newton may increase the objective.
 
     Parameters
     ----------
     relative, absolute : float
-        Converged: the next step would lower the objective by less than this share of it plus this.
+        Converged: predicted decrease below ``relative`` times the objective plus ``absolute``.
     patience : int
-        Gauss-Newton steps in a row without a new best.
+        Most consecutive Gauss-Newton steps without a new best objective.
     """
 
     relative: float
@@ -95,19 +94,19 @@ def descend_to_minimum(
     foretell: bool = False,
     limits: DescentLimits | None = None,
 ) -> Optimum:
-    """Descend from ``values`` to the local minimum, or give up early if it cannot compete.
+    """Descend from ``values`` to the local minimum, or stop early if another start is better.
 
     Parameters
     ----------
     best_known : float
-        Objective that another start has reached. The descent is rejected once it cannot get below it in reasonable
-        time: after 10 steps, or when its recent rate kept up for twenty times as long would not do.
+        Objective that another start has reached. The descent is rejected if it is above it after 10 steps, or if twenty
+        times its recent decrease would not reach it.
     max_iterations : int
         Gauss-Newton and damped steps together.
     foretell : bool
-        Save the last step where the rate of convergence foretells that it changes nothing that counts.
+        Skip the last step if the rate of convergence predicts a negligible change.
     limits : DescentLimits, optional
-        By default :func:`limits_of` the measurements.
+        Default: :func:`limits_of` the number of measurements.
 
     Returns
     -------
@@ -132,7 +131,7 @@ def descend_to_minimum(
             return end(found.decrement, "converged")
         if _hopeless(history, best_known, used):
             return end(found.decrement, "rejected")
-        # damped: always downhill, until Gauss-Newton is worth another try
+        # damped steps: the objective always decreases; then Gauss-Newton again
         before = objective
         values, taken, steps = problem.damped(values, objective, budget - used)
         history += taken
@@ -156,10 +155,10 @@ def _newton(
     foretell: bool,
     limits: DescentLimits,
 ) -> Optimum:
-    """Full Gauss-Newton steps, allowed to climb for a while.
+    """Full Gauss-Newton steps; the objective may increase for some steps.
 
-    After rotations-first the first step often trades a higher objective for the right shape, and the next ones fall
-    far below the start; a monotone method creeps instead. ``patience`` steps without a new best end the attempt.
+    After an initialisation by rotations, the first step often increases the objective, and the next ones decrease it
+    far below the start; a monotone method is slow there. The attempt ends after ``patience`` steps without a new best.
     """
     best, lowest, steps, since, before = values, objective, 0, 0, float("inf")
     while steps < budget and since < patience:
@@ -168,7 +167,7 @@ def _newton(
         except FAILED:
             break
         steps += 1
-        # at a minimum to rounding the step may go either way by a trifle; a clearly negative fall is a failed solve
+        # at a minimum the change can have either sign by rounding; a clearly negative fall is a failed solve
         if values is best and limits.reached(lowest, abs(fall)):
             if now < lowest:
                 best, lowest = moved, now
@@ -186,7 +185,7 @@ def _newton(
 
 
 def _hopeless(history: list[float], best_known: float, used: int) -> bool:
-    """Whether a descent is above the best known objective and will not get below it in reasonable time."""
+    """Whether a descent is above the best known objective and too slow to get below it."""
     if not history[-1] > best_known * (1.0 + 1e-6):
         return False
     if used > CHALLENGE and history[-1] > 1.001 * best_known:

@@ -1,10 +1,9 @@
-"""Graduated non-convexity over a whole graph: what contradicts the rest is weighed down, named, and taken out.
+"""Graduated non-convexity over a whole graph: outliers are downweighted, reported and removed.
 
-Truncated least squares by graduated non-convexity (Yang et al., RA-L 2020, algorithm 1): every doubtful factor has a
-weight in [0, 1]; the surrogate of the truncated loss begins convex and is made less so from round to round. Doubtful is
-what measured something between far instants or against the outside (matches, loops, fixes, distances, headings); the
-chain of submaps, IMU factors and priors are believed. The limit of a factor is the χ² that right measurements of its
-dimension exceed once in ``1 / (1 - confidence)``.
+Truncated least squares by graduated non-convexity (Yang et al., RA-L 2020, algorithm 1): every tested factor has a
+weight in [0, 1]; the surrogate of the truncated loss starts convex and becomes less convex in each round. Tested are
+matches, loops, fixes, distances, headings and similar; the chain of submaps, IMU factors and priors count as inliers.
+The limit of a factor is the χ² quantile at ``confidence`` of its dimension.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ from graphslam.solve.solution import Solution
 from graphslam.solve.sparse import SparseProblem
 
 BELIEVED = frozenset({"submap", "dense-submap", "levelled", "imu", "declination"})
-"""Classes of factors that are never outliers here; priors are none either."""
+"""Classes of factors that always count as inliers; so do priors."""
 
 
 @dataclass(frozen=True, slots=True)
 class GncConfig:
-    """When a factor is an outlier.
+    """Configuration of the outlier test.
 
     Parameters
     ----------
     confidence : float
-        A right measurement stays within its limit with this probability.
+        An inlier is within its limit with this probability.
     growth : float
-        By how much the surrogate is made less convex from round to round.
+        Growth of μ per round: larger is less convex.
     """
 
     confidence: float = 0.999
@@ -53,11 +52,11 @@ class GncConfig:
 
 
 class GncSolver(BatchSolver):
-    """Batch solving that finds outliers when it goes to the optimum.
+    """Batch solver that removes outliers when it solves to the optimum.
 
-    :meth:`update` solves by least squares. :meth:`solve_to_optimum` runs graduated non-convexity from there, takes
-    the outliers out of the graph (events ``outlier``: factor, class, χ² and its limit), and ends at the optimum of what
-    is left.
+    :meth:`update` solves by least squares. :meth:`solve_to_optimum` runs graduated non-convexity from there, removes
+    the outliers from the graph (events ``outlier``: factor, class, χ² and its limit), and ends at the optimum of the
+    rest.
     """
 
     name = "gnc"
@@ -65,10 +64,10 @@ class GncSolver(BatchSolver):
     def __init__(self, graph: FactorGraph, config: LevenbergConfig | None = None, gnc: GncConfig | None = None) -> None:
         super().__init__(graph, config)
         self.gnc = gnc or GncConfig()
-        self._searched = -1  # revision of the graph in which outliers were looked for last
+        self._searched = -1  # revision of the graph at the last search for outliers
 
     def solve_to_optimum(self) -> None:
-        """Find the outliers, take them out, and solve until nothing is left to gain."""
+        """Find and remove the outliers, and solve to the full tolerance."""
         t0 = time.perf_counter()
         if self.graph.revision != self._searched:
             for record, d2, limit in find_outliers(self.graph, self.gnc, self.config):
@@ -82,11 +81,11 @@ class GncSolver(BatchSolver):
         self._solve(self.config)
 
     def covariance(self) -> JointCovariance:
-        """Joint covariance of what is left, at the present values."""
+        """Joint covariance of the remaining graph at the current values."""
         return self.graph.covariance()
 
     def solution(self, *, gap: bool = True) -> Solution:
-        """See :meth:`BatchSolver.solution`; outliers are looked for first, if the graph changed since."""
+        """See :meth:`BatchSolver.solution`; outliers are removed first if the graph changed."""
         if self.graph.revision != self._searched:
             self.solve_to_optimum()
         return super().solution(gap=gap)
@@ -95,7 +94,7 @@ class GncSolver(BatchSolver):
 def find_outliers(
     graph: FactorGraph, config: GncConfig | None = None, solver: LevenbergConfig | None = None
 ) -> list[tuple[FactorRecord, float, float]]:
-    """Doubtful factors whose final weight is less than a half, with their χ² at the end and its limit.
+    """Factors with a final weight below 0.5, with their final χ² and its limit.
 
     The graph is not changed.
     """
@@ -110,14 +109,14 @@ def find_outliers(
     w = np.ones(len(records))
     d2 = flat.evaluate(values, hessian=False).chi2
     worst = float(np.max(d2[doubtful] / limit[doubtful]))
-    if worst <= 1.0:  # nothing contradicts: least squares it is
+    if worst <= 1.0:  # no factor exceeds its limit: plain least squares
         return []
     mu = 1.0 / max(2.0 * worst - 1.0, 1e-6)
     for _ in range(cfg.max_rounds):
         w[doubtful] = truncation_weights(d2[doubtful] / limit[doubtful], mu)
         try:
             optimum = optimise_problem(SparseProblem(flat, w), values, solver)
-        except IndeterminateError:  # so much is doubted that the rest does not hold together
+        except IndeterminateError:  # too many zero weights: the rest is not connected
             break
         values, d2 = optimum.values, flat.evaluate(optimum.values, hessian=False).chi2
         if np.all((w < 1e-3) | (w > 1.0 - 1e-3)) and mu > 1.0:
@@ -128,7 +127,7 @@ def find_outliers(
 
 
 def truncation_weights(ratio: Array, mu: float) -> Array:
-    """Weights of truncated least squares by the ratio of χ² to its limit (Yang et al., eq. 14)."""
+    """Weights of truncated least squares as a function of χ² over its limit (Yang et al., eq. 14)."""
     low, high = mu / (mu + 1.0), (mu + 1.0) / mu
     between = np.sqrt(mu * (mu + 1.0) / np.maximum(ratio, 1e-12)) - mu
     return np.where(ratio <= low, 1.0, np.where(ratio >= high, 0.0, np.clip(between, 0.0, 1.0)))

@@ -1,14 +1,12 @@
-"""Incremental solving with GTSAM's iSAM2, with the report that iSAM2 itself does not give.
+"""Incremental solver with GTSAM's iSAM2, with convergence diagnostics.
 
-iSAM2 relinearises a variable only when it moved by more than a threshold, so its estimate is that of a problem
-linearised in part at old values. :meth:`Isam2Solver.gap` says by how much the objective lies above the batch optimum
-reached from here, :meth:`Isam2Solver.solve_to_optimum` gets there, and a :class:`Solution` is never flagged converged
-before.
+iSAM2 relinearises a variable only if it moved by more than a threshold, so its estimate is partly linearised at old
+values. :meth:`Isam2Solver.gap` is the difference of the objective to the batch optimum reached from here,
+:meth:`Isam2Solver.solve_to_optimum` goes there, and only then a :class:`Solution` is flagged converged.
 
-An update costs what it touches: only records that changed are looked at (the graph keeps a journal of them), nothing is
-copied, and the estimate is read when somebody asks the graph for its values. GTSAM's ``update`` is not exception-safe:
-after a throw the object is dead. What it held is then made again from the graph's own records; a factor is blamed only
-if that fails, too.
+An update processes only changed records (from the journal of the graph), copies nothing, and the estimate is read
+lazily when the values of the graph are used. GTSAM's ``update`` is not exception-safe: after an exception the object is
+unusable. It is then rebuilt from the records of the graph; a factor is rejected only if that fails, too.
 """
 
 from __future__ import annotations
@@ -39,11 +37,11 @@ log = logging.getLogger(__name__)
 
 
 _FAILURES = (RuntimeError, IndexError, ValueError, SolverError)
-"""What GTSAM throws, or we on what it returns."""
+"""Exceptions of GTSAM, or of the checks of its results."""
 
 
 class FactorRejectedError(SolverError):
-    """A factor broke an update and was taken out of the graph; everything else stands as before."""
+    """A factor made an update fail and was removed from the graph; everything else is unchanged."""
 
     def __init__(self, message: str, factor_id: int) -> None:
         super().__init__(message)
@@ -56,16 +54,16 @@ class Isam2Solver:
     Parameters
     ----------
     graph : FactorGraph
-        Read at every update; its values are written back.
+        Read at every update; the result is written to its values.
     relinearize_threshold : float
-        A position that moved by more than this [m] since it was linearised is linearised again.
+        A position that moved by more than this [m] since its linearisation is relinearised.
     relinearize_angle : float
-        The same for a heading [rad]. Submap factors are linear but for the heading of their base: an error of the
-        linearisation is (change of heading) x (change of position), so headings are held much tighter.
+        The same for a heading [rad]. Submap factors are linear except for the heading of their base. The linearisation
+        error is (change of heading) x (change of position), so the limit for headings is tighter.
     relinearize_skip : int, optional
-        Look for variables that moved at every n-th update only: looking costs as much as there are variables. By
-        default 10, and 1 where there are landmarks, which are associated by where the poses are thought to be. A
-        factor between two nodes that were there before, a loop, has them looked at in any case.
+        Relinearisation is checked only at every n-th update, because the check costs time for all variables. Default
+        10; 1 with landmarks, because their association uses the poses. A loop (factor between two existing nodes)
+        always triggers the check.
     """
 
     name = "isam2"
@@ -84,8 +82,8 @@ class Isam2Solver:
                 f"{relinearize_threshold} m, {relinearize_angle} rad, {relinearize_skip}"
             )
         self.graph = graph
-        # Cholesky squares the condition number: an open chain of 900 poses with a centimetre of noise each is
-        # "indeterminate" to it. QR costs about the same in the plane, and four times as much in space.
+        # Cholesky squares the condition number and fails for an open chain of 900 poses with 1 cm of noise each. QR
+        # costs about the same in 2-D, and four times as much in 3-D.
         self.factorization = "QR"
         self.relinearize_threshold = relinearize_threshold
         self.relinearize_angle = relinearize_angle
@@ -96,14 +94,14 @@ class Isam2Solver:
         self._isam: Any  # gtsam.ISAM2, or None before the first update
         self._held: dict[int, tuple[FactorRecord, int]]  # factor id -> (record, slot)
         self._known: set[str]
-        self._read: int  # entries of the graph's journal that were taken in
+        self._read: int  # processed entries of the graph's journal
         self._since_pull = 0
         self._forget()
 
-    # ---------------------------------------------------------------- verbs
+    # ---------------------------------------------------------------- interface
 
     def update(self) -> None:
-        """Feed what changed in the graph since the last update, and write the new estimate back."""
+        """Add the changes of the graph since the last update to iSAM2, and use the new estimate."""
         t0 = time.perf_counter()
         try:
             self._update()
@@ -111,7 +109,7 @@ class Isam2Solver:
             self.seconds += time.perf_counter() - t0
 
     def solve_to_optimum(self) -> None:
-        """Go to the batch optimum reached from here, and linearise iSAM2 there."""
+        """Solve to the batch optimum reached from here, and relinearise iSAM2 there."""
         self.update()
         t0 = time.perf_counter()
         optimum = optimise_graph(self.graph)
@@ -121,15 +119,15 @@ class Isam2Solver:
         self.seconds += time.perf_counter() - t0
 
     def gap(self) -> float:
-        """Linearisation gap: objective now less the batch optimum reached from here (nothing is changed)."""
+        """Linearisation gap: current objective minus the batch optimum reached from here (nothing is changed)."""
         return linearisation_gap(self.graph)
 
     def covariance(self) -> JointCovariance:
-        """Joint covariance at the present values (fully linearised there, not at iSAM2's old points)."""
+        """Joint covariance, fully linearised at the current values (not at iSAM2's linearisation points)."""
         return self.graph.covariance()
 
     def solution(self, *, gap: bool = True) -> Solution:
-        """Solution at the present values; ``gap=False`` saves the batch solve behind the gap."""
+        """Solution at the current values; ``gap=False`` saves the batch solve for the gap."""
         return make_solution(
             self.name,
             self.graph,
@@ -142,7 +140,7 @@ class Isam2Solver:
     # ---------------------------------------------------------------- inside
 
     def _new(self) -> gtsam.ISAM2:
-        """An empty iSAM2 for graphs of this kind."""
+        """An empty iSAM2 with the parameters for this graph."""
         parameters = gtsam.ISAM2Params()
         limits = gtsam.ISAM2ThresholdMap()
         for item in thresholds(self.graph.dim, self.relinearize_threshold, self.relinearize_angle).items():
@@ -171,20 +169,20 @@ class Isam2Solver:
                 self._feed(new, gone)
                 self._promise(new)
             except _FAILURES as error:
-                # what fails step by step may be sound as a whole: a factor is blamed only if that fails, too
+                # the complete graph may still be solvable: a factor is rejected only if that fails, too
                 self._rebuild(new, gone, cause=error)
             else:
                 self.updates += 1
         self._read = len(self.graph.records.journal)
 
     def _check_fresh(self, new: list[FactorRecord]) -> None:
-        """Variables that iSAM2 is to hear of start at numbers."""
+        """Check that the initial values of new variables are finite."""
         for name in {n for r in new for n in r.variables()} - self._known - {"x0"}:
             if not np.all(np.isfinite(value_of(self.graph.structure, name, self.graph.landmark_rows))):
                 raise SolverError(f"{name} starts at a value that is not finite; iSAM2 is not touched")
 
     def _difference(self) -> tuple[list[FactorRecord], list[int]]:
-        """Records to add, and factor ids that iSAM2 holds and the graph does not (or no longer in that form)."""
+        """Records to add, and ids of factors that were removed or changed in the graph."""
         records, new, gone = self.graph.records, [], []
         for i in dict.fromkeys(self.graph.records.journal[self._read :]):
             now, held = records.get(i), self._held.get(i)
@@ -195,7 +193,7 @@ class Isam2Solver:
         return new, gone
 
     def _feed(self, new: list[FactorRecord], gone: list[int]) -> None:
-        """One update of GTSAM's."""
+        """One update of GTSAM."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         fresh: dict[str, None] = {}
         for record in new:
@@ -218,7 +216,7 @@ class Isam2Solver:
         self._known |= set(fresh)
 
     def value(self, name: str) -> Array:
-        """The present estimate of one variable that iSAM2 holds."""
+        """The current estimate of one variable in iSAM2."""
         kind, dim, key = split_name(name)[0], self.graph.dim, gtsam_key(name)
         group = kind.pose_group(dim)
         if group is not None:
@@ -236,45 +234,45 @@ class Isam2Solver:
         return math.isfinite(self._isam.calculateEstimatePose3(key).matrix().sum())
 
     def holds(self, name: str) -> bool:
-        """Is that variable in iSAM2?"""
+        """Whether the variable is in iSAM2."""
         return name in self._known
 
     def _promise(self, new: list[FactorRecord]) -> None:
-        """The graph's values are those of iSAM2 from now on; they are read when somebody asks for them.
+        """Let the graph read its values from iSAM2, lazily, when they are used.
 
-        A residual that is not finite spreads over all variables of its factor, so that one of each new factor tells:
-        the last, which most of those that came together share.
+        A residual that is not finite affects all variables of its factor, so it is sufficient to check one per new
+        factor: the last, which factors of one update often share.
         """
         for name in {next((n for n in reversed(r.variables()) if n != "x0"), None) for r in new} - {None}:
             if not self._is_finite(str(name)):
                 raise SolverError("iSAM2 returned values that are not finite")
         self.graph.expect(self)
         self._since_pull += 1
-        if self._since_pull > max(100, len(self._known) // 10):  # what a rebuild would begin at stays near
+        if self._since_pull > max(100, len(self._known) // 10):  # limits the age of the start values of a rebuild
             self._since_pull = 0
             _ = self.graph.values
 
     def pull(self, structure: Values) -> Values:
-        """All values: those that iSAM2 holds as it has them, others as they are in ``structure``."""
+        """All values: from iSAM2 if it has them, otherwise from ``structure``."""
         estimate = from_gtsam(self._isam.calculateEstimate(), structure, self.graph.landmark_rows)
         if not estimate.is_finite():
             raise SolverError("iSAM2 returned values that are not finite")
         return estimate
 
     def _rebuild(self, new: list[FactorRecord], gone: list[int], cause: Exception | None = None) -> None:
-        """Make iSAM2 again from the graph's record, linearised at the graph's values.
+        """Rebuild iSAM2 from the graph's records, linearised at the graph's values.
 
-        ``cause`` is what an update step by step failed with.
+        ``cause``: the error of the incremental update.
         """
         if cause is not None:
-            self.graph.expect(None)  # the object that knew better is dead
+            self.graph.expect(None)  # the iSAM2 object is unusable
             try:
                 self._check_finite(new)
             except SolverError:
                 ids = {r.factor_id for r in new}
                 self._restore([r for i, r in self.graph.records.items() if i not in ids])
                 raise
-        _ = self.graph.values  # while the old object can tell
+        _ = self.graph.values  # read the estimate from the old object
         self._forget()
         try:
             self._feed(list(self.graph.records.values()), [])
@@ -288,7 +286,7 @@ class Isam2Solver:
         self.updates += 1
 
     def _check_finite(self, new: list[FactorRecord]) -> None:
-        """Refuse a factor whose residual is not finite (GTSAM's own message would mislead)."""
+        """Reject a factor whose residual is not finite (the message of GTSAM would be misleading)."""
         if not self.graph.values.is_finite():
             raise SolverError("the graph holds values that are not finite; iSAM2 is not touched")
         chi2 = FactorArrays(new, self.graph.values.layout()).evaluate(self.graph.values, hessian=False).chi2
@@ -297,13 +295,13 @@ class Isam2Solver:
                 self._reject(record, f"its residual is {value}")
 
     def _check_normal_equations(self) -> None:
-        """Refuse what QR alone can solve: covariances and the batch optimum are made from squares of the Jacobian."""
+        """Reject systems that only QR can solve: covariances and the batch optimum use the squared Jacobian."""
         A = self.graph.flat().evaluate(self.graph.values).A
         if not np.all(np.isfinite(A.data if sp.issparse(A) else A)):
             raise SolverError("the squares of its Jacobian overflow")
 
     def _blame(self, new: list[FactorRecord], gone: list[int], error: Exception) -> None:
-        """The whole graph fails, too: find out why, and say it."""
+        """Find out why the whole graph fails, and raise a specific error."""
         if gone:
             self._forget()
             self.graph.diagnose().raise_if_bad()
@@ -323,12 +321,12 @@ class Isam2Solver:
         raise SolverError(f"iSAM2 update failed ({_in_words(error)}); the solver is as it was before") from error
 
     def _restore(self, records: list[FactorRecord]) -> None:
-        """Hold these records and no others, as far as they can be solved."""
+        """Rebuild iSAM2 with these records only, if they can be solved."""
         self._forget()
         try:
             self._feed(records, [])
             self._isam.calculateEstimate()
-        except _FAILURES:  # then the next update makes it anew
+        except _FAILURES:  # the next update rebuilds it
             self._forget()
 
     def _reject(self, record: FactorRecord, why: str) -> None:
@@ -341,7 +339,7 @@ class Isam2Solver:
 
 
 def _in_words(error: Exception) -> str:
-    """GTSAM's message on one line, up to the variable that it names; the advice behind that is for programmers."""
+    """GTSAM's message on one line, up to the name of the variable, without the advice for programmers."""
     text = " ".join(str(error).split()) or type(error).__name__
     found = re.search(r"(?<=near variable )\d+ \(Symbol: (\w+)\)\.?", text)
     return text if found is None else f"{text[: found.start()]}{found[1]}"

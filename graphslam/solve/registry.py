@@ -1,4 +1,4 @@
-"""Solvers by name. A solver is a class over a :class:`~graphslam.graph.factor_graph.FactorGraph` with a few verbs."""
+"""Registry of the solvers of a :class:`~graphslam.graph.factor_graph.FactorGraph`."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from graphslam.solve.solution import Solution
 
 
 class Solver(Protocol):
-    """What every solver offers; it reads the graph at each call and writes its values back."""
+    """Interface of a solver; it reads the graph at each call and writes the result to its values."""
 
     graph: FactorGraph
 
     def update(self) -> None:
-        """Take in what changed in the graph."""
+        """Process the changes of the graph."""
         ...
 
     def solve_to_optimum(self) -> None:
-        """Go to the batch optimum reached from here."""
+        """Solve to the batch optimum reached from here."""
         ...
 
     def gap(self) -> float:
-        """Objective now less that optimum."""
+        """Current objective minus that optimum."""
         ...
 
     def covariance(self) -> JointCovariance:
-        """Joint covariance at the present values."""
+        """Joint covariance at the current values."""
         ...
 
     def solution(self, *, gap: bool = True) -> Solution:
@@ -49,7 +49,7 @@ SOLVERS: dict[str, type] = {
 
 
 def make_solver(name: str, graph: FactorGraph, **options: Any) -> Solver:
-    """A registered solver over ``graph``."""
+    """A registered solver of ``graph``."""
     if name not in SOLVERS:
         raise UnknownNameError("solver", name, SOLVERS)
     solver: Solver = SOLVERS[name](graph, **options)

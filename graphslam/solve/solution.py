@@ -1,4 +1,4 @@
-"""What a solver hands over: values with their uncertainty, and the honest word on whether it is the optimum."""
+"""Result of a solver: values with their uncertainty, and whether they are the optimum."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def _name_of(name: str | int) -> str:
 
 @dataclass(frozen=True, repr=False)
 class Solution:
-    """A solved graph, independent of what happens to the graph afterwards.
+    """A solved graph, independent of later changes of the graph.
 
     Parameters
     ----------
     score : GraphScore
         χ² and dof per class of factor.
     iterations : int
-        Of the solver so far (updates for an incremental one).
+        Total iterations of the solver (updates of an incremental one).
     converged : bool
-        True only at the optimum: the decrease that the quadratic model still promises is negligible.
+        True only at the optimum: the predicted decrease of the quadratic model is negligible.
     decrement : float
-        That promised decrease.
+        That predicted decrease.
     gap : float or None
-        Objective now less the batch optimum reached from here; None if it was not asked for.
+        Objective minus the batch optimum reached from here; None if not computed.
     seconds : float
-        Spent in the solver.
+        Time in the solver.
     """
 
     solver: str
@@ -79,7 +79,7 @@ class Solution:
 
     @property
     def submap_keys(self) -> npt.NDArray[np.int64]:
-        """Keys of the submaps ``(m,)`` in the order in which they were joined."""
+        """Keys of the submaps ``(m,)`` in order."""
         return np.array([s.key for s in self._submaps], dtype=np.int64)
 
     @property
@@ -99,13 +99,13 @@ class Solution:
 
     @property
     def chart(self) -> str:
-        """The coordinates in which its landmark maps are Gaussian: "group" where all are so, otherwise "cartesian"."""
+        """Parametrisation in which its landmark maps are Gaussian: "group" if all are, otherwise "cartesian"."""
         charts = {r.chart for r in self._flat.records if isinstance(r, SubmapRecord) and len(r.landmark_ids)}
         return "group" if charts == {"group"} else "cartesian"
 
     @property
     def anchors(self) -> npt.NDArray[np.intp]:
-        """Row of :attr:`poses` at the end of the submap that saw each landmark first ``(n,)``; -1 of what none saw."""
+        """Row of :attr:`poses` at the end of the submap that observed each landmark first ``(n,)``; -1 if none did."""
         first: dict[int, int] = {}
         for r in self._flat.records:
             if isinstance(r, SubmapRecord):
@@ -115,7 +115,7 @@ class Solution:
 
     @property
     def node_times(self) -> Array:
-        """When the body was at every node ``(m + 1,)`` [s]; where two submaps meet, the start of the later one."""
+        """Time of every node ``(m + 1,)`` [s]; where two submaps meet, the start of the later one."""
         out = np.full(len(self.poses), np.nan)
         for s in self._submaps:
             out[list(s.nodes)] = s.times
@@ -133,12 +133,12 @@ class Solution:
 
     @property
     def states(self) -> int:
-        """Free scalars; the fixed first base is not one."""
+        """Number of free scalars, without the fixed first base."""
         return self._flat.layout.size
 
     @property
     def T_gps_world(self) -> Array | None:
-        """Map → the GPS stream's own frame ``(3,)`` or ``(7,)``, or None without GPS."""
+        """Map → frame of the GPS stream ``(3,)`` or ``(7,)``, or None without GPS."""
         if self.values.datum is None or self.gps_origin is None:
             return None
         if self.values.dim == 3:
@@ -148,7 +148,7 @@ class Solution:
 
     @cached_property
     def covariance(self) -> JointCovariance:
-        """Joint covariance at these values; made at the first use."""
+        """Joint covariance at these values; cached."""
         return JointCovariance(self._flat.layout, self._flat.evaluate(self.values).A)
 
     def marginal(self, name: str | int) -> Array:
@@ -182,9 +182,9 @@ class Solution:
         return vector_form(P, self.values.poses[1:], [3 * k for k in range(lay.nodes - 1)])
 
     def certificate(self) -> Certificate:
-        """Whether this is proved to be the global optimum; "not known", with the reason, where that cannot be told.
+        """Certificate of the global optimum; "not known", with the reason, if it does not apply.
 
-        The proof covers relative poses: with GPS, an IMU, landmarks, kernels … it does not apply, and says so.
+        It covers relative poses only, not GPS, IMU, landmarks, kernels …
         """
         from graphslam.solve.network.certificate import Certificate, certify
 
@@ -195,21 +195,20 @@ class Solution:
         return certify(network, self.poses, self.objective)
 
     def trajectory(self, *, covariances: bool = True, keys: Collection[int] | None = None) -> Trajectory:
-        """Path at full rate: ``x_k ∘ T_k_body(t)`` for every submap with a trajectory of its own.
+        """Path at full rate: ``x_k ∘ T_k_body(t)`` for every submap with a trajectory.
 
-        ``x_k`` is the submap's base; constant errors of wheels and sensor, where the graph has them, are taken out of
-        the local path. Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with the base
-        and the local path taken as independent. Where two submaps share an instant the later one has it: a fresh base
-        is surer than a long arm.
+        ``x_k`` is the submap's base; the local path is corrected for constant errors of wheels and sensor if the graph
+        estimates them. Covariances are first order, ``Ad(T⁻¹) P_k Ad(T⁻¹)ᵀ + P_local(t)`` with independent base and
+        local path. At a common time of two submaps the later one is used, because its local covariance is smaller.
 
-        A submap with inner nodes is bent by them: between two nodes the path is what both say of it together
-        (:class:`~graphslam.graph.submap_node.PathBridge`), so it runs through them without a jump, and its covariance
-        is that of the two nodes jointly and of the way between them.
+        The path of a submap with inner nodes is conditioned on both neighbouring nodes
+        (:class:`~graphslam.graph.submap_node.PathBridge`), so it passes through the nodes without a jump; its
+        covariance is that of the two nodes jointly and of the path between them.
 
         Parameters
         ----------
         keys : collection of int, optional
-            Only of these submaps: those of one robot, where several share the graph.
+            Only these submaps, e.g. those of one robot of several.
         """
         P_nodes = self.node_covariances() if covariances else None
         P_lasting = self._lasting_covariances() if covariances else {}
@@ -252,12 +251,12 @@ class Solution:
         )
 
     def _lasting_covariances(self) -> dict[int, Array]:
-        """Of the constant errors of each robot ``(6, 6)``."""
+        """Covariance of the constant errors of each robot ``(6, 6)``."""
         robots = range(self.values.count("wheels"))
         return {k: self.covariance.joint(bias_variable_names(k)) for k in robots}
 
     def _bent(self, s: SubmapNode, rows: npt.NDArray[np.bool_], P_nodes: Array | None) -> tuple[Array, Array]:
-        """Poses and covariances of a path between the nodes of its submap, given both neighbours of each instant."""
+        """Poses and covariances of a path between the nodes of its submap, conditioned on both neighbours."""
         assert s.trajectory is not None
         x, group = self.values.poses, group_of(self.values.poses)
         at, nodes = s.before(s.trajectory.times[rows]), np.array(s.nodes)
@@ -294,15 +293,15 @@ class Solution:
         return join_parts([html_element("b", "Solution"), said, Markup(self.score._repr_html_())])
 
 
-# The decrement at which a solution counts as the optimum, relative to max(1, objective): far below what any figure
-# printed of an objective shows, far above rounding.
+# Decrement of an optimum, relative to max(1, objective): below the precision of printed objectives, above rounding
+# errors.
 CONVERGED = 1e-8
 
 
 def make_solution(
     solver: str, graph: FactorGraph, optimum: Optimum, *, iterations: int, gap: float | None, seconds: float
 ) -> Solution:
-    """A :class:`Solution` of the graph's present state from where an optimiser stands."""
+    """A :class:`Solution` from the graph's current state and the result of an optimiser."""
     flat = graph.flat()
     return Solution(
         solver=solver,

@@ -1,7 +1,7 @@
-"""Steps of a descent without GTSAM: vectorised numpy blocks, and a choice of direct or conjugate-gradient solves.
+"""Linear steps of a descent: vectorised assembly, with direct or conjugate-gradient solvers.
 
-Conjugate gradients stop on an estimate of the error in the *energy* norm, which is the fall of the objective that is
-still missing, not on the residual: on long chains a residual of 1e-6 goes with solutions that are wrong by 100 %.
+Conjugate gradients stop on an estimate of the error in the *energy* norm, which is the remaining decrease of the
+objective, not on the residual: on long chains a solution with a residual of 1e-6 can be wrong by 100 %.
 """
 
 from __future__ import annotations
@@ -25,28 +25,27 @@ from graphslam.graph.variables import Values
 if TYPE_CHECKING:
     from graphslam.linear.block_cholesky import BlockFactor
 
-# The missing fall of the objective is estimated from the falls of this many last iterations (Strakoš & Tichý 2002).
+# The remaining decrease is estimated from this number of last iterations (Strakoš & Tichý 2002).
 DELAY = 10
-# Columns that SuperLU takes together: its default of 20 suits larger fronts than those of pose networks.
+# Panel size of SuperLU: its default of 20 is for larger fronts than those of pose networks.
 PANEL = 10
-# Beyond so many poses, in the plane and in space, they are eliminated as blocks, in an order by nested dissection.
+# Number of poses (2-D, 3-D) above which blocks are eliminated in an order by nested dissection.
 MANY = {2: 5_000, 3: 1_000}
-# The trust region begins with this radius [m, rad] and is given up at the least; shrinking it costs evaluations of the
-# objective, no solves.
+# First and smallest radius of the trust region [m, rad]; shrinking it costs evaluations of the objective only.
 FIRST_RADIUS, LEAST_RADIUS = 10.0, 1e-5
-# A damped step that lowers the objective by less than this share of it is not worth another one of its kind.
+# Damped steps end when one decreases the objective by less than this share.
 LITTLE = 1e-3
-# A dense Cholesky factorisation beats a sparse one that has no order yet below this many columns (measured).
+# Columns up to which dense Cholesky is faster than a sparse one without an order (measured).
 DENSE_SOLVE_LIMIT = 600
-# A fall of the objective by less than this share of it counts for nothing.
+# A smaller relative decrease of the objective is negligible.
 RELATIVE = 1e-9
 FAILED = (RuntimeError, IndeterminateError)
-"""What a linear system that cannot be solved throws: SuperLU's, or ours."""
+"""Exceptions of a singular linear system: from SuperLU or from this package."""
 SINGULAR = "the Gauss-Newton matrix is singular to working precision"
 
 
 def factorise_sparse(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU:
-    """Sparse symmetric factorisation; ``ordered``: rows and columns are in a good order of elimination already."""
+    """Sparse symmetric factorisation; ``ordered``: the given order is a good elimination order."""
     return spla.splu(
         sp.csc_matrix(H),
         permc_spec="NATURAL" if ordered else "MMD_AT_PLUS_A",
@@ -58,14 +57,14 @@ def factorise_sparse(H: sp.csc_matrix, *, ordered: bool = False) -> spla.SuperLU
 
 
 class BlockElimination:
-    """Cholesky factorisations of symmetric matrices of one pattern, whose nodes have ``width`` scalars each.
+    """Cholesky factorisations of symmetric matrices with one pattern; nodes have ``width`` scalars.
 
-    The order is GTSAM's METIS: on a drive of 10⁵ poses through a city it leaves 60 % of the entries that minimum degree
-    leaves in the factor, and a fifth of the time.
+    The order is METIS (from GTSAM): for a drive of 10⁵ poses in a city the factor has 60 % of the entries, and takes a
+    fifth of the time, compared with minimum degree.
     """
 
     def __init__(self, H: sp.csc_matrix, width: int) -> None:
-        import gtsam  # both of which smaller networks do not need
+        import gtsam  # both are not needed for smaller networks
 
         from graphslam.linear.block_cholesky import BlockSymbolic
 
@@ -78,7 +77,7 @@ class BlockElimination:
             pattern.push_factor(i, j)
         dissected = gtsam.Ordering.MetisSymbolicFactorGraph(pattern)
         order = np.array([dissected.at(k) for k in range(dissected.size())], dtype=np.int64)
-        alone = np.setdiff1d(np.arange(len(ptr) - 1), order)  # tied to anchors only
+        alone = np.setdiff1d(np.arange(len(ptr) - 1), order)  # connected to fixed nodes only
         order = np.concatenate([alone, order])
         self._symbolic = BlockSymbolic(order, np.full(len(order), width), ptr, nodes)
 
@@ -91,7 +90,7 @@ class BlockElimination:
         return B.indptr.astype(np.int64), B.indices.astype(np.int64), B.data.ravel()
 
     def factor(self, H: sp.csc_matrix) -> BlockFactor:
-        """Factorisation of a matrix of the pattern."""
+        """Factorisation of a matrix with the pattern."""
         _, nodes, data = self._parts(H)
         try:
             return self._symbolic.factor(np.arange(len(nodes)) * self.width**2, data)
@@ -100,20 +99,20 @@ class BlockElimination:
 
 
 class SparseProblem:
-    """A problem with direct solves.
+    """A least-squares problem with direct linear solvers.
 
     Parameters
     ----------
     weights : (f,), optional
-        Factor on the information of every factor.
+        Weight on the information of every factor.
     thorough : bool
-        Where the usual steps fail, try steps in a trust region, and QR, which squares no condition number.
+        If the usual steps fail, try a trust region, and QR, which does not square the condition number.
     """
 
     def __init__(self, flat: FactorArrays, weights: Array | None = None, *, thorough: bool = False) -> None:
         self.flat, self.weights, self.thorough = flat, weights, thorough
         layout = flat.layout
-        # many poses and nothing else: compiled block elimination, which begins with half a second of loading
+        # many poses and no other variables: compiled block elimination, which takes half a second to load
         self._by_block = layout.size > MANY[layout.dim] * layout.pose_dof and layout.stop("x") == layout.size
         self._dense = not layout.ordered and layout.size <= DENSE_SOLVE_LIMIT
         self._elimination: BlockElimination | None = None
@@ -151,7 +150,7 @@ class SparseProblem:
         return self._elimination.factor(H)
 
     def newton_step(self, values: Values) -> tuple[Values, float, float]:
-        """One Gauss-Newton step, the fall of the objective that it predicts, and the objective after it."""
+        """One Gauss-Newton step, its predicted decrease of the objective, and the objective after it."""
         H, b, step = self._full_step(values)
         moved = self.flat.layout.retract(values, step)
         return moved, float(2.0 * (b @ step) - step @ (H @ step)), self.objective(moved)
@@ -167,7 +166,7 @@ class SparseProblem:
             return H, b, self._solve_by_qr(values)
 
     def _solve_by_qr(self, values: Values) -> Array:
-        """The Gauss-Newton step from the whitened Jacobians themselves: GTSAM's elimination by QR."""
+        """The Gauss-Newton step from the whitened Jacobians, by QR elimination in GTSAM."""
         import gtsam
 
         graph, first = gtsam.GaussianFactorGraph(), 0
@@ -193,7 +192,7 @@ class SparseProblem:
         return out
 
     def decrement(self, values: Values) -> float:
-        """Predicted remaining fall of the objective, always by a direct solve; infinite if that fails."""
+        """Predicted remaining decrease of the objective, always by a direct solve; infinite if that fails."""
         try:
             H, b, step = SparseProblem._full_step(self, values)
             fall = float(2.0 * (b @ step) - step @ (H @ step))
@@ -202,10 +201,10 @@ class SparseProblem:
         return abs(fall) if np.isfinite(fall) else float("inf")
 
     def damped(self, values: Values, objective: float, budget: int) -> tuple[Values, list[float], int]:
-        """Up to ten LM steps damped by the diagonal (Marquardt), all downhill, and steps in a trust region if thorough.
+        """Up to ten LM steps damped by the diagonal (Marquardt), all decreasing, then a trust region if ``thorough``.
 
-        LM gets down from far away. In a curved valley (headings off by more than the residual is linear over) it
-        creeps, with one damping for all directions, where steps in a trust region keep their full length along it.
+        LM converges from far away. In a curved valley (large heading errors) it is slow, because one damping applies to
+        all directions; trust-region steps keep their full length along the valley.
         """
         taken: list[float] = []
         damping, steps = 1e-6, 0
@@ -235,7 +234,7 @@ class SparseProblem:
         return values, taken, steps
 
     def _in_trust_region(self, values: Values, objective: float, budget: int) -> tuple[Values, list[float]]:
-        """Powell's dog leg: the full step, cut back towards the steepest descent at the radius."""
+        """Powell's dog leg: the full step, bent towards steepest descent at the radius."""
         taken: list[float] = []
         radius = FIRST_RADIUS
         for _ in range(budget):
@@ -266,7 +265,7 @@ class SparseProblem:
 
 
 def _dog_leg(steepest: Array, full: Array, radius: float) -> Array:
-    """Where the way from the steepest descent to the full step leaves the trust region."""
+    """Point where the path from the steepest-descent step to the full step leaves the trust region."""
     if np.linalg.norm(full) <= radius:
         return full
     length = float(np.linalg.norm(steepest))
@@ -278,7 +277,7 @@ def _dog_leg(steepest: Array, full: Array, radius: float) -> Array:
 
 
 def _dense_solve(H: Array, b: Array) -> Array:
-    """By Cholesky, scaled to a unit diagonal."""
+    """Solve by Cholesky, scaled to a unit diagonal."""
     if not len(b):
         return b
     s = 1.0 / np.sqrt(H.diagonal())
@@ -293,7 +292,7 @@ def _dense_solve(H: Array, b: Array) -> Array:
 
 @dataclass
 class PcgReport:
-    """What conjugate gradients did over a whole solve."""
+    """Statistics of conjugate gradients over all linear solves."""
 
     solves: int = 0
     iterations: int = 0
@@ -302,23 +301,22 @@ class PcgReport:
 
 
 class PcgProblem(SparseProblem):
-    """A problem with two-level preconditioned conjugate gradients.
+    """A least-squares problem with two-level preconditioned conjugate gradients.
 
-    Poses are grouped, ten neighbours by number to a group, all else with the first pose that it shares a factor with.
-    The fine level solves every group for itself; the coarse level solves for one rigid motion of the world for each
-    group, which is what long chains and loops are slow in. The two are combined as a balancing preconditioner
-    (Mandel 1993). Against a spanning-tree preconditioner it needs 6 to 60 times fewer iterations on the recorded
-    networks.
+    Groups are ten poses with consecutive numbers; other variables belong to the first pose that they share a factor
+    with. The fine level solves every group separately; the coarse level solves for one rigid motion per group, the slow
+    modes of long chains and loops. Both are combined as a balancing preconditioner (Mandel 1993). It needs 6 to 60
+    times fewer iterations than a spanning-tree preconditioner on the recorded networks.
 
     Parameters
     ----------
     tolerance : float
-        Relative error of a linear solution in the energy norm. Its square is the share of the fall of the objective
-        that a step misses.
+        Relative error of a linear solution in the energy norm. Its square is the share of the decrease that a step
+        misses.
     max_iterations : int
-        Per linear solve. One that runs out is counted in ``report.unconverged`` and its step is used as it is.
+        Per linear solve. At the limit it is counted in ``report.unconverged``, and its step is used.
     group : int
-        Poses a group.
+        Poses per group.
     """
 
     def __init__(
@@ -333,7 +331,7 @@ class PcgProblem(SparseProblem):
         poses = layout.first("x", np.arange(n))
         number = np.full(layout.size + 2, far)  # by first column: the pose whose group a variable belongs to
         number[poses] = np.arange(n)
-        number[-1] = 0  # held (what is left out stands before it)
+        number[-1] = 0  # fixed
         lowest = np.full(len(flat), far)
         np.minimum.at(lowest, factors, number[variable])
         other = (variable >= 0) & (number[variable] == far)
@@ -341,7 +339,7 @@ class PcgProblem(SparseProblem):
         widths = np.zeros(layout.size + 1, dtype=np.int64)
         widths[variable[variable >= 0]] = np.concatenate([f.width for f in flat.batches])[variable >= 0]
         first = np.flatnonzero(widths)
-        # the group of every free scalar; what shares a factor with no pose goes with the first
+        # group of every free scalar; variables without a factor to a pose are in the first group
         self._owner = np.repeat(np.where(number[first] == far, 0, number[first]), widths[first]) // group
 
     def solve_linear(self, values: Values, H: sp.csc_matrix, b: Array) -> Array:
@@ -354,7 +352,7 @@ class PcgProblem(SparseProblem):
         Z = self._rigid_motions(values)
         HZ = sp.csc_matrix(H @ Z)
         E = sp.csc_matrix(Z.T @ HZ)
-        # a group that holds only an anchor moves nothing: give it a unit of its own
+        # a group with a fixed node only has a zero diagonal: set it to 1
         diagonal = E.diagonal()
         coarse = factorise_sparse(E + sp.diags(np.where(diagonal > 0.0, 1e-13 * diagonal, 1.0), format="csc"))
 
@@ -372,7 +370,7 @@ class PcgProblem(SparseProblem):
         return x
 
     def _rigid_motions(self, values: Values) -> sp.csc_matrix:
-        """Columns: a twist of the world for every group, ``Exp(ξ) x = x Exp(Ad(x⁻¹) ξ)``, for points ``ξ × l``."""
+        """Columns: a rigid motion of the world per group, ``Exp(ξ) x = x Exp(Ad(x⁻¹) ξ)``, for points ``ξ × l``."""
         layout, g = self.flat.layout, values.group
         first = layout.first("x", np.arange(layout.count("x")))
         free = np.flatnonzero(first >= 0)
@@ -408,9 +406,9 @@ def pcg(
 ) -> tuple[Array, int, bool]:
     """Preconditioned conjugate gradients with an energy-norm stopping rule.
 
-    ``‖x - x_k‖²_H`` is bounded from below by ``Σ_{j=k}^{k+d-1} α_j r_jᵀ z_j`` (Hestenes & Stiefel 1952; Strakoš &
-    Tichý 2002); with d = 10 it is a sound estimate of the error ten iterations ago. The same sum from the beginning
-    is ``‖x_k‖²_H``, so their ratio is the relative error.
+    ``‖x - x_k‖²_H`` is bounded from below by ``Σ_{j=k}^{k+d-1} α_j r_jᵀ z_j`` (Hestenes & Stiefel 1952; Strakoš & Tichý
+    2002); with d = 10 it is a good estimate of the error ten iterations ago. The sum over all iterations is
+    ``‖x_k‖²_H``, so their ratio is the squared relative error.
 
     Returns
     -------

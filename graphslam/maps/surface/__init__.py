@@ -1,1 +1,1 @@
-"""Surfaces of the solved map: a signed distance that follows the graph, and its zero set as a mesh."""
+"""Surface reconstruction: a signed distance field that follows the graph, and its zero level set as a mesh."""

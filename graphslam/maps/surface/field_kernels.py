@@ -1,4 +1,4 @@
-"""Compiled work on bricks of signed distances: what points say, what beams cleared, how pieces are put together.
+"""Compiled kernels on bricks of signed distances: integration of points and beams, and fusion of pieces.
 
 Bricks are those of the evidence grid (:mod:`graphslam.evidence.layout`): 8³ voxels, x fastest. Distances are in voxels,
 positive in front of a surface. Tables ``(nz, ny, nx)`` hold rows of bricks plus one, 0 where there is none.
@@ -13,25 +13,26 @@ import numpy as np
 from graphslam.evidence.kernels import kernel
 
 UNIT = 1024
-"""Distances and normals are summed up as whole numbers of this part of a voxel, so that their order means nothing."""
+"""Distances and normals are summed as integers in units of 1/1024 voxel, so that sums do not depend on their order."""
 ACROSS = 2
-"""A point speaks of voxels up to so far from it, along each axis [voxels]."""
+"""A point contributes to voxels up to this distance along each axis [voxels] …"""
 WIDE = 1.5
-"""… and so far along its own plane."""
+"""… and up to this distance along its plane …"""
 FRONT, BEHIND = 2.0, 2.0
-"""… and so far before its plane and behind it; from one voxel behind on with less weight."""
+"""… and up to this distance in front of its plane and behind it; beyond one voxel behind with less weight."""
 FULL = 16
-"""Weight of a point that lies right under the middle of a voxel."""
+"""Weight of a point whose normal passes through the voxel's centre."""
 NUM, WEIGHT, PASSED, HIT, NX, NY, NZ = 0, 1, 2, 3, 4, 5, 6
-"""Columns of sums: weighted distance, weight, beams that passed, points inside, weighted normal."""
+"""Columns of sums: weighted distance, weight, passing beams, points inside, weighted normal."""
 COLUMNS = 7
 MOST = 65535
-"""Weights and counts of a piece end here."""
+"""Limit of weights and counts of a piece."""
 
 
 @kernel()
 def point_weight(d, along):
-    """Weight 0 … `FULL` of a point for a voxel ``d`` before its plane and ``along`` from it in the plane [voxels]."""
+    """Weight 0 … `FULL` of a point for a voxel at distance ``d`` in front of its plane and ``along`` in the plane
+    [voxels]."""
     if along >= WIDE or d > FRONT or d <= -BEHIND:
         return 0
     w = FULL * (1.0 - along / WIDE)
@@ -42,7 +43,7 @@ def point_weight(d, along):
 
 @kernel()
 def mark_bricks(points, first, table):
-    """Mark with 1 every brick that a point (in voxels) may speak of."""
+    """Mark with 1 every brick that a point (in voxels) may contribute to."""
     for k in range(points.shape[0]):
         low = np.empty(3, np.int64)
         high = np.empty(3, np.int64)
@@ -57,9 +58,9 @@ def mark_bricks(points, first, table):
 
 @kernel()
 def add_planes(points, normals, first, table, sums):
-    """Add what points with normals (in voxels, turned to the sensor) say of the voxels around them.
+    """Integrate points (in voxels) with normals towards the sensor into the voxels around them.
 
-    The distance of a voxel's middle x is ``n · (x − p)``, as far as the plane through p holds.
+    The distance of a voxel's centre x is ``n · (x − p)``, with the plane through p.
     """
     for k in range(points.shape[0]):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
@@ -88,7 +89,8 @@ def add_planes(points, normals, first, table, sums):
 
 @kernel()
 def add_rays(points, origins, first, table, sums):
-    """Add distances along the beams, as a truncated signed distance does: the baseline of :func:`add_planes`."""
+    """Integrate distances along the beams, as in a truncated signed distance field: the baseline of
+    :func:`add_planes`."""
     for k in range(points.shape[0]):
         ox, oy, oz = origins[k, 0], origins[k, 1], origins[k, 2]
         dx, dy, dz = points[k, 0] - ox, points[k, 1] - oy, points[k, 2] - oz
@@ -115,7 +117,7 @@ def add_rays(points, origins, first, table, sums):
 
 @kernel()
 def count_passing_beams(points, origins, short, first, table, sums):
-    """Count the beams that pass through each voxel of the bricks; they end ``short`` voxels before their points."""
+    """Count the beams that pass through each voxel of the bricks; beams end ``short`` voxels before their points."""
     shape = table.shape
     for k in range(points.shape[0]):
         ox, oy, oz = origins[k, 0], origins[k, 1], origins[k, 2]
@@ -132,7 +134,7 @@ def count_passing_beams(points, origins, short, first, table, sums):
             row = 0
             if 0 <= bx < shape[2] and 0 <= by < shape[1] and 0 <= bz < shape[0]:
                 row = table[bz, by, bx]
-            if row == 0:  # to where the beam leaves this brick
+            if row == 0:  # advance to the exit of this brick
                 step = 1e9
                 for p, d, b in ((x, dx, bx + first[0]), (y, dy, by + first[1]), (z, dz, bz + first[2])):
                     if d > 1e-9:
@@ -152,9 +154,9 @@ def count_passing_beams(points, origins, short, first, table, sums):
 @kernel()
 def field_distances(sums, distance, normal, counts):
     """Distances ``(n, 512)`` float32, their gradients ``(n, 512, 3)`` int8 (in 1/127), and weight, beams and points
-    ``counts (n, 512, 3)`` uint16 of sums; 0 where nothing is.
+    ``counts (n, 512, 3)`` uint16 of sums; 0 without data.
 
-    The gradient is the mean normal: what the middle of a voxel is told about the plane goes on beside it.
+    The gradient is the mean normal; it extrapolates the distance from the voxel's centre.
     """
     for b in range(sums.shape[0]):
         for v in range(512):
@@ -169,9 +171,9 @@ def field_distances(sums, distance, normal, counts):
 
 @kernel()
 def reach_bricks(coordinates, R, t, found):
-    """Bricks of the world ``found (m, 3)`` that bricks of a piece at a pose (voxels) may touch; their number.
+    """World bricks ``found (m, 3)`` that bricks of a piece at a pose (voxels) may touch; returns their number.
 
-    Each piece brick gives the box around its turned cube; the same brick may come up often.
+    Each piece brick adds the bounding box of its rotated cube; bricks can be repeated.
     """
     count = 0
     for b in range(coordinates.shape[0]):
@@ -195,11 +197,11 @@ def reach_bricks(coordinates, R, t, found):
 
 @kernel()
 def pose_piece(bricks, rows, R, t, piece, sign, world, touched):
-    """Add what a piece at a pose says to bricks of the world, or take it away.
+    """Add a piece at a pose to world bricks, or subtract it.
 
     ``bricks (m, 3)``, ``rows (m,)`` of ``world (·, 512, 4)`` int32; ``piece``: first, table, distance, normal, counts.
-    A voxel takes the distance of the piece's voxel that its middle lies in **and its gradient times the offset**: the
-    nearest distance alone would be wrong by 0.29 voxels. ``touched (m,)``: whether the piece said anything there.
+    A voxel gets the distance of the piece's voxel at its centre **plus the gradient times the offset**, without which
+    the error is 0.29 voxels. ``touched (m,)``: has data there.
     """
     first, table, distance, normal, counts = piece
     shape = table.shape
@@ -236,11 +238,10 @@ def pose_piece(bricks, rows, R, t, piece, sign, world, touched):
 
 @kernel()
 def make_target(rows, world, figures, target, known):
-    """What the data say of each voxel: distance and trust ``target (·, 512, 2)``, and whether they say anything.
+    """Measured distance and confidence of each voxel ``target (·, 512, 2)``, and whether it is known.
 
-    ``figures``: weight from which on a voxel is known, and least beams, and beams for each point in it, for carving.
-    Trust is ``W / (W + 3)`` of W points. A voxel behind a surface that so many beams passed is free: the surface before
-    it has gone, or never was.
+    ``figures``: least weight of a known voxel, and least number of beams, total and per point, for carving. The
+    confidence is ``W / (W + 3)`` for W points. A voxel behind a surface that enough beams passed is free.
     """
     enough, least, per_hit = figures
     for k in range(rows.shape[0]):
@@ -261,7 +262,7 @@ def make_target(rows, world, figures, target, known):
 
 @kernel()
 def fill_block(b, near, phi, known, block, there):
-    """The 10³ voxels of a brick and what surrounds it: values, and whether they are known."""
+    """The 10³ voxels of a brick with its neighbours: values, and whether they are known."""
     for z in range(10):
         for y in range(10):
             for x in range(10):
@@ -277,7 +278,7 @@ def fill_block(b, near, phi, known, block, there):
 
 @kernel()
 def neighbour_values(block, there, z, y, x, step):
-    """Values on both sides along an axis, ``step`` its offset; one that is not known goes on in a straight line."""
+    """Values on both sides along an axis, ``step`` its offset; unknown ones are extrapolated linearly."""
     c = block[z, y, x]
     dz, dy, dx = step
     low, high = there[z - dz, y - dy, x - dx], there[z + dz, y + dy, x + dx]
@@ -292,7 +293,7 @@ def neighbour_values(block, there, z, y, x, step):
 
 @kernel()
 def mixed_difference(block, there, z, y, x, first, second):
-    """Mixed second difference along two axes; 0 where one of its four corners is not known."""
+    """Mixed second difference along two axes; 0 if one of its four corners is unknown."""
     total = 0.0
     for s in (-1, 1):
         for t in (-1, 1):
@@ -307,7 +308,7 @@ def mixed_difference(block, there, z, y, x, first, second):
 
 @kernel()
 def curvature(block, there, z, y, x):
-    """``κ |∇φ|`` of the level set through a voxel, at most 1 in size."""
+    """``κ |∇φ|`` of the level set through a voxel, limited to ±1."""
     xa, xb = neighbour_values(block, there, z, y, x, (0, 0, 1))
     ya, yb = neighbour_values(block, there, z, y, x, (0, 1, 0))
     za, zb = neighbour_values(block, there, z, y, x, (1, 0, 0))
@@ -345,8 +346,8 @@ def evolve_level_set(near, phi, other, target, known, rows, figures):
 def redistance(near, phi, other, start, known, rows, dt):
     """One step of ``∂φ/∂τ = sgn(φ₀)(1 − |∇φ|)`` from ``phi`` into ``other``, upwind, with Russo and Smereka's fix.
 
-    Beside a change of sign of ``start`` (φ₀) a voxel is drawn to its distance ``φ₀ / |∇φ₀|``, so that the zero set
-    stays where it was.
+    Next to a change of sign of ``start`` (φ₀) a voxel relaxes to its distance ``φ₀ / |∇φ₀|``, so that the zero set does
+    not move.
     """
     block, there = np.zeros((10, 10, 10)), np.zeros((10, 10, 10), np.uint8)
     origin, same = np.zeros((10, 10, 10)), np.zeros((10, 10, 10), np.uint8)

@@ -1,9 +1,9 @@
-"""A surface made of pieces that move with the nodes of the graph: after a loop closure no scan is read again.
+"""Surface of pieces that move with the nodes of the graph: a loop closure does not need the scans again.
 
-The world holds whole numbers: the sum of what all pieces say of each voxel. A piece that moves is taken out where it
-was and put in where it is; then the level set is evolved anew around the bricks that changed, and nowhere else. Sums of
-whole numbers have no order, and a fixed number of steps reaches a fixed number of voxels, so the surface is bit for bit
-the one that is made anew at the same poses.
+Each world voxel has the integer sum over all pieces. A piece that moves is subtracted at its old pose and added at its
+new one; then the level set is evolved again around the changed bricks only. Integer sums do not depend on their order,
+and a fixed number of steps reaches a fixed number of voxels, so the surface is bitwise equal to one made from scratch
+at the same poses.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from graphslam.maps.surface.piece import Scan, SurfaceConfig, SurfacePiece, piec
 PieceId: TypeAlias = Hashable
 Ints = npt.NDArray[np.int64]
 _ROUND = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[:, ::-1]
-"""Steps ``(27, 3)`` to the bricks around one, x fastest."""
+"""Offsets ``(27, 3)`` of a brick's neighbourhood, x fastest."""
 _BIAS = 1 << 20
 
 
 class SurfaceLayer:
-    """Pieces at poses, and the signed distance that they make."""
+    """Surface pieces with poses, and their signed distance field."""
 
     def __init__(self, config: SurfaceConfig | None = None) -> None:
         self.config = config or SurfaceConfig()
         self.pieces: dict[PieceId, SurfacePiece] = {}
         self.poses: dict[PieceId, Array] = {}
-        self._keys = np.zeros(0, np.int64)  # of bricks, ascending …
+        self._keys = np.zeros(0, np.int64)  # keys of bricks, ascending …
         self._rows = np.zeros(0, np.int64)  # … and their rows in the arrays
         self._sums = np.zeros((0, BRICK_VOXELS, 4), np.int32)
         self._pieces_in = np.zeros(0, np.int32)
@@ -51,18 +51,18 @@ class SurfaceLayer:
         self._phi = np.zeros((0, BRICK_VOXELS), np.float32)
         self._changed: set[int] = set()
         self.evolved = 0
-        """Bricks that the last :meth:`update` evolved."""
+        """Number of bricks that the last :meth:`update` evolved."""
 
     # --- pieces ----------------------------------------------------------------------------------------------
 
     def read(self, name: PieceId, scans: Iterable[Scan], pose: Array) -> SurfacePiece:
-        """Make the piece of a node of scans in the world frame, the node at ``pose`` ``(7,)``."""
+        """Make the piece of a node at ``pose`` ``(7,)`` from scans in the world frame."""
         piece = piece_of_scans(scans, pose, self.config)
         self.add(name, piece, pose)
         return piece
 
     def add(self, name: PieceId, piece: SurfacePiece, pose: Array) -> None:
-        """Put a piece in at a pose ``(7,)``."""
+        """Add a piece at a pose ``(7,)``."""
         if name in self.pieces:
             raise DataError(f"the surface of node {name!r} is there already")
         T = np.array(pose, dtype=np.float64)
@@ -70,7 +70,7 @@ class SurfaceLayer:
         self.pieces[name], self.poses[name] = piece, T
 
     def move(self, poses: Mapping[PieceId, Array]) -> int:
-        """Put pieces at other poses ``(7,)``; number of those that moved."""
+        """Move pieces to other poses ``(7,)``; returns the number of moved pieces."""
         strange = [name for name in poses if name not in self.pieces]
         if strange:
             raise DataError("no surface was read at this node", got=strange[0])
@@ -84,7 +84,7 @@ class SurfaceLayer:
     # --- the signed distance ---------------------------------------------------------------------------------
 
     def update(self) -> Ints:
-        """Evolve what changed; coordinates ``(n, 3)`` of the bricks whose distances were made anew.
+        """Evolve the changed parts; returns the coordinates ``(n, 3)`` of the bricks with new distances.
 
         Bricks without any value are freed.
         """
@@ -123,7 +123,7 @@ class SurfaceLayer:
         return np.concatenate([_keys_to(reached)])
 
     def bricks(self) -> tuple[Ints, Array, npt.NDArray[np.bool_]]:
-        """Coordinates ``(n, 3)`` in ascending order, distances ``(n, 512)`` [voxels], and which voxels are known."""
+        """Coordinates ``(n, 3)`` in ascending order, distances ``(n, 512)`` [voxels], and mask of known voxels."""
         if self._changed:
             self.update()
         rows = self._rows
@@ -134,7 +134,7 @@ class SurfaceLayer:
 
     @property
     def nbytes(self) -> int:
-        """Memory of pieces and of the world [bytes]."""
+        """Memory of the pieces and the world [bytes]."""
         own = (self._sums, self._target, self._known, self._phi)
         return sum(p.nbytes for p in self.pieces.values()) + sum(a.nbytes for a in own)
 
@@ -160,7 +160,7 @@ class SurfaceLayer:
         self._drop(np.array([k for k in keys[empty].tolist() if k not in self._changed], np.int64))
 
     def _find(self, keys: Ints) -> Ints:
-        """Rows of bricks, −1 where there is none; of keys, or of coordinates ``(n, 3)``."""
+        """Rows of bricks given by keys or coordinates ``(n, 3)``; −1 if there is none."""
         wanted = _to_keys(keys) if keys.ndim == 2 else keys
         if not len(self._keys):
             return np.full(len(wanted), -1, np.int64)
@@ -194,7 +194,7 @@ class SurfaceLayer:
 
 
 def _to_keys(coordinates: Ints) -> Ints:
-    """Whole numbers that order bricks by z, y, x."""
+    """Integer keys that sort bricks by z, y, x."""
     c = coordinates + _BIAS
     if len(c) and (c.min() < 0 or c.max() >= 2 * _BIAS):
         raise GridError("a surface reaches too far from its origin", got=f"{8 * np.abs(coordinates).max()} voxels")
@@ -207,7 +207,7 @@ def _keys_to(keys: Ints) -> Ints:
 
 
 def _around(keys: Ints, reach: int) -> Ints:
-    """Keys of bricks and of those within ``reach`` of them, ascending."""
+    """Keys of bricks and their neighbours within ``reach``, ascending."""
     for _ in range(reach):
         keys = np.unique(_to_keys((_keys_to(keys)[:, None, :] + _ROUND).reshape(-1, 3)))
     return keys

@@ -1,4 +1,4 @@
-"""Triangles of the zero set of a surface, what they hang on, and files of them."""
+"""Triangle mesh of the zero set of a surface, its position uncertainty, and mesh files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graphslam.maps.surface.piece import SurfacePiece
 
 Ints = npt.NDArray[np.int64]
 TILE = 8
-"""Bricks along the edge of the cubes in which triangles are made; only those with a change are made anew."""
+"""Bricks along the edge of a mesh tile; only changed tiles are recomputed."""
 FORMATS = (".ply", ".glb", ".obj")
 _SPAN = 8 * TILE
 
@@ -64,7 +64,7 @@ class Mesh:
 def zero_set(bricks: tuple[Ints, Array, npt.NDArray[np.bool_]], voxel: float) -> Mesh:
     """Triangles of the zero set of bricks ``(coordinates, distances, known)``; see :meth:`SurfaceLayer.bricks`.
 
-    Only cells all of whose eight corners are known have triangles, so a surface ends where nobody looked.
+    Only cells with eight known corners have triangles, so a surface ends at unknown space.
     """
     mesher = Mesher(voxel)
     mesher.update(*bricks)
@@ -72,7 +72,7 @@ def zero_set(bricks: tuple[Ints, Array, npt.NDArray[np.bool_]], voxel: float) ->
 
 
 class Mesher:
-    """Triangles tile by tile: after a change only the tiles around it are made anew.
+    """Mesh in tiles: after a change only the tiles around it are recomputed.
 
     Parameters
     ----------
@@ -85,20 +85,20 @@ class Mesher:
         self.tiles: dict[tuple[int, int, int], tuple[Array, Ints]] = {}
 
     def update(self, coordinates: Ints, phi: Array, known: npt.NDArray[np.bool_], changed: Ints | None = None) -> int:
-        """Make triangles anew; number of tiles.
+        """Recompute triangles; returns the number of tiles.
 
         Parameters
         ----------
         coordinates : (n, 3)
-            Of all bricks.
+            Coordinates of all bricks.
         phi, known : (n, 512)
         changed : (m, 3), optional
-            Bricks that changed or are gone; default all.
+            Bricks that changed or were removed; default all.
         """
         if changed is None:
             self.tiles.clear()
             changed = coordinates
-        # the cells of a tile end in the first layer of the next one
+        # the cells of a tile extend to the first layer of the next one
         dirty = np.unique(np.concatenate([changed // TILE, (changed - 1) // TILE, *_edges(changed)]), axis=0)
         owner: dict[tuple[int, int, int], list[int]] = {}
         wanted = {(int(x), int(y), int(z)) for x, y, z in dirty}
@@ -118,14 +118,14 @@ class Mesher:
         return len(wanted)
 
     def mesh(self) -> Mesh:
-        """All tiles, their common vertices made one."""
+        """Mesh of all tiles; common vertices are merged."""
         parts = [self.tiles[t] for t in sorted(self.tiles)]
         if not parts:
             return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
         start = np.cumsum([0, *(len(v) for v, _ in parts)])
         vertices = np.concatenate([v for v, _ in parts])
         triangles = np.concatenate([t + s for (_, t), s in zip(parts, start.tolist())])
-        # a vertex lies on one edge of the lattice: equal places are equal edges
+        # a vertex is on one edge of the lattice: equal positions are the same edge
         _, first, back = np.unique(
             np.round(vertices * 4096.0).astype(np.int64), axis=0, return_index=True, return_inverse=True
         )
@@ -139,7 +139,7 @@ class Mesher:
 
 
 def _edges(changed: Ints) -> list[Ints]:
-    """Tiles that a brick on the lower side of its tile belongs to as well, one for each set of axes."""
+    """Neighbouring tiles that a brick on the lower side of its tile also belongs to, one array per set of axes."""
     out = []
     for k in range(1, 7):
         back = np.array([k & 1, (k >> 1) & 1, (k >> 2) & 1])
@@ -164,22 +164,22 @@ def _triangles(
         cells &= there[dz : n - 1 + dz, dy : n - 1 + dy, dx : n - 1 + dx]
     if not cells.any() or not (values[there].min() < 0.0 < values[there].max()):
         return None
-    values[values == 0.0] = 1e-6  # a corner right on the surface would be a vertex of many edges
+    values[values == 0.0] = 1e-6  # a corner exactly on the surface would be a vertex of many edges
     mask = np.zeros((n, n, n), np.bool_)
-    mask[1:, 1:, 1:] = cells  # of a cell, its last corner
+    mask[1:, 1:, 1:] = cells  # indexed by the last corner of a cell
     try:
         vertices, triangles, _, _ = measure.marching_cubes(values, 0.0, mask=mask, allow_degenerate=False)
-    except (RuntimeError, ValueError):  # no cell of the mask is crossed
+    except (RuntimeError, ValueError):  # the surface crosses no cell of the mask
         return None
     at = vertices[:, ::-1].astype(np.float64) + 0.5 + _SPAN * np.array(tile)
-    return at, triangles[:, ::-1].astype(np.int64)  # axes were turned round: so are triangles
+    return at, triangles[:, ::-1].astype(np.int64)  # reversed axes reverse the orientation
 
 
-# --- what a mesh hangs on ----------------------------------------------------------------------------------------
+# --- uncertainty of vertices ----------------------------------------------------------------------------------------
 
 
 def vertex_owners(mesh: Mesh, layer: SurfaceLayer) -> npt.NDArray[np.int64]:
-    """Number of the piece, in the layer's order, that says most of each vertex ``(v,)``; −1 where none speaks."""
+    """Index of the piece, in the layer's order, with the largest weight at each vertex ``(v,)``; −1 if none."""
     best, out = np.zeros(len(mesh.vertices)), np.full(len(mesh.vertices), -1, np.int64)
     for k, (name, piece) in enumerate(layer.pieces.items()):
         w = _weight_at(piece, mesh.vertices, layer.poses[name], layer.config.voxel)
@@ -203,10 +203,10 @@ def _weight_at(piece: SurfacePiece, points: Array, T: Array, voxel: float) -> Ar
 
 
 def position_sigma(mesh: Mesh, layer: SurfaceLayer, covariances: Mapping[PieceId, Array]) -> Array:
-    """Standard deviation of the place of every vertex ``(v,)`` [m] that comes of the pose of its node.
+    """Standard deviation of every vertex position ``(v,)`` [m] from the pose covariance of its node.
 
-    Of a vertex ``p = R q + t``, with the node's covariance in its right tangent (rotation, translation):
-    ``J = R [−[q]×, I]``, ``σ² = trace(J Σ Jᵀ)``. NaN where no piece speaks or no covariance is given.
+    For a vertex ``p = R q + t``, with the node's covariance in its right tangent (rotation, translation):
+    ``J = R [−[q]×, I]``, ``σ² = trace(J Σ Jᵀ)``. NaN without a piece or a covariance.
     """
     out = np.full(len(mesh.vertices), np.nan)
     own = vertex_owners(mesh, layer)
@@ -222,7 +222,7 @@ def position_sigma(mesh: Mesh, layer: SurfaceLayer, covariances: Mapping[PieceId
         J[:, 0, 1], J[:, 0, 2] = q[:, 2], -q[:, 1]
         J[:, 1, 0], J[:, 1, 2] = -q[:, 2], q[:, 0]
         J[:, 2, 0], J[:, 2, 1] = q[:, 1], -q[:, 0]
-        out[mine] = np.sqrt(np.einsum("nij,jk,nik->n", J, S, J))  # a turn R keeps the trace
+        out[mine] = np.sqrt(np.einsum("nij,jk,nik->n", J, S, J))  # rotation by R does not change the trace
     return out
 
 

@@ -1,4 +1,4 @@
-"""What the scans of one node say of the surfaces around it: bricks of signed distances in the node's own frame."""
+"""Surface piece of one node: bricks of signed distances from its scans, in the node's frame."""
 
 from __future__ import annotations
 
@@ -25,44 +25,47 @@ from graphslam.maps.surface.field_kernels import (
 
 Ints = npt.NDArray[np.int64]
 Scan: TypeAlias = tuple[Array, Array]
-"""Points ``(n, 3)`` and the place of the scanner ``(3,)``, or one for each point ``(n, 3)`` [m]."""
+"""Points ``(n, 3)`` and the position of the scanner ``(3,)``, or one per point ``(n, 3)`` [m]."""
 _TABLE_LIMIT = 1 << 27
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceConfig:
-    """How surfaces are made."""
+    """Configuration of the surface reconstruction."""
 
     voxel: float = 0.05
     """Edge of a voxel [m]."""
     normal_radius: float = 0.3
-    """The plane of a point is that of its neighbours within this [m]; fewer than five make none."""
+    """Radius of the neighbours for the plane of a point [m]; at least five are needed."""
     normal_neighbours: int = 30
-    """… and of the nearest so many at most."""
+    """… and the largest number of neighbours."""
     most_range: float = 40.0
-    """Points farther from the scanner are left out [m]."""
+    """Points farther from the scanner are ignored [m]."""
     data: str = "planes"
-    """``planes``: distances to the plane of each point; ``rays``: along its beam, as a truncated signed distance."""
+    """``planes``: distances to the plane of each point; ``rays``: along its beam, as in a truncated signed distance
+    field."""
     enough: float = 0.06
-    """A voxel is known from so many points on, each right under its middle; one at its rim is a sixteenth."""
+    """Least weight of a known voxel: a point whose normal passes through its centre counts 1, at the rim 1/16."""
     flatness: float = 4.0
-    """A point has a plane where its neighbours scatter by so much more (in squares) along it than across it."""
+    """Least ratio of the scatter (squared) along the plane to that across it."""
     carving: bool = True
-    """Beams clear what they passed through."""
+    """Beams carve free space."""
     carve_beams: int = 4
-    """A voxel behind a surface is free where at least so many beams passed …"""
+    """A voxel behind a surface is free if at least this number of beams passed …"""
     carve_ratio: float = 3.0
-    """… and more than this for each point in it."""
+    """λ: weight of curvature relative to the data (W / (W + 3) for W points); in voxel units, so that its error
+    decreases with the square of the voxel size."""
     smoothing: float = 0.1
-    """λ: weight of curvature beside the data, whose weight is W / (W + 3) of W points; in units of voxels, so that
-    its error shrinks with the square of their size."""
+    """λ: weight of curvature relative to the data, whose weight is W / (W + 3) for W points; in voxel units, so that
+    its error decreases with the square of the voxel size."""
     steps: int = 6
-    """Of the evolution …"""
+    """… and of the redistancing. Both are fixed: a voxel depends only on voxels up to that distance, so changes can be
+    recomputed locally with a bitwise equal result."""
     redistance_steps: int = 2
-    """… and of making it a distance again. Both are fixed: a voxel depends on others at most so many voxels away, so
-    what changed somewhere can be made anew there and nowhere else, bit for bit."""
+    """… and of the redistancing. Both are fixed, so a voxel depends only on voxels up to that distance, and changes can
+    be recomputed locally with a bitwise equal result."""
     dt: float = 0.2
-    """Length of a step of the evolution."""
+    """Step size of the evolution."""
 
     def __post_init__(self) -> None:
         for name in ("voxel", "normal_radius", "most_range", "enough", "flatness", "carve_ratio", "dt"):
@@ -81,22 +84,22 @@ class SurfaceConfig:
 
     @property
     def halo(self) -> int:
-        """Bricks that a change may reach beyond its own."""
+        """Number of bricks that a change can reach."""
         return -(-(self.steps + self.redistance_steps) // 8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePiece:
-    """Sums in bricks that move with one node.
+    """Bricks of signed distances that move with one node.
 
     Parameters
     ----------
     coordinates : (n, 3) int64
-        Of the bricks, in the node's frame; each once.
+        Coordinates of the bricks in the node's frame; each once.
     distance : (n, 512) float32
     normal : (n, 512, 3) int8
     counts : (n, 512, 3) uint16
-        Distances, their gradients, and weight, beams that passed and points of every voxel; see
+        Distances, their gradients, and weight, passing beams and points of every voxel; see
         :func:`~graphslam.maps.surface.field_kernels.field_distances`.
     """
 
@@ -130,7 +133,7 @@ class SurfacePiece:
 
 
 def _box(coordinates: Ints) -> tuple[Ints, Ints]:
-    """First brick ``(3,)`` and shape of the box around bricks."""
+    """First brick ``(3,)`` and shape of the bounding box of bricks."""
     if not len(coordinates):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     first = coordinates.min(axis=0)
@@ -141,9 +144,9 @@ def _box(coordinates: Ints) -> tuple[Ints, Ints]:
 
 
 def normals_of(points: Array, towards: Array, config: SurfaceConfig) -> Array:
-    """Normals ``(n, 3)`` of points, turned to where they were seen from ``(n, 3)``; NaN where too few others are near.
+    """Normals ``(n, 3)`` of points, oriented towards the sensor positions ``(n, 3)``; NaN with too few neighbours.
 
-    The direction in which a point's neighbours scatter least.
+    A normal is the direction of least scatter of the neighbours.
     """
     out = np.full((len(points), 3), np.nan)
     if len(points) < 5:
@@ -158,13 +161,13 @@ def normals_of(points: Array, towards: Array, config: SurfaceConfig) -> Array:
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
     n = vectors[..., 0]
     n = n * np.where(np.sum(n * (towards - points), axis=1) < 0.0, -1.0, 1.0)[:, None]
-    flat = (count >= 5) & (values[:, 1] > config.flatness * values[:, 0])  # points along a line have no plane
+    flat = (count >= 5) & (values[:, 1] > config.flatness * values[:, 0])  # points on a line define no plane
     out[flat] = n[flat]
     return out
 
 
 def piece_of_scans(scans: Iterable[Scan], pose: Array, config: SurfaceConfig) -> SurfacePiece:
-    """The piece of a node at ``pose`` ``(7,)`` of scans whose points and scanner are in the world frame."""
+    """The piece of a node at ``pose`` ``(7,)`` from scans with points and scanner positions in the world frame."""
     parts, origins = [], []
     to_node = se3.se3_inverse(np.asarray(pose, dtype=np.float64))
     for points, origin in scans:
@@ -189,7 +192,7 @@ def piece_of_scans(scans: Iterable[Scan], pose: Array, config: SurfaceConfig) ->
 def piece_of_planes(
     points: Array, seen_from: Array, normals: Array, flat: npt.NDArray[np.bool_], config: SurfaceConfig
 ) -> SurfacePiece:
-    """A piece of points ``(n, 3)`` with normals in the node's frame; those that are not ``flat`` only carve."""
+    """A piece from points ``(n, 3)`` with normals in the node's frame; points that are not ``flat`` only carve."""
     p = np.ascontiguousarray(points / config.voxel)
     at = np.floor(p[flat]).astype(np.int64) // 8
     first, shape = _box(at)

@@ -1,1 +1,1 @@
-"""Where a vehicle can drive: obstacles, edges, holes and free ground, with probabilities."""
+"""Traversability maps for a vehicle: obstacles, edges, holes and free ground, with probabilities."""

@@ -1,6 +1,6 @@
-"""Where up is, and how high a scanner stands, found from the ground in its own scans.
+"""Vertical direction and height of a scanner, estimated from the ground in its scans.
 
-The frame of a recorded path need not be level, and a scanner that is carried by hand has no fixed height.
+The frame of a recorded path can be tilted, and a hand-carried scanner has no fixed height.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class GroundPlane:
     Parameters
     ----------
     up : (3,)
-        Its normal, upwards, in the frame of the points.
+        Upward normal in the frame of the points.
     below : float
         Height of the scanner above it [m].
     """
@@ -37,18 +37,18 @@ class GroundPlane:
 
 
 def ground_plane(points: Array, origin: Array, up: Array, height: float | None = None) -> GroundPlane | None:
-    """The plane of the lowest points of the squares around a scanner; None where no such plane is near.
+    """Plane through the lowest points of the squares around a scanner; None if there is none.
 
     Parameters
     ----------
     points : (n, 3)
         [m]
     origin : (3,)
-        Of the scanner.
+        Position of the scanner.
     up : (3,)
-        About where up is; the ground is looked for within 20° of it.
+        Approximate upward direction; the ground normal must be within 20° of it.
     height : float, optional
-        Of the scanner above the ground, where it is known about [m]; what is not within 0.5 m of that is no ground.
+        Approximate height of the scanner above the ground [m]; points more than 0.5 m off are not ground.
     """
     R = level_rotation(up)
     q = (np.asarray(points, dtype=np.float64) - origin) @ R.T
@@ -63,7 +63,7 @@ def ground_plane(points: Array, origin: Array, up: Array, height: float | None =
         np.flatnonzero(np.any(np.diff(square, axis=0, prepend=square[:1] - 1), axis=1)) if len(q) else np.zeros(0, int)
     )
     many = np.diff(np.append(first, len(q)))
-    low = q[first[many >= 3] + many[many >= 3] // 10]  # not the very lowest: a stray beam
+    low = q[first[many >= 3] + many[many >= 3] // 10]  # not the lowest one, which can be a stray beam
     if len(low) < _LEAST:
         return None
     plane = np.array([0.0, 0.0, float(np.median(low[:, 2]))])  # z = a x + b y + c
@@ -81,7 +81,7 @@ def ground_plane(points: Array, origin: Array, up: Array, height: float | None =
 
 
 def level_rotation(up: Array) -> npt.NDArray[np.float64]:
-    """The least rotation ``(3, 3)`` that turns ``up`` into z."""
+    """The smallest rotation ``(3, 3)`` that rotates ``up`` to z."""
     u = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     axis = np.cross(u, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
@@ -91,7 +91,7 @@ def level_rotation(up: Array) -> npt.NDArray[np.float64]:
 
 
 def common_up(planes: list[GroundPlane | None]) -> Array:
-    """Where up is for a whole path: the mean of its planes' normals, those that differ by more than 10° left out."""
+    """Upward direction of a whole path: mean of the plane normals, without those that differ by more than 10°."""
     normals = np.array([p.up for p in planes if p is not None])
     if len(normals) < 3:
         raise DataError(

@@ -1,10 +1,9 @@
-"""The terrain of a run as pieces that move with the nodes of the graph: after a loop closure no scan is read again.
+"""Terrain of a run as pieces that move with the nodes of the graph: a loop closure does not need the scans again.
 
-What was seen while a node was the last one is summed up in that node's level frame (place and yaw), in the cells of
-each range band. A world cell takes what the piece says of the cell that its middle lies in; all sums are of whole
-numbers. So a map whose pieces were moved one by one is, bit for bit, the map that is made anew at the same poses.
-
-Statements are relative to the ground of their own line and do not feel a change of tilt.
+The observations between a node and the next are summed in the node's level frame (position and yaw), in the cells of
+each range band. A world cell gets the values of the piece's cell at its centre; all sums are integers. So a map with
+moved pieces is bitwise equal to one made from scratch at the same poses. Detections are relative to the ground of their
+own line, so a change of tilt does not affect them.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TerrainPiece:
-    """What lines said of the cells around a node.
+    """Detections of scan lines in the cells around a node.
 
     Parameters
     ----------
     cells : (n, 3) int64
-        Band, ix, iy in the node's level frame, each once.
+        Band, ix, iy in the node's level frame; unique.
     ratios : (2, n) int32
     counts : (4, n) int32
     heights : (3, n) int64
         Heights above the node; see :func:`~graphslam.maps.terrain.line_kernels.add_rows`.
     pose : (7,)
-        Of the node when the piece was made.
+        Pose of the node when the piece was made.
     """
 
     cells: Ints
@@ -57,7 +56,7 @@ class TerrainPiece:
 
 
 def piece_of(rows: Rows, tables: TerrainWeights, pose: Array) -> TerrainPiece:
-    """Sum up statements ``(k, 6)`` that were made in the level frame of a node."""
+    """Sum up detections ``(k, 6)`` in the level frame of a node."""
     bands = tables.bands
     first, last = np.full((bands, 2), 1 << 40), np.full((bands, 2), -(1 << 40))
     bound_rows(rows, first, last)
@@ -66,7 +65,7 @@ def piece_of(rows: Rows, tables: TerrainWeights, pose: Array) -> TerrainPiece:
     n = int(offsets[-1])
     ratios, counts, heights = np.zeros((2, n), np.int32), np.zeros((4, n), np.int32), np.zeros((3, n), np.int64)
     add_rows(rows, first, shapes, offsets, tables.ratios, ratios, counts, heights)
-    said = np.flatnonzero(counts.any(axis=0))  # ground is always said to have support, too
+    said = np.flatnonzero(counts.any(axis=0))  # ground detections always have a support detection, too
     band = np.searchsorted(offsets, said, side="right") - 1
     iy, ix = np.divmod(said - offsets[band], shapes[band, 1])
     cells = np.column_stack([band, ix + first[band, 0], iy + first[band, 1]])
@@ -75,7 +74,7 @@ def piece_of(rows: Rows, tables: TerrainWeights, pose: Array) -> TerrainPiece:
 
 
 class TerrainLayer:
-    """Pieces at poses, and the map that they make.
+    """Terrain pieces with poses, and their map.
 
     Parameters
     ----------
@@ -94,7 +93,7 @@ class TerrainLayer:
     def read(
         self, name: PieceId, lines: Iterable[ScanLines], pose: Array, config: DetectorConfig | None = None
     ) -> TerrainPiece:
-        """Make the piece of a node of lines in the world frame, the node at ``pose`` ``(7,)``."""
+        """Make the piece of a node at ``pose`` ``(7,)`` from lines in the world frame."""
         if name in self.pieces:
             raise DataError(f"the terrain of node {name!r} is there already")
         edges = self.sensor.band_edges(self.cells)
@@ -107,9 +106,9 @@ class TerrainLayer:
         return piece
 
     def move(self, poses: Mapping[PieceId, Array]) -> int:
-        """Put pieces at other poses ``(7,)``; number of those that moved.
+        """Move pieces to other poses ``(7,)``; returns the number of moved pieces.
 
-        Only what the moved ones say is taken out of the map and put in at its new place.
+        Only the moved pieces are subtracted from the map and added at their new poses.
         """
         strange = [name for name in poses if name not in self.pieces]
         if strange:
@@ -130,12 +129,12 @@ class TerrainLayer:
         return len(moved)
 
     def pyramid(self) -> Pyramid:
-        """All pieces at their poses."""
+        """Evidence of all pieces at their poses."""
         if self._made is None:
             box = self._box({})
             if box is None:
                 raise GridError("a map of the terrain without any piece that says something")
-            margin = 4.0  # a loop moves pieces by some metres: no new box each time
+            margin = 4.0  # a loop moves pieces by some metres: avoids a new box each time
             grown = (box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin)
             self._made = Pyramid(grown, self.tables, self.vehicle, self.sensor, self.cells)
             for name, piece in self.pieces.items():
@@ -159,7 +158,7 @@ class TerrainLayer:
 
 
 def _placed(T: Array) -> tuple[float, float, float, int]:
-    """Place, yaw, and height in whole millimetres: what a piece is put by."""
+    """Position, yaw, and height in integer millimetres, which determine the cells of a piece."""
     return (float(T[0]), float(T[1]), _yaw(T), round(1000.0 * float(T[2])))
 
 
@@ -194,7 +193,7 @@ def _inside(box: Box | None, made: Pyramid) -> bool:
 
 
 def _add(made: Pyramid, piece: TerrainPiece, T: Array, sign: int) -> None:
-    """Add a piece at a pose, or take it away."""
+    """Add (or subtract) a piece at a pose."""
     yaw, height = _yaw(T), round(1000.0 * float(T[2]))
     c, s = math.cos(yaw), math.sin(yaw)
     for b, width in enumerate(made.cells.tolist()):

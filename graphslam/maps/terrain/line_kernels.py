@@ -1,8 +1,7 @@
-"""Compiled detectors: what one scan line says of the ground, cell by cell.
+"""Compiled detectors of steps, missing support and obstacles in one scan line, per cell.
 
-A line is read from its lowest beam upwards. Each statement is one row
-``(line, band, ix, iy, channel, value)`` int32; of the channels below `GROUND`, a line makes one statement a cell, the
-largest value.
+A line is processed from its lowest beam upwards. Each detection is one row ``(line, band, ix, iy, channel, value)``
+int32; for the channels below `GROUND`, a line has one detection per cell, the largest value.
 """
 
 from __future__ import annotations
@@ -16,19 +15,19 @@ from graphslam.core.geometry import Array
 from graphslam.evidence.kernels import kernel
 
 STEP, SUPPORT, OVERHANG, ABOVE, GROUND, ROUGH = 0, 1, 2, 3, 4, 5
-"""Channels: height of a step [cm], depth of missing support [cm], something at the height of the vehicle [1], something
-above its reach [1], height of the ground [mm], roughness of the ground [mm]."""
+"""Channels: height of a step [cm], depth of missing support [cm], obstacle at the height of the vehicle [1], object
+above the vehicle [1], height of the ground [mm], roughness of the ground [mm]."""
 
 
 class BandCells(NamedTuple):
-    """Cells of the bands."""
+    """Cells of the range bands."""
 
     edges: Array
     """Ranges at which the bands end ``(b,)`` [m]."""
     cells: Array
     """Widths of their cells ``(b,)`` [m]."""
     nearest: float
-    """Nothing is said of what is nearer to the sensor than this [m]."""
+    """Detections nearer to the sensor are ignored [m]."""
 
 
 class DetectorSettings(NamedTuple):
@@ -51,11 +50,11 @@ class DetectorSettings(NamedTuple):
 
 @kernel()
 def put_row(out, key, value, where, lattice):
-    """Write a statement, or raise the value of the one that this line made of the same cell.
+    """Write a detection, or increase the value of the one of the same line and cell.
 
-    ``out``: rows, slots of statements (a power of 2), the number of rows so far and that before this line ``(2,)``;
-    ``key``: line and channel; ``where``: x, y and range from the sensor. Beyond the last band and nearer than the first
-    nothing is written.
+    ``out``: rows, hash slots (a power of 2), the number of rows so far and that before this line ``(2,)``; ``key``:
+    line and channel; ``where``: x, y and range from the sensor. Nothing is written beyond the last band or nearer than
+    the first.
     """
     rows, slots, total = out
     x, y, r = where
@@ -84,9 +83,9 @@ def put_row(out, key, value, where, lattice):
 
 @kernel()
 def smooth_heights(s, z, n, reach, out):
-    """``out``: mean height of each point and of those before and after it until one is ``reach`` farther or nearer.
+    """``out``: mean height of each point and its neighbours on both sides within ``reach``.
 
-    Neighbours whose height differs by more than that are on something else: a curb stays sharp.
+    Neighbours whose height differs by more than that are excluded: a curb stays sharp.
     """
     for i in range(n):
         total, many = z[i], 1
@@ -101,19 +100,19 @@ def smooth_heights(s, z, n, reach, out):
 
 @kernel()
 def follow_ground(s, z, n, foot, f, ground, chain):
-    """Which points ``ground (n,)`` are on the ground, 1 where it led there and 2 on another level, and what each found
-    before it: ``chain (n, 4)``.
+    """Classify ground points ``ground (n,)``: 1 continued from the previous ground, 2 on another level; and the state
+    before each point, ``chain (n, 4)``.
 
-    ``chain``: place and height of the last ground point before on which the vehicle can be, the slope of the ground
-    there, and 1 where something stands in between. Where the line climbs by more than the vehicle does, it cannot be on
-    what is narrower than it: a rail, a hedge, a bumper. There the last point is that before the climb; where the first
-    ground that is seen lies higher than the foot by so much, it is at that place, as high as the foot. A point is on
-    the ground if it lies where the ground leads within ``residual + residual_rate · way``; a level that goes on for
-    three points above (at most ``clearance``) or six below becomes the ground.
+    ``chain``: range and height of the last previous ground point on which the vehicle can be, the ground slope there,
+    and 1 if an obstacle is in between. If the line climbs more than the vehicle can, the vehicle cannot be on anything
+    narrower than itself (rail, hedge, bumper); then the last point is that before the climb. If the first observed
+    ground is higher than the foot by that much, the last point is at that range with the height of the foot. A point is
+    on the ground if it differs from the extrapolated ground by at most ``residual + residual_rate · distance``; a level
+    of three points above (at most ``clearance``) or six below becomes the ground.
     """
     last_s, last_z, slope = 0.0, foot, 0.0
-    from_s, from_z = 0.0, foot  # of the slope: half a metre back
-    first = 0  # of the ground points that the slope may be taken from
+    from_s, from_z = 0.0, foot  # for the slope: about 0.5 m back
+    first = 0  # first ground point for the slope
     run, side, blocked, found = 0, 0, 0.0, False
     raised, base_s, base_z, from_raised = False, 0.0, foot, 0.0
     for i in range(n):
@@ -123,7 +122,7 @@ def follow_ground(s, z, n, foot, f, ground, chain):
         ground[i] = 0
         way = s[i] - last_s
         off = z[i] - (last_z + slope * way)
-        # the lowest beam may meet the ground far from the sensor: there the ground is known first
+        # the lowest beam can meet the ground far from the sensor, which is then the first known ground
         near = way < 2.0 * f.memory or not found
         if way > -0.05 and abs(off) < f.residual + f.residual_rate * max(way, 0.0) and near:
             accept = 1
@@ -153,15 +152,15 @@ def follow_ground(s, z, n, foot, f, ground, chain):
         first_seen = not found
         ground[i], found = accept, True
         if accept == 1 and abs(way) < 0.03:
-            continue  # the foot of a wall is not climbed point by point
+            continue  # do not follow a wall upwards point by point
         if first_seen and z[i] - foot > f.climb:
-            # nothing was seen of the way up to here: a slope, or a bumper before the lowest beam
+            # the ground up to here was not observed: a slope, or a bumper below the lowest beam
             raised, base_s, base_z, from_raised = True, s[i], foot, s[i]
         elif raised:
             on_it = z[i] - base_z - f.slack * (s[i] - base_s) > f.climb
             raised = on_it and s[i] - from_raised < f.width
         else:
-            # the lowest of the ground that the line climbs from within a step's window, or the point before
+            # lowest ground within the step window before the climb, or the previous point
             low_s, low_z = last_s, last_z
             for j in range(i - 1, -1, -1):
                 if s[i] - s[j] > f.window:
@@ -181,7 +180,7 @@ def follow_ground(s, z, n, foot, f, ground, chain):
 
 @kernel()
 def heights_above(s, z, n, ground, reach, out):
-    """``out``: height of each point above the nearest ground point of the line; NaN where none is within ``reach``."""
+    """``out``: height of each point above the nearest ground point of the line; NaN if none is within ``reach``."""
     low = np.empty(n, np.int64)
     many = 0
     for i in range(n):
@@ -201,9 +200,9 @@ def heights_above(s, z, n, ground, reach, out):
 
 @kernel()
 def passed_below(s, z, n, i, edge, ground, f):
-    """Whether the beam to point i passed below ground that a higher beam of its line met: then it was reflected.
+    """Whether the beam to point i passed below ground observed by a higher beam of its line, i.e. was a reflection.
 
-    ``edge``: range at which it went below the ground; place and height of the last ground before.
+    ``edge``: range at which it went below the ground; range and height of the last ground before.
     """
     pierced, last_s, last_z = edge
     for j in range(i + 1, n):
@@ -214,7 +213,7 @@ def passed_below(s, z, n, i, edge, ground, f):
 
 @kernel()
 def observe_line(line, points, origin, foot, lattice, f, out):
-    """Statements of one line; ``out``: see `put_row`."""
+    """Detections of one line; ``out``: see `put_row`."""
     m = points.shape[0]
     p, s = np.empty((m, 3)), np.empty(m)
     n = 0
@@ -243,8 +242,8 @@ def observe_line(line, points, origin, foot, lattice, f, out):
             channel = OVERHANG if height[i] <= f.height else ABOVE
             if height[i] <= f.above_limit:
                 put_row(out, (line, channel), 1, where, lattice)
-        # Missing support: the beam went below the ground before it came back, and what it met lies deeper than the
-        # steepest ground that may be driven leads to, and by more than the vehicle climbs: there is a fall on the way.
+        # Missing support: the beam passed below the ground, and its point is below the steepest drivable slope by more
+        # than the vehicle climbs: there is a drop in between.
         last_s, last_z, _, blocked = chain[i]
         depth = last_z - f.slack * (s[i] - last_s) - p[i, 2]
         if ground[i] != 1 and depth > f.climb and blocked == 0.0 and origin[2] > last_z > p[i, 2]:
@@ -269,9 +268,9 @@ def observe_line(line, points, origin, foot, lattice, f, out):
 def book_steps(line, profile, lattice, f, out):
     """Steps between points of a profile ``(points, ranges, heights, heights above the ground, number)``.
 
-    Of every point: the largest rise or fall to a later one within ``window``, less what a slope that may be driven
-    gives (``slack`` per metre), booked where the line is steepest between the two; and its rise to the next point,
-    booked at itself, so that every cell that a point lies in hears something.
+    For every point: the largest rise or fall to a later one within ``window``, minus that of a drivable slope
+    (``slack`` per metre), written at the steepest place between the two; and its rise to the next point, written at the
+    point, so that every cell with a point gets a detection.
     """
     p, s, z, height, n = profile
     for i in range(n):
@@ -285,7 +284,7 @@ def book_steps(line, profile, lattice, f, out):
                 continue
             ahead, rise = abs(s[j] - s[i]), abs(z[j] - z[i])
             if ahead > f.window:
-                if before == i:  # neighbours that are farther apart: the middle between them
+                if before == i:  # neighbours farther apart: the middle between them
                     value = max(round(100.0 * (rise - f.slack * ahead)), 0)
                     where = (0.5 * (p[i, 0] + p[j, 0]), 0.5 * (p[i, 1] + p[j, 1]), 0.5 * (s[i] + s[j]))
                     if ahead < 2.0:
@@ -318,7 +317,7 @@ def book_steps(line, profile, lattice, f, out):
 
 @kernel()
 def observe_lines(points, origins, feet, lattice, figures, rows, counts):
-    """Statements of all lines ``points (n, m, 3)`` (NaN: no return), lowest beam first; number of rows written.
+    """Detections of all lines ``points (n, m, 3)`` (NaN: no return), lowest beam first; number of rows written.
 
     ``counts (n,)``: rows after each line. Writing stops where ``rows`` is full.
     """
@@ -335,14 +334,14 @@ def observe_lines(points, origins, feet, lattice, figures, rows, counts):
 
 @kernel()
 def sort_into_columns(points, origin, order, filled):
-    """Numbers of the points of each column by azimuth, lowest first: ``order (columns, beams)``; ``filled (columns,)``
-    of them are there. Of more points the lowest stay.
+    """Indices of the points of each azimuth column, lowest first: ``order (columns, beams)``, of which
+    ``filled (columns,)`` are valid. Of more points the lowest are kept.
     """
     columns, beams = order.shape
     rising = np.empty((columns, beams))
     filled[:] = 0
     count = points.shape[0]
-    down = count > 1 and points[0, 2] > points[count - 1, 2]  # scanners tell the highest ring first, or last
+    down = count > 1 and points[0, 2] > points[count - 1, 2]  # scanners store the highest ring first, or last
     for i in range(count):
         k = count - 1 - i if down else i
         x, y, z = points[k, 0] - origin[0], points[k, 1] - origin[1], points[k, 2] - origin[2]
@@ -362,7 +361,7 @@ def sort_into_columns(points, origin, order, filled):
 
 @kernel()
 def bound_rows(rows, low, high):
-    """Least and largest ix and iy of each band: ``low (b, 2)`` and ``high (b, 2)``, made larger by the statements."""
+    """Extend the least and largest ix and iy of each band, ``low (b, 2)`` and ``high (b, 2)``, by the detections."""
     for k in range(rows.shape[0]):
         b = rows[k, 1]
         for axis in range(2):
@@ -372,11 +371,11 @@ def bound_rows(rows, low, high):
 
 @kernel()
 def add_rows(rows, first, shapes, offsets, tables, llr, counts, ground):
-    """Add statements to cells; number of those outside the box.
+    """Add detections to cells; returns the number of those outside the box.
 
     ``first (b, 2)``: ix and iy of the first cell of every band; ``shapes (b, 2)``: ny and nx; ``offsets (b,)`` into the
     flat cells. ``tables (2, b, bins)`` int32; ``llr (2, c)`` int32: sums of the table; ``counts (4, c)`` int32:
-    statements of `STEP`, `SUPPORT`, `OVERHANG`, `ABOVE`; ``ground (3, c)`` int64: number and sum of heights [mm], sum
+    detections of `STEP`, `SUPPORT`, `OVERHANG`, `ABOVE`; ``ground (3, c)`` int64: number and sum of heights [mm], sum
     of roughness [mm].
     """
     outside = 0

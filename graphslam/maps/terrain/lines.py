@@ -1,7 +1,7 @@
-"""Scan lines: beams in one upright plane, from the lowest up, and what they say of the ground.
+"""Scan lines (beams in one vertical plane, lowest first), and the detections in them.
 
-The detectors look along each line by itself. What two points of one line differ by does not feel an error of the pose
-that both share, so a map is not spoilt by the pose noise between lines.
+The detectors process each line separately. Differences between points of one line do not depend on their common pose
+error, so pose noise between lines does not affect the map.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ _LINES_AT_ONCE = 256
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorConfig:
-    """How lines are read. Lengths in metres."""
+    """Configuration of the line detectors. Lengths in metres."""
 
     smooth: float = 0.05
-    """Heights are means over neighbours within this: of close beams, the ranges are noisier than the ground."""
+    """Heights are averaged over neighbours within this distance, because of the range noise of close beams."""
     nearest: float = 1.3
-    """Nothing is said of ground nearer than this: seen from straight above, heights are as noisy as ranges."""
+    """Ground nearer to the sensor than this is ignored: straight below, heights are as noisy as ranges."""
     window: float = 0.3
-    """Points within this of each other make a step, or neighbouring ones that are farther apart."""
+    """Steps are differences between points within this distance, or between neighbours farther apart."""
     residual: float = 0.06
-    """A point so near to where the ground leads is on the ground …"""
+    """Largest deviation of a ground point from the extrapolated ground …"""
     residual_rate: float = 0.08
-    """… and so much more per metre since the last one."""
+    """… plus this per metre since the last ground point."""
     memory: float = 2.0
-    """The ground is not led on farther than this."""
+    """Longest extrapolation of the ground."""
     support_reach: float = 2.5
-    """Cells so far behind the place where a beam went below the ground are said to lack support."""
+    """Cells up to this distance behind the place where a beam went below the ground lack support."""
     above_limit: float = 6.0
-    """What is higher above the ground than this is not booked."""
+    """Higher points above the ground are ignored."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -62,7 +62,7 @@ class ScanLines:
     points : (n, m, 3)
         Lowest beam of each line first; NaN: no return [m].
     origins : (n, 3)
-        Of the sensor [m].
+        Positions of the sensor [m].
     feet : (n,)
         Height of the ground under the sensor [m].
     """
@@ -93,21 +93,21 @@ class ScanLines:
         return len(self.points)
 
     def take(self, index: slice | npt.NDArray[np.bool_]) -> ScanLines:
-        """Some of the lines."""
+        """A subset of the lines."""
         return ScanLines(self.points[index], self.origins[index], self.feet[index])
 
 
 def lines_of_scans(scans: RangeScans, path: Trajectory, height: float) -> ScanLines:
-    """The lines of a scanner that looks at an upright plane, its points where the path has them.
+    """Lines of a scanner with a vertical scan plane, in the frame of the path.
 
     Parameters
     ----------
     scans : RangeScans
-        Of beams from the lowest to the highest, or the other way round.
+        Beams from the lowest to the highest, or reversed.
     path : Trajectory
-        ``T_world_base`` in space, z up; each beam has the pose of its own time.
+        ``T_world_base`` in 3-D, z up; each beam uses the pose at its own time.
     height : float
-        Of the sensor above the ground it drives on [m].
+        Height of the sensor above the ground [m].
     """
     if path.dim != 3:
         raise DataError("terrain is read along a path in space", got=f"{path.dim}-D", wanted="3-D, z up")
@@ -131,7 +131,7 @@ def lines_of_scans(scans: RangeScans, path: Trajectory, height: float) -> ScanLi
         )
     met = np.isfinite(scans.ranges) & (scans.ranges < scans.max_range)
     local = origin + np.where(met, scans.ranges, np.nan).astype(np.float64)[..., None] * directions
-    begin, end = (path.interpolate(times[:, k]) for k in (0, -1))  # within a line the body moves evenly
+    begin, end = (path.interpolate(times[:, k]) for k in (0, -1))  # constant velocity within a line
     share = (scans.beam_times - scans.beam_times[0]) / max(float(scans.beam_times[-1] - scans.beam_times[0]), 1e-12)
     points, rising, origins = np.zeros((n, m, 3)), 0.0, np.zeros((n, 3))
     for T, part in ((begin, 1.0 - share), (end, share)):
@@ -145,22 +145,22 @@ def lines_of_scans(scans: RangeScans, path: Trajectory, height: float) -> ScanLi
 
 
 COLUMNS = 900
-"""Of a turn of a spinning scanner."""
+"""Azimuth columns per turn of a spinning scanner."""
 
 
 def lines_of_clouds(points: Array, origin: Array, foot: float, *, beams: int = 64) -> ScanLines:
-    """Lines of one turn of a spinning scanner: its points by azimuth, in each column from the lowest up.
+    """Lines of one turn of a spinning scanner: columns by azimuth, lowest point first.
 
     Parameters
     ----------
     points : (k, 3)
         In a level frame [m].
     origin : (3,)
-        Of the scanner [m].
+        Position of the scanner [m].
     foot : float
         Height of the ground under it [m].
     beams : int
-        Most points of a column; of more, the lowest ones stay.
+        Most points of a column; of more, the lowest are kept.
     """
     p = np.ascontiguousarray(points, dtype=np.float64)
     order, filled = np.zeros((COLUMNS, beams), np.int64), np.zeros(COLUMNS, np.int64)
@@ -174,15 +174,15 @@ def lines_of_clouds(points: Array, origin: Array, foot: float, *, beams: int = 6
 def observe_terrain(
     lines: ScanLines, edges: Array, cells: Array, vehicle: Vehicle, config: DetectorConfig | None = None
 ) -> Iterator[Rows]:
-    """Statements of lines, some lines at a time; see :mod:`graphslam.maps.terrain.line_kernels`.
+    """Detections of lines, in chunks; see :mod:`graphslam.maps.terrain.line_kernels`.
 
     Parameters
     ----------
     edges, cells : (b,)
         Ranges at which the bands end, and widths of their cells [m].
     vehicle : Vehicle
-        Its clearance and height tell steps, obstacles and what is above reach apart; its slope is no step. A fall
-        begins on ground that it can be on, not on what it does not climb and is narrower than it.
+        Its clearance and height separate steps, obstacles and objects above it; its slope is not a step. A drop starts
+        on ground that the vehicle can be on.
 
     Yields
     ------

@@ -1,4 +1,4 @@
-"""Ways over a terrain map, and its cost map as a file: the search itself is a library's."""
+"""Cost map of a terrain map for path planning, and its file formats. The search itself is left to a library."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from graphslam.maps.terrain.pyramid import HAZARDS, TerrainMap
 from graphslam.maps.terrain.vehicle import Vehicle
 
 _THRESHOLDS = 0.01, 0.99
-"""Below and above which the map server takes a cell of a ``scale`` map for free and occupied."""
+"""Limits below and above which the map server reads a cell of a ``scale`` map as free and as occupied."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CostConfig:
-    """What a metre of way costs besides its length."""
+    """Cost per metre of path in addition to its length."""
 
     hazard: float = 20.0
-    """Times the probability of a hazard."""
+    """Factor on the probability of a hazard."""
     unknown: float = 3.0
-    """Where nothing is known; infinity forbids it."""
+    """In unknown cells; infinity forbids them."""
     provisional: float = 0.2
-    """Where a hole is not yet excluded."""
+    """In cells where a hole is not yet excluded."""
     margin: float = 0.3
-    """Cost falls off over this distance from where the vehicle just fits [m]."""
+    """The cost decreases over this distance from the closest passable position [m]."""
     closing_bands: int | None = None
-    """Hazards that only coarser bands than the first so many know cost, but do not close: their cells may be wider than
-    a gap between two of them, and a nearer look will tell. None: all close, as in a map that is not looked at again."""
+    """Hazards that only coarser bands than the first N detect have a cost but do not block: their cells can be wider
+    than a gap between two hazards, and later observations are finer. None: all block, for a final map."""
 
     def __post_init__(self) -> None:
         for name in ("hazard", "unknown", "provisional", "margin"):
@@ -48,7 +48,7 @@ class CostConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostMap:
-    """Cost of a metre of way at every cell; infinite where the vehicle's middle may not be.
+    """Cost per metre of path at every cell; infinite where the centre of the vehicle may not be.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class CostMap:
         [m]
     cost : (ny, nx)
     lethal : (ny, nx) bool
-        Hazards themselves.
+        Hazard cells.
     known : (ny, nx) bool
     """
 
@@ -69,7 +69,7 @@ class CostMap:
     known: npt.NDArray[np.bool_]
 
     def index(self, point: Array) -> tuple[int, int]:
-        """Row and column of the cell of a point ``(2,)``."""
+        """Row and column of the cell that contains a point ``(2,)``."""
         ix, iy = (math.floor(v) for v in (np.asarray(point, dtype=np.float64) - self.origin) / self.cell)
         ny, nx = self.cost.shape
         if not (0 <= ix < nx and 0 <= iy < ny):
@@ -78,7 +78,7 @@ class CostMap:
 
 
 def cost_map(found: TerrainMap, vehicle: Vehicle, config: CostConfig | None = None) -> CostMap:
-    """Costs of a terrain map: hazards grown by half the width of the vehicle are closed."""
+    """Costs of a terrain map: hazards, inflated by half the vehicle width, are blocked."""
     c = config or CostConfig()
     lethal = np.isin(found.classes, [int(k) for k in HAZARDS])
     if c.closing_bands is not None:
@@ -95,7 +95,7 @@ def cost_map(found: TerrainMap, vehicle: Vehicle, config: CostConfig | None = No
 
 
 def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "raw") -> tuple[Path, Path]:
-    """Write a cost map as ``path`` (``.yaml``) and the image beside it, as nav2's map server reads them.
+    """Write a cost map as ``path`` (``.yaml``) and an image for the map server of nav2.
 
     The server's grid then holds the values of :func:`occupancy_values`, cell by cell.
 
@@ -104,8 +104,8 @@ def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "
     path : path
         Ending in ``.yaml``.
     mode : {"raw", "scale"}
-        ``raw``: a PGM, whose bytes are the values, 0 to 100, and 255, unknown. ``scale``: a PNG, a grey a cost, where
-        what is unknown is transparent; a PGM cannot say that in this mode.
+        ``raw``: a PGM with the values 0 to 100, and 255 for unknown. ``scale``: a PNG with grey values for costs and
+        transparent unknown cells, which a PGM does not support.
     """
     target = Path(path)
     if target.suffix != ".yaml":
@@ -137,7 +137,7 @@ def save_cost_map(costs: CostMap, path: str | os.PathLike[str], *, mode: str = "
 
 
 def occupancy_values(costs: CostMap) -> npt.NDArray[np.int16]:
-    """Values ``(ny, nx)`` of an occupancy grid: 100 hazards, 99 too near to one, 0 to 98 by cost, −1 unknown."""
+    """Values ``(ny, nx)`` of an occupancy grid: 100 hazards, 99 too near to a hazard, 0 to 98 by cost, −1 unknown."""
     finite = np.isfinite(costs.cost)
     extra = np.where(finite, costs.cost, 1.0) - 1.0
     values = np.clip(np.round(98.0 * extra / (extra + 5.0)), 0, 98).astype(np.int16)

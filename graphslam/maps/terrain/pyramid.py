@@ -1,7 +1,7 @@
-"""One map for every range band, coarser with range; the finest that knows a cell wins, channel by channel.
+"""One map per range band, coarser with range; per channel, the finest band that knows a cell is used.
 
-What was seen from far away is coarse and uncertain, but it is seen early: all bands are used to plan, and none is ever
-added to another. So no amount of evidence from far away can outvote a single look from near by.
+Distant observations are coarse and uncertain, but early: all bands are used for planning, and bands are never summed.
+So distant evidence, however much, cannot override one near observation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOST_CELLS = 1 << 26
 
 
 class TerrainClass(IntEnum):
-    """What a cell is to the vehicle."""
+    """Class of a cell for the vehicle."""
 
     UNKNOWN = 0
     FREE = 1
@@ -42,7 +42,7 @@ HAZARDS = (TerrainClass.STEP, TerrainClass.STEEP, TerrainClass.OBSTACLE, Terrain
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TerrainMap:
-    """What a pyramid says, on its finest cells; rows are y, columns x, from the lower left corner on.
+    """Classified map of a pyramid on its finest cells; rows are y, columns x, from the lower left corner.
 
     Parameters
     ----------
@@ -51,18 +51,17 @@ class TerrainMap:
     cell : float
         [m]
     probability : (ny, nx)
-        Of a hazard; NaN where nothing is known.
+        Probability of a hazard; NaN if unknown.
     classes : (ny, nx) int8
         `TerrainClass`.
     ground : (ny, nx)
-        Height of the ground [m]; NaN where none was seen.
+        Height of the ground [m]; NaN if not observed.
     roughness : (ny, nx)
-        Mean deviation of the ground from a straight line between its neighbours on the line [m], noise of the ranges
-        included.
+        Mean deviation of the ground from a straight line between its neighbours on the line [m], including range noise.
     band : (ny, nx) int8
-        Band that speaks of steps there; −1 none.
+        Band that is used for steps; −1 none.
     provisional : (ny, nx) bool
-        Free as far as can be told, but support was not yet looked at from near enough to exclude a hole.
+        Free so far, but support was not yet observed from near enough to exclude a hole.
     """
 
     origin: Array
@@ -84,13 +83,13 @@ class TerrainMap:
 
     @property
     def known(self) -> npt.NDArray[np.bool_]:
-        """Cells that anything is known of."""
+        """Mask of the known cells."""
         return np.isfinite(self.probability)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClassGrid:
-    """The classes of a terrain that was written before, in the frame of its run.
+    """Classes of a stored terrain map, in the frame of its run.
 
     Parameters
     ----------
@@ -119,15 +118,15 @@ class ClassGrid:
 
 
 class Pyramid:
-    """Evidence of a vehicle's surroundings.
+    """Evidence of the terrain in all range bands.
 
     Parameters
     ----------
     box : (x0, y0, x1, y1)
-        What it covers [m]; grown to whole cells of the coarsest band.
+        Covered area [m]; enlarged to whole cells of the coarsest band.
     cells : tuple of float, optional
-        Widths of the cells of the bands [m]; the same width for all is a map of a single resolution, in which all
-        bands are *added*.
+        Widths of the cells of the bands [m]; if all are equal, it is a map with a single resolution in which all bands
+        are *summed*.
     """
 
     def __init__(
@@ -171,7 +170,7 @@ class Pyramid:
         self.bands = 1 if self.single else len(cells)
 
     def insert(self, lines: ScanLines, config: DetectorConfig | None = None) -> int:
-        """Read lines; number of statements."""
+        """Process lines; returns the number of detections."""
         count = 0
         for rows in observe_terrain(lines, self.edges, self.cells, self.vehicle, config):
             self.add(rows)
@@ -180,7 +179,7 @@ class Pyramid:
         return count
 
     def add(self, rows: Rows) -> None:
-        """Add statements; those outside the box are counted and left out."""
+        """Add detections; those outside the box are counted and ignored."""
         self.outside += int(
             add_rows(
                 rows, self.first, self.shapes, self.offsets, self.tables.ratios, self.ratios, self.counts, self.heights
@@ -188,7 +187,7 @@ class Pyramid:
         )
 
     def merge(self, other: Pyramid) -> None:
-        """Add the evidence of another pyramid of the same box and bands; the order of such sums means nothing."""
+        """Add the evidence of another pyramid with the same box and bands; the order of such sums does not matter."""
         same = np.array_equal(self.first, other.first) and np.array_equal(self.shapes, other.shapes)
         if not same or not np.array_equal(self.cells, other.cells):
             raise GridError("terrain maps of different boxes or cells cannot be added")
@@ -218,11 +217,10 @@ class Pyramid:
     def classify(self, threshold: float | None = None) -> TerrainMap:
         """The map on the finest cells.
 
-        Of steps and of support the finest band that knows the cell speaks. Something hanging is believed of any band,
-        because a near band that saw the ground may not have looked at the space above it; where a finer band saw
-        something hang in the cell of a coarser one, the finer one gives the height. What pieces saw hang (see
-        :mod:`graphslam.maps.terrain.layer`) has moved away where more than twice as many, of all bands,
-        saw ground alone.
+        For steps and support the finest band that knows the cell is used. Overhangs of all bands are used, because a
+        near band may have observed only the ground; if a finer band has an overhang in the cell of a coarser one, it
+        replaces it. Overhangs of pieces (see :mod:`graphslam.maps.terrain.layer`) count as moved away if more than
+        twice as many pieces, of all bands, observed only ground.
 
         Parameters
         ----------
@@ -231,7 +229,7 @@ class Pyramid:
         """
         limit = self.tables.threshold if threshold is None else threshold
         ny, nx = self.shapes[0]
-        free = np.ones((3, ny, nx))  # probability that nothing of each kind is there
+        free = np.ones((3, ny, nx))  # probability that no hazard of each kind is there
         known = np.zeros((3, ny, nx), bool)
         band = np.full((ny, nx), -1, np.int8)
         support_band = np.full((ny, nx), -1, np.int8)
@@ -250,7 +248,7 @@ class Pyramid:
                 known[channel] |= fresh
                 (band if channel == STEP else support_band)[fresh] = b
             hanging = (counts[OVERHANG] > 0) & stays
-            if b:  # where a finer band saw something hang within the cell, it says better where
+            if b:  # a finer band with an overhang within the cell locates it better
                 k = round(float(self.cells[b] / self.cells[0]))
                 within = known[2].reshape(ny // k, k, nx // k, k).any(axis=(1, 3))
                 hanging &= ~within.repeat(k, axis=0).repeat(k, axis=1)
@@ -261,7 +259,7 @@ class Pyramid:
             fresh = (number > 0) & ~np.isfinite(ground)
             ground[fresh] = height[fresh] / number[fresh] / 1000.0
             rough[fresh] = bend[fresh] / number[fresh] / 1000.0
-        # what is seen of a cell only high above it says nothing of its ground
+        # observations only high above a cell give no information on its ground
         any_known = known.any(axis=0)
         speaks = np.where(band >= 0, band, np.where(support_band >= 0, support_band, self.bands - 1))
         u, v = np.array([self.weights_of(b)[-2:] for b in range(self.bands)]).T
@@ -284,7 +282,7 @@ class Pyramid:
         )
 
     def _steep(self, ground: Array) -> npt.NDArray[np.bool_]:
-        """Where the ground rises evenly by more than the vehicle climbs: as steep over 0.2 m as over 0.6 m."""
+        """Mask of ground with a uniform slope above the vehicle's limit: over 0.2 m about as steep as over 0.6 m."""
         limit = np.tan(self.vehicle.max_slope)
         out = np.zeros(ground.shape, bool)
         wide, narrow = max(round(float(0.3 / self.cells[0])), 1), 1

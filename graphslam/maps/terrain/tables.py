@@ -1,7 +1,7 @@
-"""What a statement is worth: log-likelihood ratios by band and channel, and how the channels make a probability.
+"""Learnt weights of detections: log-likelihood ratios by band and channel, and their combination to a probability.
 
-The file of a table says what it was learnt on. Tables belong to a sensor and to a vehicle: its climbable step decides
-which cells were taught as hazards.
+The file of a table contains the training data's description. Tables belong to one sensor and one vehicle: its climbable
+step defines which training cells are hazards.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from graphslam.core.geometry import Array
 
 FORMAT = "graphslam.terrain-tables/2"
 BINS = 48
-"""Of 1 cm; the last one holds all that is more."""
+"""Bins of 1 cm; the last one contains all larger values."""
 SCALE = 256
-"""Ratios are stored as whole numbers in units of 1/256, so that sums do not depend on their order."""
+"""Ratios are stored as integers in units of 1/256, so that sums do not depend on their order."""
 WEIGHTS = 9
-"""Of a band."""
+"""Number of weights per band."""
 DEFAULT = Path(__file__).with_name("tables.json")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TerrainWeights:
-    """Learnt weights.
+    """Learnt weights of detections.
 
     Parameters
     ----------
     ratios : (2, b, 48) int32
         Log-likelihood ratios of a step [cm] and of missing support [cm], hazard against free, in units of 1/256.
     weights : (b, 9)
-        Of every band ``p, a0, a1, q, b0, b1, c``, see `hazard_factors`, and ``u, v``, see `calibrated`.
+        Per band ``p, a0, a1, q, b0, b1, c``, see `hazard_factors`, and ``u, v``, see `calibrated`.
     single : (9,)
-        The same for a map of a single resolution.
+        The same for a map with a single resolution.
     threshold : float
-        Probability above which a cell is not driven, fixed on the drives that the tables were learnt on.
+        Probability above which a cell is a hazard, from the training drives.
     provenance : dict
-        What they were learnt on.
+        Description of the training data.
     """
 
     ratios: npt.NDArray[np.int32]
@@ -75,7 +75,7 @@ class TerrainWeights:
         return self.ratios.shape[1]
 
     def write(self, path: str | Path) -> None:
-        """Write them as JSON."""
+        """Write the weights as JSON."""
         write_json(
             path,
             {
@@ -91,7 +91,7 @@ class TerrainWeights:
 
 
 def read_tables(path: str | Path = DEFAULT) -> TerrainWeights:
-    """Tables of a file; default those of the package, learnt for the panning line laser of the simulated streets."""
+    """Read a table file; default: that of the package, learnt for the panning line laser of the simulated streets."""
     shape = {
         "provenance": object, "threshold": float, "step": [[int]], "support": [[int]], "weights": [(float,) * WEIGHTS],
         "single": (float,) * WEIGHTS,
@@ -114,24 +114,24 @@ def fixed_tables(bands: int, hit: float, miss: float) -> npt.NDArray[np.int32]:
 
 
 def effective_count(count: Array) -> Array:
-    """What ``count`` statements are worth, 5 at most: lines in one cell are not independent."""
+    """Effective number of ``count`` detections, at most 5: lines in one cell are not independent."""
     return count / (1.0 + count / 5.0)
 
 
 def hazard_factors(ratios: Array, counts: Array, weights: Array) -> Array:
-    """Probabilities ``(3, ...)`` that there is no step, that no support is missing and that nothing hangs in cells.
+    """Probabilities ``(3, ...)`` that cells have no step, no missing support and no overhang.
 
-    With ``n`` statements about steps whose ratios sum to ``L``, and ``m(n) = n / (1 + n/5)``, the first one is
-    ``σ(−p − m (a0 + a1 L / n))``; the second one is ``σ(−q − m (b0 + b1 L / n))`` with the statements about support;
-    the third one is ``exp(−c n)`` with the number of lines that saw something at the height of the vehicle. Where
-    nothing was said, it is 1.
+    With ``n`` step detections whose ratios sum to ``L``, and ``m(n) = n / (1 + n/5)``, the first one is
+    ``σ(−p − m (a0 + a1 L / n))``; the second one is ``σ(−q − m (b0 + b1 L / n))`` with the support detections; the
+    third one is ``exp(−c n)`` with the number of lines with an obstacle at the height of the vehicle. Without
+    detections it is 1.
 
     Parameters
     ----------
     ratios : (2, ...)
         Sums of log-likelihood ratios of steps and of support.
     counts : (3, ...)
-        Statements about steps, about support, and lines that saw something at the height of the vehicle.
+        Detections of steps, of support, and lines with an obstacle at the height of the vehicle.
     weights : (9,)
     """
     p, a0, a1, q, b0, b1, c = weights[:7]
@@ -145,19 +145,19 @@ def hazard_factors(ratios: Array, counts: Array, weights: Array) -> Array:
 
 
 def noisy_or(ratios: Array, counts: Array, weights: Array) -> Array:
-    """Probability ``(...)`` of a hazard: that not all of `hazard_factors` hold."""
+    """Probability ``(...)`` of a hazard: that not all of the conditions in `hazard_factors` hold."""
     return np.asarray(1.0 - hazard_factors(ratios, counts, weights).prod(axis=0))
 
 
 def calibrate_probability(p: Array, u: Array | float, v: Array | float) -> Array:
-    """Probability whose log-odds are ``u + v · log-odds(p)``: as often a hazard as it says (Platt's scaling).
+    """Probability whose log-odds are ``u + v · log-odds(p)``: calibrated frequencies (Platt scaling).
 
     Parameters
     ----------
     p : (...)
-        Of the noisy-OR, NaN where nothing is known; taken to be 0.0001 at least and 0.9999 at most.
+        Of the noisy-OR, NaN if unknown; clipped to 0.0001 … 0.9999.
     u, v : (...)
-        The last two weights.
+        Calibration, the last two weights.
     """
     q = np.clip(p, 1e-4, 1.0 - 1e-4)
     return np.asarray(1.0 / (1.0 + np.exp(-(u + v * np.log(q / (1.0 - q))))))

@@ -1,1 +1,1 @@
-"""Pose networks from files: starts, solvers, robust solvers, certificates."""
+"""Pose networks from files: initialisation, solvers, robust solvers, certificates."""

@@ -1,12 +1,12 @@
-"""Is a solved pose network at its *global* optimum? A certificate by duality, in the manner of SE-Sync.
+"""Certificate of global optimality of a solved pose network by duality, as in SE-Sync.
 
 With isotropic noise and chordal distances,
 
     ``F(X) = Σ κ ‖R_j - R_i Z_ij‖² + τ ‖t_j - t_i - R_i z_ij‖² = tr(X Q Xᵀ)``,  ``X = [t_1 R_1 … t_n R_n]``,
 
-pose-graph optimisation is a quadratic program whose Lagrangian dual says when a stationary point is a global minimum
-(Rosen, Carlone, Bandeira & Leonard 2019, theorem 7 and eq. 107-110; here with the positions left in, which keeps the
-matrix sparse): with ``Λ_i = sym(R_iᵀ [X Q]_i)``, the multipliers of ``R_iᵀ R_i = I``, the point is a global minimum if
+pose-graph optimisation is a quadratic program whose Lagrangian dual shows when a stationary point is a global minimum
+(Rosen, Carlone, Bandeira & Leonard 2019, theorem 7 and eq. 107-110; here with the positions, which keeps the matrix
+sparse): with ``Λ_i = sym(R_iᵀ [X Q]_i)``, the multipliers of ``R_iᵀ R_i = I``, the point is a global minimum if
 ``S = Q - BlkDiag(0, Λ_i)`` has no negative eigenvalue.
 
 The objective of this package (full logarithm, any information) is not F. So a solution is called *certified* if
@@ -14,8 +14,8 @@ The objective of this package (full logarithm, any information) is not F. So a s
 1. descent of F from it ends at a stationary point Y with ``S ⪰ 0``: Y is F's global minimum, and
 2. descent of the real objective from Y ends at the solution again.
 
-That certifies the basin, by the global minimum of the nearest problem for which there is a proof. Where the real
-objective and F disagree about the best basin, the answer is "not known".
+That certifies the basin, by the global minimum of a similar problem for which a proof exists. If the real objective and
+F have different best basins, the answer is "not known".
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ from graphslam.solve.network.start import network_arrays
 from graphslam.solve.sparse import SparseProblem, factorise_sparse
 
 Verdict = Literal["certified", "not certified", "not known"]
-# S is taken for positive semi-definite if S + TOLERANCE · (median diagonal of Q) has no negative pivot.
+# S counts as positive semi-definite if S + TOLERANCE · (median diagonal of Q) has no negative pivot.
 TOLERANCE = 1e-7
-# Descent of F stops when the predicted fall is below this share of F, or after so many steps.
+# Descent of F stops when the predicted decrease is below this share of F, or after this number of steps.
 FALL, STEPS = 1e-12, 200
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What is known about the solution being the global optimum.
+    """Result of the test for global optimality.
 
     Parameters
     ----------
     verdict : {"certified", "not certified", "not known"}
     reason : str
-        Why, where it is not certified.
+        Reason if it is not certified.
     smallest_eigenvalue : float
-        Of ``S``, in units of the median diagonal of Q; ``nan`` if it was not computed. At a global minimum of F it is
-        zero (the gauge) to rounding.
+        Of ``S``, in units of the median diagonal of Q; ``nan`` if not computed. At a global minimum of F it is zero
+        (the gauge) up to rounding.
     relaxed_objective : float
         F at its stationary point.
     objective_from_relaxation : float
-        The real objective after descent from there; ``nan`` if it was not tried.
+        The real objective after descent from there; ``nan`` if not tried.
     """
 
     verdict: Verdict
@@ -73,23 +73,23 @@ class Certificate:
 
 
 def certify(network: PoseNetwork, poses: Array, objective: float, *, eigenvalue: bool = True) -> Certificate:
-    """Say whether a solution is the global optimum.
+    """Test whether a solution is the global optimum.
 
     Parameters
     ----------
     network : PoseNetwork
-        The measurements that were minimised: for gnc the inliers alone.
+        The measurements that were minimised: for gnc only the inliers.
     poses : (n, 3) or (n, 7)
         A stationary point of the objective.
     objective : float
         ``Σ rᵀ Ω r`` there.
     eigenvalue : bool
-        Also say how far from zero; the verdict needs only its sign.
+        Also compute its value; the verdict needs only its sign.
 
     Returns
     -------
     Certificate
-        Never raises for a network that it cannot judge: that is "not known", with the reason.
+        "not known", with the reason, if the test does not apply; no exception.
     """
     if len(network.observations):
         return Certificate("not known", "landmark observations are not part of the relaxation")
@@ -151,7 +151,7 @@ def _matrices(network: PoseNetwork, poses: Array) -> tuple[Array, Array]:
 def residual_matrix(network: PoseNetwork, kappa: Array, tau: Array) -> sp.csr_matrix:
     """``A`` with ``F = ‖A Xᵀ‖²`` and ``Q = AᵀA``; columns by pose: t_i, then R_i.
 
-    Through A the objective and its gradient keep their digits where positions are large and weights extreme.
+    A keeps the precision of objective and gradient with large positions and extreme weights.
     """
     p, n, m = network.dim, len(network), len(network.edges)
     z, Z = _matrices(network, network.measurements)
@@ -185,10 +185,10 @@ def _stack(t: Array, R: Array) -> Array:
 
 
 def _descend(network: PoseNetwork, A: sp.csr_matrix, poses: Array) -> tuple[Array, float, bool]:
-    """Stationary point of F from given poses, by Newton on the manifold with a damped Hessian.
+    """Stationary point of F, from given poses, by Newton's method on the manifold with a damped Hessian.
 
-    The Riemannian Hessian is ``2 (Q - BlkDiag(0, Λ))`` between tangents ``R_i [ω_i]×`` and ``t_i``: the exact one, so
-    the end is quadratic. Damping keeps it positive on the way.
+    The Riemannian Hessian is ``2 (Q - BlkDiag(0, Λ))`` between tangents ``R_i [ω_i]×`` and ``t_i``: it is exact, so
+    convergence is quadratic. Damping keeps it positive definite.
     """
     p, n = network.dim, len(network)
     basis = np.array([[[0.0, -1.0], [1.0, 0.0]]]) if p == 2 else se3.skew(np.eye(3))
@@ -199,7 +199,7 @@ def _descend(network: PoseNetwork, A: sp.csr_matrix, poses: Array) -> tuple[Arra
     for _ in range(STEPS):
         Y = _stack(t, R)
         S = dual_matrix(A, Y)
-        # tangent directions of Xᵀ: columns of D are vec of one direction over the p columns of Xᵀ
+        # tangent directions of Xᵀ: each column of D is a direction, vectorised over the p columns of Xᵀ
         D = _directions(R, basis)[:, d:]
         gradient = D.T @ np.asarray(A.T @ (A @ Y)).T.reshape(-1)
         H = sp.csc_matrix(D.T @ (sp.block_diag([S] * p, format="csr") @ D))
@@ -227,8 +227,8 @@ def _descend(network: PoseNetwork, A: sp.csr_matrix, poses: Array) -> tuple[Arra
 
 
 def _directions(R: Array, basis: Array) -> sp.csr_matrix:
-    """Tangent directions ``(p n(p+1), n d)``: position along every axis, rotation ``R_i [e_k]×``; the first pose is
-    held by leaving its columns out later."""
+    """Tangent directions ``(p n(p+1), n d)``: position along every axis, rotation ``R_i [e_k]×``; the caller removes
+    the columns of the fixed first pose."""
     n, p = R.shape[:2]
     q, d = len(basis), p + len(basis)
     size = n * (p + 1)
@@ -271,8 +271,7 @@ def dual_matrix(A: sp.csr_matrix, X: Array) -> sp.csr_matrix:
 def _negative_pivots(S: sp.csc_matrix) -> int:
     """Negative eigenvalues, by the signs of the pivots of ``L D Lᵀ`` (Sylvester's law of inertia).
 
-    SuperLU's symmetric mode without pivoting is that factorisation; where it did pivot, the matrix is not positive
-    definite either.
+    SuperLU's symmetric mode without pivoting is that factorisation; if it pivoted, the matrix is not positive definite.
     """
     try:
         lu = factorise_sparse(S)
@@ -291,7 +290,7 @@ def smallest_eigenvalue(S: sp.spmatrix) -> float:
 
 
 def _least_bound(S: sp.csc_matrix) -> float:
-    """Smallest eigenvalue where S is positive semi-definite up to the tolerance, by inverse Lanczos."""
+    """Smallest eigenvalue of a positive semi-definite S (up to the tolerance), by inverse Lanczos."""
     try:
         shift = -10.0 * TOLERANCE
         return float(spla.eigsh(S, k=1, sigma=shift, which="LM", tol=1e-6, return_eigenvectors=False)[0])

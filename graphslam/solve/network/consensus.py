@@ -1,12 +1,12 @@
-"""Which loops do their neighbours bear out? A first guess of the inliers that needs no solution.
+"""Initial guess of the inlier loops from consistency with neighbouring loops, without a solution.
 
-A robot that comes back to a place sees it for a while, so a right loop (a, b) has right neighbours (c, d) with c near a
-and d near b, and the cycle through both is short: two loops and a few steps of odometry, whose covariance is small
-however far the robot drifted in between. A wrong loop has no such neighbours, or, where places look alike, a few.
+A robot that returns to a place observes it repeatedly, so a true loop (a, b) has true neighbours (c, d) with c near a
+and d near b. The cycle through both is short: two loops and a few steps of odometry, with a small covariance even after
+a long drift. A false loop has no such neighbours, or only a few in similar places.
 
-Noise in files is rarely what it says it is (the recorded networks overstate their variance 10 to 100,000 times), and
-thresholds by the stated one let wrong loops pass that bend the map. The neighbours give the scale, too: among the pairs
-of nearest loops at least the better quarter should be right ones, and its quantile says what χ² is there.
+The noise in files is rarely right (the recorded networks overstate their variance 10 to 100,000 times), and thresholds
+from it accept false loops. The neighbours also give the scale: at least the best quarter of the pairs of nearest loops
+should be true ones, and its quantile gives the scale of χ².
 """
 
 from __future__ import annotations
@@ -27,44 +27,44 @@ from graphslam.core.poses import group_of
 
 Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
-# Every loop is compared with so many of its nearest ones.
+# Every loop is compared with this number of its nearest ones …
 NEIGHBOURS = 8
-# … that are within so many times the distance at which right loops have their nearest one.
+# … within this multiple of the distance at which true loops have their nearest one.
 REACH = 5.0
-# A loop is likely if it has this share of the votes that a loop with any vote has in the median.
+# A loop is likely if it has this share of the median votes of loops with a vote.
 SUPPORT = 0.25
-# Two loops agree if the D² of their cycle, in the scale of the network, is below this quantile.
+# Two loops agree if the D² of their cycle, in the scale of the network, is below this χ² quantile.
 AGREEMENT = 0.999
-# A cycle that closes to within this D² is a repetition, not a measurement.
+# A cycle with a smaller D² is a repetition, not a measurement.
 REPEATED = 1e-10
-# A loop takes part if the chain's variance between its ends is at least this share of its own, on average.
+# A loop is used if the chain's variance between its ends is at least this share of its own, on average.
 INFORMATIVE = 0.05
-# A chain of odometry that joins fewer of the vertices than this is none: the ids are not in the order of a drive.
+# Least share of the vertices in the odometry chain; below it the ids are not in the order of a drive.
 CHAINED = 0.9
-# Clusters of loops are compared with each other by about so many representatives, together …
+# Total number of representatives for the comparison of loop clusters …
 REPRESENTATIVES = 700
-# … and disagree if this share of the pairs does: only pairs that are near to each other can.
+# … and share of disagreeing pairs for a contradiction; only near pairs can disagree.
 DISAGREEMENT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class LoopConsensus:
-    """What the loops of a network say about each other.
+    """Mutual consistency of the loops of a network.
 
     Parameters
     ----------
     odometry : (m,) bool
-        Edges between neighbours in vertex order that make up the chain; nothing if ``ordered`` is False.
+        Edges between neighbours in vertex order that form the chain; none if ``ordered`` is False.
     ordered : bool
-        Whether vertices come in the order of a drive.
+        Whether vertices are in the order of a drive.
     likely : (m,) bool
-        Loops that neighbours bear out, in clusters that do not contradict the others.
+        Loops confirmed by neighbours, in clusters that do not contradict the others.
     core : (m,) bool
         The largest of these clusters, which together hold half of the likely loops.
     votes : (m,) int64
-        Neighbours that agree with a loop.
+        Number of neighbours that agree with a loop.
     scale : float
-        Estimated ratio of the true to the stated variance, at most 1.
+        Estimated ratio of the true variance to that in the file, at most 1.
     """
 
     odometry: Mask
@@ -78,7 +78,7 @@ class LoopConsensus:
 def odometry_edges(network: PoseNetwork) -> Mask:
     """Edges between neighbours in vertex order ``(m,)``; none if they do not join nearly all vertices.
 
-    A file whose ids are in no particular order has such edges too, by chance; they are then nothing to be trusted.
+    A file with arbitrary ids has some such edges by chance; they are not used.
     """
     step = np.asarray(np.abs(network.edges[:, 1] - network.edges[:, 0]) == 1)
     joined = np.unique(network.edges[step].min(axis=1)) if step.any() else np.zeros(0)
@@ -88,7 +88,7 @@ def odometry_edges(network: PoseNetwork) -> Mask:
 
 
 def odometry_chain(network: PoseNetwork, odometry: Mask) -> OdometryChain:
-    """The odometry of a network as a chain, cut where an increment is missing or its information singular."""
+    """The odometry of a network as a chain, divided where an increment is missing or its information is singular."""
     n, d = len(network), network.tangent_dim
     rows = np.flatnonzero(odometry)
     loops = LoopArrays.of(_blank(network), network.edges[rows], network.measurements[rows], np.zeros((len(rows), d, d)))
@@ -119,9 +119,9 @@ def _blank(network: PoseNetwork) -> OdometryChain:
 
 
 def loop_consensus(network: PoseNetwork) -> LoopConsensus:
-    """Votes of neighbouring loops for each other, the noise scale, and the loops that are likely right.
+    """Votes of neighbouring loops for each other, the noise scale, and the likely true loops.
 
-    Landmark observations take no part.
+    Landmark observations are not used.
     """
     m, d = len(network.edges), network.tangent_dim
     odometry = odometry_edges(network)
@@ -143,14 +143,14 @@ def loop_consensus(network: PoseNetwork) -> LoopConsensus:
     loops = LoopArrays(loops.ends[told], loops.measured[told], loops.covariance[told])
     near = min(NEIGHBOURS, len(rows) - 1)
     distance, other = cKDTree(loops.ends.astype(np.float64)).query(loops.ends, k=near + 1, p=1)
-    # the loop itself is among the nearest, but not always the first: two loops may join the same nodes
+    # the loop itself is among the nearest, but not always first: two loops can have the same nodes
     distance = distance[:, 1:]
     other = np.where(other[:, :1] == np.arange(len(rows))[:, None], other, _own_first(other))[:, 1:]
     d2 = pair_chi2(chain, loops, np.repeat(np.arange(len(rows)), near), other.ravel()).reshape(-1, near)
-    # far neighbours agree by chance: the cycle through them is long and its covariance large
+    # distant neighbours agree by chance: their cycle is long and its covariance large
     close = distance <= REACH * max(float(np.quantile(distance[:, 0], 0.25)), 2.0)
     nearest = d2[:, 0][np.isfinite(d2[:, 0])]
-    # said twice word for word (a robot that stands still): nothing about noise
+    # repeated measurements (robot at standstill) have no information on noise
     nearest = nearest[nearest > REPEATED]
     if len(nearest) < 8:
         return nothing
@@ -172,7 +172,7 @@ def loop_consensus(network: PoseNetwork) -> LoopConsensus:
 
 
 def _informative(chain: OdometryChain, loops: LoopArrays) -> Mask:
-    """Loops whose ends the chain does not tie far better than they do: those agree with anything near them."""
+    """Loops that are informative relative to the chain: others agree with any near loop."""
     a, b = loops.ends.T
     g = group_of(chain.poses)
     home = g.adjoint(g.inverse(chain.poses[b]))
@@ -190,7 +190,7 @@ def _largest(label: Ints, keep: Mask) -> Mask:
 
 
 def _own_first(other: Ints) -> Ints:
-    """Neighbour lists with the row's own number moved to the front (or the last neighbour dropped for it)."""
+    """Neighbour lists with the row's own index first (it replaces the last neighbour if missing)."""
     out = other.copy()
     for k in np.flatnonzero(other[:, 0] != np.arange(len(other))):
         rest = other[k][other[k] != k][: other.shape[1] - 1]
@@ -199,10 +199,10 @@ def _own_first(other: Ints) -> Ints:
 
 
 def _agreeing_clusters(chain: OdometryChain, loops: LoopArrays, label: Ints, limit: float) -> Mask:
-    """Loops of clusters that are left when the most contradicted cluster has been taken out again and again.
+    """Loops of the clusters that remain after the most contradicted cluster was removed repeatedly.
 
-    A cluster is contradicted by the loops of every cluster that disagrees with it; the one for which they are most,
-    in its own size, goes first. A cluster too small to be represented is left out.
+    A cluster is contradicted by the loops of every cluster that disagrees with it; the one with the largest number,
+    relative to its size, is removed first. A cluster too small for representatives is removed.
     """
     chosen, size = np.unique(label[label >= 0], return_counts=True)
     order = np.argsort(-size, kind="stable")[:REPRESENTATIVES]

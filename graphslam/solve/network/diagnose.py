@@ -1,7 +1,7 @@
-"""Which variables a pose network does not determine, in the file's own words, before a solver hides it.
+"""Undetermined variables of a pose network, reported with the names of the file before solving.
 
-GTSAM's LM "succeeds" on an undetermined network (its damping fills the gap) and its other solvers name one key. Here
-the whole set is named, with what would fix it.
+GTSAM's LM "succeeds" on an undetermined network (because of its damping), and its other solvers report one key. Here
+all are reported, with what would fix it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graphslam.graph.variables import Values, split_name
 
 
 def check_determined(network: PoseNetwork, flat: FactorArrays) -> None:
-    """Raise if some vertex or landmark is not connected to an anchor by measurements."""
+    """Raise if a vertex or landmark is not connected to an anchor by measurements."""
     lost, islands = unconnected_variables(flat)
     if lost:
         names = _in_words(network, lost)
@@ -34,7 +34,7 @@ def check_determined(network: PoseNetwork, flat: FactorArrays) -> None:
 def check_full_rank(network: PoseNetwork, flat: FactorArrays, values: Values) -> None:
     """Raise if measurements with rank-deficient information leave a direction free.
 
-    Costs nothing where every information matrix has full rank.
+    No cost if every information matrix has full rank.
     """
     pivots = (np.diagonal(f.whiteners, axis1=1, axis2=2) for f in flat.batches if isinstance(f, UniformBatch))
     if all((np.abs(p) > 1e-12 * np.abs(p).max(axis=1, keepdims=True)).all() for p in pivots):
@@ -50,7 +50,7 @@ def check_full_rank(network: PoseNetwork, flat: FactorArrays, values: Values) ->
 
 
 def _in_words(network: PoseNetwork, names: Sequence[str]) -> tuple[str, ...]:
-    """Variables as the file calls them, in its order."""
+    """Names of variables as in the file, in its order."""
     said = sorted((kind.word == "l", k) for kind, k in map(split_name, names))
     return tuple(f"landmark {k}" if mark else f"vertex {network.ids[k]}" for mark, k in said)
 

@@ -1,8 +1,8 @@
-"""A pose network fed to iSAM2 pose by pose, as a robot would have built it.
+"""Incremental solution of a pose network with iSAM2, pose by pose.
 
-iSAM2 (Kaess et al. 2012) keeps old linearisation points and stops solving where steps are small. With GTSAM's default
-thresholds it is fast and *near* the optimum; how near is not something it knows. So its estimate is a start of the
-descent, whose end the gap is measured against.
+iSAM2 (Kaess et al. 2012) keeps old linearisation points and does not update variables with small steps. With GTSAM's
+default thresholds it is fast and *near* the optimum, with an unknown gap. So its estimate is used as a start of the
+descent, and the gap is measured from its end.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from graphslam.solve.isam2 import Isam2Solver
 from graphslam.solve.network.start import cartesian_observations, neighbours
 
 log = logging.getLogger(__name__)
-# At most so many updates by default: each then relinearises more at once and, usually, gets nearer to the optimum.
+# Default limit of updates: each then relinearises more variables and usually gets nearer to the optimum.
 UPDATES = 500
-# GTSAM's defaults: thresholds of positions [m] and of headings [rad], looked at in every tenth update.
+# GTSAM's defaults: thresholds of positions [m] and of headings [rad], checked at every tenth update.
 THRESHOLD, SKIP = 0.1, 10
-# Further held vertices hang on the first one with this standard deviation [m, rad].
+# Other fixed vertices are connected to the first one with this standard deviation [m, rad].
 HELD_SIGMA = 1e-6
 
 
 def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
-    """Vertices in id order as far as the network allows, each with the edges to vertices already in.
+    """Vertices in id order as far as possible, each with its edges to previous vertices.
 
-    A vertex enters when it is connected to what is there; among those that are, the lowest id first. A chain of
-    odometry therefore comes in its own order.
+    A vertex is added when it is connected to previous ones, the lowest id first. A chain of odometry therefore keeps
+    its order.
     """
     first, edge, other = neighbours(network)
     inside = np.zeros(len(network), dtype=bool)
@@ -60,14 +60,14 @@ def insertion_order(network: PoseNetwork) -> Iterator[tuple[int, list[int]]]:
 
 
 def grow_with_isam2(network: PoseNetwork, *, batch: int = 0, progress: bool = False) -> Values:
-    """Estimate of iSAM2 after the whole network has been fed to it in :func:`insertion_order`.
+    """Estimate of iSAM2 after adding the whole network in :func:`insertion_order`.
 
-    By Cholesky factorisations, and once more by QR where they fail on the way (large or badly scaled information).
+    With Cholesky factorisation; repeated with QR if that fails (large or badly scaled information).
 
     Parameters
     ----------
     batch : int
-        Poses an update; 0: as many as make :data:`UPDATES`.
+        Poses per update; 0: total over :data:`UPDATES`.
     """
     batch = batch or -(-len(network) // UPDATES)
     try:
@@ -81,7 +81,7 @@ def grow_with_isam2(network: PoseNetwork, *, batch: int = 0, progress: bool = Fa
 
 
 def _grow(network: PoseNetwork, factorization: str, batch: int, progress: bool) -> Values:
-    """The graph as it grows: its nodes are the vertices in the order in which they enter, its landmarks rows."""
+    """Grow the graph; its nodes are the vertices in insertion order, its landmarks rows."""
     steps = list(insertion_order(network))
     vertices = np.array([v for v, _ in steps])
     node = np.empty(len(network), dtype=np.int64)
@@ -129,7 +129,7 @@ def _grow(network: PoseNetwork, factorization: str, batch: int, progress: bool) 
 def _from_neighbour(
     graph: FactorGraph, network: PoseNetwork, v: int, links: list[int], node: Ids, z: Array, z_back: Array
 ) -> Array:
-    """A new pose from that of the neighbour with the nearest id and the measurement between them."""
+    """A new pose from the neighbour with the nearest id and the measurement between them."""
     e = links[int(np.argmin(np.abs(network.edges[links].sum(axis=1) - 2 * v)))]
     i, j = network.edges[e].tolist()
     known = graph.pose(int(node[i if j == v else j]))

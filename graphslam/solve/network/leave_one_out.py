@@ -1,25 +1,24 @@
-"""What is accepted in the end: every loop and every group of loops against the posterior of all the others.
+"""Final outlier decision: every loop and every group of loops is tested against the posterior of all others.
 
-A loop's cost at the answer says little: a wrong loop that bends the map to itself is cheap there, and a right one that
-alone ties a stretch is dear without it. What counts is the evidence of the others. With the whitened residual r, the
-whitened Jacobian A and H the information of what is accepted, ``B = A H⁻¹ Aᵀ``, the fall of the objective if an
-accepted loop is taken out, and its rise if a refused one is taken in, are to first order
+The cost of a loop at the solution is a bad criterion: a false loop that distorts the map has a low cost. With the
+whitened residual r, the whitened Jacobian A, the information H of the accepted measurements and ``B = A H⁻¹ Aᵀ``, the
+decrease of the objective if an accepted loop is removed, and its increase if a rejected one is added, are to first
+order
 
     ``D² = rᵀ (I - B)⁻¹ r`` and ``D² = rᵀ (I + B)⁻¹ r``,
 
 the same number for the same loop: χ² of the loop against the posterior of all others (Cook 1979).
 
-Wrong loops that come from one mistaken place agree with each other, so ten of them are one piece of evidence and not
-ten. A group of loops that are neighbours is therefore judged by the one thing that all of them say together, the rigid
-motion of one stretch against the other. With ``G_k`` the whitened derivative of loop k by that motion, the χ² of the
-motion against all that is not of the group, which is what the objective would fall if the motion were free (accepted),
-or rise because it is not (refused), is
+False loops from one wrong place recognition agree with each other, so ten of them are not independent. A group of
+neighbouring loops is therefore tested by their common rigid motion of one path section relative to the other. With
+``G_k``, the whitened derivative of loop k with respect to that motion, the χ² of the motion against all measurements
+outside the group is
 
     ``D² = gᵀ (Gᵀ (I - B) G)⁻¹ g``, ``g = Gᵀ r`` (accepted), and the same with ``r → (I + B)⁻¹ r`` and
     ``I - B → (I + B)⁻¹`` (refused).
 
-The limit is the file's own: recorded loops have tails of their own kind, and the bulk says nothing about them. The tail
-of the accepted D² is followed as far as it is populated (Hill 1975).
+The limit is estimated per file: recorded loops have heavy tails, which do not follow from the bulk. The tail of the
+accepted D² is estimated as far as it is populated (Hill 1975).
 """
 
 from __future__ import annotations
@@ -46,26 +45,27 @@ from graphslam.solve.sparse import SparseProblem, factorise_sparse
 
 Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
-# Loops are neighbours if their ends are so many nodes apart, both together; larger groups are not judged as groups.
+# Loops are neighbours if the sum of the distances of their ends is at most this number of nodes; larger groups are not
+# tested.
 NEAR, LARGEST = 4, 40
-# Refused loops that are looked at in every round, those of least cost; columns that are solved for at a time.
+# Rejected loops that are tested in every round (least cost first); columns per linear solve.
 TESTED, COLUMNS = 300, 400
-# Rounds of accepting and refusing; steps of a solve between two of them.
+# Rounds of accepting and rejecting; steps of a solve between two of them.
 ROUNDS, STEPS = 15, 20
-# In a round only what is within this factor of the worst is taken out: one wrong loop makes its neighbours look bad.
+# In a round only loops within this factor of the worst are removed: a false loop increases D² of its neighbours.
 WORST = 0.25
-# The tail is told by this share of the accepted loops, with the weight of so many more of a tail index in between that
-# of a Gaussian and a Cauchy; the limit is where so many right loops are expected beyond.
+# The tail is estimated from this share of the accepted loops, with a prior of this weight (in loops) on a tail index
+# between Gaussian and Cauchy; beyond the limit this number of true loops is expected.
 TAIL, PRIOR, INDEX, BEYOND = 0.05, 5.0, 0.5, 0.5
-# … found by following the tail from the bulk's quantile, in so many steps.
+# … found by iteration from the bulk's quantile, with this number of steps.
 FOLLOWED, QUANTILE = 50, 0.9999
-# Fewer loops tell neither tail nor scale: the stated noise stands.
+# With fewer loops neither tail nor scale is estimated: the noise of the file is used.
 FEW = 30
-# With more loops than this a right one is refused by chance as seldom as with so many, not more often.
+# The probability of rejecting any true loop does not increase beyond this number of loops.
 FAMILY = 100
-# After the first round, loops and groups below this quantile, in the scale of the bulk, are not looked at again.
+# After the first round, loops and groups below this quantile, in the scale of the bulk, are not tested again.
 DULL = 0.95
-# B comes so close to 1 where nothing but the loop itself holds its ends.
+# Tolerance of eigenvalues of B near 1, i.e. of directions that only the loop itself determines.
 HELD = 1e-9
 
 
@@ -78,19 +78,19 @@ class RobustResult:
     inliers : (m + k,) bool
         Edges, then observations.
     problem : SparseProblem
-        Of the inliers alone.
+        Of the inliers only.
     end : Optimum
         Its objective is that of the inliers.
     limit : (m + k,)
-        What a measurement pays at most, that of edges by the tail of those accepted; infinite for trusted ones.
+        Largest cost of a measurement, for edges from the tail of the accepted ones; infinite for trusted ones.
     truncated : float
-        Truncated cost here.
+        Truncated cost of the solution.
     scale : float
-        True over stated variance of the edges: estimated (from the median D² of the accepted loops), or given.
+        True variance of the edges over that in the file: from the median D² of the accepted loops, or given.
     rounds : int
-        Of settling until nothing changed; ``ROUNDS`` if something still did.
+        Rounds until nothing changed; ``ROUNDS`` if the limit was reached.
     start : str
-        Which start led here.
+        Start that led to this solution.
     reached : dict of str to float
         Truncated cost by start.
     """
@@ -113,30 +113,30 @@ def weighted_problem(network: PoseNetwork, weights: npt.NDArray[Any]) -> SparseP
 
 
 def family_quantile(probability: float, count: int) -> float:
-    """Probability that one of ``count`` right loops is kept, so that all are as likely kept as ``FAMILY`` of them are
-    with the probability given."""
+    """Probability of keeping one of ``count`` true loops; all are kept as likely as ``FAMILY`` loops with
+    ``probability``."""
     return 1.0 - (1.0 - probability) * min(1.0, FAMILY / max(count, 1))
 
 
 def tail_limit(D2: Array, dof: int, quantile: float = QUANTILE) -> tuple[float, float]:
-    """Where the tail of right loops ends, and the noise scale of their bulk.
+    """Limit of the tail of true loops, and noise scale of their bulk.
 
     Parameters
     ----------
     D2 : (l,)
-        Of accepted loops, wrong ones perhaps among them.
+        Of accepted loops, possibly with false ones.
     dof : int
-        Of one.
+        Degrees of freedom of one loop.
     quantile : float
-        Of χ², in the scale of the bulk: the limit is at least that.
+        Lower bound of the limit: this quantile of χ², in the scale of the bulk.
 
     Returns
     -------
     limit : float
-        Where the tail ``P(D² > x) ~ x^(-1/ξ)`` has half a loop beyond it. ξ is Hill's estimate from the top twentieth
-        of what is within the limit, so what lies beyond a gap that the tail does not bridge tells nothing about it.
+        Point of the tail ``P(D² > x) ~ x^(-1/ξ)`` with half a loop expected beyond it. ξ is Hill's estimate from the
+        largest twentieth of the loops within the limit, so loops beyond a gap in the tail do not affect it.
     scale : float
-        Median over that of χ².
+        Median D² over that of χ².
     """
     x = np.sort(D2[np.isfinite(D2) & (D2 >= 0.0)])
     if not len(x):
@@ -161,7 +161,7 @@ def tail_limit(D2: Array, dof: int, quantile: float = QUANTILE) -> tuple[float, 
 
 
 def groups_of(ends: npt.ArrayLike) -> Ints:
-    """Number of the group of every loop ``(l,)``: neighbours of neighbours, by the nodes that they join ``(l, 2)``."""
+    """Group index of every loop ``(l,)``: connected neighbours, by the nodes of the loops ``(l, 2)``."""
     e = np.sort(np.asarray(ends, dtype=np.float64).reshape(-1, 2), axis=1)
     if not len(e):
         return np.zeros(0, dtype=np.int64)
@@ -173,18 +173,18 @@ def groups_of(ends: npt.ArrayLike) -> Ints:
 def loop_evidence(
     flat: FactorArrays, inliers: Mask, rows: npt.ArrayLike, values: Values, *, accepted: bool
 ) -> tuple[Array, Array, Ints]:
-    """``D²`` of loops and of their groups against the posterior of what is accepted, themselves left out.
+    """``D²`` of loops and of their groups against the posterior of the accepted measurements without themselves.
 
     Parameters
     ----------
     flat : FactorArrays
-        Edges come first.
+        Edges first.
     inliers : (m + k,) bool
-        What is accepted.
+        Accepted measurements.
     rows : (l,) int
-        Edges, all of them accepted or all refused.
+        Edges, all accepted or all rejected.
     values : Values
-        A minimum of the accepted's objective.
+        Minimum of the objective of the accepted measurements.
     accepted : bool
         Whether ``rows`` are among the inliers.
 
@@ -192,9 +192,9 @@ def loop_evidence(
     -------
     single : (l,)
     group : (l,)
-        Of the group's common motion; that of the loop itself where it is alone or its group is too large.
+        Of the group's common motion; that of the loop if it is alone or its group is too large.
     label : (l,) int64
-        Which group.
+        Group index.
     """
     at = np.asarray(rows, dtype=np.intp)
     edges = flat.batches[0]
@@ -203,7 +203,7 @@ def loop_evidence(
     label = groups_of(edges.ends[at])
     order = np.argsort(label, kind="stable")
     H = sp.csc_matrix(flat.evaluate(values, dense=False, weights=inliers.astype(np.float64)).A)
-    H.eliminate_zeros()  # what is refused would fill the factor
+    H.eliminate_zeros()  # rejected loops would fill the factor
     lu = factorise_sparse(H)
     ordered = BetweenBatch.of_arrays(
         edges.ends[at[order]], edges.measured[at[order]], edges.whiteners[at[order]], layout
@@ -247,10 +247,10 @@ def loop_evidence(
 
 
 def _common_motion(loops: BetweenBatch, J: Array, poses: Array) -> Array:
-    """Whitened derivative ``(l d, d)`` of the loops' residuals by a motion of all later ends, a left tangent about the
-    middle of their positions (the condition of what follows is better there than about the origin)."""
+    """Whitened derivative ``(l d, d)`` of the loops' residuals with respect to a motion of all later ends, a left
+    tangent about the mean of their positions (better conditioned than about the origin)."""
     g, ends = group_of(poses), loops.ends
-    # a loop that runs back says the same of the inverse motion: the later end is the one that moves
+    # always move the later end, also for loops with reversed direction
     moved = poses[np.max(ends, axis=1)].copy()
     moved[:, : g.dim] -= moved[:, : g.dim].mean(axis=0) if len(moved) else 0.0
     blocks = np.where((ends[:, 0] > ends[:, 1])[:, None, None], J[:, :, : g.dof], J[:, :, g.dof :])
@@ -258,7 +258,7 @@ def _common_motion(loops: BetweenBatch, J: Array, poses: Array) -> Array:
 
 
 def _chunks(label: Ints, most: int) -> list[tuple[int, int]]:
-    """Pieces of a sorted label array that cut no group of at most ``LARGEST``."""
+    """Chunks of a sorted label array that do not split groups of at most ``LARGEST``."""
     starts = np.flatnonzero(np.diff(label, prepend=-1))
     ends = np.append(starts[1:], len(label))
     out: list[tuple[int, int]] = []
@@ -288,7 +288,7 @@ def leave_one_out_test(
     probability: float = QUANTILE,
     own_tail: bool = True,
 ) -> RobustResult:
-    """Rounds of accepting and refusing by ``D²`` until nothing changes.
+    """Rounds of accepting and rejecting by ``D²`` until nothing changes.
 
     Parameters
     ----------
@@ -297,13 +297,14 @@ def leave_one_out_test(
     values : Values
         Near a minimum of the inliers' objective.
     inliers : (m + k,) bool
-        Believed so far.
+        Current inliers.
     limit : (m + k,)
-        Infinite for trusted edges; of observations.
+        Cost limits; infinite for trusted edges.
     probability : float
-        With which a right loop is kept (:func:`family_quantile`) if the stated noise is right: no limit is wider.
+        Probability of keeping a true loop (:func:`family_quantile`) with the noise of the file; upper bound of the
+        limit.
     own_tail : bool
-        The limit of edges is the file's own (:func:`tail_limit`); that of ``limit`` if not.
+        The limit of edges is estimated (:func:`tail_limit`); otherwise it is ``limit``.
     """
     m, d = len(network.edges), network.tangent_dim
     w = np.linalg.eigvalsh(network.information)
@@ -345,11 +346,11 @@ def leave_one_out_test(
         outside = outside[np.argsort(costs[outside], kind="stable")]
         against = np.full(m, np.inf)
         for first, last in ((0, TESTED), (TESTED, len(outside))):
-            # the dear ones only where nothing else changes: what the accepted do not hold may lie far off
+            # expensive ones only if nothing else changes: parts without accepted loops can be far off
             some = outside[first:last]
             if len(some) and (first == 0 or (fresh == inliers).all()):
                 against[some] = loop_evidence(flat, inliers, some, here, accepted=False)[0]
-        # the group of a right loop is that of those that could be right: wrong ones may lie beside it
+        # groups are formed from possible inliers only: false loops can be near true ones
         good = outside[against[outside] <= limit[outside]]
         if len(good):
             alone, group, _ = loop_evidence(flat, inliers, good, here, accepted=False)

@@ -1,4 +1,4 @@
-"""The batch optimum of a pose network from several starts, because a local minimum is not an answer."""
+"""Batch optimum of a pose network from several starts, to avoid local minima."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ from graphslam.solve.sparse import SparseProblem
 log = logging.getLogger(__name__)
 
 Start = tuple[Array, Array]
-# Starts with initial objectives as close as this are one start (a file's values are often its printed odometry).
+# Starts with a smaller relative difference of the initial objective are equal (values in files are often the odometry).
 TWIN = 1e-5
-# Networks with more residuals than this stop at the first two starts that agree on the lowest objective.
+# Larger networks (number of residuals) stop at the first two starts with the same lowest objective.
 LARGE = 50_000
-# χ² that far above its expectation, in standard deviations of what the stated noise allows, is no chance.
+# Limit of χ² above its expectation, in standard deviations under the noise of the file.
 BEYOND = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class StartReport:
-    """What became of one start.
+    """Result of one start.
 
     Parameters
     ----------
     objective_initial, objective : float
         Before and after descent.
     status : str
-        "converged", "rejected" (could not get below another start), "stalled", "out of iterations",
-        "same as …" (not tried) or "failed".
+        "converged", "rejected" (another start is lower), "stalled", "out of iterations", "same as …" (not tried) or
+        "failed".
     """
 
     name: str
@@ -86,7 +86,7 @@ def _incremental(network: PoseNetwork) -> Start:
     return found.poses, found.landmarks
 
 
-# In the order in which they are tried.
+# In the order of trial.
 STARTS: dict[str, Callable[[PoseNetwork], Start | None]] = {
     "incremental": _incremental,
     "chordal": _chordal,
@@ -97,10 +97,10 @@ STARTS: dict[str, Callable[[PoseNetwork], Start | None]] = {
 
 
 def default_starts(network: PoseNetwork) -> tuple[str, ...]:
-    """Names of the starts worth trying.
+    """Names of the useful starts.
 
-    The rotations of a landmark network are tied by odometry alone, so rotations first know nothing of its loops: it
-    is built up pose by pose instead.
+    The rotations of a landmark network are constrained only by odometry, so rotations first would ignore its loops: it
+    is solved incrementally instead.
     """
     names = ["chordal", "file", "tree", "odometry"]
     if len(network.observations) and network.observation_kind == "bearing-range":
@@ -109,7 +109,7 @@ def default_starts(network: PoseNetwork) -> tuple[str, ...]:
 
 
 def canonical_start(network: PoseNetwork) -> Values:
-    """What the file says: its values where it has them all, else its odometry chain."""
+    """Values of the file if complete, otherwise its odometry chain."""
     return network_values(network, *(_file(network) or _odometry(network)))
 
 
@@ -120,10 +120,10 @@ class StartsResult:
     Parameters
     ----------
     start : str
-        Which won.
+        Name of the best start.
     doubt : str
-        What spoke against the first start's answer, so that it was certified or the others were tried; empty if
-        nothing did, or if starts were named.
+        Reason to doubt the first start's solution, so that a certificate or other starts were tried; empty without a
+        reason, or if starts were given.
     """
 
     problem: SparseProblem
@@ -134,18 +134,18 @@ class StartsResult:
 
     @property
     def iterations(self) -> int:
-        """Steps of all starts together."""
+        """Total steps of all starts."""
         return sum(r.iterations for r in self.reports)
 
 
 def suspicion_of_answer(network: PoseNetwork, end: Optimum) -> str:
-    """Why an answer may not be the best one, in words; empty if nothing speaks against it.
+    """Reason why a solution may not be the global minimum; empty if there is none.
 
     * The descent did not end at a stationary point.
-    * A cycle of edges is wound (:func:`~graphslam.solve.network.start.wound_cycles`): every minimum other than the
-      best that was met from random starts on the recorded networks shows that, or the next.
-    * χ² is beyond what the stated noise allows, and the cycles do not decide whether it is the noise or the answer.
-    * Landmarks: their observations close loops that no cycle of edges shows.
+    * A cycle of edges is wound (:func:`~graphslam.solve.network.start.wound_cycles`): on the recorded networks, all
+      other minima found from random starts show this or the next.
+    * χ² is too large for the noise of the file, and the cycles do not decide whether noise or solution is wrong.
+    * Landmarks: their observations close loops that are not cycles of edges.
     """
     if end.status != "converged":
         return f"the first start did not converge ({end.status})"
@@ -172,21 +172,21 @@ def best_of_starts(
     certified: Callable[[PoseNetwork, Optimum], bool] | None = None,
     progress: bool = False,
 ) -> StartsResult:
-    """Descend from a start, from all that can compete if there is doubt of the answer, and keep the lowest objective.
+    """Descend from one start, or from several if the solution is doubtful, and keep the lowest objective.
 
     Parameters
     ----------
     names : sequence of str, optional
-        Keys of :data:`STARTS`, all of which are tried. If not given: the first (of ``given``, then of
-        :func:`default_starts`), and the others if there is :func:`suspicion_of_answer` that no certificate settles.
+        Keys of :data:`STARTS` to try. Default: the first (of ``given``, then of :func:`default_starts`), and the others
+        if :func:`suspicion_of_answer` has a reason and there is no certificate.
     given : dict of str to Values, optional
         Further starts, tried first.
     flat : FactorArrays, optional
-        The network as a problem, where it was made already.
+        The network as a problem, if available.
     problem : SparseProblem, optional
-        How it is solved; by direct solves if not given.
+        The problem with its linear solver; default: direct solves.
     certified : callable, optional
-        Whether an answer is proved to be the best, which settles a doubt for less than other starts cost.
+        Test for global optimality, which is faster than other starts.
     """
     chosen = tuple(names) if names is not None else default_starts(network)
     for name in chosen:
@@ -242,7 +242,7 @@ def _shown(names: list[str]) -> Iterable[str]:
 
 
 def _better(a: Any, b: Any) -> bool:
-    """Lower; or equal, and converged where the other is not."""
+    """Whether a has a lower objective; or an equal one, and only a converged."""
     if a.objective < b.objective * (1.0 - SAME):
         return True
     return a.objective <= b.objective * (1.0 + SAME) and a.status == "converged" != b.status

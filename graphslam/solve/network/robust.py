@@ -1,12 +1,11 @@
-"""Truncated least squares on a pose network: which measurements are wrong, and the tight solve of the rest.
+"""Truncated least squares on a pose network: detection of outliers, and solution of the inliers.
 
-A measurement pays at most ``s² χ²_d(p)`` (Yang, Antonante, Tzoumas & Carlone 2020, TLS cost), where s² is how far the
-file misstates its variance. Graduated non-convexity finds a good local minimum if it begins near one; least squares of
-everything, its usual start, is no such place when a third of the loops are wrong. So it begins from the loops that
-their neighbours bear out (:mod:`~graphslam.solve.network.consensus`), with the schedule as late as the residuals there
-allow. Plain trimming from every start is the competitor. What it ends with is settled by evidence, loop by loop and
-group by group (:mod:`~graphslam.solve.network.leave_one_out`), with the file's own limit, and the lowest truncated cost
-wins.
+The cost of a measurement is at most ``s² χ²_d(p)`` (Yang, Antonante, Tzoumas & Carlone 2020, TLS cost), where s² is the
+true variance over that in the file. Graduated non-convexity finds a good local minimum from a near start; least squares
+of all measurements, its usual start, is not near if a third of the loops are false. So it starts from the loops that
+are confirmed by their neighbours (:mod:`~graphslam.solve.network.consensus`), with μ as large as the residuals allow.
+The alternative is trimming from every start. The results are tested loop by loop and group by group
+(:mod:`~graphslam.solve.network.leave_one_out`) with an estimated limit, and the lowest truncated cost is selected.
 """
 
 from __future__ import annotations
@@ -37,25 +36,25 @@ log = logging.getLogger(__name__)
 
 Mask = npt.NDArray[np.bool_]
 ROUNDS = 12
-# The bulk of recorded loops says little of the tail: with an estimated scale, the limit is so many times wider until
-# the tail is known, though never beyond that of the stated noise.
+# The bulk of recorded loops does not determine the tail: with an estimated scale, the limit is wider by this factor
+# until the tail is estimated, but at most that of the file's noise.
 MARGIN = 20.0
-# Growth of μ, descent steps at each, and when to stop (Yang et al. 2020 use 1.4).
+# Growth of μ, descent steps at each, and largest number of stages (Yang et al. 2020 use growth 1.4).
 GROWTH, STEPS, STAGES = 1.4, 2, 60
-# Residuals of the loops believed at the start are taken to be at most so many times the limit: μ starts there.
+# Assumed largest ratio of residuals to the limit for the initial inliers, which gives the initial μ.
 WORST = 1e3
-# The guess is confirmed if fewer of all edges than this were believed at first and are outliers in the end.
+# The guess is confirmed if fewer than this share of all edges are initial inliers and final outliers.
 CONFIRMED = 0.001
 # Steps of a solve between two choices of inliers; the last solve goes to the end.
 TRIM_STEPS = 6
 FINAL_STEPS = 200
-# Where neighbours bear out fewer of the loops than this, they are no guess: least squares of everything under a kernel
-# makes another start, and noise is taken as stated. A scale estimated from the few loops that happen to suit the
-# odometry is too small, and with it rejecting all others is cheap.
+# If neighbours confirm fewer of the loops than this share, they are not used as a guess: robust least squares of all
+# measurements gives another start, and the noise of the file is used. A scale estimated from the few loops that fit the
+# odometry by chance is too small, and would reject all others.
 BORNE_OUT = 0.2
 # Cauchy's width in standard deviations (95 % efficient), rounds of reweighting, and descent steps in each.
 CAUCHY, KERNEL_ROUNDS, KERNEL_STEPS = 2.385, 15, 2
-# Steps for a sub-network: wrong loops among the guess make it hard, and the answer is only a start.
+# Steps for a sub-network: false loops in the guess make it hard, and the result is only a start.
 START_STEPS = 40
 
 
@@ -81,15 +80,15 @@ def truncated_least_squares(
     flat : FactorArrays
         All measurements of the network.
     given : dict of str to Values, optional
-        Further starts.
+        Additional starts.
     probability : float
-        An inlier is kept with this probability, if noise is Gaussian.
+        Probability of keeping an inlier with Gaussian noise.
     trust_odometry : bool
-        Edges between neighbours in id order are never outliers (they are not loop closures), if they join nearly all
-        vertices; where they do not, nothing is trusted.
+        Edges between neighbours in id order are never outliers (they are not loop closures), if they connect nearly all
+        vertices; otherwise no edge is trusted.
     noise_scale : float, optional
-        s², true over stated variance of the edges. Estimated from the network if not given. Observations of landmarks
-        are always taken at their word.
+        s², true variance of the edges over that in the file; default: estimated. The noise of landmark observations is
+        not scaled.
     """
     if not 0.0 < probability < 1.0:
         raise ConfigError(f"inlier_probability must lie between 0 and 1, got {probability}")
@@ -146,10 +145,10 @@ def truncated_least_squares(
         )
         found.append((name, best))
         if name == "consensus" and (best.inliers[:m] | ~consensus.likely).mean() > 1.0 - CONFIRMED:
-            starts.pop("core", None)  # the loops believed first are believed last
+            starts.pop("core", None)  # the initial inliers are the final ones
     if not found:
         raise IndeterminateError(f"{network.source}: no robust start could be made")
-    # one limit for all, that of the cleanest answer: wrong loops widen the tail that they are judged by
+    # one limit for all, the smallest: false loops widen the estimated tail
     limit = np.min([f.limit for _, f in found], axis=0)
     reached: dict[str, float] = {}
     for name, settled in found:
@@ -161,7 +160,7 @@ def truncated_least_squares(
 
 
 def _least_squares(network: PoseNetwork, used: Mask, *, chordal: bool) -> Values | None:
-    """Least squares of the measurements in ``used`` alone, from rotations first or from dead reckoning."""
+    """Least squares of the measurements in ``used``, from rotations first or from dead reckoning."""
     part = network.only(used)
     inner = SparseProblem(network_arrays(part), thorough=True)
     try:
@@ -178,7 +177,7 @@ def _least_squares(network: PoseNetwork, used: Mask, *, chordal: bool) -> Values
 
 
 def _under_kernel(network: PoseNetwork, flat: FactorArrays, values: Values, trusted: Mask) -> Values:
-    """Iteratively reweighted least squares of everything, loops under Cauchy's kernel."""
+    """Iteratively reweighted least squares of all measurements, loops with Cauchy's kernel."""
     for _ in range(KERNEL_ROUNDS):
         weights = np.where(trusted, 1.0, 1.0 / (1.0 + flat.squared(values) / CAUCHY**2))
         values = descend_to_minimum(weighted_problem(network, weights), values, max_iterations=KERNEL_STEPS).values
@@ -186,19 +185,18 @@ def _under_kernel(network: PoseNetwork, flat: FactorArrays, values: Values, trus
 
 
 def _scale(network: PoseNetwork, costs: Array, used: Mask, believed: Mask) -> float:
-    """True over stated variance of the loops, at most 1, from the median cost of those believed, after least squares.
+    """True variance of the loops over that in the file, at most 1, from the median cost of the inliers after the fit.
 
-    More than 1 would as well be wrong loops among the believed, or odometry with a bias: the stated noise stands then,
-    and where loops are few.
+    A value above 1 can also come from false loops or biased odometry: the noise of the file is then used, and also with
+    few loops.
 
-    A residual after the fit is smaller than the noise: all together they have ``rows - states`` degrees of freedom
-    left of ``rows``.
+    Residuals after the fit are smaller than the noise: ``rows`` residuals have ``rows - states`` degrees of freedom.
     """
     m = len(network.edges)
     rows = int(used[:m].sum()) * network.tangent_dim + 2 * int(used[m:].sum())
     left = max(rows - network.states, 1) / rows
     costs = costs[:m][believed]
-    costs = costs[costs > REPEATED]  # a loop of two moments between which nothing moved says nothing about noise
+    costs = costs[costs > REPEATED]  # loops at standstill have no information on noise
     if len(costs) < FEW:
         return 1.0
     return min(1.0, float(np.median(costs)) / (left * chi2_quantile(0.5, network.tangent_dim)))
@@ -214,7 +212,7 @@ def _limits(network: PoseNetwork, probability: float, scale: float, trusted: Mas
 def _anneal(
     network: PoseNetwork, flat: FactorArrays, values: Values, limit: Array, believed: Mask
 ) -> tuple[Array, Values]:
-    """Graduated non-convexity (Yang et al. 2020, eq. 14-16): weights and the values they lead to."""
+    """Graduated non-convexity (Yang et al. 2020, eq. 14-16): weights and the resulting values."""
 
     def ratio(values: Values) -> Array:
         return np.where(loose, flat.squared(values) / np.where(loose, limit, 1.0), 0.0)
@@ -237,9 +235,9 @@ def _anneal(
 def _trim(
     network: PoseNetwork, flat: FactorArrays, values: Values, inliers: Mask, limit: Array, *, steps: int = TRIM_STEPS
 ) -> RobustResult:
-    """Alternate least squares of the inliers and the choice of inliers until the choice stays.
+    """Alternate least squares of the inliers and selection of inliers until the selection is constant.
 
-    Neither step raises the truncated cost, so it ends.
+    Neither step increases the truncated cost, so it terminates.
     """
     for _ in range(ROUNDS):
         inner = weighted_problem(network, inliers)

@@ -1,4 +1,4 @@
-"""``solve_network``: one function, four solvers, and an answer that says how good it is."""
+"""``solve_network``: solve a pose network with one of four solvers, with convergence diagnostics."""
 
 from __future__ import annotations
 
@@ -33,55 +33,55 @@ if TYPE_CHECKING:
     from graphslam.solve.network.certificate import Certificate
     from graphslam.solve.network.leave_one_out import RobustResult
 
-# A threshold at 0.99 leaves out one right loop in a hundred, which alone costs the rest more than 1 % (measured).
+# A threshold at 0.99 rejects one true loop in a hundred, which increases the error by more than 1 % (measured).
 INLIER_PROBABILITY = 0.9999
-# Least squares of all measurements, beside the robust answer, gets so many steps.
+# Steps of least squares of all measurements after the robust solution …
 BATCH_STEPS = 10
-# … unless more than this share of everything is left out.
+# … which is skipped if more than this share was rejected.
 FEW = 0.05
-# Of fewer loops nobody can say that most contradict the rest.
+# Least number of loops for the test whether most contradict the rest.
 FEWEST_LOOPS = 10
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkSolution:
-    """Answer of a solver to a pose network.
+    """Result of a solver for a pose network.
 
     Parameters
     ----------
     network : PoseNetwork
-        What was solved.
+        The solved network.
     poses : (n, 3) or (n, 7)
     landmarks : (l, 2)
     objective : float
         ``Σ rᵀ Ω r`` with GTSAM's residual (full logarithm), over all edges and observations.
     objective_initial : float
-        The same at what the file says: its values, or its odometry chain if it has edges only.
+        The same at the values of the file, or at its odometry chain if it has only edges.
     iterations : int
-        Steps of the descent that won (all solvers count linear solves of the whole network).
+        Steps of the best descent (all solvers count linear solves of the whole network).
     converged : bool
-        At a stationary point (the decrement is negligible) *and* not above the best objective that any start
-        reached. For gnc: at a stationary point of the inliers' objective, and not where most loops contradict each
-        other and the odometry (``details["doubt"]``).
+        At a stationary point (the decrement is negligible) *and* not above the best objective of all starts. For gnc:
+        at a stationary point of the inliers' objective, and most loops do not contradict each other and the odometry
+        (``details["doubt"]``).
     decrement : float
-        Predicted further fall of the objective (gnc: of the inliers' objective).
+        Predicted further decrease of the objective (gnc: of the inliers' objective).
     gap : float
-        Objective minus the lowest that any start reached in this run (there may be one only); nan where the start that
-        reached it did not converge, because then no optimum is known to measure against. For gnc it is what leaving
-        out outliers costs in the objective of all measurements, against what a few steps of least squares from there
-        reach (or the starts that were asked for); nan if so much is left out that this was not tried.
+        Objective minus the lowest of all starts in this run (possibly one); nan if that start did not converge, because
+        the optimum is then unknown. For gnc: increase of the objective of all measurements by rejecting outliers,
+        relative to the result of a few least-squares steps from there (or of the given starts); nan if too much was
+        rejected for this.
     start : str
-        Which start won.
+        Name of the best start.
     starts : tuple of StartReport
-        What every start that was tried reached.
+        Results of all tried starts.
     initial : Values
-        What the file says.
+        Values of the file.
     details : dict
-        What only this solver has to say.
+        Details that are specific to the solver.
     inliers : (m + k,) bool or None
-        Edges, then observations, that gnc kept; None from solvers that keep everything.
+        Edges, then observations, that gnc kept; None for other solvers.
     certificate : Certificate or None
-        If it was asked for.
+        If requested.
     """
 
     network: PoseNetwork
@@ -104,16 +104,16 @@ class NetworkSolution:
 
     @property
     def objective_g2o(self) -> float:
-        """``Σ rᵀ Ω r`` with g2o's residual (x, y, θ or t, vec q) at the same answer."""
+        """``Σ rᵀ Ω r`` with g2o's residual (x, y, θ or t, vec q) at the solution."""
         return g2o_objective(self.network, network_values(self.network, self.poses, self.landmarks))
 
     @property
     def objective_g2o_initial(self) -> float:
-        """g2o's objective at what the file says."""
+        """g2o's objective at the values of the file."""
         return g2o_objective(self.network, self.initial)
 
     def to_network(self) -> PoseNetwork:
-        """The network with the solution as its values, ready to be written."""
+        """The network with the solution as its values, for writing."""
         return self.network.with_poses(self.poses, self.landmarks)
 
     def __repr__(self) -> str:
@@ -145,7 +145,7 @@ class _Answer:
     optimum: StartsResult
     start: str
     details: dict[str, Any]
-    # what the solver minimised, where that is not the whole objective
+    # the minimised problem, if it is not the whole objective
     minimised: SparseProblem | None = None
     minimum: float | None = None
     inliers: npt.NDArray[np.bool_] | None = None
@@ -178,17 +178,17 @@ def solve_network(
     solver : {"lm", "isam2", "gnc", "pcg"}
         Key of :data:`SOLVERS`.
     starts : sequence of str or "all", optional
-        Starts to try (:data:`graphslam.solve.network.multistart.STARTS`); "all" that are worth trying for this
-        network. If not given one, and the others if there is doubt of its answer
+        Starts to try (:data:`graphslam.solve.network.multistart.STARTS`); "all" that are useful for this network.
+        Default: one, and the others if its solution is doubtful
         (:func:`graphslam.solve.network.multistart.suspicion_of_answer`).
     certificate : bool
-        Also say whether the answer is the global optimum of what was minimised (for gnc: of the inliers), in
+        Also test whether the solution is the global optimum of the minimised problem (for gnc: of the inliers), in
         ``NetworkSolution.certificate``.
     progress : bool
         Progress bars on stderr.
     **options
         isam2: ``relinearise`` (True: close the gap); gnc: ``inlier_probability`` (0.9999), ``trust_odometry`` (True),
-        ``noise_scale`` (true over stated variance; None: estimated); pcg: ``tolerance``, ``max_iterations``.
+        ``noise_scale`` (true variance over that in the file; None: estimated); pcg: ``tolerance``, ``max_iterations``.
     """
     if solver not in SOLVERS:
         raise UnknownNameError("solver", solver, SOLVERS)
@@ -208,7 +208,7 @@ def solve_network(
     value = best.objective if answer.values is best.values else flat.objective(answer.values)
     gap = value - best.objective
     if answer.values is best.values and best.converged:
-        # judged where the descent ended: evaluated again one step on, a decrement at the limit may lie beyond it
+        # evaluated where the descent ended: one step later, a decrement at the limit can be above it
         decrement, stationary = best.decrement, True
     else:
         decrement = (answer.minimised or answer.optimum.problem).decrement(answer.values)
@@ -278,7 +278,7 @@ def _isam2(task: _Task) -> _Answer:
     begin = time.perf_counter()
     grown = grow_with_isam2(network, progress=progress)
     seconds = time.perf_counter() - begin
-    # the batch optimum is what the gap is measured against; iSAM2's own estimate is one of its starts
+    # the gap is measured from the batch optimum; iSAM2's estimate is one of its starts
     names = None if starts is None else [n for n in starts if n != "incremental"]
     given = {"incremental": grown}
     optimum = best_of_starts(network, names, given=given, flat=flat, certified=_certified, progress=progress)
@@ -291,26 +291,25 @@ def _isam2(task: _Task) -> _Answer:
     }
     if not close:
         return _Answer(grown, 0, optimum, "incremental", details)
-    # closed by relinearising everything, again and again: by the descent from there, or from another start in a lower
-    # basin
+    # the gap is closed by relinearisation: by the descent from there, or from another start in a lower basin
     details["objective_relinearised"] = optimum.reports[0].objective
     details["reseeded"] = optimum.start != "incremental"
     return _Answer(best.values, best.iterations, optimum, optimum.start, details)
 
 
 def _gnc(task: _Task) -> _Answer:
-    from graphslam.solve.network.consensus import odometry_edges  # scipy's statistics take a second to load
+    from graphslam.solve.network.consensus import odometry_edges  # scipy.stats takes a second to load
     from graphslam.solve.network.robust import BORNE_OUT, truncated_cost, truncated_least_squares
 
     network, flat, starts, options, progress = task
     probability = float(options.get("inlier_probability", INLIER_PROBABILITY))
     scale = options.get("noise_scale")
-    # least squares of everything, from every start, is worth its time only if asked for: wrong loops make it slow
+    # least squares of all measurements from every start only on request: false loops make it slow
     asked = best_of_starts(network, starts, flat=flat, progress=progress) if starts is not None else None
     trust = bool(options.get("trust_odometry", True))
     given = {asked.start: asked.best.values} if asked is not None else {}
     if not given and not (trust and odometry_edges(network).any()):
-        # nothing is trusted, so nothing else can make a start
+        # no edge is trusted, so there is no other start
         asked = best_of_starts(network, starts, flat=flat, progress=progress)
         given = {asked.start: asked.best.values}
     robust = truncated_least_squares(
@@ -329,7 +328,7 @@ def _gnc(task: _Task) -> _Answer:
     loops = ~odometry_edges(network)
     kept = int(np.count_nonzero(robust.inliers[:m] & loops))
     doubt = ""
-    # loops that their neighbours bear out may be fewer than those that contradict everything
+    # loops confirmed by neighbours can be fewer than those that contradict everything
     enough = 0.5 if robust.start in ("odometry", "cauchy") else BORNE_OUT
     if kept < enough * np.count_nonzero(loops) and np.count_nonzero(loops) >= FEWEST_LOOPS:
         doubt = (
@@ -364,11 +363,11 @@ def _gnc(task: _Task) -> _Answer:
 
 
 def _from_robust(flat: FactorArrays, robust: RobustResult) -> StartsResult:
-    """What least squares of everything makes of the robust answer, in a few steps: the gap is measured against it."""
+    """Result of a few least-squares steps of all measurements from the robust solution, the reference of the gap."""
     problem = SparseProblem(flat, thorough=True)
     initial = problem.objective(robust.end.values)
     if np.mean(~robust.inliers) > FEW:
-        # random loops fill the factorisation: a step of everything costs many times the whole robust solve
+        # random loops fill the factorisation: a step with all costs many times the whole robust solution
         unknown = Optimum(robust.end.values, initial, float("nan"), float("inf"), 0, "rejected")
         return StartsResult(
             problem, unknown, "inliers", (StartReport("inliers", initial, float("nan"), 0, "not tried"),)

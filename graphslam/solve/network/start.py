@@ -1,9 +1,9 @@
-"""Where to start: odometry chain, spanning tree, and rotations first (chordal relaxation).
+"""Initialisation: odometry chain, spanning tree, and rotations first (chordal relaxation).
 
-Pose-graph optimisation is not convex; which minimum a local solver reaches is decided here. The chordal relaxation
-(Martinec & Pajdla 2007; Carlone, Tron, Daniilidis & Dellaert 2015) drops the constraint that rotations are rotations,
-which makes them the solution of one sparse linear system, projects the answer back, and then solves for positions,
-which are linear given the rotations.
+Pose-graph optimisation is not convex; the start decides which minimum a local solver reaches. The chordal relaxation
+(Martinec & Pajdla 2007; Carlone, Tron, Daniilidis & Dellaert 2015) drops the orthogonality constraint of rotations,
+solves one sparse linear system, projects the result to rotations, and then solves for positions, which are linear given
+the rotations.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from graphslam.solve.sparse import MANY, BlockElimination, factorise_sparse
 
 Index = npt.NDArray[np.intp]
 
-# A cycle that the measurements themselves close no better than this [rad] says nothing about turns too many.
+# A cycle whose measurements have a larger closing error [rad] is not used to detect extra turns.
 UNDECIDED = 2.0 * np.pi / 3.0
 
 
 def network_arrays(network: PoseNetwork, used: Mask | None = None) -> FactorArrays:
-    """The problem of a network, in an order of elimination unless it is dissected later."""
+    """Least-squares problem of a network, in an elimination order, unless nested dissection is used later."""
     return problem_of_network(network, used, ordered=len(network) <= MANY[network.dim] or len(network.landmark_ids) > 0)
 
 
@@ -76,12 +76,12 @@ class SpanningTree:
 
 
 def spanning_tree(network: PoseNetwork, *, chain: bool = False) -> SpanningTree:
-    """Breadth first: fewest edges between a vertex and an anchor, so the least accumulated error.
+    """Breadth-first tree: fewest edges between a vertex and an anchor, so the least accumulated error.
 
     With ``chain`` edges between neighbours in id order have precedence: dead reckoning.
     """
     n, (i, j) = len(network), network.edges.T
-    # anchors hang from one extra node; of parallel edges the first counts, one that points forward before another
+    # anchors are connected to one extra node; of parallel edges the first is used, preferably a forward one
     low, high = np.minimum(i, j), np.maximum(i, j)
     order = np.lexsort((np.arange(len(i)), i > j))
     pair, first = np.unique((low * n + high)[order], return_index=True)
@@ -120,7 +120,7 @@ def tree_poses(network: PoseNetwork, tree: SpanningTree) -> Array:
 
 
 def odometry_start(network: PoseNetwork) -> Array:
-    """Dead reckoning: every vertex from its predecessor in id order where an edge joins them, else from any edge."""
+    """Dead reckoning: every vertex from its predecessor in id order if there is an edge, otherwise from any edge."""
     return tree_poses(network, spanning_tree(network, chain=True))
 
 
@@ -130,13 +130,13 @@ def tree_start(network: PoseNetwork) -> Array:
 
 
 def wound_cycles(network: PoseNetwork, poses: Array) -> tuple[int, int, int]:
-    """Cycles of edges around which a solution turns once more (or less) than the measurements do.
+    """Cycles of edges along which a solution has a full turn more (or less) than the measurements.
 
-    Given the rotations of a pose network its positions are linear, so another minimum has other rotations; and what
-    no small change of rotations undoes is a turn too many around some cycle. Every edge outside a spanning tree closes
-    one cycle. In 2-D the residual angles around it must add up to less than half a turn; in 3-D the product of the
-    residual rotations, each lifted to the nearer of its two quaternions, must have the sign of what was measured (two
-    turns are none there). A cycle whose measurements miss by more than a third of a turn decides nothing.
+    Given the rotations of a pose network, its positions are linear, so another minimum has other rotations, usually
+    with an extra turn in some cycle. Every edge outside a spanning tree closes one cycle. In 2-D the residual angles
+    around it must add up to less than half a turn; in 3-D the product of the residual rotations, each lifted to the
+    nearer of its two quaternions, must have the sign of the measurements (there, two turns are none). A cycle with a
+    closing error of more than a third of a turn is undecided.
     """
     tree, (i, j) = spanning_tree(network), network.edges.T
     branch = tree.edge >= 0
@@ -184,7 +184,7 @@ def chordal_start(network: PoseNetwork) -> tuple[Array, Array]:
 def _least_squares(A: sp.csc_matrix, b: Array, width: int) -> Array:
     """Least squares of variables of ``width`` real scalars each (a complex number is two)."""
     H = sp.csc_matrix(A.conj().T @ A)
-    # every vertex of a component without an anchor would be singular; a rounding-size ridge keeps the factor finite
+    # a component without an anchor would be singular; a tiny ridge keeps the factor finite
     H = sp.csc_matrix(H + sp.identity(H.shape[0], format="csc") * (1e-12 * float(np.abs(H.diagonal()).max())))
     rhs = np.asarray(A.conj().T @ b)
     whole = np.iscomplexobj(rhs)
@@ -215,7 +215,7 @@ def chordal_rotations(network: PoseNetwork) -> Array:
         if free.any():
             u[free] = _least_squares(A, b, 2)
         return rotation2(np.angle(u))
-    # R_jᵀ = Z_ijᵀ R_iᵀ: the columns of Rᵀ obey the same 3n × 3n system
+    # R_jᵀ = Z_ijᵀ R_iᵀ: the columns of Rᵀ solve the same 3n × 3n system
     weight = np.sqrt(np.trace(network.information[:, :3, :3], axis1=1, axis2=2) / 3.0)
     Zt = np.swapaxes(se3.quat_to_matrix(network.measurements[:, 3:]), 1, 2)
     known3 = np.swapaxes(se3.quat_to_matrix(network.poses[:, 3:]), 1, 2)
@@ -243,7 +243,7 @@ def chordal_rotations(network: PoseNetwork) -> Array:
 def _relaxed(
     own: Array, z: Array, weight: Array, i: Array, j: Array, free: Array, at: Array, known: Array
 ) -> tuple[sp.csc_matrix, Array]:
-    """Rows ``w (u_j - z u_i)``, known values moved to the right."""
+    """Rows ``w (u_j - z u_i)``, known values moved to the right-hand side."""
     m = np.arange(len(i))
     keep_i, keep_j = free[i], free[j]
     values = np.concatenate([(weight * own)[keep_j], (-weight * z)[keep_i]])
@@ -257,7 +257,7 @@ def translations_from(network: PoseNetwork, rotations: Array) -> tuple[Array, Ar
     """Positions and landmarks by linear least squares, given rotations ``(n, dim, dim)``.
 
     Minimises ``Σ ‖R_iᵀ(t_j - t_i) - z‖²_Ω + Σ ‖R_iᵀ(l - t_i) - z‖²_Ω`` with the translational blocks of Ω
-    (bearing-range observations with their information turned to Cartesian coordinates).
+    (bearing-range observations with their information transformed to Cartesian coordinates).
     """
     n, l, p = len(network), len(network.landmark_ids), network.dim
     free = np.ones(n + l, dtype=bool)
@@ -313,7 +313,7 @@ def cartesian_observations(network: PoseNetwork) -> tuple[Array, Array]:
 
 
 def landmarks_from(network: PoseNetwork, poses: Array) -> Array:
-    """Landmark positions ``(l, 2)``: the information-free mean of where each is seen from the given poses."""
+    """Landmark positions ``(l, 2)``: the unweighted mean of its observations from the given poses."""
     if len(network.landmark_ids) == 0:
         return np.zeros((0, 2))
     i, j = network.observations.T
