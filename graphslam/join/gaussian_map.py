@@ -147,8 +147,7 @@ class GaussianMap:
         return np.cumsum(width) - width
 
     def kinds(self) -> Iterator[tuple[str, VariableKind, Index, Index, Index]]:
-        """Name, type, indices in :attr:`variables`, rows of values, local columns ``(n, dof)`` of each variable
-        type."""
+        """Name, type, indices in :attr:`variables`, rows of values, local columns ``(n, dof)`` by variable type."""
         at, dim = self._at, self.problem.dim
         for word in self.problem.words:
             a, b = self.problem.range_of[word]
@@ -192,8 +191,7 @@ class GaussianMap:
         return step
 
     def tangents(self, step: Array, *, inverse: bool = False) -> sp.csc_matrix | None:
-        """``T``, the derivative of the total step with respect to a small additional step, or its inverse; None:
-        identity."""
+        """``T``, the derivative of the total step by a small additional step, or its inverse; None: identity."""
         blocks: list[tuple[Index, Array]] = []
         for _, kind, _, _, columns in self.kinds():
             g = kind.pose_group(self.problem.dim)

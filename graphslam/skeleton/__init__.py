@@ -1,4 +1,4 @@
-"""Layer 4: skeleton networks: landmarks are integrated out, the pose network is relaxed (urban GraphSLAM)."""
+"""Layer 4: skeleton networks: landmarks are marginalised out, the pose network is optimised (urban GraphSLAM)."""
 
 from graphslam.core.lazy_exports import lazy_exports
 

@@ -1,4 +1,4 @@
-"""Numba kernels of a table of the blocks of a sparse matrix, which grows as they come."""
+"""Numba kernels of a growing hash table for the blocks of a sparse matrix."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from graphslam.core.jit import njit
 
 
 class BlockTable(NamedTuple):
-    """Blocks (row, column), row ≤ column, by open addressing; made by :func:`make_block_table`."""
+    """Blocks (row, column), row ≤ column, with open addressing; made by :func:`make_block_table`."""
 
     key: npt.NDArray[np.int64]
-    """(2^b,): row · keyframes + column, -1 where free."""
+    """(2^b,): row · keyframes + column, -1 if free."""
     place: npt.NDArray[np.int32]
     """(2^b,)"""
     block: npt.NDArray[np.float64]
     """(capacity, 6, 6)"""
     filled: npt.NDArray[np.int64]
-    """(1,): blocks so far."""
+    """(1,): number of blocks."""
 
 
 @njit(nogil=True)
@@ -39,7 +39,7 @@ def make_block_table(capacity):
 
 @njit(nogil=True)
 def _find(table, key):
-    """Place of a block; it is made where there is none."""
+    """Index of a block; a missing one is added."""
     mask = len(table.key) - 1
     at = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(20)) & mask
     while table.key[at] != key:
@@ -54,7 +54,7 @@ def _find(table, key):
 
 @njit(nogil=True)
 def _grown(table):
-    """The same table with twice the room."""
+    """The table with twice the capacity."""
     n = table.filled[0]
     big = make_block_table(2 * len(table.block))
     big.block[:n] = table.block[:n]

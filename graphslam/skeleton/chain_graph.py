@@ -1,8 +1,8 @@
-"""Pose graphs that are one long chain with loops: everything between loop ends is eliminated exactly, along the chain.
+"""Pose graphs of one long chain with loops: poses between loop ends are eliminated exactly, along the chain.
 
-Poses at which a loop begins or ends stay, with the first and the last one; the links of a segment between two of them
-are joined to one. The reduced network is factored by the sparse block Cholesky. Time and memory are linear in the
-poses, and depend on the loops by the fill of a network of twice their number.
+Poses at the ends of loops are kept, and the first and last one; the links between two of them are combined to one. The
+reduced network is factorised by a sparse block Cholesky. Time and memory are linear in the number of poses, and depend
+on the loops by the fill-in of a network with twice their number of nodes.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from graphslam.skeleton.segment_kernels import SegmentLinks
 
 @dataclass(frozen=True, eq=False)
 class ChainGraph:
-    """Odometry from pose to pose, and loops between any two. The first pose is held at the origin.
+    """Odometry between consecutive poses, and loops between any two. The first pose is fixed at the origin.
 
     Parameters
     ----------
     rotation, translation : (N - 1, 3, 3), (N - 1, 3)
         From each pose to the next, in the body frame.
     covariance : (6, 6) or (N - 1, 6, 6)
-        Rotation vector [rad], then way [m].
+        Rotation vector [rad], then translation [m].
     ends : (L, 2)
         Poses i and j of each loop.
     loop_rotation, loop_translation : (L, 3, 3), (L, 3)
@@ -91,9 +91,9 @@ class ChainGraph:
         )
 
     def links(self, stay: npt.ArrayLike = ()) -> tuple[SegmentLinks, SegmentLinks]:
-        """Odometry, in segments between poses that are kept, and loops, as the kernels take them.
+        """Odometry in segments between kept poses, and loops, as input of the kernels.
 
-        Kept are the ends of loops, the first and the last pose, and those of ``stay``.
+        Kept poses: ends of loops, first and last pose, and those in ``stay``.
         """
         N, L, info = self.poses, len(self.ends), self.information
         k = np.arange(N, dtype=np.int64)
@@ -107,7 +107,7 @@ class ChainGraph:
         )
 
     def dead_reckoning(self) -> Poses:
-        """Poses from the odometry alone."""
+        """Poses from odometry only."""
         R, p = np.empty((self.poses, 3, 3)), np.empty((self.poses, 3))
         R[0], p[0] = np.eye(3), 0.0
         chains.compose_odometry(self.rotation, self.translation, R, p)
@@ -115,7 +115,7 @@ class ChainGraph:
 
 
 class ReducedChain:
-    """What is left of a chain with loops when the poses between kept ones are eliminated.
+    """A chain with loops after elimination of the poses between the kept ones.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class ReducedChain:
         self._place = place[:K], place[K:]
 
     def join(self, poses: Poses) -> JoinedLinks:
-        """All links, joined at some poses."""
+        """All links, combined at given poses."""
         S, n = len(self.kept) - 1, len(self._ends)
         covariance, misfit = np.empty((n, 6, 6)), np.empty((n, 6))
         total = kernels.join_links(self._odometry, poses, covariance[:S], misfit[:S])
@@ -160,25 +160,25 @@ class ReducedChain:
 
 
 class JoinedLinks(NamedTuple):
-    """Links joined at some poses."""
+    """Links combined at given poses."""
 
     poses: Poses
     total: float
     """Σ rᵀ Ω r over all links …"""
     energy: float
-    """… and what is left of it when the poses between kept ones go where it is least."""
+    """… and its minimum over the poses between the kept ones."""
     blocks: Array
     """(nb, 6, 6): matrix of the kept poses."""
     gradient: Array
-    """(K, 6): half of it."""
+    """(K, 6): half the gradient."""
     information: Array
-    """(S, 6, 6): of the joined links …"""
+    """(S, 6, 6): covariances of the combined links …"""
     misfit: Array
     """… and their residuals (S, 6)."""
 
 
 def block_keys(ends: npt.NDArray[np.int64], frames: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Keys of the diagonal blocks of a network and of those of its links, and where each of them is among the keys."""
+    """Keys of the diagonal blocks of a network and of its links, and the index of each among the sorted keys."""
     c = np.arange(frames)
     keys, place = np.unique(
         np.concatenate([c * frames + c, ends.min(axis=1) * frames + ends.max(axis=1)]), return_inverse=True
@@ -187,7 +187,7 @@ def block_keys(ends: npt.NDArray[np.int64], frames: int) -> tuple[npt.NDArray[np
 
 
 HELD = 1e12 * np.eye(6)
-"""Of the first pose: softer than the rounding of its own moves, harder than any measurement."""
+"""Added information of the first pose: weaker than the rounding of its moves, stronger than any measurement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,11 +197,11 @@ class RelaxedChain:
     Parameters
     ----------
     objective : float
-        Σ rᵀ Ω r; residuals are the rotation vector and the way in the frame of the first pose of each link.
+        Σ rᵀ Ω r; residuals are rotation vector and translation in the frame of the first pose of each link.
     history : list of float
         The objective before the first step and after each.
     predicted, largest_move : float
-        What the last step was predicted to gain, and how far it moved a pose [m].
+        Predicted decrease of the last step, and its largest move of a pose [m].
     """
 
     poses: Poses
@@ -220,14 +220,14 @@ def relax_chain(
     gain: float = 1e-6,
     progress: Callable[[float], None] | None = None,
 ) -> RelaxedChain:
-    """Gauss-Newton, each system solved exactly.
+    """Gauss-Newton with exact linear solves.
 
     Parameters
     ----------
     poses : Poses, optional
         Default: dead reckoning.
     gain : float
-        It ends when a step is predicted to gain less than this share of the objective (and 1e-9 at least).
+        It ends when the predicted decrease is below this share of the objective (at least 1e-9).
     progress : callable, optional
         Called with the objective after every step.
     """

@@ -1,4 +1,4 @@
-"""Numba kernels of what ties a pose alone, or to the next one: odometry and tilt; block-tridiagonal algebra.
+"""Numba kernels of odometry and tilt factors, and block-tridiagonal algebra.
 
 Poses are perturbed in the world frame, ``R ← Exp(w) R``, ``p ← p + u``; vectors are ``(N, 6)``: w, then u. A chain of
 blocks is ``diagonal (N, 6, 6)`` and ``upper (N - 1, 6, 6)``, the blocks (i, i + 1). Plain arrays only.
@@ -20,24 +20,24 @@ class ChainArrays(NamedTuple):
     """Odometry and tilt of all poses."""
 
     rotation: Array
-    """(N - 1, 3, 3): turn from each pose to the next, in the body …"""
+    """(N - 1, 3, 3): rotation from each pose to the next, in the body frame …"""
     translation: Array
-    """(N - 1, 3): … and its way [m]."""
+    """(N - 1, 3): … and translation [m]."""
     information: Array
-    """(1, 6, 6) or (N - 1, 6, 6): rotation vector, then way."""
+    """(1, 6, 6) or (N - 1, 6, 6): information of rotation vector, then translation."""
     up: Array
-    """(N, 3): direction up as the body saw it."""
+    """(N, 3): measured upward direction in the body frame."""
     up_information: Array
-    """(1,) or (N,) [1/rad²]; zero where nothing was seen."""
+    """(1,) or (N,): its information [1/rad²]; zero if not measured."""
 
 
 @njit(nogil=True)
 def _log(R, r):
-    """Rotation vector of a rotation matrix, below a half turn."""
+    """Rotation vector of a rotation matrix, below half a turn."""
     c = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
     q = x * x + y * y + z * z
-    if q < 2e-3 and c > 0.0:  # asin(s) / s; what is left out is below 1e-15
+    if q < 2e-3 and c > 0.0:  # asin(s) / s; truncation error below 1e-15
         k = 1.0 + q * (1.0 / 6.0 + q * (3.0 / 40.0 + q * (15.0 / 336.0 + q * 105.0 / 3456.0)))
     else:
         s = np.sqrt(q)
@@ -62,7 +62,7 @@ def write_se3_exp(w, R):
 
 @njit(nogil=True)
 def move_chain(rotation, position, step, scale, rotation_out, position_out):
-    """Move every pose by ``scale * step`` (N, 6); rotations are made orthonormal again to second order."""
+    """Move every pose by ``scale * step`` (N, 6); rotations are orthonormalised to second order."""
     E = np.empty((3, 3))
     w = np.empty(3)
     A = np.empty((3, 3))
@@ -100,7 +100,7 @@ def compose_odometry(rotation, translation, R, p):
 def odometry_residual(chain, poses, k, r, J):
     """Residual (6,) of odometry k and the left half (6, 6) of its Jacobian with respect to pose k + 1.
 
-    By pose k it is minus the same, plus ``Rᵀ (p' - p) ×`` on the turn of pose k; see :func:`linearise_chain`.
+    For pose k it is the negative, plus ``Rᵀ (p' - p) ×`` for the rotation of pose k; see :func:`linearise_chain`.
     """
     Ra, Rb = poses.rotation[k], poses.rotation[k + 1]
     A = np.empty((3, 3))
@@ -148,13 +148,13 @@ def _sandwich(X, P, Y, M, row, column):
 
 @njit(nogil=True)
 def linearise_chain(chain, poses, span, blocks, diagonal, upper, g):
-    """Add half the gradient of odometry and tilt to ``g (N, 6)`` and, if asked for, their blocks. Returns Σ rᵀ Ω r.
+    """Add half the gradient of odometry and tilt to ``g (N, 6)``, optionally their blocks. Returns Σ rᵀ Ω r.
 
-    Of the poses ``begin … end - 1`` of the span: their tilt, and the odometry from them on.
+    For the poses ``begin … end - 1`` of the span: their tilt, and the odometry starting at them.
 
     Odometry: with J the derivative by the later pose, that by the earlier one is ``-J T``, T = [[I, 0], [-[d]×, I]], d
-    the way from one to the other. So with ``M = Jᵀ Ω J`` the blocks are ``Tᵀ M T``, ``-Tᵀ M`` and ``M``.
-    Tilt: ``Rᵀ e_z - m`` of two unit vectors, isotropic; in the world its derivative by w is ``e_z × w``.
+    the translation between both. So with ``M = Jᵀ Ω J`` the blocks are ``Tᵀ M T``, ``-Tᵀ M`` and ``M``. Tilt:
+    ``Rᵀ e_z - m`` of two unit vectors, isotropic; in the world frame its derivative with respect to w is ``e_z × w``.
     """
     N = len(poses.position)
     J, M, A = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
@@ -240,7 +240,7 @@ def chain_product(diagonal, upper, v, begin, end, out):
 
 @njit(nogil=True)
 def _cholesky(A):
-    """Lower Cholesky factor in place of a block (6, 6); False where it is not positive definite."""
+    """Lower Cholesky factor in place of a block (6, 6); False if it is not positive definite."""
     for j in range(6):
         s = A[j, j]
         for k in range(j):
@@ -273,7 +273,7 @@ def _solve(L, x):
 
 @njit(nogil=True)
 def solve_chain(diagonal, upper, x):
-    """Solve a chain of blocks in place of ``x (N, 6)`` by elimination; ``diagonal`` and ``upper`` are used up.
+    """Solve a chain of blocks in place of ``x (N, 6)`` by elimination; ``diagonal`` and ``upper`` are overwritten.
 
     Returns the first pose whose block is not positive definite, or -1.
     """

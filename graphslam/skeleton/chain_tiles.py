@@ -1,13 +1,13 @@
-"""Chains with loops that are larger than memory: tiles on disk, one in memory at a time, and tasks of some tiles.
+"""Chains with loops that are larger than memory: tiles on disk, one in memory at a time, processed in tasks of several
+tiles.
 
-A tile is a range of poses; it shares its last pose with the next one. The *separator* is these shared poses and the
-ends of loops between tiles. In each step a task takes as many neighbouring tiles as make it worth being handed out. Of
-one after the other it moves the poses by the last step, joins the links, eliminates all poses that are not of the
-separator and hands over what is left; the separator is solved exactly where the tasks are given out. So a step is the
-Gauss-Newton step of the whole network, as if it were in memory.
+A tile is a range of poses; it shares its last pose with the next one. The *separator* consists of these shared poses
+and the ends of loops between tiles. In each step a task processes several neighbouring tiles, one by one: it moves the
+poses by the last step, combines the links, eliminates all poses outside the separator and returns the rest; the main
+process solves the separator exactly. So a step equals the Gauss-Newton step of the whole network in memory.
 
-Every file is named by the digest of its bytes, and a task only reads files and writes files: it can be repeated, by the
-same worker or by another one, at any moment, and nothing changes.
+Every file is named by the digest of its bytes, and a task only reads and writes files: any worker can repeat it at any
+time with the same result.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from graphslam.skeleton.segment_kernels import SegmentLinks
 from graphslam.skeleton.tile_store import store_arrays, stored_arrays
 
 TASK_SECONDS = 1.0
-"""CPU time from which a task is worth being handed out."""
+"""Least CPU time of a task [s]."""
 POSE_SECONDS = 2e-6
-"""CPU time of a pose in one step, until the first step has told it: as measured, loops at one pose in a hundred."""
+"""CPU time per pose and step [s] before the first measurement: typical value with loops at one pose in a hundred."""
 FORMAT = "graphslam.chain-tiles/1"
 _INDEX = "chain.json"
 _SHAPE = {"format": str, "ties": str, "tiles": [{"file": str, "poses": str, "begin": int, "end": int}]}
@@ -50,9 +50,9 @@ Index = npt.NDArray[np.int64]
 
 
 class ChainPiece(NamedTuple):
-    """Odometry that goes on where the piece before ended, and the loops whose later ends are in it.
+    """Odometry that continues the previous piece, and the loops whose later ends are in it.
 
-    Arrays as in :class:`~graphslam.skeleton.chain_graph.ChainGraph`, but ``ends`` are numbers in the whole chain.
+    Arrays as in :class:`~graphslam.skeleton.chain_graph.ChainGraph`, but ``ends`` are indices in the whole chain.
     """
 
     rotation: Array
@@ -65,12 +65,12 @@ class ChainPiece(NamedTuple):
 
 
 def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
-    """Write a chain with loops as tiles, and poses from dead reckoning to start from.
+    """Write a chain with loops as tiles, with initial poses from dead reckoning.
 
     Parameters
     ----------
     folder : path
-        Made if it is not there. Files that it holds already are kept.
+        Created if it does not exist. Existing files are kept.
     pieces : iterable of ChainPiece
         One tile each.
     """
@@ -82,7 +82,7 @@ def chain_to_disk(folder: str | Path, pieces: Iterable[ChainPiece]) -> Path:
     for piece in pieces:
         n = len(piece.translation) + 1
         end = begin + n - 1
-        # as a chain of its own, with loops between any of its poses, everything about it is looked at
+        # validate the piece as a separate chain, with its loops between arbitrary poses
         loops = {name: np.asarray(getattr(piece, name)) for name in _LOOPS}
         ends = loops["ends"].astype(np.int64).reshape(-1, 2)
         if len(ends) and (ends.min() < 0 or ends.max() > end or (ends[:, 0] == ends[:, 1]).any()):
@@ -112,9 +112,9 @@ class RelaxedTiles:
     Parameters
     ----------
     names : list of str
-        Files of the poses, tile by tile.
+        Pose files, tile by tile.
     separator : int
-        Poses of the separator.
+        Number of poses in the separator.
     tasks : list of float
         CPU time of the tasks of the last step [s].
     """
@@ -130,7 +130,7 @@ class RelaxedTiles:
     tasks: list[float]
 
     def poses(self, tile: int) -> Poses:
-        """Poses of one tile; its first one is the last one of the tile before."""
+        """Poses of one tile; its first pose is the last one of the previous tile."""
         return _poses(self.folder, self.names[tile])
 
 
@@ -144,21 +144,20 @@ def relax_tiles(
     task_seconds: float = TASK_SECONDS,
     progress: Callable[[float], None] | None = None,
 ) -> RelaxedTiles:
-    """Gauss-Newton on a chain with loops on disk, each system solved exactly.
+    """Gauss-Newton on a chain with loops on disk, with exact linear solves.
 
     Parameters
     ----------
     folder : path
-        From :func:`chain_to_disk`; poses are written beside the tiles.
+        From :func:`chain_to_disk`; poses are written to the same folder.
     workers : int, optional
-        Processes of a Dask cluster on this machine; default: all is done in this process, tile by tile.
+        Processes of a Dask cluster on this machine; default: this process only, tile by tile.
     cluster : str, optional
-        Address of a running Dask scheduler, whose workers see the same folder.
+        Address of a running Dask scheduler, whose workers have access to the folder.
     iterations, gain, progress
         As in :func:`~graphslam.skeleton.chain_graph.relax_chain`.
     task_seconds : float
-        A task takes as many tiles, one after the other, as make so much CPU time [s]: a shorter one is not worth being
-        handed out. Nothing else depends on it.
+        Least CPU time of a task [s], which gets consecutive tiles accordingly. It does not affect the result.
     """
     where = Path(folder).resolve()
     index = read_json(where / _INDEX, fmt=FORMAT, shape=_SHAPE)
@@ -176,18 +175,18 @@ def relax_tiles(
                 (str(where), t["file"], name, stay, None if x is None else x[a:b], scale)
                 for t, name, stay, (a, b) in zip(tiles, names, separator.stay, separator.rows)
             ]
-            # without a step there is half to do
+            # without a step a task takes half the time
             given_out = tasks_of(seconds, task_seconds * (2.0 if x is None else 1.0))
             done = [d for some in run(work_on_tiles, [(work[s],) for s in given_out]) for d in some]
             spent[:] = [sum(d.seconds for d in done[s]) for s in given_out]
             if x is not None:
-                # what a worker does for the first time takes longer
+                # the first call of a worker takes longer
                 seconds[:] = [min(s, d.seconds) for s, d in zip(seconds if known else [np.inf] * len(done), done)]
                 known.append(True)
             return done
 
         def keep(done: list[TaskResult]) -> None:
-            """Remove what earlier steps wrote."""
+            """Remove the files of earlier steps."""
             needed = given | {d.poses for d in done}
             for path in where.glob("*.arrays"):
                 if path.name not in needed:
@@ -226,7 +225,7 @@ def relax_tiles(
 
 
 class TaskResult(NamedTuple):
-    """What a task hands back: names of files, and a few figures."""
+    """Result of a task: file names, and a few values."""
 
     poses: str
     left: str
@@ -234,11 +233,11 @@ class TaskResult(NamedTuple):
     gain: float
     far: float
     seconds: float
-    """CPU time that it took."""
+    """CPU time of the task."""
 
 
 def tasks_of(seconds: Sequence[float], least: float) -> list[slice]:
-    """Neighbouring tiles, grouped to tasks of ``least`` seconds or more; all in one where they are fewer.
+    """Group neighbouring tiles to tasks of at least ``least`` seconds; a single task if the total is shorter.
 
     Parameters
     ----------
@@ -251,7 +250,7 @@ def tasks_of(seconds: Sequence[float], least: float) -> list[slice]:
         if taken >= least:
             out.append(slice(begin, k + 1))
             begin, taken = k + 1, 0.0
-    if begin < len(seconds):  # what is left is no task of its own
+    if begin < len(seconds):  # the rest is added to the last task
         first = out.pop().start if out else 0
         out.append(slice(first, len(seconds)))
     return out
@@ -263,18 +262,18 @@ def work_on_tiles(work: Sequence[tuple[Any, ...]]) -> list[TaskResult]:
 
 
 def work_on_tile(folder: str, tile: str, poses: str, stay: Index, x: Array | None, scale: float) -> TaskResult:
-    """Move the poses of a tile, and eliminate what is not of the separator.
+    """Move the poses of a tile, and eliminate the poses outside the separator.
 
     Parameters
     ----------
     folder, tile, poses : str
         Files.
     stay : (s,)
-        Poses of the tile that are of the separator, its first and last one among them.
+        Poses of the tile in the separator, including its first and last one.
     x : (s, 6), optional
-        Their steps; none: poses stay where they are.
+        Their steps; None: poses are not moved.
     scale : float
-        Share of the step that is taken.
+        Factor on the step.
     """
     where, began = Path(folder), process_time()
     network = ReducedChain(ChainGraph(**stored_arrays(where, tile)), stay)
@@ -306,19 +305,19 @@ def _poses(folder: Path, name: str) -> Poses:
 
 
 class EliminationResult(NamedTuple):
-    """What the elimination of the inner poses leaves to those that stay."""
+    """Result of the elimination of the inner poses."""
 
     keys: Index
     blocks: Array
     gradient: Array
     gain: float
     parts: list[tuple[Index, Index, Array]]
-    """Inner poses that hang together (numbers among the kept ones), those that stay beside them (numbers among those
-    that stay), and the inner ones' steps for unit steps of the others; for none at all in the last column."""
+    """For each connected group of inner poses: their indices among the kept poses, the indices of their neighbours
+    among the separator poses, and the inner steps for unit steps of these; last column: for zero steps."""
 
 
 class _Inner:
-    """Kept poses of a tile that are not of the separator: ends of loops inside it."""
+    """Kept poses of a tile outside the separator: ends of loops inside it."""
 
     def __init__(self, network: ReducedChain, stay: Index) -> None:
         K = len(network.kept)
@@ -346,7 +345,7 @@ class _Inner:
         return nodes, beside, KeyframePattern(a * len(nodes) + b, len(nodes)), edges[inner], edges[~inner]
 
     def eliminate(self, joined: JoinedLinks) -> EliminationResult:
-        """What is left for the poses that stay."""
+        """Matrix and gradient of the separator poses."""
         s = len(self._stay)
         numbers, blocks = [], [joined.blocks[self._outside]]
         numbers.append(np.stack([self._number[self._i[self._outside]], self._number[self._j[self._outside]]]))
@@ -377,7 +376,7 @@ class _Inner:
         return EliminationResult(keys, out, g, gain, parts)
 
     def solve(self, left: EliminationResult, x: Array) -> Array:
-        """Steps of all kept poses from those ``(s, 6)`` of the ones that stay."""
+        """Steps of all kept poses from those ``(s, 6)`` of the separator poses."""
         out = np.empty((len(self._number), 6))
         out[self._stay] = x
         for nodes, beside, X in left.parts:
@@ -396,7 +395,7 @@ class _Together(NamedTuple):
 
 
 class _Separator:
-    """Poses that tiles share, and ends of loops between tiles."""
+    """Poses shared by tiles, and ends of loops between tiles."""
 
     def __init__(self, ties: dict[str, npt.NDArray[Any]], spans: list[tuple[int, int]]) -> None:
         ends = ties["ends"].astype(np.int64).reshape(-1, 2)
@@ -415,7 +414,7 @@ class _Separator:
         self._pattern: KeyframePattern | None = None
 
     def gather(self, folder: Path, done: list[TaskResult]) -> _Together:
-        """What the tiles left, and the loops between them."""
+        """Sum of the results of the tiles and the loops between them."""
         K = self.size
         keys, blocks, g = [], [], np.zeros((K, 6))
         poses = Poses(np.empty((K, 3, 3)), np.empty((K, 3)))

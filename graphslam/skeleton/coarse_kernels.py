@@ -1,8 +1,8 @@
-"""Numba kernels of the keyframe network: the skeleton with every k-th pose kept, and rigid motion between them.
+"""Numba kernels of the keyframe network: only every k-th pose is a variable, with interpolated rigid motion between.
 
-Between the keyframes K and K + 1 a pose moves by ``u_i = Σ h (u_K + w_K × (p_i - p_K))``, ``w_i = Σ h w_K``, h linear
-in the number of the pose. A measurement seen through a keyframe then is ``h ((l - p_K) × w_K - u_K)``, so of each
-landmark and keyframe only ``Σ h W`` is needed. Pose N - 1 belongs to the last interval. Plain arrays only.
+Between the keyframes K and K + 1 a pose moves by ``u_i = Σ h (u_K + w_K × (p_i - p_K))``, ``w_i = Σ h w_K``, with
+weights h linear in the pose number. The derivative of a measurement is then ``h ((l - p_K) × w_K - u_K)``, so only
+``Σ h W`` is needed per landmark and keyframe. Pose N - 1 belongs to the last interval. Plain arrays only.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Array = npt.NDArray[np.float64]
 
 
 class PendingLandmarks(NamedTuple):
-    """Landmarks that have not been seen for the last time; made by :func:`make_pending`."""
+    """Landmarks with later observations; made by :func:`make_pending`."""
 
     slot: npt.NDArray[np.int32]
-    """(L,): zero between two intervals."""
+    """(L,): slot in the current interval; zero between two intervals."""
     head: npt.NDArray[np.int32]
     """(L,): latest entry of each, -1."""
     frame: npt.NDArray[np.int32]
@@ -33,12 +33,12 @@ class PendingLandmarks(NamedTuple):
     kept: Array
     """(room, 6): … and its Σ h W."""
     ends: npt.NDArray[np.int64]
-    """(2,): entries that were ever used; first free one, -1."""
+    """(2,): number of used entries; first free one, -1 if none."""
 
 
 @njit(nogil=True)
 def make_pending(landmarks):
-    """Nothing waits."""
+    """An empty set of pending landmarks."""
     ends = np.zeros(2, np.int64)
     ends[1] = -1
     return PendingLandmarks(
@@ -53,9 +53,9 @@ def make_pending(landmarks):
 
 @njit(nogil=True, error_model="numpy")
 def _sum_interval(sightings, poses, interval, slot, ids, sums):
-    """Sums over the poses of one interval, a row for each landmark seen there; ``slot`` is zero before.
+    """Sums over the poses of one interval, one row per observed landmark; ``slot`` is initially zero.
 
-    A row: Σ h₀ W, Σ h₁ W, Σ h₀ h₀ W, Σ h₀ h₁ W, Σ h₁ h₁ W (six figures each), number of sightings.
+    A row: Σ h₀ W, Σ h₁ W, Σ h₀ h₀ W, Σ h₀ h₁ W, Σ h₁ h₁ W (six values each), number of observations.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def _sum_interval(sightings, poses, interval, slot, ids, sums):
     Returns
     -------
     int
-        Rows.
+        Number of rows.
     """
     a, b, end = interval
     n = 0
@@ -134,7 +134,7 @@ def _interval(c, k, N):
 
 @njit(nogil=True)
 def _most(first, k, N, begin, end):
-    """Most measurements of an interval ``begin … end - 1``."""
+    """Largest number of measurements of an interval in ``begin … end - 1``."""
     most = 1
     for c in range(begin, end):
         a, _, e = _interval(c, k, N)
@@ -144,7 +144,7 @@ def _most(first, k, N, begin, end):
 
 @njit(nogil=True)
 def _weighted(S, qx, qy, qz, X):
-    """``X = S G`` (3, 6), G = [[q]×, -I], of a symmetric S (six figures)."""
+    """``X = S G`` (3, 6), G = [[q]×, -I], of a symmetric S (six values)."""
     for r in range(3):
         if r == 0:
             a, b, c = S[0], S[1], S[2]
@@ -179,7 +179,7 @@ def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
     ----------
     landmarks : (l (L, 3), D⁻¹ (L, 6))
     k : int
-        Poses from keyframe to keyframe.
+        Number of poses between keyframes.
     """
     l, Di = landmarks
     N, K = len(poses.position), len(out)
@@ -246,7 +246,7 @@ def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
 
 @njit(nogil=True)
 def _subtract_pairs(chain, landmark, waiting, position, size, room, table):
-    """Subtract ``S D⁻¹ S`` of a landmark for all pairs of its keyframes, those of the entries ``chain``."""
+    """Subtract ``S D⁻¹ S`` of a landmark for all pairs of its keyframes (entries ``chain``)."""
     l, Di = landmark
     frame, kept = waiting
     k, K = size
@@ -267,20 +267,20 @@ def _subtract_pairs(chain, landmark, waiting, position, size, room, table):
 
 @njit(nogil=True)
 def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table):
-    """Add the blocks of ``Pᵀ S P`` that come from measurements to ``table``, interval after interval.
+    """Add the blocks of ``Pᵀ S P`` from measurements to ``table``, interval by interval.
 
-    Returns what waits and the table, as both may have grown.
+    Returns the pending landmarks and the table, as both may have grown.
 
-    A landmark waits with its sums over each keyframe until it has been seen for the last time; then the pairs of its
-    keyframes are made, and its room is free.
+    The sums of a landmark per keyframe are stored until its last observation; then the pairs of its keyframes are
+    added, and its memory is freed.
 
     Parameters
     ----------
     landmarks : (l (L, 3), D⁻¹ (L, 6))
     span : (begin, end)
-        Intervals between keyframes; all of them one after the other.
+        Intervals between keyframes; to be called for all of them in order.
     count : (L,) int32
-        Sightings of each landmark that are still to come; changed.
+        Remaining observations of each landmark; changed.
     """
     l, Di = landmarks
     N = len(poses.position)
@@ -296,7 +296,7 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
     T = np.empty((3, 6))
     for c in range(span[0], span[1]):
         n = _sum_interval(sightings, poses, _interval(c, k, N), slot, ids, sums)
-        if used + 2 * n > room:  # everything may be new
+        if used + 2 * n > room:  # all may be new
             room = 2 * (used + 2 * n)
             frame, after, kept = _longer(frame, after, kept, room)
         a, b, _ = _interval(c, k, N)
@@ -336,7 +336,7 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
             count[j] -= np.int32(row[30])
             if count[j] > 0:
                 continue
-            # seen for the last time: all pairs of its keyframes
+            # last observation: add all pairs of its keyframes
             f = 0
             at = head[j]
             while at >= 0:
@@ -391,14 +391,14 @@ def _carried(A, left, right, h, T):
     """``T = h · Cₗᵀ A Cᵣ`` with C = [[I, 0], [-[d]×, I]] for the offsets ``left`` and ``right`` from a keyframe."""
     M = np.empty((6, 6))
     x, y, z = right[0], right[1], right[2]
-    for r in range(6):  # A Cᵣ: the turn's columns get -A_u [d]
+    for r in range(6):  # A Cᵣ: the rotation columns get -A_u [d]
         a, b, c = A[r, 3], A[r, 4], A[r, 5]
         M[r, 0] = h * (A[r, 0] - (b * z - c * y))
         M[r, 1] = h * (A[r, 1] - (c * x - a * z))
         M[r, 2] = h * (A[r, 2] - (a * y - b * x))
         M[r, 3], M[r, 4], M[r, 5] = h * a, h * b, h * c
     x, y, z = left[0], left[1], left[2]
-    for c2 in range(6):  # Cₗᵀ M: the turn's rows get [d] M_u
+    for c2 in range(6):  # Cₗᵀ M: the rotation rows get [d] M_u
         a, b, c = M[3, c2], M[4, c2], M[5, c2]
         T[0, c2] = M[0, c2] - z * b + y * c
         T[1, c2] = M[1, c2] + z * a - x * c

@@ -1,4 +1,4 @@
-"""Collapse of measurement nodes into landmarks: measurements that correspond are one and the same landmark (C3)."""
+"""Collapse of measurements into landmarks: corresponding measurements are one landmark (C3)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Labels = npt.NDArray[np.int32]
 class Collapse:
     """Streaming union-find over measurements.
 
-    Correspondences come in blocks of any size and in any order, and are not kept: memory is four bytes a measurement.
+    Correspondences come in blocks of any size and order and are not stored: memory is four bytes per measurement.
 
     Parameters
     ----------
     measurements : int
-        How many there are; below 2³¹.
+        Number of measurements; below 2³¹.
 
     Attributes
     ----------
     pairs : int
-        Correspondences so far.
+        Number of correspondences so far.
     joined : int
-        Those of them that joined two sets.
+        Number of them that joined two sets.
 
     Examples
     --------
@@ -44,7 +44,7 @@ class Collapse:
         self.joined = 0
 
     def add(self, a: npt.ArrayLike, b: npt.ArrayLike) -> None:
-        """Measurements ``a[k]`` and ``b[k]`` are of one landmark.
+        """Add correspondences: measurements ``a[k]`` and ``b[k]`` are of one landmark.
 
         Parameters
         ----------
@@ -71,9 +71,9 @@ class Collapse:
         self.pairs += len(left)
 
     def landmarks(self) -> tuple[Labels, int]:
-        """Landmark of every measurement ``(M,)``, and how many there are; numbered by first observation.
+        """Landmark of every measurement ``(M,)``, numbered by first observation, and their number.
 
-        The numbers are written over the sets, so nothing can be added afterwards.
+        The numbers overwrite the sets, so nothing can be added afterwards.
         """
         label = self._open()
         self._parent = None
@@ -86,7 +86,8 @@ class Collapse:
 
 
 def number_by_first_sighting(landmark: npt.ArrayLike) -> tuple[Labels, int]:
-    """Number landmarks of measurements in pose order ``(M,)`` by their first sighting; labels of any kind ≥ 0."""
+    """Number landmarks of measurements in pose order ``(M,)`` by first observation; labels are arbitrary integers ≥
+    0."""
     label = np.array(landmark, dtype=np.int32)
     table = np.full(int(label.max(initial=-1)) + 1, -1, dtype=np.int32)
     return label, int(kernels.renumber(label, table))

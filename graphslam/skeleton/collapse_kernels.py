@@ -9,7 +9,7 @@ from graphslam.core.jit import njit
 
 @njit(nogil=True)
 def _root(parent, i):
-    """First member of the set of ``i``; every other node on the way is hung one step higher (path halving)."""
+    """First member of the set of ``i``, with path halving."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -18,7 +18,7 @@ def _root(parent, i):
 
 @njit(nogil=True)
 def join_pairs(parent, a, b):
-    """Join the sets of ``a[k]`` and ``b[k]``; the smaller index becomes the root, so no parent is above its child.
+    """Join the sets of ``a[k]`` and ``b[k]``; the smaller index becomes the root (parent index ≤ child index).
 
     Returns
     -------
@@ -39,9 +39,9 @@ def join_pairs(parent, a, b):
 
 @njit(nogil=True)
 def number_sets(parent):
-    """Replace every parent by the number of its set; sets are numbered by their first members. Returns their count.
+    """Replace every parent by the number of its set; sets are numbered by their first members. Returns the count.
 
-    A parent is not above its child, so its place holds the number already when the child is reached.
+    A parent's index is at most its child's, so it already has its number when the child is processed.
     """
     n = 0
     for i in range(len(parent)):
@@ -55,7 +55,7 @@ def number_sets(parent):
 
 @njit(nogil=True)
 def renumber(label, table):
-    """Number labels anew by their first appearance; ``table`` is -1 for each old label. Returns how many there are."""
+    """Renumber labels by first appearance; ``table`` is -1 for each old label. Returns their number."""
     n = 0
     for i in range(len(label)):
         if table[label[i]] < 0:

@@ -1,4 +1,4 @@
-"""Numba kernels that find wrong unions of measurements and take them apart. Plain arrays only."""
+"""Numba kernels that find and split falsely merged landmarks. Plain arrays only."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 @njit(nogil=True)
 def count_passes(landmark, first, gap, last, passes):
-    """``passes[j]``: how often landmark j came into view after ``gap`` poses or more without it."""
+    """``passes[j]``: number of traversals with landmark j, separated by more than ``gap`` poses without it."""
     for i in range(len(first) - 1):
         for m in range(first[i], first[i + 1]):
             j = landmark[m]
@@ -21,7 +21,7 @@ def count_passes(landmark, first, gap, last, passes):
 
 @njit(nogil=True)
 def worst_in_view(landmark, first, ratio, out):
-    """``out[j]``: the largest ``ratio (L,)`` of all landmarks that some pose sees together with landmark j."""
+    """``out[j]``: the largest ``ratio (L,)`` of all landmarks observed from a common pose with landmark j."""
     for i in range(len(first) - 1):
         worst = 0.0
         for m in range(first[i], first[i + 1]):
@@ -33,16 +33,16 @@ def worst_in_view(landmark, first, ratio, out):
 
 @njit(nogil=True, error_model="numpy")
 def split_labels(sightings, poses, wrong, rules, landmark, n):
-    """Give every track of a wrong landmark a number of its own, from ``n`` on. Returns the count of all labels.
+    """Give every track of a false landmark a new number, from ``n`` on. Returns the number of labels.
 
-    A track is a run of sightings within one pass that lie in one place: each is compared with the last one of the
-    track, in the world and in units of the noise of both. The first track keeps the number.
+    A track is a sequence of observations in one traversal at one place: each is compared with the last one of the
+    track, in the world frame and in units of the noise of both. The first track keeps its number.
 
     Parameters
     ----------
     wrong : (L,) bool
     rules : (gap, gate)
-        Poses without a sighting between two passes; chi-square (3) up to which two sightings are one place.
+        Poses without an observation between two traversals; limit of χ²(3) for one place.
     landmark : (M,) changed
     n : int
     """
@@ -70,7 +70,7 @@ def split_labels(sightings, poses, wrong, rules, landmark, n):
             best, least = -1, 2.0 * gate
             at = head[j]
             while at >= 0:
-                if i - last[at] <= gap and last[at] < i:  # a pose sees a thing once
+                if i - last[at] <= gap and last[at] < i:  # a pose observes an object once
                     ex, ey, ez = place[at, 0] - px - sx, place[at, 1] - py - sy, place[at, 2] - pz - sz
                     d = sx * ex + sy * ey + sz * ez
                     misfit = al * (ex * ex + ey * ey + ez * ez) + be * d * d

@@ -1,4 +1,5 @@
-"""Wrong unions: landmarks that hold measurements of two things, found by their χ² and split by passes and places."""
+"""False correspondences: landmarks with measurements of two objects, detected by χ² and split by traversals and
+places."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from graphslam.skeleton.schur import Network
 
 Labels = npt.NDArray[np.int32]
 
-# A landmark is taken for wrong when its χ² is at least this share of the worst in view, and of the worst of all.
+# A landmark is false if its χ² is at least this share of the worst in view, and of the worst of all.
 _AMONG, _OF_ALL = 0.3, 0.01
 
 
@@ -35,23 +36,22 @@ def landmark_chi2(network: Network) -> Array:
 
 
 FALSE_ALARM, GAP = 1e-10, 20
-"""Chance for a right landmark to be taken for a wrong one; poses without a sighting between two passes."""
+"""False-alarm probability for a correct landmark; poses without an observation between two traversals."""
 
 
 def split_false_correspondences(network: Network) -> tuple[Labels, int]:
-    """Give every pass of a landmark whose χ² is impossible a landmark of its own; two, if it sees two things at once.
+    """Split a landmark with an implausible χ² into one per traversal, or two if both objects are observed at once.
 
-    The poses may still be wrong, which raises the χ² of all: it is compared in units of the median over the landmarks
-    of several passes (never of less than one per degree of freedom). A wrong union also bends the poses that see it,
-    and so its neighbours: only those go that are among the worst of all that is in view with them. The rest is judged
-    again when the poses have moved.
+    Pose errors increase the χ² of all landmarks: it is compared relative to the median over the landmarks of several
+    traversals (at least one per degree of freedom). A false landmark also distorts the poses that observe it, and thus
+    its neighbours: only landmarks that are among the worst in view are split. The others are tested again later.
 
     Returns
     -------
     landmark : (M,)
-        Numbered by first sighting; the problem's own array where nothing was wrong.
+        Numbered by first observation; the problem's array if nothing was split.
     found : int
-        Landmarks that were split.
+        Number of landmarks that were split.
     """
     problem, counts = network.layout.problem, network.layout.counts
     L = problem.landmarks

@@ -1,13 +1,13 @@
 """Numba kernels of the measurements: landmarks, gradient, diagonal blocks and product of the Schur complement.
 
 The residual of a measurement z (in the body frame) of landmark l from pose (R, p) is ``e = l - p - R z``. Poses are
-perturbed in the world frame about their own position, ``R ← Exp(w) R``, ``p ← p + u``, so with the lever ``q = l - p``
-the residual moves by ``q × w - u + dl``. The lever is the predicted one everywhere: with the measured ``s = R z`` a
-turn of the whole map would cost something, and Gauss-Newton converges linearly. ``s`` belongs only into the weight
+perturbed in the world frame about their position, ``R ← Exp(w) R``, ``p ← p + u``, so with the lever ``q = l - p`` the
+residual changes by ``q × w - u + dl``. The lever is always the predicted one: with the measured ``s = R z`` a rotation
+of the whole map would change the objective, and Gauss-Newton would converge linearly. ``s`` is used only in the weight
 ``W = α I + β s sᵀ``, α = 1/(σ_bearing |z|)², α + β |z|² = 1/σ_range². Vectors of poses are ``(N, 6)``: w, then u.
 
-Every kernel works on the poses ``begin … end - 1``; what it adds up over landmarks goes into arrays of the caller.
-Plain arrays only.
+Every kernel works on the poses ``begin … end - 1``; sums over landmarks are added to arrays of the caller. Plain arrays
+only.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Sightings(NamedTuple):
     landmark: npt.NDArray[np.int32]
     """(M,)"""
     first: npt.NDArray[np.int64]
-    """(N + 1,): where the measurements of each pose begin."""
+    """(N + 1,): first measurement of each pose."""
     along: float
     """1 / σ_range² [1/m²]."""
     across: float
     """1 / σ_bearing² [1/rad²]."""
     base: int
-    """Measurements before the first row of ``points`` and ``landmark``: not zero where only a tile is in memory."""
+    """Number of measurements before the first row of ``points``; not zero if only a tile is in memory."""
 
 
 class Poses(NamedTuple):
@@ -50,7 +50,7 @@ class Poses(NamedTuple):
 
 @njit(nogil=True, inline="always", error_model="numpy")
 def _seen(R, x, y, z, along, across):
-    """``s = R z`` and the two figures of its weight: W = α I + β s sᵀ."""
+    """``s = R z`` and the two parameters of its weight: W = α I + β s sᵀ."""
     r2 = x * x + y * y + z * z
     alpha = across / r2
     beta = (along - alpha) / r2
@@ -70,7 +70,7 @@ def _nine(R, i):
 
 @njit(nogil=True)
 def count_sightings(landmark, out):
-    """Add one to ``out (L,)`` for each sighting."""
+    """Add the number of observations to ``out (L,)``."""
     for m in range(len(landmark)):
         out[landmark[m]] += 1
 
@@ -166,7 +166,7 @@ def landmark_chi2_kernel(sightings, poses, l, begin, end, out, count):
 def schur_diagonal(sightings, poses, landmarks, begin, end, blocks):
     """Add the measurements' diagonal blocks of the Schur complement to ``blocks (N, 6, 6)``.
 
-    Exact where a pose sees each landmark once; otherwise the block is smaller by what the two share.
+    Exact if a pose observes each landmark once; otherwise the block is too small by their common part.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Additive preconditioner of the Schur complement: block Jacobi on poses and on keyframes, and a factored network."""
+"""Additive preconditioner of the Schur complement: block Jacobi on poses and keyframes, factorised keyframe network."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Index = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class PreconditionerLevels:
-    """Which keyframes the preconditioner has.
+    """Keyframe levels of the preconditioner.
 
     Parameters
     ----------
     jacobi : int
-        Block Jacobi on a keyframe every so many poses; 0 for none.
+        Poses per keyframe for block Jacobi; 0: none.
     factored : int
-        A network of keyframes every so many poses, factored; 0 for none.
+        Poses per keyframe for the factorised network; 0: none.
     """
 
     jacobi: int = 0
@@ -37,7 +37,7 @@ class PreconditionerLevels:
 
 
 def preconditioner_levels(poses: int) -> PreconditionerLevels:
-    """Levels by size: one factored network up to 2·10⁴ poses, beyond it a sparser one and block Jacobi between."""
+    """Default levels: one factorised network up to 2·10⁴ poses, above it a sparser one with block Jacobi between."""
     if poses < 40:
         return PreconditionerLevels()
     if poses <= 20_000:
@@ -46,7 +46,7 @@ def preconditioner_levels(poses: int) -> PreconditionerLevels:
 
 
 class KeyframePattern:
-    """Which keyframes share a block, in what order they are eliminated: the same at all poses."""
+    """Block pattern and elimination order of a keyframe network, independent of the pose values."""
 
     def __init__(self, keys: Index, frames: int) -> None:
         self.keys, self.frames = keys, frames
@@ -54,7 +54,7 @@ class KeyframePattern:
         order = elimination_order(row.astype(np.intp), column.astype(np.intp), frames).astype(np.int64)
         when = np.empty(frames, np.int64)
         when[order] = np.arange(frames)
-        # each pair stands with the keyframe that is eliminated first, its block transposed where need be
+        # each pair is stored with the keyframe that is eliminated first, its block transposed if needed
         self._turned = when[row] > when[column]
         node, other = np.where(self._turned, column, row), np.where(self._turned, row, column)
         self._sorted = np.lexsort((other, node))
@@ -68,14 +68,14 @@ class KeyframePattern:
 
 
 class KeyframeNetwork:
-    """``Pᵀ S P``, factored.
+    """``Pᵀ S P``, factorised.
 
     Parameters
     ----------
     k : int
-        Poses from keyframe to keyframe.
+        Poses per keyframe.
     pattern : KeyframePattern, optional
-        Of an earlier one of the same problem and k.
+        Of an earlier network of the same problem and k.
     """
 
     def __init__(self, network: Network, k: int, pattern: KeyframePattern | None = None) -> None:
@@ -131,7 +131,7 @@ def _poses_of(poses: int, k: int, begin: int, end: int) -> tuple[int, int]:
 
 
 def _interval_chunks(network: Network, k: int, begin: int, end: int) -> Iterator[tuple[int, int]]:
-    """Ranges of intervals to take at a time: all at once in memory, about a tile from disk."""
+    """Ranges of intervals to process at once: all if in memory, about a tile if on disk."""
     problem = network.layout.problem
     size = end - begin if problem.tiles is None else max(1, problem.tiles.size // k)
     for a in range(begin, end, max(1, size)):
@@ -141,7 +141,7 @@ def _interval_chunks(network: Network, k: int, begin: int, end: int) -> Iterator
 
 
 def keyframe_chain_blocks(network: Network, k: int) -> tuple[Array, Array]:
-    """Blocks of ``Pᵀ A P`` of what ties a pose alone or to the next: diagonal and upper."""
+    """Blocks of ``Pᵀ A P`` of odometry, tilt and priors: diagonal and upper."""
     K = keyframes_of(network.layout.problem.poses, k)
     diagonal, upper = np.zeros((K, 6, 6)), np.zeros((K - 1, 6, 6))
     kernels.keyframe_chain(network.poses.position, *network.chain_blocks(), k, diagonal, upper)
@@ -149,12 +149,12 @@ def keyframe_chain_blocks(network: Network, k: int) -> tuple[Array, Array]:
 
 
 class Preconditioner:
-    """``M⁻¹ r``: the sum of block Jacobi on poses, block Jacobi on keyframes, and a factored network of keyframes.
+    """``M⁻¹ r``: the sum of block Jacobi on poses, block Jacobi on keyframes, and a factorised keyframe network.
 
     Parameters
     ----------
     pattern : KeyframePattern, optional
-        Of an earlier one.
+        Of an earlier preconditioner.
     """
 
     def __init__(self, network: Network, levels: PreconditionerLevels, pattern: KeyframePattern | None = None) -> None:
@@ -171,7 +171,7 @@ class Preconditioner:
 
             def fill(first: int, last: int) -> None:
                 for a, b in _interval_chunks(network, k, first, last):
-                    # a keyframe is seen from the interval before it as well
+                    # a keyframe also belongs to the interval before it
                     sight = network.layout.problem.sightings_of(*_poses_of(len(self.position), k, max(0, a - 1), b))
                     kernels.keyframe_diagonal(sight, network.poses, landmarks, k, a, b, blocks)
 
@@ -182,7 +182,7 @@ class Preconditioner:
 
     @property
     def pattern(self) -> KeyframePattern | None:
-        """What a later preconditioner of the same problem can take over."""
+        """Pattern that a later preconditioner of the same problem can reuse."""
         return None if self.network is None else self.network.pattern
 
     def __call__(self, r: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a skeleton network is made of: measurements of landmarks, odometry, tilt, GPS and a prior, as arrays."""
+"""Input of a skeleton network: landmark measurements, odometry, tilt, GPS and a prior, as arrays."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from graphslam.skeleton.tile_store import Tiles
 class SkeletonProblem:
     """Measurements sorted by pose, with priors and odometry factors.
 
-    World frame: z up. A pose is the body in the world. Covariances are given once for all, or one each.
+    World frame: z up. Poses are ``T_world_body``. A covariance is given once for all, or one each.
 
     Parameters
     ----------
     points : (M, 3) float32
         Measured points in the body frame [m].
     landmark : (M,) int32
-        Landmark of each, numbered by first observation (:class:`~graphslam.skeleton.collapse.Collapse`).
+        Landmark of each measurement, numbered by first observation (:class:`~graphslam.skeleton.collapse.Collapse`).
     first : (N + 1,)
-        Where the measurements of each pose begin; the last entry is M.
+        First measurement of each pose; the last entry is M.
     odometry_rotation, odometry_translation : (N - 1, 3, 3), (N - 1, 3)
         From each pose to the next, in the body frame.
     odometry_covariance : (6, 6) or (N - 1, 6, 6)
-        Rotation vector [rad], then way [m].
+        Rotation vector [rad], then translation [m].
     range_sigma, bearing_sigma : float
         Noise of the points along [m] and across [rad] the ray.
     start_rotation, start_position, start_covariance : (3, 3), (3,), (6, 6)
-        Prior on the first pose: turn in the world frame, then position.
+        Prior on the first pose: rotation in the world frame, then position.
     up : (N, 3), optional
-        Unit vector up in the body, from an accelerometer.
+        Upward unit vector in the body frame, from an accelerometer.
     up_sigma : float or (N,)
-        Its noise [rad]; infinite where it was not seen.
+        Its noise [rad]; infinite if not measured.
     gps_pose, gps_position : (G,), (G, 3)
-        Which poses have a fix, and where [m]; of the body's origin.
+        Poses with a fix, and fixes of the body origin [m].
     gps_covariance : (3, 3) or (G, 3, 3)
     tiles : Tiles, optional
         Measurements on disk; ``points`` and ``landmark`` are empty then
@@ -52,7 +52,7 @@ class SkeletonProblem:
     Raises
     ------
     DataError
-        Shapes do not fit, numbers are not finite, a point lies in the sensor, landmarks are not numbered by first
+        Shapes do not fit, numbers are not finite, a point is at the sensor origin, landmarks are not numbered by first
         observation.
     CovarianceError
         A covariance is not positive definite.
@@ -183,11 +183,11 @@ class SkeletonProblem:
 
     @property
     def sightings(self) -> Sightings:
-        """The measurements, as the kernels take them."""
+        """The measurements as input of the kernels."""
         return self.sightings_of(0, self.poses)
 
     def sightings_of(self, begin: int, end: int) -> Sightings:
-        """The measurements of the poses ``begin … end - 1`` at least, as the kernels take them."""
+        """At least the measurements of the poses ``begin … end - 1``, as input of the kernels."""
         along, across = self.range_sigma**-2, self.bearing_sigma**-2
         if self.tiles is None:
             return Sightings(self.points, self.landmark, self.first, along, across, 0)
@@ -195,18 +195,18 @@ class SkeletonProblem:
         return Sightings(points, landmark, self.first, along, across, int(self.first[begin]))
 
     def chunks(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
-        """Ranges of poses to take at a time: all at once in memory, tile by tile from disk."""
+        """Ranges of poses to process at once: all if in memory, tile by tile if on disk."""
         if self.tiles is None:
             yield begin, end
         else:
             yield from self.tiles.ranges(begin, end)
 
     def room(self, shape: tuple[int, ...]) -> Array:
-        """Zeros for something large: in memory, or on disk where the measurements are."""
+        """A large zero array: in memory, or on disk if the measurements are there."""
         return np.zeros(shape) if self.tiles is None else self.tiles.room(shape)
 
     def pieces(self, count: int, least: int = 1 << 20) -> Iterator[tuple[int, int]]:
-        """Ranges of ``count`` rows of large arrays to take at a time; a quarter of them in memory, fewer from disk."""
+        """Ranges of ``count`` rows of large arrays to process at once; a quarter if in memory, fewer if on disk."""
         step = max(1, -(-count // 4)) if self.tiles is None else least
         for a in range(0, count, step):
             if self.tiles is not None:
@@ -215,7 +215,7 @@ class SkeletonProblem:
 
     @cached_property
     def chain(self) -> ChainArrays:
-        """Odometry and tilt, as the kernels take them."""
+        """Odometry and tilt as input of the kernels."""
         if self.up is None:
             up, weight = np.zeros((self.poses, 3)), np.zeros(1)
         else:
@@ -224,14 +224,14 @@ class SkeletonProblem:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom of the objective: scalars measured, less scalars estimated."""
+        """Degrees of freedom of the objective: measured minus estimated scalars."""
         tilts = 0
         if self.up is not None:
             tilts = int(np.isfinite(np.broadcast_to(np.asarray(self.up_sigma, np.float64), self.poses)).sum())
         return 3 * self.measurements + 6 * self.poses + 2 * tilts + 3 * self.fixes - 6 * self.poses - 3 * self.landmarks
 
     def dead_reckoning(self) -> Poses:
-        """Poses from the prior of the first one and the odometry alone."""
+        """Poses from the prior of the first one and odometry only."""
         R, p = np.empty((self.poses, 3, 3)), np.empty((self.poses, 3))
         R[0], p[0] = self.start_rotation, self.start_position
         compose_odometry(self.odometry_rotation, self.odometry_translation, R, p)
@@ -243,7 +243,7 @@ class SkeletonProblem:
 
 
 def inverse_covariance(covariance: Array, name: str) -> Array:
-    """Information matrices of covariances ``(n, d, d)``, or a CovarianceError that says ``name``."""
+    """Information matrices of covariances ``(n, d, d)``, or a CovarianceError with ``name``."""
     try:
         np.linalg.cholesky(covariance)
         inverse = np.linalg.inv(covariance)

@@ -1,4 +1,4 @@
-"""The thinned network written out, as in the paper: every landmark integrated out, a block for every pair of poses."""
+"""The explicit reduced network, as in the paper: all landmarks marginalised out, a block for every pair of poses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _by_landmark(problem: SkeletonProblem) -> _ORDER:
 
 
 def blocks_per_pose(problem: SkeletonProblem, samples: int = 2_000, order: _ORDER | None = None) -> float:
-    """Blocks on and right of the diagonal in a row of the thinned network, mean over some poses."""
+    """Blocks on and right of the diagonal per row of the reduced network, mean over sampled poses."""
     ptr, pose, _ = order or _by_landmark(problem)
     step = max(1, problem.poses // samples)
     mark = np.full(problem.poses, -1, np.int32)
@@ -32,12 +32,12 @@ def blocks_per_pose(problem: SkeletonProblem, samples: int = 2_000, order: _ORDE
 
 
 class ReducedNetwork:
-    """Schur complement of all landmarks as blocks.
+    """Schur complement of all landmarks as a block matrix.
 
     Parameters
     ----------
     limit : float
-        Memory that the blocks may take [bytes].
+        Memory limit of the blocks [bytes].
     """
 
     def __init__(self, network: Network, limit: float) -> None:

@@ -1,4 +1,4 @@
-"""Numba kernels of the thinned network written out: a block for any two poses that saw the same landmark (C4)."""
+"""Numba kernels of the explicit reduced network: a block for any two poses that observed the same landmark (C4)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphslam.skeleton.landmark_kernels import _nine, _seen
 
 @njit(nogil=True)
 def order_by_landmark(landmark, first, ptr, pose, measurement):
-    """Sightings of each landmark: ``ptr (L + 1,)``, poses and measurements ``(M,)`` in pose order; out."""
+    """Sort observations by landmark: ``ptr (L + 1,)``, poses and measurements ``(M,)`` in pose order (output)."""
     for m in range(len(landmark)):
         ptr[landmark[m] + 1] += 1
     for j in range(len(ptr) - 1):
@@ -27,7 +27,7 @@ def order_by_landmark(landmark, first, ptr, pose, measurement):
 
 @njit(nogil=True)
 def count_blocks(landmark, first, ptr, pose, step, mark):
-    """Blocks right of the diagonal, the diagonal included, in the rows of every ``step``-th pose."""
+    """Number of blocks on and right of the diagonal in the rows of every ``step``-th pose."""
     total = 0
     for i in range(0, len(first) - 1, step):
         for m in range(first[i], first[i + 1]):
@@ -41,7 +41,7 @@ def count_blocks(landmark, first, ptr, pose, step, mark):
 
 @njit(nogil=True, error_model="numpy")
 def eliminate_landmarks(sightings, poses, landmarks, order, table):
-    """Integrate every landmark out: ``Σ Jᵀ W J`` on the diagonal, less the pairs of its sightings, into ``table``.
+    """Marginalise all landmarks: ``Σ Jᵀ W J`` on the diagonal, minus the pairs of observations, into ``table``.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Relaxation of a skeleton network: Gauss-Newton with preconditioned conjugate gradients, and its rivals (C5)."""
+"""Optimisation of a skeleton network: Gauss-Newton with preconditioned conjugate gradients, and alternatives (C5)."""
 
 from __future__ import annotations
 
@@ -36,40 +36,40 @@ STARTS: tuple[Start, ...] = ("forward", "chain", "odometry")
 
 @dataclass(frozen=True)
 class RelaxConfig:
-    """How a skeleton network is relaxed.
+    """Configuration of the optimisation.
 
     Parameters
     ----------
     method : {"gn", "cg", "blocks", "levels"}
         ``gn``: Gauss-Newton; its linear systems by conjugate gradients, the Schur complement applied without being
-        formed. ``cg``: non-linear conjugate gradients, as in the paper. ``blocks``: Gauss-Newton with the thinned
-        network written out. ``levels``: keyframes alone move, rigid motion between them: *approximate*.
+        formed. ``cg``: non-linear conjugate gradients, as in the paper. ``blocks``: Gauss-Newton with the explicit
+        reduced network. ``levels``: only keyframes are variables, rigid motion between them: *approximate*.
     start : {"forward", "chain", "odometry"}
-        Where it begins: odometry alone; the chain of odometry, tilt and GPS; one walk against older landmarks after it.
+        Initial poses: odometry; ``chain``: with tilt and GPS; ``forward``: then one pass against older landmarks.
     iterations : int
-        Most Gauss-Newton steps; of ``cg`` most gradients.
+        Most Gauss-Newton steps; for ``cg`` most gradients.
     gain, move : float
-        When a step is predicted to gain less than ``gain`` (in units of χ²), one or two more follow, whose linear
-        systems are solved to 1 % however little that gains. It has converged (``"poses"``) if the last one moves no
-        pose by more than ``move`` [m]; if one does, ``converged`` is ``"objective"``: long modes are soft.
+        If the predicted decrease of a step is below ``gain`` (in units of χ²), one or two more follow, with linear
+        systems solved to 1 %. It has converged (``"poses"``) if the last one moves no pose by more than ``move`` [m];
+        otherwise ``converged`` is ``"objective"``: long modes are weakly determined.
     enough : float
-        It also ends when a step is predicted to gain less than this.
+        It also ends when the predicted decrease is below this.
     levels : PreconditionerLevels, optional
-        Of the preconditioner. Default: by size. ``PreconditionerLevels(-1, 0)`` with ``cg``: no preconditioner at all.
+        Of the preconditioner. Default: by size. ``PreconditionerLevels(-1, 0)`` with ``cg``: no preconditioner.
     rebuild : int
         Gradients between two preconditioners of ``cg``; 0: the first one is kept.
     inner : int
         Most products of one linear system.
     limit : float
-        Memory that the written-out network may take [bytes].
+        Memory limit of the explicit network [bytes].
     halve : bool
-        Halve a step that raises the objective; if not, it is accepted.
+        Halve a step that increases the objective; otherwise it is accepted.
     split : bool
-        Look for wrong unions and split them.
+        Detect and split false correspondences.
     soft : int
-        How many of the softest modes are reported; 0 for none.
+        Number of weakest modes to report; 0: none.
     threads : int
-        The result does not depend on it.
+        Number of threads; it does not affect the result.
     """
 
     method: Method = "gn"
@@ -97,20 +97,20 @@ class RelaxConfig:
 
 @dataclass(frozen=True)
 class Iteration:
-    """One step of a relaxation.
+    """One step of the optimisation.
 
     Parameters
     ----------
     objective, chi2 : float
         After the step; χ² per degree of freedom.
     products : int
-        Products with the Schur complement.
+        Number of products with the Schur complement.
     predicted, gained : float
-        What the linear model promised, and what came.
+        Predicted and actual decrease of the objective.
     largest_move : float
         [m]
     scale : float
-        Share of the step that was taken.
+        Factor on the step.
     seconds : float
         CPU time since the start.
     """
@@ -127,13 +127,13 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class RelaxationResult:
-    """A relaxed skeleton network.
+    """An optimised skeleton network.
 
     Parameters
     ----------
     landmarks : (L, 3)
     landmark : (M,) int32
-        Landmark of each measurement: other than the problem's where unions were split.
+        Landmark of each measurement; differs from the problem's if landmarks were split.
     objective, chi2 : float
         Sum of squared normalised residuals; per degree of freedom.
     gradient : float
@@ -142,7 +142,7 @@ class RelaxationResult:
     soft : list of WeakMode
         Approximate.
     split, refused : int
-        Landmarks that were wrong unions; sightings that the forward pass did not believe.
+        Number of split landmarks; number of observations that the forward pass rejected.
     seconds : dict
         CPU time by stage.
     approximate : bool
@@ -166,12 +166,12 @@ class RelaxationResult:
 
     @property
     def iterations(self) -> int:
-        """Steps."""
+        """Number of steps."""
         return len(self.history)
 
     @property
     def products(self) -> int:
-        """Products with the Schur complement."""
+        """Number of products with the Schur complement."""
         return sum(h.products for h in self.history)
 
     @property
@@ -181,7 +181,7 @@ class RelaxationResult:
 
     @property
     def predicted(self) -> float:
-        """What the last step was predicted to gain, in units of χ²."""
+        """Predicted decrease of the last step, in units of χ²."""
         return self.history[-1].predicted if self.history else 0.0
 
 
@@ -193,14 +193,14 @@ class StageTimes:
         self._begin = self._last = time.process_time()
 
     def __call__(self, name: str) -> None:
-        """What was done since the last call belongs to ``name``."""
+        """Add the time since the last call to ``name``."""
         now = time.process_time()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now
 
     @property
     def total(self) -> float:
-        """Since the start."""
+        """CPU time since the start."""
         return time.process_time() - self._begin
 
 
@@ -210,7 +210,7 @@ def relax_skeleton(
     poses: Poses | None = None,
     progress: Callable[[Iteration], None] | None = None,
 ) -> RelaxationResult:
-    """Move the poses of a skeleton network to where all its measurements fit best.
+    """Optimise the poses of a skeleton network.
 
     Parameters
     ----------
@@ -224,12 +224,12 @@ def relax_skeleton(
     Returns
     -------
     Relaxation
-        Poses in the world frame, χ², how far the last step moved a pose [m], and the softest modes.
+        Poses in the world frame, χ², largest move of the last step [m], and the weakest modes.
 
     Raises
     ------
     IndeterminateError
-        Something does not constrain a pose.
+        A pose or landmark is not determined.
     SolverError
         The objective is not finite; or ``blocks`` would need more memory than ``config.limit``.
 
@@ -287,7 +287,7 @@ def relax_skeleton(
 
 
 class _Descent:
-    """One descent: the network at the poses so far, and the steps."""
+    """One descent: the network at the current poses, and the steps."""
 
     def __init__(
         self,
@@ -326,7 +326,7 @@ class _Descent:
         return M
 
     def split(self) -> int:
-        """Split wrong unions at the present poses; how many there were."""
+        """Split false correspondences at the current poses; returns their number."""
         landmark, found = split_false_correspondences(self.network)
         self.stages("wrong unions")
         self.found += found
@@ -340,7 +340,7 @@ class _Descent:
         return self.network.objective / max(1, self.problem.freedom)
 
     def run(self) -> None:
-        """Steps until nothing is gained."""
+        """Iterate until convergence."""
         self.converged = ""
         self._finishing, self._before = 0, len(self.history)
         if not np.isfinite(self.network.objective):
@@ -361,7 +361,7 @@ class _Descent:
             if M is None or self.chi2 > 1.5 or (last is not None and last.scale < 1.0) or (close and not rebuilt):
                 M = self._preconditioner()
                 rebuilt = int(close)
-            # soft modes gain next to nothing: whether poses still move is seen only when the system is solved
+            # weak modes hardly change the objective: accurate solves are needed to see whether poses still move
             self._finishing += last is not None and last.predicted < c.gain
             tolerance = 0.01 if self.chi2 > 2.0 or self._finishing else 1e-3 if close else 0.03
             gain = 0.0 if self._finishing else 1e-3 * c.gain
@@ -376,10 +376,10 @@ class _Descent:
             if self._take(step, predicted, products):
                 return
             if c.split and len(self.history) == 1 and self.split():
-                M = None  # before it, the start bends too many right ones; later, wrong ones have bent the poses
+                M = None  # earlier, too many correct ones look false; later, false ones have distorted the poses
 
     def _levels(self) -> None:
-        """Steps of the keyframes alone."""
+        """Steps of the keyframes only."""
         if not self.levels.factored:
             raise ConfigError(f"the method 'levels' needs keyframes; got {self.levels}")
         for _ in range(self.config.iterations):
@@ -392,13 +392,13 @@ class _Descent:
                 return
 
     def _take(self, step: Array, predicted: float, products: int) -> bool:
-        """Take a step, halved while the objective rises; True if it was the last one."""
+        """Apply a step, halved while the objective increases; True if it was the last one."""
         c, before = self.config, self.network
         scale = 1.0
         while True:
             there = self._network(step_poses(before.poses, step, scale))
             gained = before.objective - there.objective
-            # what rounding makes of the sum of all residuals counts as nothing
+            # ignore rounding errors of the sum of all residuals
             if not c.halve or gained >= -1e-12 * before.objective * np.sqrt(self.problem.measurements):
                 break
             scale *= 0.5
@@ -426,7 +426,7 @@ class _Descent:
     # ---- non-linear conjugate gradients ------------------------------------------------------------------------
 
     def _gradients(self) -> None:
-        """Polak-Ribière; the step length from one product, halved while the objective rises."""
+        """Polak-Ribière; step length from one product, halved while the objective increases."""
         c = self.config
         plain = self.levels.jacobi < 0
         M: Callable[[Array], Array] | None = None
@@ -464,14 +464,14 @@ def conjugate_gradients(
 ) -> tuple[Array, float, int]:
     """Solve ``S x = b`` by preconditioned conjugate gradients.
 
-    It ends when the residual, in the norm of the preconditioner, has fallen to ``tolerance`` of what it was, or when
-    the last four products together lowered the quadratic by less than ``gain``.
+    It ends when the residual, in the norm of the preconditioner, is below ``tolerance`` times its initial value, or
+    when the last four products together decreased the quadratic by less than ``gain``.
 
     Returns
     -------
     x : (N, 6)
     predicted : float
-        ``xᵀ b``: by how much the objective falls if it is as the linear model has it.
+        ``xᵀ b``: decrease of the objective in the linear model.
     """
     x = np.zeros_like(b)
     r = b.copy()

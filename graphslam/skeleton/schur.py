@@ -1,4 +1,4 @@
-"""The skeleton network at given poses: objective, gradient, and the Schur complement applied without being formed."""
+"""The skeleton network at given poses: objective, gradient, and matrix-free products with the Schur complement."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from graphslam.skeleton.landmark_kernels import Poses, Sightings
 from graphslam.skeleton.problem import SkeletonProblem
 
 PARTS = 2
-"""Ranges of poses whose sums over landmarks are kept apart and added in order: results depend on it, not on threads."""
+"""Ranges of poses with separate sums over landmarks, added in order; results depend on it, not on threads."""
 
 
 class Workers:
-    """Runs a kernel over ranges on some threads; the ranges, and so the results, do not depend on their number."""
+    """Run a kernel over ranges on several threads; the ranges, and so the results, do not depend on their number."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -41,9 +41,9 @@ class Workers:
 
 
 class WorkRanges:
-    """Ranges of poses and of landmarks, and the arrays into which each range of poses sums.
+    """Ranges of poses and landmarks, and the arrays for the sums of each range of poses.
 
-    Landmarks are numbered by first observation, so the first range of poses sees the first landmarks only.
+    Landmarks are numbered by first observation, so the first range of poses observes the first landmarks only.
     """
 
     def __init__(self, problem: SkeletonProblem, workers: Workers, parts: int = PARTS) -> None:
@@ -68,11 +68,11 @@ class WorkRanges:
         self.workers.over(work, self.problem.pieces(self.problem.landmarks))
 
     def over_poses(self, work: Callable[[int, int], Any]) -> list[Any]:
-        """``work(begin, end)`` for ranges of poses, where the measurements themselves are not needed."""
+        """``work(begin, end)`` for ranges of poses, without the measurements."""
         return self.workers.over(work, (c for r in self.ranges for c in self.problem.chunks(*r)))
 
     def over(self, work: Callable[..., None]) -> None:
-        """``work(k, sightings, begin, end)`` for the chunks of each range k of poses, in their order within a range."""
+        """``work(k, sightings, begin, end)`` for the chunks of each range k of poses, in order within a range."""
 
         def walk(k: int) -> None:
             for a, b in self.problem.chunks(*self.ranges[k]):
@@ -81,11 +81,11 @@ class WorkRanges:
         self.workers.over(walk, [(k,) for k in range(len(self.ranges))])
 
     def sums(self, width: int) -> list[Array]:
-        """A zero array ``(landmarks in reach, width)`` for each range of poses; the last one has all landmarks."""
+        """A zero array ``(landmarks in reach, width)`` per range of poses; the last one has all landmarks."""
         return [self.problem.room((r, width)) for r in self.reach]
 
     def total(self, sums: list[Array]) -> Array:
-        """Sum over the ranges, in their order, in the last array."""
+        """Sum over the ranges, in order, written to the last array."""
         out = sums[-1]
 
         def add(a: int, b: int) -> None:
@@ -102,11 +102,11 @@ class Network:
     Attributes
     ----------
     landmarks : (L, 3)
-        Best places of the landmarks, given the poses.
+        Optimal landmark positions, given the poses.
     objective : float
         Sum of squared normalised residuals.
     gradient : (N, 6)
-        Half its derivative by the poses (turn, then way, in the world frame), with the landmarks following.
+        Half its derivative by the poses (rotation, then translation, in the world frame), with optimal landmarks.
     """
 
     def __init__(self, layout: WorkRanges, poses: Poses) -> None:
@@ -124,7 +124,7 @@ class Network:
         self._blocks: tuple[Array, Array] | None = None
 
     def _add_chain(self, g: Array, diagonal: Array | None, upper: Array | None) -> float:
-        """Add what ties a pose alone or to the next; returns its objective."""
+        """Add odometry, tilt and priors; returns their objective."""
         problem, poses = self.layout.problem, self.poses
         none = np.empty((0, 6, 6))
         total = 0.0
@@ -141,7 +141,7 @@ class Network:
         return float(total) + add_fixes(problem, poses, g, diagonal) + add_start(problem, poses, g, diagonal)
 
     def chain_blocks(self) -> tuple[Array, Array]:
-        """Blocks ``(N, 6, 6)`` and ``(N - 1, 6, 6)`` of what ties a pose alone or to the next."""
+        """Blocks ``(N, 6, 6)`` and ``(N - 1, 6, 6)`` of odometry, tilt and priors."""
         if self._blocks is None:
             N = self.layout.problem.poses
             diagonal, upper = self.layout.problem.room((N, 6, 6)), self.layout.problem.room((N - 1, 6, 6))
@@ -183,7 +183,7 @@ class Network:
 
 
 def add_fixes(problem: SkeletonProblem, poses: Poses, g: Array, diagonal: Array | None) -> float:
-    """Add GPS to gradient and blocks; its objective."""
+    """Add GPS to gradient and blocks; returns its objective."""
     if not problem.fixes:
         return 0.0
     at = problem.gps_pose
@@ -201,7 +201,7 @@ def add_fixes(problem: SkeletonProblem, poses: Poses, g: Array, diagonal: Array 
 
 
 def add_start(problem: SkeletonProblem, poses: Poses, g: Array, diagonal: Array | None) -> float:
-    """Add the prior on the first pose to gradient and blocks; its objective."""
+    """Add the prior on the first pose to gradient and blocks; returns its objective."""
     w = so3_log(matrix_to_quat(poses.rotation[0] @ problem.start_rotation.T))
     r = np.concatenate([w, poses.position[0] - problem.start_position])
     J = np.eye(6)

@@ -1,11 +1,10 @@
-"""Numba kernels of pose graphs whose links are joined to segments: a path of links acts on its two ends like one link.
+"""Numba kernels for combining links to segments: a path of links acts on its two ends like one link.
 
 Poses are perturbed in the world frame as in :mod:`~graphslam.skeleton.chain_kernels`. The residual of a link from pose
-i to pose j is r; its derivative is ``J Δ`` with ``Δ = (w_j - w_i, u_j - u_i - w_i × (p_j - p_i))`` and ``J =
-diag(J_r⁻¹(r) R_jᵀ, R_iᵀ)``. Twists taken about one point add up along a path, so what its links give way adds up, too,
-as springs one after the other: with ``G`` = ``J⁻¹``, then the shift to the path's first pose, the path is one link of
-covariance ``Σ G Ω⁻¹ Gᵀ`` and residual ``Σ G r``. This is the exact elimination of all poses in between. Plain arrays
-only.
+i to pose j is r; its derivative is ``J Δ`` with ``Δ = (w_j - w_i, u_j - u_i - w_i × (p_j - p_i))`` and
+``J = diag(J_r⁻¹(r) R_jᵀ, R_iᵀ)``. Twists about one point add up along a path, so the covariances of its links are
+summed: with ``G`` = ``J⁻¹``, then the shift to the path's first pose, the path is one link of covariance ``Σ G Ω⁻¹ Gᵀ``
+and residual ``Σ G r``. This is the exact elimination of all poses in between. Plain arrays only.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ Index = npt.NDArray[np.int64]
 
 
 class SegmentLinks(NamedTuple):
-    """Relative poses, and the segments they form."""
+    """Relative poses, and the segments that they form."""
 
     ends: Index
     """(E, 2): poses i and j of each."""
     first: Index
-    """(S + 1,): where the links of each segment begin; each begins where the one before it ends."""
+    """(S + 1,): first link of each segment; a segment starts at the end of the previous one."""
     rotation: Array
-    """(E, 3, 3): turn from i to j, in the frame of i …"""
+    """(E, 3, 3): rotation from i to j, in the frame of i …"""
     translation: Array
-    """(E, 3): … and way [m]."""
+    """(E, 3): … and translation [m]."""
     covariance: Array
-    """(1, 6, 6) or (E, 6, 6): rotation vector, then way."""
+    """(1, 6, 6) or (E, 6, 6): covariance of rotation vector, then translation."""
     information: Array
     """Its inverse."""
 
@@ -60,7 +59,7 @@ def _residual(links, e, turns, way, scratch, r):
 
 @njit(nogil=True, error_model="numpy")
 def _turned(Rb, r, B):
-    """Write ``R_j J_r(r)`` (3, 3), J_r the right Jacobian of the rotation residual: a turn of the body in the world."""
+    """Write ``R_j J_r(r)`` (3, 3), J_r the right Jacobian of the rotation residual."""
     x, y, z = r[0], r[1], r[2]
     t2 = x * x + y * y + z * z
     if t2 < 1e-2:
@@ -82,15 +81,16 @@ def _turned(Rb, r, B):
 
 @njit(nogil=True, error_model="numpy")
 def join_links(links, poses, covariance, misfit):
-    """Join the links of each segment to one.
+    """Combine the links of each segment to one.
 
     Parameters
     ----------
     links : SegmentLinks
     poses : Poses
     covariance, misfit : (S, 6, 6), (S, 6)
-        Out: of ``y = (w_b - w_a, u_b - u_a - w_b × (p_b - p_a))`` for the ends a and b of each segment, and ``Σ G r``.
-        The segment costs ``(y + misfit)ᵀ covariance⁻¹ (y + misfit)``, with the poses between where that is least.
+        Output: of ``y = (w_b - w_a, u_b - u_a - w_b × (p_b - p_a))`` for the ends a and b of each segment, and
+        ``Σ G r``. The cost of the segment is ``(y + misfit)ᵀ covariance⁻¹ (y + misfit)``, minimised over the poses
+        between.
 
     Returns
     -------
@@ -180,18 +180,18 @@ def join_links(links, poses, covariance, misfit):
 
 @njit(nogil=True)
 def add_end_blocks(ends, position, covariance, misfit, place, blocks, g):
-    """Add joined links to the matrix and half the gradient of the poses at their ends.
+    """Add combined links to the matrix and half the gradient of the poses at their ends.
 
     Parameters
     ----------
     ends : (S, 2)
-        Of each segment, among K poses.
+        Ends of each segment, among K poses.
     position : (K, 3)
     covariance, misfit : (S, 6, 6), (S, 6)
         From :func:`join_links`; the covariances are replaced by their inverses.
     place : (diagonal (K,), between (S,))
-        Where in ``blocks (nb, 6, 6)`` the block of each pose is, and that of each segment, whose rows belong to the
-        pose with the smaller number. Added to.
+        Index in ``blocks (nb, 6, 6)`` of the block of each pose and of each segment, whose rows belong to the pose with
+        the smaller number. Blocks are added.
     g : (K, 6)
         Added to.
 
@@ -282,7 +282,7 @@ def follow_links(links, poses, information, misfit, x):
         y[3] += dy * x[b, 2] - dz * x[b, 1]
         y[4] += dz * x[b, 0] - dx * x[b, 2]
         y[5] += dx * x[b, 1] - dy * x[b, 0]
-        # what pulls at the segment is the same all along it
+        # the wrench of a segment is constant along it
         for m in range(6):
             f[m] = 0.0
             for n in range(6):
@@ -306,7 +306,7 @@ def follow_links(links, poses, information, misfit, x):
                 y[m] = -r[m]
                 for n in range(6):
                     y[m] += S[m, n] * h[n]
-            # Δ = J⁻¹ of it; the way first, because the turn of pose i belongs to it
+            # Δ = J⁻¹ of it; translation first, because it depends on the rotation of pose i
             ux += wy * dz - wz * dy + Ra[0] * y[3] + Ra[1] * y[4] + Ra[2] * y[5]
             uy += wz * dx - wx * dz + Ra[3] * y[3] + Ra[4] * y[4] + Ra[5] * y[5]
             uz += wx * dy - wy * dx + Ra[6] * y[3] + Ra[7] * y[4] + Ra[8] * y[5]

@@ -1,4 +1,4 @@
-"""Where the relaxation begins: the chain of odometry with tilt and GPS, then one walk against older landmarks."""
+"""Initial poses: the chain of odometry with tilt and GPS, then one pass against older landmarks."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from graphslam.skeleton.start_kernels import forward_pass_kernel
 
 
 def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
-    """Optimum of odometry, tilt, GPS and prior alone: Gauss-Newton from dead reckoning, block by block along the chain.
+    """Optimum of odometry, tilt, GPS and prior only: Gauss-Newton from dead reckoning, block-tridiagonal.
 
-    A step that raises the objective is halved. It ends when a step gains less than 0.1 %, or after ``iterations``.
+    A step that increases the objective is halved. It ends when a step gains less than 0.1 %, or after ``iterations``.
     """
     poses = problem.dead_reckoning()
     N = problem.poses
@@ -26,7 +26,7 @@ def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
     objective, g = _linearised(problem, poses, *blocks)
     for _ in range(iterations):
         step = -g
-        # a long way without GPS: what holds its end at all may be less than rounding makes of the odometry
+        # on a long path without GPS the information of its end can be below the rounding error of the odometry
         np.einsum("nii->ni", blocks[0])[:] *= 1.0 + 1e-12
         bad = kernels.solve_chain(*blocks, step)
         if bad >= 0:
@@ -47,7 +47,7 @@ def chain_start(problem: SkeletonProblem, iterations: int = 6) -> Poses:
 
 
 def _linearised(problem: SkeletonProblem, poses: Poses, diagonal: Array, upper: Array) -> tuple[float, Array]:
-    """Objective and half the gradient of the chain; its blocks replace what was in ``diagonal`` and ``upper``."""
+    """Objective and half the gradient of the chain; its blocks overwrite ``diagonal`` and ``upper``."""
     g = np.zeros((problem.poses, 6))
     diagonal[:] = 0.0
     upper[:] = 0.0
@@ -58,14 +58,14 @@ def _linearised(problem: SkeletonProblem, poses: Poses, diagonal: Array, upper: 
 
 @dataclass(frozen=True)
 class ForwardPass:
-    """What :func:`forward_pass` did.
+    """Result of :func:`forward_pass`.
 
     Parameters
     ----------
     tied : int
-        Poses that were tied to landmarks of an earlier pass.
+        Number of poses that were aligned with landmarks of an earlier traversal.
     refused : int
-        Sightings of such landmarks that were not believed.
+        Number of rejected observations of such landmarks.
     """
 
     poses: Poses
@@ -74,9 +74,9 @@ class ForwardPass:
 
 
 TURN_SIGMA, WAY_SIGMA = 2e-3, 0.03
-"""How far a pose may move from its prediction [rad, m]."""
+"""Prior σ of a pose around its prediction [rad, m]."""
 GATE = 16.27
-"""Chi-square of three scalars that 99.9 % pass."""
+"""99.9 % quantile of χ² with three degrees of freedom."""
 
 
 def forward_pass(
@@ -85,13 +85,12 @@ def forward_pass(
     *,
     ago: int = 50,
 ) -> ForwardPass:
-    """Walk once along the poses and tie each to the landmarks that were first seen more than ``ago`` poses before.
+    """Process the poses in order and align each with landmarks first observed more than ``ago`` poses before.
 
-    A pose is predicted by the chain's increment. Where three old landmarks or more are in view, three Gauss-Newton
-    steps place it against their running means; a landmark whose misfit is above :data:`GATE` and above nine times the
-    median of those in view has no part in the second and third. A sighting that is then above the gate is *refused*:
-    it is not added to the mean of its landmark, so a wrong correspondence bends neither this pose nor a later one.
-
+    A pose is predicted by the chain's increment. If at least three old landmarks are in view, three Gauss-Newton steps
+    align it with their running means; a landmark with a χ² above :data:`GATE` and above nine times the median of those
+    in view is excluded in the second and third. An observation that is then above the gate is *refused*: it is not
+    added to the mean of its landmark, so a false correspondence affects neither this pose nor a later one.
     """
     N, L = problem.poses, problem.landmarks
     out = Poses(np.empty((N, 3, 3)), np.empty((N, 3)))

@@ -1,4 +1,4 @@
-"""Numba kernels of the first values: one walk along the poses, each tied to landmarks seen long before."""
+"""Numba kernels of the forward pass: poses in order, each aligned with older landmarks."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from graphslam.skeleton.chain_kernels import _cholesky, _log, _solve, write_se3_
 
 @njit(nogil=True)
 def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, out):
-    """One walk along the poses: each is tied to the landmarks that were seen long before, then adds its sightings.
+    """Process the poses in order: each is aligned with older landmarks, then its observations are added.
 
     Parameters
     ----------
     chain_poses : Poses
-        Their increments are followed.
+        Their increments predict the poses.
     span : (begin, end)
-        Poses; those before are done.
+        Poses; earlier ones are finished.
     rules : (ago, turn, way, gate)
-        A landmark is old when it was first seen more than ``ago`` poses earlier; prior information of a pose against
-        its prediction [1/rad², 1/m²]; chi-square (3) up to which a sighting is believed.
+        A landmark is old if it was first observed more than ``ago`` poses earlier; prior information of a pose around
+        its prediction [1/rad², 1/m²]; limit of χ²(3) for an observation.
     start_seen : (L,) int32
-        The pose that saw each landmark first, at the beginning -1; changed.
+        Pose of the first observation of each landmark, initially -1; changed.
     D, b : (L, 6), (L, 3)
-        Sums of weights and of weighted places, at the beginning zero; changed.
+        Sums of weights and of weighted positions, initially zero; changed.
     out : Poses
         The first pose is that of the chain.
 
     Returns
     -------
     tied, refused : int
-        Poses that were tied to old landmarks; sightings of old landmarks that were not believed.
+        Number of poses aligned with old landmarks; number of rejected observations of old landmarks.
     """
     ago, turn, way, gate = rules
     rotation, position, points = chain_poses.rotation, chain_poses.position, sightings.points
@@ -96,7 +96,7 @@ def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, o
             for step in range(3):
                 A[:] = 0.0
                 x[:] = 0.0
-                for k in range(3):  # prior: the turn and the way since the prediction
+                for k in range(3):  # prior: rotation and translation from the prediction
                     A[k, k] = turn
                     A[3 + k, 3 + k] = way
                     x[3 + k] = -way * (p[k] - pp[k])
@@ -186,7 +186,7 @@ def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, o
 def _add_weight(A, qx, qy, qz, sx, sy, sz, weight):
     """Add ``Jᵀ W J``, J = [[q]× , -I], to a block (6, 6)."""
     al, be = weight
-    # W = α I + β s sᵀ; columns of Jᵀ: the turn sees a = s × q … (q × w)·s = w·(s × q)
+    # W = α I + β s sᵀ; columns of Jᵀ: rotation part a = s × q … (q × w)·s = w·(s × q)
     cx, cy, cz = sy * qz - sz * qy, sz * qx - sx * qz, sx * qy - sy * qx
     q2 = qx * qx + qy * qy + qz * qz
     A[0, 0] += al * (q2 - qx * qx) + be * cx * cx

@@ -1,8 +1,8 @@
 """Measurements of a skeleton network in tiles on disk: a tile is a range of poses, named by the digest of its bytes.
 
-A folder holds ``tiles.json`` and the tiles. A tile is, one after the other and little-endian: measurements of each pose
-(int32), points (float32, three each), landmarks (int32). A tile that is there already is not written again, so writing
-can be stopped at any moment and repeated, by one process or by many, and the folder is the same to the byte.
+A folder holds ``tiles.json`` and the tiles. A tile contains, little-endian: number of measurements of each pose
+(int32), points (float32, three each), landmarks (int32). An existing tile is not written again, so writing can be
+interrupted and repeated at any time, by one or several processes, and the folder is bitwise equal.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from graphslam.core.npz import read_arrays
 FORMAT = "graphslam.tiles/1"
 _INDEX = "tiles.json"
 _STEPS = 32
-"""Ranges from one release of mapped memory to the next."""
+"""Number of ranges between two releases of mapped memory."""
 _SHAPE = {
     "format": str,
     "landmarks": int,
@@ -49,9 +49,9 @@ class Tiles:
     Attributes
     ----------
     first : (N + 1,)
-        Where the measurements of each pose begin.
+        First measurement of each pose.
     landmarks, measurements, size : int
-        How many landmarks and measurements there are, and poses of the largest tile.
+        Number of landmarks and measurements, and number of poses of the largest tile.
     """
 
     def __init__(self, folder: str | Path, verify: bool = False) -> None:
@@ -89,7 +89,7 @@ class Tiles:
         return self.folder / name
 
     def ranges(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
-        """The poses ``begin … end - 1``, cut where tiles meet."""
+        """The poses ``begin … end - 1``, divided at tile boundaries."""
         met = 0
         for a, b in zip(self._begin[:-1], self._begin[1:]):
             if a < end and begin < b:
@@ -99,9 +99,9 @@ class Tiles:
                 yield max(int(a), begin), min(int(b), end)
 
     def room(self, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
-        """Zeros that lie on disk: a nameless file of the folder, mapped, that is gone when the array is.
+        """A zero array on disk: a memory-mapped unnamed file in the folder, removed with the array.
 
-        What is read and written of it stays in memory until :meth:`release`, or as long as the system likes.
+        Its pages stay in memory until :meth:`release`, or until the system evicts them.
         """
         kind = np.dtype(dtype)
         size = int(np.prod(shape)) * kind.itemsize
@@ -114,8 +114,8 @@ class Tiles:
         return np.frombuffer(mapped, kind).reshape(shape)
 
     def release(self) -> None:
-        """Let go of the memory of all arrays of :meth:`room`; their numbers stay."""
-        if hasattr(mmap, "MADV_DONTNEED"):  # elsewhere the system decides alone
+        """Free the memory pages of all arrays of :meth:`room`; their values are kept on disk."""
+        if hasattr(mmap, "MADV_DONTNEED"):  # otherwise the system decides
             for mapped in list(self._maps):
                 mapped.madvise(mmap.MADV_DONTNEED)
 
@@ -137,12 +137,12 @@ class Tiles:
 
 
 def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points, Labels]]) -> Tiles:
-    """Write tiles, one for each block, and then the index that makes them a network.
+    """Write one tile per block, then the index.
 
     Parameters
     ----------
     folder : path
-        Made if it is not there. Tiles that it holds already are kept.
+        Created if it does not exist. Existing tiles are kept.
     blocks : iterable of (counts (n,), points (m, 3), landmarks (m,))
         Measurements of each pose, in pose order; landmarks numbered by first observation over all blocks.
     """
@@ -174,7 +174,7 @@ def write_tiles(folder: str | Path, blocks: Iterable[tuple[npt.ArrayLike, Points
 
 
 def store_arrays(folder: Path, arrays: Mapping[str, npt.ArrayLike]) -> str:
-    """Write arrays to a file that is named by the digest of its bytes, if it is not there; its name."""
+    """Write arrays to a file named by the digest of its bytes, unless it exists; returns its name."""
     stream = io.BytesIO()
     np.savez(stream, **{name: np.ascontiguousarray(value) for name, value in arrays.items()})  # type: ignore[arg-type]
     data = stream.getvalue()
@@ -186,7 +186,7 @@ def store_arrays(folder: Path, arrays: Mapping[str, npt.ArrayLike]) -> str:
 
 
 def stored_arrays(folder: Path, name: str) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of such a file."""
+    """The arrays of such a file, after a check of its digest."""
     path = folder / name
     if path.name != name or path.suffix != ".arrays":
         raise FormatError("name of a file of arrays", where=str(folder), got=name, wanted="<digest>.arrays")
@@ -198,7 +198,7 @@ def stored_arrays(folder: Path, name: str) -> dict[str, npt.NDArray[Any]]:
 
 
 def _numbers(path: Path, out: T, begin: int) -> T:
-    """``out``, filled from byte ``begin`` of a tile on."""
+    """``out``, filled from byte ``begin`` of a tile."""
     with path.open("rb") as stream:
         stream.seek(begin)
         got = stream.readinto(out.data)

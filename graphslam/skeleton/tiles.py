@@ -1,4 +1,4 @@
-"""A skeleton network whose measurements stay on disk, one tile in memory at a time."""
+"""Skeleton networks with measurements on disk, one tile in memory at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphslam.skeleton.tile_store import Labels, Points, Tiles, write_tiles
 
 
 def write_tiled_problem(problem: SkeletonProblem, folder: str | Path, size: int = 20_000) -> SkeletonProblem:
-    """The same network with its measurements in tiles of ``size`` poses; every kernel gives the same bytes on both.
+    """Write the measurements in tiles of ``size`` poses; results are bitwise equal to those of the network in memory.
 
     Odometry, tilt, GPS and poses stay in memory.
     """
@@ -32,6 +32,6 @@ def write_tiled_problem(problem: SkeletonProblem, folder: str | Path, size: int 
 
 
 def load_tiled_problem(problem: SkeletonProblem, tiles: Tiles) -> SkeletonProblem:
-    """The network with the measurements of some tiles in place of its own."""
+    """The network with the measurements of given tiles in place of its own."""
     nothing = np.empty((0, 3), np.float32), np.empty(0, np.int32)
     return replace(problem, points=nothing[0], landmark=nothing[1], first=tiles.first, tiles=tiles)

@@ -1,4 +1,4 @@
-"""The softest modes of a skeleton network: which long bends the measurements hold least. Approximate."""
+"""The weakest modes of a skeleton network: deformations that the measurements determine least. Approximate."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from graphslam.skeleton.schur import Network
 
 @dataclass(frozen=True)
 class WeakMode:
-    """How far one mode moves the poses when the objective rises by one unit of χ².
+    """Displacement of the poses by one mode for an increase of the objective by one unit of χ².
 
     Parameters
     ----------
     rms, largest : float
-        Over the keyframes, and of the keyframe that moves most [m].
+        RMS over the keyframes, and largest displacement of a keyframe [m].
     pose : int
-        Where that is.
+        Pose of the largest displacement.
     """
 
     rms: float
@@ -30,10 +30,10 @@ class WeakMode:
 
 
 def weakest_modes(network: Network, count: int = 3) -> list[WeakMode]:
-    """The modes with the largest variance of position, softest first, by Lanczos on the factored keyframe network.
+    """Modes with the largest position variance, weakest first, by Lanczos on the factorised keyframe network.
 
-    The keyframes bend the path only as rigid motion between them allows, so the true modes are at least as soft: the
-    figures are lower bounds.
+    The keyframes allow only rigid motion between them, so the true modes are at least as weak: the values are lower
+    bounds.
     """
     poses = network.layout.problem.poses
     keyframes = KeyframeNetwork(network, preconditioner_levels(poses).factored or max(1, poses // 40))

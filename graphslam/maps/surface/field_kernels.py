@@ -31,8 +31,7 @@ MOST = 65535
 
 @kernel()
 def point_weight(d, along):
-    """Weight 0 … `FULL` of a point for a voxel at distance ``d`` in front of its plane and ``along`` in the plane
-    [voxels]."""
+    """Weight 0 … `FULL` of a point for a voxel ``d`` in front of its plane and ``along`` in the plane [voxels]."""
     if along >= WIDE or d > FRONT or d <= -BEHIND:
         return 0
     w = FULL * (1.0 - along / WIDE)
@@ -89,8 +88,7 @@ def add_planes(points, normals, first, table, sums):
 
 @kernel()
 def add_rays(points, origins, first, table, sums):
-    """Integrate distances along the beams, as in a truncated signed distance field: the baseline of
-    :func:`add_planes`."""
+    """Integrate distances along the beams (truncated signed distance): the baseline of :func:`add_planes`."""
     for k in range(points.shape[0]):
         ox, oy, oz = origins[k, 0], origins[k, 1], origins[k, 2]
         dx, dy, dz = points[k, 0] - ox, points[k, 1] - oy, points[k, 2] - oz

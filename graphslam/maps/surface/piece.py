@@ -42,8 +42,7 @@ class SurfaceConfig:
     most_range: float = 40.0
     """Points farther from the scanner are ignored [m]."""
     data: str = "planes"
-    """``planes``: distances to the plane of each point; ``rays``: along its beam, as in a truncated signed distance
-    field."""
+    """``planes``: distances to the plane of each point; ``rays``: along its beam (truncated signed distance)."""
     enough: float = 0.06
     """Least weight of a known voxel: a point whose normal passes through its centre counts 1, at the rim 1/16."""
     flatness: float = 4.0
@@ -53,17 +52,15 @@ class SurfaceConfig:
     carve_beams: int = 4
     """A voxel behind a surface is free if at least this number of beams passed …"""
     carve_ratio: float = 3.0
+    """… and more than this per point in it."""
+    smoothing: float = 0.1
     """λ: weight of curvature relative to the data (W / (W + 3) for W points); in voxel units, so that its error
     decreases with the square of the voxel size."""
-    smoothing: float = 0.1
-    """λ: weight of curvature relative to the data, whose weight is W / (W + 3) for W points; in voxel units, so that
-    its error decreases with the square of the voxel size."""
     steps: int = 6
+    """Steps of the evolution …"""
+    redistance_steps: int = 2
     """… and of the redistancing. Both are fixed: a voxel depends only on voxels up to that distance, so changes can be
     recomputed locally with a bitwise equal result."""
-    redistance_steps: int = 2
-    """… and of the redistancing. Both are fixed, so a voxel depends only on voxels up to that distance, and changes can
-    be recomputed locally with a bitwise equal result."""
     dt: float = 0.2
     """Step size of the evolution."""
 

@@ -45,8 +45,7 @@ from graphslam.solve.sparse import SparseProblem, factorise_sparse
 
 Mask = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
-# Loops are neighbours if the sum of the distances of their ends is at most this number of nodes; larger groups are not
-# tested.
+# Loops are neighbours if their ends are at most this number of nodes apart (sum of both); largest tested group.
 NEAR, LARGEST = 4, 40
 # Rejected loops that are tested in every round (least cost first); columns per linear solve.
 TESTED, COLUMNS = 300, 400
