@@ -1,4 +1,4 @@
-"""Files that are either whole or not there, and npz archives that are either read fully or refused."""
+"""Atomic writing of files, and checked reading of npz archives and JSON."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _PART = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.part(\.[a-z]+)?")
 
 
 def part_path(target: Path, ending: str = "") -> Path:
-    """A temporary name beside ``target`` that nobody else has; ``ending`` is for writers that look at it (``.npz``)."""
+    """A unique temporary name in the folder of ``target``; ``ending`` is for writers that depend on it (``.npz``)."""
     return target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.part{ending}")
 
 
 def is_part(name: str) -> bool:
-    """Is it a name that :func:`part_path` gives?"""
+    """Whether it is a name from :func:`part_path`."""
     return _PART.fullmatch(name) is not None
 
 
 def sweep_parts(folder: str | os.PathLike[str]) -> None:
-    """Remove the halves of files that a killed process left directly in a folder.
+    """Remove the temporary files that a killed process left directly in a folder.
 
-    The caller knows that the folder is ours and that nobody else is writing into it.
+    The caller must ensure that no other process is writing to the folder.
     """
     if Path(folder).is_dir():
         for path in Path(folder).iterdir():
@@ -45,7 +45,7 @@ def sweep_parts(folder: str | os.PathLike[str]) -> None:
 
 
 def sync_to_disk(path: str | os.PathLike[str]) -> None:
-    """Ask the system to bring a file, or the names in a folder, to the disk."""
+    """Flush a file, or the entries of a folder, to the disk."""
     try:
         handle = os.open(path, os.O_RDONLY)
     except PermissionError:  # a folder, on systems that cannot open one
@@ -60,7 +60,7 @@ def sync_to_disk(path: str | os.PathLike[str]) -> None:
 def atomic_open(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> Iterator[IO[Any]]:
     """Write to a temporary name in the same folder; rename on success, remove on failure.
 
-    A reader, or a run that was killed, sees the old file or the new one, never half of one.
+    A reader sees the old file or the new one, never a partial one, even if the process is killed.
     """
     target = Path(path)
     temporary = part_path(target)
@@ -81,7 +81,7 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
     for name, value in arrays.items():
         if np.asarray(value).dtype.hasobject:
             raise FormatError(f"array {name!r} holds Python objects", where=str(path), wanted="numbers or strings")
-    # a Ctrl-C inside would surface as an error of the half-written archive, and not as what it is
+    # a Ctrl-C inside would appear as an error of the partial archive
     with defer_interrupts(), atomic_open(path) as stream:
         np.savez_compressed(stream, **{k: np.asarray(v) for k, v in arrays.items()})  # type: ignore[arg-type]
 
@@ -89,12 +89,12 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
 def read_npz(
     path: str | os.PathLike[str], *, fmt: str, fields: Mapping[str, Field] | None = None
 ) -> dict[str, npt.NDArray[Any]]:
-    """Read the arrays of an npz whose array ``format`` says ``fmt``; never unpickles.
+    """Read the arrays of an npz whose array ``format`` is ``fmt``; never unpickles.
 
     Parameters
     ----------
     fields : mapping of str to Field, optional
-        What the arrays must be; only these are returned, and checked. Without: all, for a caller that checks them.
+        Declaration of the arrays; only these are checked and returned. Without it all are returned unchecked.
     """
     where = str(path)
     arrays = read_arrays(path)
@@ -103,7 +103,7 @@ def read_npz(
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
-    """Write JSON atomically; NaN and infinities are refused, because JSON has none."""
+    """Write JSON atomically; NaN and infinities are refused, because JSON does not have them."""
     try:
         text = json.dumps(value, indent=1, sort_keys=False, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -113,7 +113,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def read_json(path: str | os.PathLike[str], *, fmt: str, shape: Any = None) -> dict[str, Any]:
-    """Read a JSON object whose key ``format`` says ``fmt``, and check its shape (:func:`reading.check_json`)."""
+    """Read a JSON object whose key ``format`` is ``fmt``, and check its shape (:func:`reading.check_json`)."""
     where = str(path)
     value: Any = parse_json(read_text(path), where)
     if not isinstance(value, dict):

@@ -1,8 +1,8 @@
-"""The coordinates in which a landmark map is Gaussian.
+"""Parametrisations ("charts") in which a landmark map is Gaussian.
 
-An error of the heading turns the end of a submap and its landmarks together, along arcs; a Gaussian over Cartesian
-coordinates lets them err along straight lines. In the *group chart* of SE₁₊ₙ(2) the residual of a pose (t, θ) and of
-every point l that hangs on it is, with ``d = θ - θ̂``,
+A heading error moves the end of a submap and its landmarks along arcs; a Gaussian over Cartesian coordinates models
+straight lines. In the *group chart* of SE₁₊ₙ(2) the residual of a pose (t, θ) and of every point l with this pose as
+anchor is, with ``d = θ - θ̂``,
 
     (V(d)⁻¹ (t - R(d) t̂),  d,  V(d)⁻¹ (l - R(d) l̂)),        V(d) = ∫₀¹ R(s d) ds.
 
@@ -10,17 +10,17 @@ Because ``R(d) = I + S V(d) d`` (S the quarter turn), this is
 
     (V(d)⁻¹ (t - t̂) - S t̂ d,  d,  V(d)⁻¹ (l - l̂) - S l̂ d),
 
-and the terms in ``S`` are what the change of the information matrix to this chart takes back: the weighted square of
+and the terms in ``S`` cancel with the transformation of the information matrix to this chart: the weighted square of
 the residual is that of ``u = (V(d)⁻¹ (t - t̂), d, V(d)⁻¹ (l - l̂))`` with the *Cartesian* information matrix. So mean
-and covariance of a map stay what they are, and the chart is one scaled rotation,
+and covariance of a map are unchanged, and the chart is one scaled rotation,
 
     V(d)⁻¹ = a I - b S,        a = (d/2) cot(d/2),  b = d/2.
 
-In a joined map a point hangs on its *anchor*, the end pose of the submap that saw it first.
+In a joined map the *anchor* of a point is the end pose of the submap that observed it first.
 
-In space the same holds in SE₁₊ₙ(3). The error of the rotation is ``w = Log(R R̂ᵀ)``, about the axes of the base frame;
+In 3-D the same is true in SE₁₊ₙ(3). The error of the rotation is ``w = Log(R R̂ᵀ)``, about the axes of the base frame;
 ``Exp(w) = I + [w]× V(w)``, so with the Cartesian information matrix over ``(w, t, l…)`` the weighted square of the
-residual is that of ``(w, V(w)⁻¹ (t - t̂), V(w)⁻¹ (l - l̂))``. For a pose alone that is its right tangent, exactly:
+residual is that of ``(w, V(w)⁻¹ (t - t̂), V(w)⁻¹ (l - l̂))``. For a single pose that is exactly its right tangent:
 ``Log(T T̂⁻¹) = Ad(T̂) Log(T̂⁻¹ T)``.
 """
 
@@ -39,13 +39,13 @@ CHARTS: tuple[str, ...] = get_args(Chart)
 
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 _SMALL_TURN = 0.1
-"""Below this angle [rad] the series of :func:`inverse_left_jacobian_slopes` are as exact as the closed forms."""
+"""Below this angle [rad] the series of :func:`inverse_left_jacobian_slopes` are as accurate as the closed forms."""
 _SMALL = 1e-3
-"""Below this half angle [rad] series are exact to rounding, and differences of cotangents are not."""
+"""Below this half angle [rad] the series are accurate to rounding, and the closed forms suffer from cancellation."""
 
 
 def check_chart(chart: str) -> str:
-    """The name of a chart, or a refusal of what is none."""
+    """Return the name of a chart, or refuse an unknown one."""
     if chart not in CHARTS:
         raise ConfigError(f"unknown chart {chart!r}; wanted {' or '.join(repr(c) for c in CHARTS)}")
     return chart
@@ -63,7 +63,7 @@ def inverse_left_jacobian_terms(d: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def apply_inverse_left_jacobian(difference: Array, d: ArrayLike) -> Array:
-    """``V(d)⁻¹ e`` for differences e ``(..., 2)`` of points that hang on a pose whose heading differs by ``d``."""
+    """``V(d)⁻¹ e`` for differences e ``(..., 2)`` of points whose anchor pose has a heading difference ``d``."""
     a, b, _ = inverse_left_jacobian_terms(d)
     x, y = difference[..., 0], difference[..., 1]
     return np.stack([a * x + b * y, a * y - b * x], -1)
@@ -98,7 +98,7 @@ def inverse_left_jacobian_slopes(w: Array, e: Array) -> Array:
 
 
 def pose_differences(poses: Array, means: Array, chart: str) -> tuple[Array, Array]:
-    """What poses in space differ from means by ``(m, 6)``: turn about the axes of the base, then shift; and the turns.
+    """Differences ``(m, 6)`` of 3-D poses from means (rotation about the base axes, translation), and the rotations.
 
     Parameters
     ----------
@@ -111,14 +111,14 @@ def pose_differences(poses: Array, means: Array, chart: str) -> tuple[Array, Arr
 
 
 def chart_difference(e: Array, w: Array, chart: str) -> Array:
-    """Differences ``(n, 3)`` of points that hang on poses turned by ``w`` ``(n, 3)``, in a chart."""
+    """Differences ``(n, 3)`` of points whose anchor poses are rotated by ``w`` ``(n, 3)``, in a chart."""
     return np.einsum("kij,kj->ki", inverse_left_jacobians(w), e) if chart == "group" else e
 
 
 def map_difference(x: ArrayLike, mean: ArrayLike, chart: str, *, space: bool = False) -> Array:
-    """What a vector ``[x, y, θ, l1x, l1y, …]`` differs from a mean by, in the coordinates of a chart ``(n,)``.
+    """Difference of a vector ``[x, y, θ, l1x, l1y, …]`` from a mean, in a chart ``(n,)``.
 
-    In space the vector is ``[pose (7), l1x, l1y, l1z, …]``, and the difference has the pose's turn and shift (6) first.
+    In 3-D the vector is ``[pose (7), l1x, l1y, l1z, …]``; the difference starts with rotation and translation (6).
     ``rᵀ P⁻¹ r`` with the covariance P of the Cartesian vector is the squared distance in that chart.
 
     Parameters

@@ -1,4 +1,4 @@
-"""A connection to a Dask cluster, where one is wanted: the package itself needs none."""
+"""Optional connection to a Dask cluster."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def connect_cluster(address: str, *, timeout: float = 10.0) -> Client:
 
 @contextmanager
 def task_runner(workers: int | None = None, address: str | None = None) -> Iterator[Callable[..., list[Any]]]:
-    """Something that runs tasks: ``run(work, [arguments, …])`` gives what each call of ``work`` returned, in order.
+    """A task runner: ``run(work, [arguments, …])`` returns the results of the calls of ``work``, in order.
 
     Parameters
     ----------
     workers : int, optional
-        Processes of a Dask cluster that lives as long as this; one that dies is started again, and its task repeated.
+        Processes of a temporary Dask cluster; a process that dies is restarted, and its task repeated.
     address : str, optional
-        Of a running scheduler. Without either, tasks run here, one after the other.
+        Of a running scheduler. Without either, tasks run in this process, in sequence.
     """
     if workers is not None and (address is not None or workers < 1):
         raise ConfigError(f"{workers} workers and the cluster {address!r}; wanted one of them, and at least 1 worker")

@@ -1,6 +1,6 @@
 """Configuration as frozen dataclasses: built from nested mappings, merged, read from and written as TOML.
 
-Defaults stand in the code, a file is optional and partial, unknown keys are refused with their full name.
+Defaults are in the code, a file is optional and partial, unknown keys are refused with their full name.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ KEYS = "keys"
 
 
 def flattened_field(default: Any, **keys: str) -> Any:
-    """A field that holds a small dataclass and is spelled as several keys beside the others, one a field of it.
+    """A field with a small dataclass that is written as several keys, one per field.
 
     ``robust: Robust = flattened_field(NO_KERNEL, robust="kind", robust_width="k")`` is ``robust = "cauchy"`` and
-    ``robust_width = 2.385`` in TOML; a key that is left out keeps the default's value.
+    ``robust_width = 2.385`` in TOML; a missing key keeps the default.
     """
     return dataclasses.field(default=default, metadata={KEYS: keys})
 
@@ -55,7 +55,7 @@ def build_config(kind: Any, values: Mapping[str, Any], where: str = "") -> Any:
 
 
 def convert_option(hint: Any, value: Any, name: str) -> Any:
-    """``value`` as the type that ``hint`` asks for; ``name`` is that of the option, for messages."""
+    """Convert ``value`` to the type ``hint``; ``name`` is the option in messages."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None or (value == "none" and str not in args):
@@ -91,7 +91,7 @@ def convert_option(hint: Any, value: Any, name: str) -> Any:
 
 
 def merge_options(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Deep merge of nested mappings, ``over`` wins."""
+    """Deep merge of nested mappings, ``over`` has priority."""
     out = dict(base)
     for key, value in over.items():
         old = out.get(key)

@@ -1,14 +1,14 @@
 """Control points, check points and measured distances: rows of a small table, each with its standard deviation.
 
 A row measures a *place*: a point of the body at a time, or a landmark. It gives the coordinates of the place, or the
-distance to another place. Columns, in any order; those that no row needs may be left out:
+distance to another place. Columns, in any order; unused ones can be omitted:
 
 * ``name``: of the row, for the ``to`` or ``place`` of other rows.
 * ``place``: a time on the clock of the log [s], ``l17`` for landmark 17, or the name of another row.
 * ``lever``: the measured point of the body in the body frame [m], numbers with spaces; empty: its origin.
-* ``frame``: of the coordinates: ``survey``, a frame of its own, or ``gps``, that of the fixes of the log.
-* ``x``, ``y``, ``z``: coordinates [m]; or ``to``, ``distance``: another place, and how far it is [m].
-* ``sigma``: standard deviation [m], one number, or one for each axis with spaces.
+* ``frame``: of the coordinates: ``survey``, a separate frame, or ``gps``, that of the fixes of the log.
+* ``x``, ``y``, ``z``: coordinates [m]; or ``to``, ``distance``: another place, and the distance to it [m].
+* ``sigma``: standard deviation [m], one number, or one per axis with spaces.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from graphslam.core.reading import LARGEST, read_text
 COLUMNS = ("name", "place", "lever", "frame", "x", "y", "z", "to", "distance", "sigma")
 FRAMES = ("survey", "gps")
 CONTRADICTED = 5.0
-"""Two rows of one place that differ by more than so many standard deviations are both refused."""
+"""Two rows of one place that differ by more than this number of standard deviations are both refused."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPlace:
-    """What a row measures: a point of the body at a time, or a landmark."""
+    """The measured place of a row: a point of the body at a time, or a landmark."""
 
     time: float | None = None
     landmark: int | None = None
@@ -81,7 +81,7 @@ class ControlRow:
         return f"line {self.line}" + (f" ({self.name})" if self.name else "")
 
     def coordinates(self, dim: int) -> tuple[Array, Array]:
-        """Coordinates ``(dim,)`` and their covariance ``(dim, dim)``; in the plane the height is left out."""
+        """Coordinates ``(dim,)`` and their covariance ``(dim, dim)``; in 2-D without the height."""
         assert self.position is not None
         if len(self.position) < dim:
             raise DataError("a map in space needs a height", got="no z", wanted="x, y and z")
@@ -91,7 +91,7 @@ class ControlRow:
 
 @dataclass(frozen=True)
 class ControlTable:
-    """Rows that can be used, and those that cannot.
+    """Usable and refused rows of a table.
 
     Parameters
     ----------
@@ -149,12 +149,12 @@ def measured_places(*tables: ControlTable | None) -> tuple[Array, Array] | None:
 
 
 def control_lines(given: Any) -> dict[str, Any]:
-    """Lines of a file, or of rows in memory: what the folder of a run keeps.
+    """Lines of a file, or of rows in memory, for storing them in a run folder.
 
     Parameters
     ----------
     given : path, table, or sequence of mapping
-        A mapping holds the cells of a row by column; ``sigma`` and ``lever`` may be numbers or sequences of them.
+        A mapping contains the cells of a row by column; ``sigma`` and ``lever`` can be numbers or sequences.
     """
     if isinstance(given, (str, Path)):
         return {"source": Path(given).name, "rows": read_text(given).splitlines()}
@@ -179,7 +179,7 @@ def _cell(value: Any) -> str:
 
 
 def _names(found: list[tuple[int, dict[str, str], int]]) -> dict[str, tuple[int, MeasuredPlace]]:
-    """By name, the line and the place of the first row that has it."""
+    """Line and place of the first row with each name."""
     names: dict[str, tuple[int, MeasuredPlace]] = {}
     for line, row, _ in found:
         name = row.get("name", "")
@@ -253,7 +253,7 @@ def _row(line: int, row: Mapping[str, str], names: Mapping[str, tuple[int, Measu
 
 
 def _contradictions(rows: list[ControlRow]) -> list[tuple[int, str]]:
-    """Rows of one place, or of one pair of places, that differ by more than chance."""
+    """Rows of one place, or of one pair of places, that contradict each other."""
     groups: dict[Any, list[ControlRow]] = {}
     for r in rows:
         key: Any = (r.place, r.frame) if r.to is None else frozenset([r.place, r.to])

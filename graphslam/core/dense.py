@@ -1,7 +1,7 @@
-"""What a submap knows densely: an evidence grid, a cloud, or both, and the one view that everybody asks.
+"""Dense maps of submaps (evidence grid, cloud, or both), and their common interface.
 
-Registration, loops and fused maps ask a :class:`DenseMapView` and nothing else; `graphslam.evidence.views.dense_view`
-makes that of a submap.
+Registration, loops and fused maps use only a :class:`DenseMapView`; `graphslam.evidence.views.dense_view` makes that of
+a submap.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ Ints = npt.NDArray[np.int64]
 
 
 class DensePayload(Protocol):
-    """An evidence grid, seen from here: core knows no grid."""
+    """Interface of an evidence grid, which core does not import."""
 
     def save(self, path: Any) -> None: ...
 
 
 class CloudMap:
-    """Points on the surfaces around a submap, in the frame of its base. A value that does not change; its points lie on
-    the shelf of the process (:mod:`graphslam.core.spill_cache`), so that those of a long run do not fill the memory.
+    """Surface points around a submap, in the frame of its base. Immutable; its points are in the spill cache
+    (:mod:`graphslam.core.spill_cache`), which limits the memory of long runs.
 
     Parameters
     ----------
     points : (m, dim)
         [m]
     origins : (s, dim), optional
-        Where the sensor was when it took its scans [m]. With them it is known which space is free; without, points can
-        be matched, but nothing tells that a place is *not* where they fit.
+        Sensor positions of the scans [m]. They define free space; without them points can be matched, but
+        contradictions are not detected.
     scan : (m,) int64, optional
-        Row of ``origins`` from which each point was seen; with ``origins`` only, and then needed.
+        Row of ``origins`` of each point; required with ``origins``.
     cell : float
-        Edge of the cells in which the points are thinned to be matched, and of the voxels of the space they saw [m].
+        Edge of the cells for downsampling before matching, and of the voxels of observed space [m].
     """
 
     __slots__ = ("_points", "_scan", "_shape", "cell", "origins")
@@ -98,14 +98,14 @@ def _rows(values: Any, what: str) -> Array:
     a = np.ascontiguousarray(values, dtype=np.float64)
     if a.ndim != 2 or a.shape[1] not in (2, 3):
         raise GeometryError(f"{what} have the wrong shape", got=a.shape, wanted="(m, 2) or (m, 3)")
-    good = (np.abs(a) < FARTHEST).all(axis=1)  # NaN is not
+    good = (np.abs(a) < FARTHEST).all(axis=1)  # also excludes NaN
     if not good.all():
         raise GeometryError(f"{what} are impossible", got=a[~good][0].tolist(), wanted="finite, < 1000 km")
     return a
 
 
 class DenseMapView(Protocol):
-    """What a submap knows of its surroundings, in the frame of its base."""
+    """Interface of a submap's dense map, in the frame of its base."""
 
     @property
     def dim(self) -> int:
@@ -114,26 +114,26 @@ class DenseMapView(Protocol):
 
     @property
     def knows_space(self) -> bool:
-        """Whether it tells free space from what nobody saw."""
+        """Whether free space is distinguished from unknown space."""
         ...
 
     @property
     def cloud(self) -> CloudMap | None:
-        """Points as they were measured, where they were kept."""
+        """The original points, if they are stored."""
         ...
 
     def points(self, level: int = 0) -> Array:
-        """Points on surfaces ``(m, dim)`` [m], gathered in cells of ``2**level`` times its own."""
+        """Surface points ``(m, dim)`` [m], averaged in cells of ``2**level`` times the cell size."""
         ...
 
     def known_at(self, points: Any) -> npt.NDArray[np.bool_]:
-        """Whether points ``(n, dim)`` [m] lie where something is known, be it that the place is free."""
+        """Whether points ``(n, dim)`` [m] are in known space, free or occupied."""
         ...
 
     def log_odds_at(self, points: Any) -> npt.NDArray[np.float32]:
-        """Log-odds ``(n,)`` that points ``(n, dim)`` [m] are occupied; NaN where nothing is known."""
+        """Log-odds ``(n,)`` that points ``(n, dim)`` [m] are occupied; NaN if unknown."""
         ...
 
     def evidence(self) -> Any:
-        """An ``EvidenceGrid`` of all that: what fused maps are made of."""
+        """The map as an ``EvidenceGrid``, for fused maps."""
         ...

@@ -1,4 +1,4 @@
-"""Digests of arrays: the same numbers give the same text, on every machine."""
+"""Digests of arrays, equal on every machine for equal numbers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Digest:
         self._state = hashlib.blake2b(digest_size=size)
 
     def add(self, name: str, value: Any) -> None:
-        """Add an array, number, text, bytes or None under a name; the name, type and shape count too."""
+        """Add an array, number, text, bytes or None under a name; name, type and shape are included."""
         if isinstance(value, bytes):
             kind, data = "bytes", memoryview(value)
         elif value is None:

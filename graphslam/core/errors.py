@@ -1,6 +1,6 @@
-"""The one exception tree.
+"""The exceptions of the package.
 
-A message says what went wrong, where (file, record), what was found and what was wanted. Libraries raise;
+A message says what went wrong, where (file, record), which value was found and which was expected. Libraries raise;
 only the command line catches :class:`GraphSlamError`, prints its one line and exits 1.
 """
 
@@ -10,16 +10,16 @@ import difflib
 
 
 class GraphSlamError(Exception):
-    """Base of every error this project raises on purpose."""
+    """Base class of all errors of this package."""
 
 
 class DataError(GraphSlamError):
-    """A recorded file or stream holds something we cannot use.
+    """A recorded file or stream has unusable content.
 
     Parameters
     ----------
     what : str
-        What is wrong, in words.
+        What is wrong.
     where : str, optional
         File, and record or line inside it.
     got, wanted : object, optional
@@ -41,11 +41,11 @@ class FormatError(DataError):
 
 
 class MissingDataError(DataError):
-    """A file, stream or data set that was asked for is not there."""
+    """A requested file, stream or data set is missing."""
 
 
 class MissingExtraError(MissingDataError):
-    """A package that only some uses need is not installed; the message names the extra that brings it."""
+    """An optional package is not installed; the message names the extra that contains it."""
 
 
 class CovarianceError(DataError):
@@ -53,7 +53,7 @@ class CovarianceError(DataError):
 
 
 class UnknownNameError(GraphSlamError):
-    """A card, front end, solver, joiner or world of that name is not registered."""
+    """A data set, front end, solver, map-joining method or world of that name is not registered."""
 
     def __init__(self, kind: str, name: str, known: object = ()) -> None:
         names = sorted(str(k) for k in known) if known else []  # type: ignore[attr-defined]
@@ -72,7 +72,7 @@ class GeometryError(DataError):
 
 
 class EvidenceReusedError(GraphSlamError):
-    """A measurement was about to be spent twice (see :mod:`graphslam.graph.ledger`)."""
+    """A measurement would be used twice (see :mod:`graphslam.graph.ledger`)."""
 
 
 class IndeterminateError(GraphSlamError):
@@ -90,7 +90,7 @@ class IndeterminateError(GraphSlamError):
 
 
 class SolverError(GraphSlamError):
-    """A solver failed, or was asked for something that its state cannot give."""
+    """A solver failed, or cannot provide a result in its state."""
 
 
 class RunFolderError(GraphSlamError):
@@ -98,8 +98,8 @@ class RunFolderError(GraphSlamError):
 
 
 class GridError(DataError):
-    """An evidence grid was asked for something impossible (voxel size, shape, a place outside its cube)."""
+    """An impossible request to an evidence grid (voxel size, shape, a place outside its cube)."""
 
 
 class GridLockedError(GraphSlamError):
-    """A locked map, which is only localised in, was about to be changed."""
+    """A locked map (localisation only) would be changed."""

@@ -1,4 +1,4 @@
-"""Packages that only some uses need, and the extra of the distribution that brings each."""
+"""Optional packages, and the extra of the distribution that contains each."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Extra:
     """One extra: ``pip install 'graphslam-submaps[NAME]'``."""
 
     buys: str
-    """What can be done with it that cannot be done without."""
+    """What it enables."""
     modules: tuple[str, ...]
-    """What it must make importable."""
+    """Modules that it must make importable."""
     size: int
-    """What it adds to the base install, bytecode and all [MB]; measured, with Python 3.11 on Linux."""
+    """Size in addition to the base install, including bytecode [MB]; measured with Python 3.11 on Linux."""
 
 
 EXTRAS = {
@@ -37,16 +37,16 @@ EXTRAS = {
 
 
 def import_extra(module: str, need: str, *, where: str | None = None) -> ModuleType:
-    """Import a package that an extra brings.
+    """Import a package of an extra.
 
     Parameters
     ----------
     module : str
         Such as ``"rosbags.rosbag1"``.
     need : str
-        What needs the package: the beginning of the message.
+        Feature that needs the package: the beginning of the message.
     where : str, optional
-        File that asks for it.
+        File that needs it.
     """
     package = module.partition(".")[0]
     extra = next(name for name, e in EXTRAS.items() if package in e.modules)
@@ -64,7 +64,7 @@ def import_extra(module: str, need: str, *, where: str | None = None) -> ModuleT
 
 def _open3d() -> ModuleType:
     """Open3D's wheel links to ``libusb-1.0.so.0``, which a stock Debian does not have. The pure-wheel package
-    ``libusb-package`` carries that library; loading it first satisfies the loader, because it matches by SONAME.
+    ``libusb-package`` contains that library; loading it first is sufficient, because the loader matches by SONAME.
     """
     try:
         return importlib.import_module("open3d")

@@ -1,4 +1,4 @@
-"""Statements of a run about itself, as a user without truth sees them: the lines of its verdict."""
+"""Findings: the lines of the verdict of a run."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, Literal, cast
 from graphslam.core.markup import html_element, join_parts
 
 Level = Literal["good", "look", "bad", ""]
-"""``good``: checked and right. ``look``: may be wrong. ``bad``: wrong, the map is not to be trusted. Empty: a fact."""
+"""``good``: checked and right. ``look``: may be wrong. ``bad``: wrong, do not use the map. Empty: information."""
 LEVELS: tuple[Level, ...] = ("", "good", "look", "bad")
-"""In order of how much they weigh."""
+"""Ascending severity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Finding:
     code : str
         Name of the check, the same in every run, for programs that read a verdict: ``"gps-not-used"``.
     text : str
-        A full sentence with the figures and, where something is wrong, what to do about it.
+        A full sentence with the values and, if something is wrong, what to do.
     """
 
     level: Level
@@ -37,7 +37,7 @@ class Finding:
 
     @classmethod
     def from_row(cls, row: Any) -> Finding | None:
-        """Finding of a JSON object; None if it is none."""
+        """Finding of a JSON object; None if it is invalid."""
         if not isinstance(row, Mapping) or not all(isinstance(row.get(k), str) for k in ("level", "code", "text")):
             return None
         if row["level"] not in LEVELS:
@@ -46,7 +46,7 @@ class Finding:
 
 
 class Findings(list[Finding]):
-    """Lines of a verdict, which print as text and show as a list in a notebook."""
+    """Lines of a verdict; printed as text, displayed as a list in a notebook."""
 
     def __str__(self) -> str:
         return "\n".join(f"{f.level or '-':4}  {f.text}" for f in self)
@@ -57,7 +57,7 @@ class Findings(list[Finding]):
 
 
 def worst_level(findings: Iterable[Finding]) -> Level:
-    """The level that weighs most among the findings."""
+    """The highest severity among the findings."""
     return max((f.level for f in findings), key=LEVELS.index, default="")
 
 
@@ -67,12 +67,12 @@ def verdict_json(headline: Finding, findings: Iterable[Finding]) -> dict[str, An
 
 
 def headline_of_json(value: Any) -> Finding | None:
-    """The first line of the JSON object that :func:`verdict_json` makes; None where there is none."""
+    """The first line of the JSON object that :func:`verdict_json` makes; None if there is none."""
     said = value if isinstance(value, Mapping) else {}
     return Finding.from_row({"level": said.get("level"), "code": "headline", "text": said.get("headline")})
 
 
 def findings_of_json(value: Any) -> Findings:
-    """Findings of the JSON object that :func:`verdict_json` makes; what is none of ours is left out."""
+    """Findings of the JSON object that :func:`verdict_json` makes; invalid entries are ignored."""
     lines = value.get("lines") if isinstance(value, Mapping) else None
     return Findings(f for row in (lines if isinstance(lines, list) else []) if (f := Finding.from_row(row)))

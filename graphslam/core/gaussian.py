@@ -1,7 +1,7 @@
-"""Gaussians, and the chi-square numbers that judge them.
+"""Gaussians, and chi-square quantiles.
 
-Headings are components that live on the circle: functions that take differences or means accept ``angular``, the
-indices of those components.
+Headings are periodic: functions with differences or means have an argument ``angular``, the indices of these
+components.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from graphslam.core.reading import finite_mask
 def check_covariance(
     cov: ArrayLike, *, what: str = "covariance", where: str | None = None, dim: int | None = None
 ) -> Array:
-    """Return a symmetric positive-definite copy of ``cov`` ``(n, n)``, or say exactly what is wrong with it.
+    """Return a symmetric positive-definite copy of ``cov`` ``(n, n)``, or raise a specific error.
 
-    Asymmetry at the level of rounding (1e-6 relative) is averaged away; more is refused, because GTSAM would
-    silently read one triangle only.
+    Rounding asymmetry (1e-6 relative) is averaged; more is refused, because GTSAM would read only one triangle without
+    a warning.
     """
     P = np.array(cov, dtype=np.float64)
     if P.ndim != 2 or P.shape[0] != P.shape[1] or dim not in (None, len(P)):
@@ -150,7 +150,7 @@ def chi2_quantile(probability: float, dof: float) -> float:
 
 
 def equal_tail_gate(gate: float, dof: int, other_dof: int) -> float:
-    """χ² gate for ``other_dof`` that fails as many good observations as ``gate`` does for ``dof``."""
+    """χ² gate for ``other_dof`` with the same false-rejection rate as ``gate`` for ``dof``."""
     return float(special.chdtri(other_dof, special.chdtrc(dof, gate)))
 
 
@@ -169,19 +169,19 @@ def ellipse_rings(centres: ArrayLike, covariances: ArrayLike, confidence: float,
     turn = np.linspace(0.0, 2.0 * np.pi, corners + 1)
     circle = np.stack([np.cos(turn), np.sin(turn)], -1)
     circle[-1] = circle[0]
-    # c + √χ² L u with L Lᵀ = P; L has a positive determinant, so rings keep their sense
+    # c + √χ² L u with L Lᵀ = P; L has a positive determinant, so rings keep their orientation
     L = np.linalg.cholesky(np.asarray(covariances, dtype=np.float64))
     return np.asarray(centres)[:, None] + np.sqrt(chi2_quantile(confidence, 2)) * circle @ L.swapaxes(1, 2)
 
 
 def largest_sigmas(covariances: ArrayLike) -> Array:
-    """Standard deviation ``(n,)`` in the least known direction of each of the covariances ``(n, d, d)``."""
+    """Standard deviation ``(n,)`` along the most uncertain direction of each of the covariances ``(n, d, d)``."""
     P = np.asarray(covariances, dtype=np.float64)
     return np.sqrt(np.linalg.eigvalsh(P)[:, -1]) if len(P) else np.zeros(0)
 
 
 def first_no_covariance(covariances: Array) -> int | None:
-    """Which of ``(n, d, d)`` is first not symmetric, or has a negative variance that rounding does not explain."""
+    """Index of the first of ``(n, d, d)`` that is not symmetric, or has a negative eigenvalue beyond rounding."""
     if not covariances.size:
         return None
     skew = np.abs(covariances - np.swapaxes(covariances, 1, 2)).max(axis=(1, 2))

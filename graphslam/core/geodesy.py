@@ -1,4 +1,4 @@
-"""From a local tangent plane (east, north, up) to latitude and longitude on the WGS 84 ellipsoid, and back.
+"""Conversion between a local tangent plane (east, north, up) and latitude, longitude on the WGS 84 ellipsoid.
 
 Angles are degrees, heights metres above the ellipsoid. Arrays broadcast over leading axes.
 """
@@ -17,7 +17,7 @@ _E2 = FLATTENING * (2.0 - FLATTENING)
 
 
 def check_geodetic(latitude: ArrayLike, longitude: ArrayLike) -> None:
-    """Refuse what is no place on Earth."""
+    """Refuse impossible latitudes and longitudes."""
     lat, lon = np.asarray(latitude, dtype=np.float64), np.asarray(longitude, dtype=np.float64)
     if not (np.all(np.isfinite(lat)) and np.all(np.abs(lat) <= 90.0)):
         raise GeometryError("latitude is impossible", got=latitude, wanted="degrees in [-90, 90]")
@@ -68,7 +68,7 @@ def enu_to_geodetic(enu: ArrayLike, latitude: float, longitude: float, height: f
     Parameters
     ----------
     enu : (..., 2) or (..., 3)
-        East, north and (else zero) up [m].
+        East, north and up (default 0) [m].
     latitude, longitude, height : float
         Of the plane's origin.
     """

@@ -1,6 +1,6 @@
 """SE(2) and SE(3) on arrays.
 
-Conventions (stated once, used everywhere)
+Conventions (of the whole package)
 ------------------------------------------
 * A 2-D pose is ``(..., 3)``: x, y, θ [m, m, rad]. A 3-D pose is ``(..., 7)``: x, y, z, qx, qy, qz, qw.
 * ``T_ab`` takes coordinates in frame b to frame a, so ``T_ac = compose(T_ab, T_bc)``.
@@ -43,7 +43,7 @@ def rotation2(theta: ArrayLike) -> Array:
 
 
 def arc_length(points: ArrayLike) -> Array:
-    """Length of the way along points ``(n, k)`` up to each of them ``(n,)``; the first is 0. ``n ≥ 1``."""
+    """Path length along points ``(n, k)`` up to each of them ``(n,)``; the first is 0. ``n ≥ 1``."""
     p = np.asarray(points, dtype=np.float64)
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
 
@@ -158,8 +158,8 @@ def se2_right_jacobian(xi: ArrayLike) -> Array:
 def vector_to_tangent_covariance(pose: ArrayLike, cov_vector: ArrayLike) -> Array:
     """Covariance of (x, y, θ) *in the parent frame* → right-tangent covariance ``(..., 3, 3)`` of the same pose.
 
-    A landmark submap keeps its exit as the plain vector of Combined SLAM eq. 15 (parent frame); graphs use the
-    tangent at the pose. The two differ by the rotation of the position part.
+    A landmark submap has its exit as the plain vector of Combined SLAM eq. 15 (parent frame); graphs use the tangent at
+    the pose. Both differ by the rotation of the position part.
     """
     p = np.asarray(pose, dtype=np.float64)
     G = np.zeros(p.shape[:-1] + (3, 3))

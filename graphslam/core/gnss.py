@@ -1,4 +1,4 @@
-"""Raw measurements of a receiver of satellite navigation: pseudoranges, before anybody made positions of them."""
+"""Raw GNSS measurements: pseudoranges."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from graphslam.core.records import check_times
 SPEED_OF_LIGHT = 299_792_458.0
 """[m/s]"""
 EARTH_RATE = 7.2921151467e-5
-"""Of the Earth's rotation, as GPS defines it [rad/s]."""
+"""Rotation rate of the Earth as defined by GPS [rad/s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pseudoranges:
     """Pseudoranges of several satellites at each epoch (ragged).
 
-    A pseudorange is the distance to the satellite plus what the receiver's clock is fast, times the speed of light.
-    What is known of satellite clocks and of the atmosphere has been taken off.
+    A pseudorange is the distance to the satellite plus the receiver clock offset times the speed of light, corrected
+    for satellite clocks and the atmosphere as far as known.
 
     Parameters
     ----------
@@ -34,11 +34,11 @@ class Pseudoranges:
     offsets : (n + 1,) int64
         Pseudoranges of epoch k are rows ``offsets[k]:offsets[k + 1]``; an epoch may be empty.
     ranges, sigmas : (q,)
-        Pseudoranges and their stated standard deviations [m].
+        Pseudoranges and their standard deviations [m].
     satellites : (q, 3)
-        Where the satellite was when it sent, in Earth-fixed axes of that instant [m].
+        Satellite position at transmission, in the Earth-fixed axes of that time [m].
     ids, systems : (q,) int64
-        Number of the satellite, unique over all systems; system (one of several, each with a time of its own).
+        Number of the satellite, unique over all systems; system (one of several, each with its own time scale).
     elevation : (q,)
         Of the satellite above the horizon [rad].
     density : (q,)
@@ -101,7 +101,7 @@ class Pseudoranges:
 
 @dataclass(frozen=True, slots=True)
 class TangentPlane:
-    """East, north and up at a place: the frame in which positions by satellites are solved for.
+    """Local frame (east, north, up) for GNSS positions.
 
     Parameters
     ----------
@@ -126,15 +126,15 @@ class TangentPlane:
         return np.asarray((np.asarray(points, dtype=np.float64) - self.origin) @ axes.T)
 
     def satellites(self, sent: ArrayLike) -> Array:
-        """Satellites ``(q, 3)`` in this frame as the axes lie when their signals arrive (east, north, up).
+        """Satellites ``(q, 3)`` in this frame at the reception time of their signals (east, north, up).
 
-        While a signal travels, the Earth turns on: in axes of the arrival the satellite was farther west by 20 to 30 m.
-        Left out, every position is too far east by as much.
+        The Earth rotates while a signal travels: in the axes at reception the satellite is 20 to 30 m farther west.
+        Without this correction every position is too far east by as much.
 
         Parameters
         ----------
         sent : (q, 3)
-            Earth-fixed axes of the instant of sending [m].
+            Earth-fixed axes at transmission [m].
         """
         s = np.asarray(sent, dtype=np.float64)
         a = EARTH_RATE / SPEED_OF_LIGHT * np.linalg.norm(s - self.origin, axis=-1)

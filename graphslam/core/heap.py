@@ -1,4 +1,4 @@
-"""Memory that was freed and is still held."""
+"""Return of freed heap memory to the system."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ def _trim() -> Callable[[int], int] | None:
 
 
 def trim_heap() -> None:
-    """Hand freed heap back to the system, where the C library can.
+    """Return freed heap to the system, if the C library supports it.
 
-    glibc keeps arrays of up to 32 MB after they are freed. Between the stages of a long run that is as much as the
-    largest stage uses; given back, the next stage takes what it needs.
+    glibc keeps freed arrays of up to 32 MB. Between the stages of a long run that is as much as the largest stage uses.
     """
     trim = _trim()
     if trim is not None:

@@ -1,4 +1,4 @@
-"""Inertial measurements with the noise their maker states."""
+"""Inertial measurements with their noise model."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuNoise:
-    """Stated noise, continuous: densities, and the walks of the biases."""
+    """Continuous noise model: densities, and random walks of the biases."""
 
     gyro: float
-    """Density of the angular rate [rad/s/√Hz]."""
+    """Noise density of the angular rate [rad/s/√Hz]."""
     gyro_bias: float
     """σ of the angular rate's constant bias at the start [rad/s]."""
     gyro_walk: float
-    """Walk of that bias [rad/s/√s]."""
+    """Random walk of that bias [rad/s/√s]."""
     accelerometer: float
-    """Density of the specific force [m/s²/√Hz]."""
+    """Noise density of the specific force [m/s²/√Hz]."""
     accelerometer_bias: float
     """σ of its constant bias [m/s²]."""
     accelerometer_walk: float
-    """Walk of that bias [m/s²/√s]."""
+    """Random walk of that bias [m/s²/√s]."""
     attitude: float = 0.0
-    """σ of the unit's own roll and pitch [rad]; 0 where it gives none."""
+    """σ of the unit's roll and pitch [rad]; 0 if it has none."""
     attitude_time: float = 1.0
-    """Time over which errors of roll and pitch stay alike [s]."""
+    """Correlation time of the roll and pitch errors [s]."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -47,8 +47,8 @@ class ImuNoise:
 class Imu:
     """Angular rates and specific forces.
 
-    A planar IMU (yaw rate and two accelerations, gravity taken out) has zeros in the rates about x and y and in the
-    forces along z, in every record. A graph in the plane uses it, and also a unit with three axes on a level body.
+    A planar IMU (yaw rate and two accelerations without gravity) has zero rates about x and y and zero forces along z
+    in every record. 2-D graphs use it, and also a three-axis unit on a level body.
 
     Parameters
     ----------
@@ -56,10 +56,10 @@ class Imu:
     angular_rate : (n, 3)
         [rad/s], frame of the unit.
     specific_force : (n, 3)
-        [m/s²], frame of the unit; (0, 0, +g) at rest and level, (0, 0, 0) of a planar unit.
+        [m/s²], frame of the unit; (0, 0, +g) at rest and level, (0, 0, 0) for a planar unit.
     noise : ImuNoise
     attitude : (n, 2) or None
-        The unit's own roll and pitch [rad]: gravity is seen, heading is not.
+        Roll and pitch estimated by the unit [rad].
     T_base_imu : (7,)
 
     Examples
@@ -99,7 +99,7 @@ class Imu:
 
     @property
     def planar(self) -> bool:
-        """Yaw rate and two accelerations without gravity; see above."""
+        """Whether it is a planar IMU (yaw rate, two accelerations without gravity)."""
         return not (np.any(self.angular_rate[:, :2]) or np.any(self.specific_force[:, 2]))
 
     def take(self, index: Any) -> Imu:

@@ -1,7 +1,6 @@
-"""Ctrl-C, put off where a value must not be left half-written.
+"""Deferred Ctrl-C for blocks that must not be interrupted.
 
-Python raises `KeyboardInterrupt` wherever it happens to be. Between two writes that belong together it leaves a value
-broken.
+Python raises `KeyboardInterrupt` at any point. Between two related writes it would leave an inconsistent value.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from types import FrameType
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Let this block end before Ctrl-C is heard; for short blocks that must be whole or not at all.
+    """Defer Ctrl-C to the end of this block; for short blocks that must be atomic.
 
     Does nothing outside the main thread, which no signal interrupts.
     """
@@ -23,7 +22,7 @@ def defer_interrupts() -> Iterator[None]:
         yield
         return
     before = signal.getsignal(signal.SIGINT)
-    if not callable(before):  # ignored, the system's own, or not of Python
+    if not callable(before):  # ignored, the default of the system, or not set by Python
         yield
         return
     pending: list[tuple[int, FrameType | None]] = []

@@ -1,7 +1,7 @@
-"""Compilation of kernels by numba, with the compiled code in the user's cache folder.
+"""Compilation of kernels by numba, with a cache in the user's cache folder.
 
-Numba's own place for compiled code is beside the source. There it outlives an uninstall, and the folder that is left is
-imported as an empty namespace package. So every kernel of the package is compiled through :func:`njit` of this module.
+By default numba caches in the folder of the source. There the cache remains after an uninstall, and the remaining
+folder is imported as an empty namespace package. So all kernels are compiled with :func:`njit` of this module.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from graphslam.core.progress import say_compiling
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """For work that makes very many objects that live: looking through them again and again is a tenth of the time
-    that compiling takes, and a fifth of the time to load the compiler.
-    """
+    """Disable garbage collection: it takes a tenth of the compile time, and a fifth of the time to load the
+    compiler."""
     was = gc.isenabled()
     gc.disable()
     try:
@@ -49,16 +48,16 @@ with without_garbage_collection():
 logger = logging.getLogger(__name__)
 
 COMPILING = "GRAPHSLAM_COMPILING"
-"""Set in the environment of processes that compile for another one."""
+"""Environment variable of processes that compile for another one."""
 MOST_BYTES = 1_000_000_000
 """Largest size of the compiled code of all versions."""
 UNUSED_SECONDS = 30 * 86_400.0
-"""Compiled code of another version of numba or Python is deleted when it has not been used for this long."""
+"""Compiled code of another version of numba or Python is deleted if it was not used for this time."""
 _IMPORTED = re.compile(r"^from (graphslam[\w.]*) import", re.MULTILINE)
 
 
 class _Compilations(event.Listener):
-    """Time that this process spends compiling; bars of progress say so meanwhile."""
+    """Compile time of this process; progress bars show the compilation."""
 
     def __init__(self) -> None:
         self.seconds, self._depth, self._since = 0.0, 0, 0.0
@@ -81,13 +80,13 @@ event.register("numba:compile", _compilations)
 
 
 def compile_seconds() -> float:
-    """Time that this process has spent compiling kernels, or waiting for another one that did [s]."""
+    """Time of this process for compiling kernels, or waiting for another process to do so [s]."""
     return _compilations.seconds
 
 
 @contextmanager
 def compiling_elsewhere() -> Iterator[None]:
-    """While another process compiles for this one: counted as compilation."""
+    """Count the block as compile time: another process compiles for this one."""
     begin = time.perf_counter()
     try:
         yield
@@ -103,7 +102,8 @@ def compiled_root() -> Path:
 
 
 def compiled_folder() -> Path:
-    """Folder of compiled code: ``NUMBA_CACHE_DIR``, or one of this numba and Python in the user's cache folder."""
+    """Folder of compiled code: ``NUMBA_CACHE_DIR``, or a folder per numba and Python version in the user's cache
+    folder."""
     if os.environ.get("NUMBA_CACHE_DIR"):
         return compiled_root()
     return compiled_root() / f"numba-{numba.__version__}-python-{sys.version_info.major}.{sys.version_info.minor}"
@@ -116,18 +116,18 @@ def compiled_code() -> tuple[int, int]:
 
 
 def clear_compiled_code() -> None:
-    """Delete the compiled code of all versions; a process that runs keeps what it has loaded.
+    """Delete the compiled code of all versions; running processes keep their loaded code.
 
-    A folder named by ``NUMBA_CACHE_DIR`` may hold code of other packages, and stays as it is.
+    A folder given by ``NUMBA_CACHE_DIR`` can contain code of other packages and is not changed.
     """
     if not os.environ.get("NUMBA_CACHE_DIR"):
         shutil.rmtree(compiled_root(), ignore_errors=True)
 
 
 def trim_compiled_code(root: Path, current: Path) -> None:
-    """Delete versions that were not used for a month, then the oldest files until the rest is small enough.
+    """Delete versions that were not used for a month, then the oldest files until the rest is within the size limit.
 
-    Other processes may do the same, or read what is deleted here: they compile it anew.
+    Other processes may do the same concurrently; they recompile deleted code.
     """
     oldest = time.time() - UNUSED_SECONDS
     with contextlib.suppress(OSError):
@@ -154,7 +154,7 @@ def _files(root: Path) -> Iterator[tuple[float, int, Path]]:
 
 @cache
 def unwritable() -> str:
-    """Why compiled code cannot be kept in :func:`compiled_folder`; empty where it can."""
+    """Reason why :func:`compiled_folder` is not writable; empty if it is."""
     folder = compiled_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -183,7 +183,7 @@ def _trim_once() -> None:
 
 
 class _InMemory(caching.NullCache):
-    """Compiled code that is not kept; a warning says so when something is compiled."""
+    """No cache on disk; gives a warning when something is compiled."""
 
     def __init__(self, why: str) -> None:
         self.why = why
@@ -196,7 +196,7 @@ class _InMemory(caching.NullCache):
 def _digest_with_imports(file: str) -> str:
     """SHA-256 of a source file and of all files of the package that it imports, directly or not.
 
-    Their functions and constants are compiled into its own, so code of an older state of any of them is of no use.
+    Their functions and constants are compiled into it, so the cache is invalid if any of them changes.
     """
     texts: dict[str, str] = {}
     todo = [file]
@@ -209,7 +209,7 @@ def _digest_with_imports(file: str) -> str:
 
 
 class _BySource(caching.UserProvidedCacheLocator):
-    """Compiled code under a digest of its source: copies of the package, wherever they are, have it in common."""
+    """Cache named by a digest of the source, shared by all copies of the package."""
 
     def __init__(self, function: Any, file: str) -> None:
         super().__init__(function, file)
@@ -221,7 +221,7 @@ class _ChosenFolder(caching.CompileResultCacheImpl):
 
 
 class _OnDisk(caching.FunctionCache):
-    """Compiled code of a function on disk. What cannot be read is compiled again; what cannot be written is lost."""
+    """Cache of a function on disk. Unreadable code is compiled again; unwritable code is not cached."""
 
     _impl_class = _ChosenFolder
 
@@ -247,7 +247,7 @@ def _cache_of(function: Callable[..., Any]) -> Any:
         return _InMemory(unwritable())
     config: Any = numba.config
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(compiled_folder())  # other packages keep theirs
+    config.CACHE_DIR = str(compiled_folder())  # do not change that of other packages
     try:
         return _OnDisk(function)
     except RuntimeError:  # numba found no folder for it
@@ -257,18 +257,18 @@ def _cache_of(function: Callable[..., Any]) -> Any:
 
 
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """``numba.njit`` whose compiled code is kept in :func:`compiled_folder`, where that can be written to.
+    """``numba.njit`` with a cache in :func:`compiled_folder`, if that is writable.
 
     Parameters
     ----------
     function : callable, optional
-        What ``@njit`` without parentheses decorates.
+        Decorated function of ``@njit`` without parentheses.
     **options
-        Those of ``numba.njit``, without ``cache``.
+        Options of ``numba.njit`` except ``cache``.
     """
     if function is None:
         return lambda decorated: njit(decorated, **options)
     made = numba.njit(**options)(function)
-    if hasattr(made, "enable_caching"):  # it is the function itself under NUMBA_DISABLE_JIT
+    if hasattr(made, "enable_caching"):  # with NUMBA_DISABLE_JIT it is the function itself
         made._cache = _cache_of(function)
     return made

@@ -1,4 +1,4 @@
-"""JSON that is read as declared, or refused: finite numbers, every key once, values of the right type."""
+"""Checked reading of JSON: finite numbers, every key once, values of the declared type."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graphslam.core.errors import FormatError
 from graphslam.core.reading import LARGEST, read_text
 
 MOST_NESTED = 64
-"""Levels of lists and mappings."""
+"""Most levels of lists and mappings."""
 
 
 def _constant(word: str) -> Any:
@@ -64,17 +64,17 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def check_json(value: Any, shape: Any, where: str, at: str = "") -> Any:
-    """The value, if it has the shape.
+    """Return the value if it has the declared shape.
 
     Parameters
     ----------
     value : object
-        Of :func:`parse_json`.
+        From :func:`parse_json`.
     shape : object
         ``int``, ``float`` (whole numbers, too), ``str``, ``bool``, ``None`` or ``object`` (anything); ``[shape]`` for a
         list of any length, ``(shape, shape)`` for a list of that length; ``{key: shape}`` for a mapping, where a key
-        that ends in ``?`` may be missing or null and others than those named are left alone, ``{str: shape}`` for a
-        mapping of any keys.
+        that ends in ``?`` may be missing or null and other keys are ignored, ``{str: shape}`` for a mapping of any
+        keys.
     where, at : str
         File, and place in it.
     """
@@ -130,7 +130,7 @@ def _words(shape: Any) -> str:
 
 
 def read_json_lines(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """The JSON objects of a file that has one a line."""
+    """The JSON objects of a file with one per line."""
     out = []
     for number, line in enumerate(read_text(path).split("\n"), start=1):
         if not line:

@@ -1,7 +1,7 @@
-"""The face of a room: names that the package of a room offers, each looked up in its module when it is first used.
+"""Public names of a package, imported lazily from their modules at first use.
 
-A face lists what is documented and may be imported by notebooks and programs of others: ``from graphslam.plots import
-plot_scan``. Which module holds a name may change; importing a face costs nothing heavy.
+They are documented and can be imported by notebooks and other programs: ``from graphslam.plots import plot_scan``. The
+module of a name can change. Importing the package is cheap.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any
 def lazy_exports(
     room: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """What a room's ``__init__`` binds to ``__getattr__``, ``__dir__`` and ``__all__``.
+    """Values for ``__getattr__``, ``__dir__`` and ``__all__`` of a package's ``__init__``.
 
     Parameters
     ----------
     room : str
         Name of the package.
     modules : mapping of str to str
-        Module, relative to the room → the names of it that are offered, separated by spaces. No name may be that of a
-        module or package of the room: importing that would take its place.
+        Module, relative to the package → its public names, separated by spaces. No name may equal that of a module of
+        the package, whose import would replace it.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A sensor log: named streams on one clock, with truth where it is known, and the count of what was dropped."""
+"""A sensor log: named streams on one clock, optional ground truth, counts of dropped records."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from graphslam.core.records import Stream, check_times
 from graphslam.core.trajectory import Trajectory
 
 FAR_FIX = "far from all other fixes"
-"""Reason for which readers leave out a fix; a check of the log names it."""
+"""Reason for a dropped fix, reported by a check of the log."""
 
 
 @dataclass
 class DropCounter:
-    """Counts records that were read and not used, with the reason: nothing is lost silently."""
+    """Counts dropped records by reason."""
 
     counts: Counter[str] = field(default_factory=Counter)
 
@@ -34,14 +34,14 @@ class DropCounter:
 
 @dataclass(frozen=True, slots=True)
 class BeamLabels:
-    """Which thing that moves each beam of a stream met.
+    """Labels of the moving objects that the beams of a stream hit.
 
     Parameters
     ----------
     times : (n,)
         Stamps of the records.
     labels : (n, m) int16
-        Number of the thing; -1: nothing, or something that stands still.
+        Number of the object; -1: nothing, or a static object.
     """
 
     times: Array
@@ -55,7 +55,7 @@ class BeamLabels:
         object.__setattr__(self, "labels", np.ascontiguousarray(labels, dtype=np.int16))
 
     def of(self, times: Array) -> npt.NDArray[np.int16]:
-        """Labels ``(k, m)`` of the records with these stamps ``(k,)``, for instance of a part of the log."""
+        """Labels ``(k, m)`` of the records with these stamps ``(k,)``, e.g. of a part of the log."""
         k = np.clip(np.searchsorted(self.times, times), 0, max(len(self.times) - 1, 0))
         if len(times) and (not len(self.times) or np.any(self.times[k] != times)):
             raise DataError("a stamp that no labelled record has", got=len(times), wanted="stamps of the stream")
@@ -64,7 +64,7 @@ class BeamLabels:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Truth:
-    """What a simulator or a surveyor knows.
+    """Ground truth from a simulator or a survey.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Truth:
     landmarks : (n, dim)
         True positions in the same frame.
     moving : mapping of str to BeamLabels
-        By stream of beams: which of them met something that moves.
+        By stream: labels of beams that hit moving objects.
     """
 
     trajectory: Trajectory
@@ -98,7 +98,7 @@ class SensorLog:
     read, dropped : mapping of str to int
         Records read per stream, and records dropped per "stream: reason".
     meta : mapping
-        What else a report should print (source, noise figures, seed …); JSON-serialisable.
+        Additional entries for a report (source, noise, seed …); JSON-serialisable.
 
     Examples
     --------
@@ -150,10 +150,11 @@ class SensorLog:
         for name, s in self.streams.items():
             i, j = np.searchsorted(s.times, t_start, "left"), np.searchsorted(s.times, t_end, "right")
             cut[name] = s.take(slice(int(i), int(j)))
-        return replace(self, streams=cut, read={})  # the counts were those of the whole log
+        return replace(self, streams=cut, read={})  # the counts are those of the whole log
 
     def events(self) -> Iterator[tuple[float, str, int]]:
-        """Merge the streams in time order: yields (time, stream, record index); ties in order of the streams' names."""
+        """Merge the streams in time order: yields (time, stream, record index); equal times in order of the streams'
+        names."""
         names = sorted(self.streams)
         times = np.concatenate([self.streams[n].times for n in names])
         which = np.concatenate([np.full(len(self.streams[n].times), k) for k, n in enumerate(names)])

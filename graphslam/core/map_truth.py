@@ -1,4 +1,4 @@
-"""Where submaps really end and where their landmarks really are."""
+"""Ground truth of submap ends and landmarks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graphslam.core.reading import finite_mask
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MapTruth:
-    """Truth of a chain of submaps, everything in the frame of the first base.
+    """Ground truth of a chain of submaps, in the frame of the first base.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""HTML that is safe by its making: templates of Jinja2 with autoescape, so that all that is not markup yet is escaped.
+"""Safe HTML from Jinja2 templates with autoescape.
 
-Pages and the tables that notebooks show are made with it, and with nothing else.
+All pages and notebook tables are made with it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from markupsafe import Markup
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-# What HTML allows in no text at all: control characters, halves of surrogate pairs, non-characters.
+# Not allowed in HTML text: control characters, unpaired surrogates, non-characters.
 _UNFIT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
 NOTHING = "–"
 _ELEMENT = (
@@ -36,7 +36,7 @@ _TABLE = """\
 
 @cache
 def template_environment(package: str | None = None) -> Environment:
-    """The template engine, with autoescape; of a package with its folder ``templates``."""
+    """The template engine, with autoescape; optionally with the folder ``templates`` of a package."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     loader = None if package is None else PackageLoader(package)
@@ -49,7 +49,7 @@ def _template(source: str) -> Any:
 
 
 def plain_text(value: Any) -> str:
-    """The value as text that a page may hold: characters that none may hold become ``�``."""
+    """The value as text; characters that are not allowed in HTML become ``�``."""
     return value if isinstance(value, Markup) else _UNFIT.sub("\ufffd", str(value))
 
 
@@ -80,12 +80,12 @@ def inline_picture(png: bytes, caption: str) -> Markup:
 
 
 def join_parts(parts: Iterable[Any], between: str = "") -> Markup:
-    """Parts after each other, each escaped unless it is markup."""
+    """Concatenated parts, each escaped unless it is markup."""
     return Markup(between).join(escape_text(p) for p in parts if p is not None)
 
 
 def value_text(value: Any) -> str:
-    """A value as a cell of a table shows it: six digits, ``–`` for none and not-a-number, yes and no."""
+    """A value as text of a table cell: six digits, ``–`` for None and NaN, yes and no."""
     if value is None:
         return NOTHING
     if isinstance(value, bool):
@@ -102,13 +102,13 @@ def value_text(value: Any) -> str:
 
 
 def is_numeric(value: Any) -> bool:
-    """Is it a number, which stands to the right of its cell?"""
+    """Whether it is a number (right-aligned)."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of a table with a class and data of its own."""
+    """A table row with its own class and data attributes."""
 
     cells: Mapping[str, Any]
     class_: str = ""
@@ -145,7 +145,7 @@ def _cell(value: Any) -> dict[str, Any]:
 
 
 def pair_list(values: Mapping[str, Any]) -> Markup:
-    """Names and values, one pair a line."""
+    """Names and values, one pair per line."""
     rows = [{"class_": "", "data": {}, "name": plain_text(k), "cells": [_cell(v)]} for k, v in values.items()]
     return Markup(_template(_TABLE).render(class_="", head=[], rows=rows))
 

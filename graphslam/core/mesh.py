@@ -1,4 +1,4 @@
-"""Triangle meshes: arrays of vertices and of rows of them."""
+"""Triangle meshes: arrays of vertices and vertex indices."""
 
 from __future__ import annotations
 

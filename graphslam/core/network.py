@@ -1,8 +1,8 @@
 """Pose networks: poses, relative measurements with information, and (in 2-D) landmarks, as plain arrays.
 
-A network is what a pose-graph file says, before any solver has seen it. Its conventions are those of
-:mod:`graphslam.core.geometry`: information is the inverse covariance of ``Log(z⁻¹ x_i⁻¹ x_j)`` in GTSAM's tangent
-order (2-D: x, y, θ; 3-D: rotation first, then translation), whatever order the file used.
+A network is the content of a pose-graph file. Its conventions are those of :mod:`graphslam.core.geometry`: information
+is the inverse covariance of ``Log(z⁻¹ x_i⁻¹ x_j)`` in GTSAM's tangent order (2-D: x, y, θ; 3-D: rotation first, then
+translation), for any order in the file.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ Ids = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 ObservationKind = Literal["cartesian", "bearing-range"]
 
-# An eigenvalue below -ROUNDING · (largest) cannot be the rounding of a printed number: the matrix is indefinite.
+# An eigenvalue below -ROUNDING · (largest) is not caused by rounding of printed numbers: the matrix is indefinite.
 ROUNDING = 1e-9
-# A repaired matrix keeps this share of its largest eigenvalue in every direction, so that it has an inverse.
+# Least eigenvalue of a repaired matrix relative to its largest, so that it is invertible.
 REPAIR_FLOOR = 1e-9
-# So many matrices are checked at a time.
+# Number of matrices per chunk of a check.
 _PART = 1 << 15
 
 
 class Labels(Sequence[str]):
-    """Names made only when an error needs them (a network may have a million edges)."""
+    """Names made lazily for error messages (a network can have a million edges)."""
 
     def __init__(self, name: Callable[[int], str]) -> None:
         self._name = name
@@ -46,9 +46,9 @@ class Labels(Sequence[str]):
 
 
 def all_positive_definite(matrices: Array) -> bool:
-    """Whether every one of ``(m, d, d)`` symmetric matrices has a Cholesky factor; a fifth of the work of eigenvalues.
+    """Whether every one of ``(m, d, d)`` symmetric matrices has a Cholesky factor; five times cheaper than eigenvalues.
 
-    False says nothing yet: a positive semi-definite matrix has none either.
+    False is not conclusive: a positive semi-definite matrix has none either.
     """
     try:
         np.linalg.cholesky(matrices)
@@ -58,7 +58,7 @@ def all_positive_definite(matrices: Array) -> bool:
 
 
 def _eigen_floor(information: Array) -> tuple[Array, Array]:
-    """Smallest eigenvalue of every matrix and the scale it is judged by, ``(m,)`` each."""
+    """Smallest eigenvalue of every matrix and its scale for the test, ``(m,)`` each."""
     w = np.linalg.eigvalsh(information)
     return np.asarray(w[:, 0], dtype=np.float64), np.maximum(np.abs(w).max(axis=1), np.finfo(float).tiny)
 
@@ -70,14 +70,14 @@ def _names(labels: Sequence[str], bad: Index, extra: Sequence[str] | None = None
 
 
 def check_informations(information: ArrayLike, labels: Sequence[str], *, what: str, where: str | None = None) -> Array:
-    """Return ``(m, d, d)`` information matrices, made exactly symmetric, or name the ones that are impossible.
+    """Return ``(m, d, d)`` information matrices, made exactly symmetric, or raise an error with the invalid ones.
 
     Positive *semi*-definite is accepted: a direction that was not measured has information zero.
 
     Parameters
     ----------
     labels : sequence of str
-        How to call matrix k in an error, for example ``"3 -> 7"``.
+        Name of matrix k in an error, for example ``"3 -> 7"``.
     """
     info = np.array(information, dtype=np.float64)
     bad = _where(info, lambda part: ~finite_mask(part).all(axis=(1, 2)))
@@ -108,7 +108,7 @@ def check_informations(information: ArrayLike, labels: Sequence[str], *, what: s
 
 
 def _where(matrices: Array, test: Callable[[Array], Mask]) -> Index:
-    """Indices of the matrices that ``test`` is true of, a part at a time: a million of them fill memory once only."""
+    """Indices of the matrices for which ``test`` is true, processed in chunks to limit memory."""
     found = [k + np.flatnonzero(test(matrices[k : k + _PART])) for k in range(0, len(matrices), _PART)]
     return np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
 
@@ -130,12 +130,12 @@ def repair_informations(information: ArrayLike) -> tuple[Array, Index]:
     """Project indefinite information matrices to the nearest positive definite ones.
 
     Negative eigenvalues become a small positive floor (``1e-9`` of the largest); that is the nearest positive
-    semi-definite matrix in Frobenius norm (Higham 1988) up to the floor. Sound matrices are returned bit for bit.
+    semi-definite matrix in Frobenius norm (Higham 1988) up to the floor. Valid matrices are returned unchanged.
 
     Parameters
     ----------
     information : (m, d, d)
-        Finite. The symmetric part is taken.
+        Finite. The symmetric part is used.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def repair_informations(information: ArrayLike) -> tuple[Array, Index]:
 
 @dataclass(frozen=True, slots=True)
 class PoseNetwork:
-    """A pose network, frozen; every array is checked on construction.
+    """A pose network, immutable; every array is checked on construction.
 
     Parameters
     ----------
@@ -176,9 +176,9 @@ class PoseNetwork:
     ids : (n,) int64
         Vertex names of the file, unique. Everything else counts vertices 0 … n-1.
     poses : (n, 3) or (n, 7)
-        ``T_world_vertex`` where the file gives one, identity elsewhere.
+        ``T_world_vertex`` if the file gives one, otherwise identity.
     has_initial : (n,) bool
-        Which poses the file gave.
+        Whether the file gives the pose.
     edges : (m, 2)
         Vertex index pairs (i, j).
     measurements : (m, 3) or (m, 7)
@@ -186,9 +186,9 @@ class PoseNetwork:
     information : (m, d, d)
         Inverse covariance of ``Log(z⁻¹ x_i⁻¹ x_j)``, GTSAM's tangent order, positive semi-definite.
     fixed : (n,) bool
-        Vertices held at their given pose. None of them: the first vertex is held (the gauge).
+        Vertices fixed at their given pose. If none: the first vertex is fixed (gauge).
     landmark_ids : (l,) int64
-        Disjoint from ``ids``. 2-D only, as all that follows.
+        Disjoint from ``ids``. 2-D only, as all following fields.
     landmarks : (l, 2)
         World positions, zero where unknown.
     has_landmark : (l,) bool
@@ -201,11 +201,11 @@ class PoseNetwork:
         In the order of the values.
     observation_kind : {"cartesian", "bearing-range"}
     repaired : int
-        Matrices that were projected to positive definite while reading.
+        Number of matrices that were projected to positive definite while reading.
     noise : str
-        How the file's noise columns were read, in words.
+        Description of how the noise columns were read.
     source : str
-        File the network came from; names it in errors.
+        Source file, for errors.
     """
 
     dim: int
@@ -338,22 +338,22 @@ class PoseNetwork:
 
     @property
     def anchors(self) -> Index:
-        """Vertices that hold the gauge: the fixed ones, or the first if none is fixed. ``(a,)``."""
+        """Fixed vertices, or the first if none is fixed. ``(a,)``."""
         held = np.flatnonzero(self.fixed)
         return held if len(held) else np.zeros(1, dtype=np.intp)
 
     @property
     def states(self) -> int:
-        """Free scalars: what a solver has to find."""
+        """Number of free scalars."""
         return (len(self.ids) - len(self.anchors)) * self.tangent_dim + 2 * len(self.landmark_ids)
 
     @property
     def residuals(self) -> int:
-        """Scalars measured."""
+        """Number of measured scalars."""
         return len(self.edges) * self.tangent_dim + 2 * len(self.observations)
 
     def with_poses(self, poses: ArrayLike, landmarks: ArrayLike | None = None) -> PoseNetwork:
-        """The same measurements with other values, for example a solution that is to be written to a file."""
+        """The same measurements with other values, e.g. a solution for writing to a file."""
         marks = self.landmarks if landmarks is None else np.asarray(landmarks, dtype=np.float64)
         return replace(
             self,

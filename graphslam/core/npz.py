@@ -1,4 +1,4 @@
-"""Archives of arrays (npz) that are read fully and as declared, or refused: names, types, shapes, finite numbers."""
+"""Checked reading of array archives (npz): names, types, shapes, finite numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.reading import LARGEST, check_size, finite_mask
 
 MOST_HEADER = 1 << 16
-"""Bytes of the longest header of an array that is read."""
+"""Most bytes of an array header."""
 
 _KINDS = {"float": "fiu", "int": "iu", "bool": "b", "text": "U"}
 _HEADER = re.compile(
@@ -30,18 +30,17 @@ _HEADER = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What an array of a file must be.
+    """Declaration of an array in a file.
 
     Parameters
     ----------
     kind : {"float", "int", "bool", "text"}
     shape : tuple of int or str
-        Lengths. A name stands for a length that is the same wherever it stands; ``"n+1"`` is one more.
+        Lengths. Equal names are equal lengths; ``"n+1"`` is one more.
     optional : bool
-        May be missing.
+        Whether it may be missing.
     finite : bool or None
-        False: NaN and infinities mean something here. None: any number may stand here, because nothing is computed
-        with it but statistics.
+        False: NaN and infinities have a meaning. None: any number is allowed, because it is used only for statistics.
     """
 
     kind: Literal["float", "int", "bool", "text"]
@@ -51,27 +50,27 @@ class Field:
 
 
 def floats(*shape: int | str, optional: bool = False, finite: bool | None = True) -> Field:
-    """Numbers with a fraction."""
+    """Declaration of floating-point numbers."""
     return Field("float", shape, optional, finite)
 
 
 def ints(*shape: int | str, optional: bool = False) -> Field:
-    """Whole numbers."""
+    """Declaration of integers."""
     return Field("int", shape, optional)
 
 
 def flags(*shape: int | str, optional: bool = False) -> Field:
-    """Truth values."""
+    """Declaration of booleans."""
     return Field("bool", shape, optional)
 
 
 def texts(*shape: int | str, optional: bool = False) -> Field:
-    """Texts."""
+    """Declaration of texts."""
     return Field("text", shape, optional)
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
-    """All arrays of an npz archive. Nothing is unpickled, and no more than the limit is read."""
+    """All arrays of an npz archive. Nothing is unpickled, and at most the size limit is read."""
     where = str(path)
     if not Path(path).is_file():
         raise MissingDataError("no such file", where=where)
@@ -85,7 +84,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
                     raise ValueError(f"{m.filename!r} is no array, or stands in it twice")
                 if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or m.flag_bits & 1:
                     raise ValueError(f"{m.filename} is packed in another way than NumPy does")
-                # zlib packs a byte into no less than 1/1032 byte (zlib.net, Technical Details); a header may lie
+                # zlib packs a byte into no less than 1/1032 byte (zlib.net, Technical Details); a header can be wrong
                 if m.file_size > 1032 * m.compress_size + 1024:
                     raise ValueError(f"{m.filename} claims {m.file_size} bytes in {m.compress_size}")
                 names.add(name)
@@ -102,7 +101,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
 
 
 def read_npy(stream: IO[bytes], size: int, name: str) -> npt.NDArray[Any]:
-    """The one array of a stream of ``size`` bytes in NumPy's format: numbers, truth values or texts."""
+    """The array of a stream of ``size`` bytes in NumPy's format: numbers, booleans or texts."""
     shape, fortran, dtype, begin = npy_header(stream, name)
     claimed = dtype.itemsize * math.prod(shape)
     if claimed != size - begin:
@@ -114,7 +113,7 @@ def read_npy(stream: IO[bytes], size: int, name: str) -> npt.NDArray[Any]:
         if not got:
             raise EOFError(f"{name} ends too early")
         view = view[got:]
-    if stream.read(1):  # the end of a member is where its checksum is compared
+    if stream.read(1):  # the checksum is verified at the end of a member
         raise ValueError(f"{name} goes on after its array")
     if dtype.kind == "b" and claimed and max(buffer) > 1:
         raise ValueError(f"{name} holds truth values that are neither true nor false")
@@ -127,7 +126,7 @@ def read_npy(stream: IO[bytes], size: int, name: str) -> npt.NDArray[Any]:
 
 
 def npy_begin(head: bytes) -> int:
-    """Where the numbers of an array in NumPy's format begin, by its first 12 bytes."""
+    """Offset of the data of an array in NumPy's format, from its first 12 bytes."""
     width = 2 if head[6:7] == b"\x01" else 4
     return 8 + width + min(int.from_bytes(head[8 : 8 + width], "little"), MOST_HEADER)
 
@@ -157,7 +156,7 @@ def npy_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.
 def check_arrays(
     arrays: Mapping[str, npt.NDArray[Any]], fields: Mapping[str, Field], where: str
 ) -> dict[str, npt.NDArray[Any]]:
-    """The declared arrays, whole numbers as int64 and others as they are; arrays that are not declared are left out."""
+    """The declared arrays, integers as int64, others unchanged; undeclared arrays are ignored."""
     lengths: dict[str, int] = {}
     found = {}
     for name, field in fields.items():
@@ -167,7 +166,7 @@ def check_arrays(
             raise FormatError(f"array {name!r} is missing", where=where, got=sorted(arrays)[:20])
         a = arrays[name]
         if a.size == 0 and a.dtype.kind in "fiu" and field.kind in ("float", "int"):
-            a = a.astype(np.float64 if field.kind == "float" else np.int64)  # an empty list has no type of its own
+            a = a.astype(np.float64 if field.kind == "float" else np.int64)  # an empty list has no type
         if a.dtype.kind not in _KINDS[field.kind] or not _fits(a.shape, field.shape, lengths):
             wanted = ", ".join(f"{n} = {lengths[n]}" if n in lengths else str(n) for n in field.shape)
             raise FormatError(

@@ -1,8 +1,8 @@
-"""Points of a submap's own path that belong to its joint Gaussian, as its landmarks do: where fixes were taken.
+"""Points of a submap's path at the times of fixes, in the joint Gaussian of the submap.
 
-A fix in the middle of a submap measures a place whose error is that of the way there: shared with the exit, with the
-landmarks, and with all other fixes of the submap. The front end knows all of it when it smooths; kept as further points
-of its Gaussian, nothing of it is lost, and nothing is spent twice.
+The error of the path at a fix inside a submap is correlated with the exit, the landmarks, and all other fixes of the
+submap. The front end computes these correlations when it smooths; with the points in the Gaussian they are preserved,
+and no measurement is used twice.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.reading import finite_mask
 
 SAME_TIME = 1e-6
-"""A fix this near to the instant of a point is at it [s]."""
+"""Largest time difference between a fix and its point [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +63,7 @@ class PathPoints:
         return len(self.times)
 
     def at(self, time: float, lever: Array) -> int | None:
-        """The point of a fix at an instant, with an antenna in the body frame; None where there is none."""
+        """Index of the point of a fix at a time, with a given antenna in the body frame; None if there is none."""
         if not len(self.times) or np.shape(lever) != self.lever.shape or np.abs(lever - self.lever).max() > 1e-9:
             return None
         k = int(np.argmin(np.abs(self.times - time)))
@@ -75,7 +75,7 @@ class PathPoints:
         return (d * np.asarray(points, dtype=np.intp)[:, None] + np.arange(d)).ravel()
 
     def given(self, joint: Array, points: npt.ArrayLike) -> tuple[Array, Array]:
-        """What exit and landmarks tell of points: gain ``(k dim, n)``, and the covariance that is left.
+        """Points conditioned on exit and landmarks: gain ``(k dim, n)``, and conditional covariance.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class PathPoints:
         return gain, np.asarray(0.5 * (left + left.T))
 
     def of_landmarks(self, keep: npt.NDArray[np.intp]) -> PathPoints:
-        """The same beside fewer landmarks: ``keep`` are columns of the landmark map's vector."""
+        """The points for a subset of landmarks: ``keep`` are columns of the landmark map's vector."""
         return PathPoints(
             times=self.times, lever=self.lever, positions=self.positions, covariance=self.covariance,
             cross=self.cross[:, keep],

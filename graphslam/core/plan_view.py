@@ -1,4 +1,4 @@
-"""Maps in space seen from above, for pictures and for what is scored in the plane."""
+"""Projection of 3-D poses to the horizontal plane, for plots and 2-D metrics."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ def plan_pose(poses: ArrayLike) -> Array:
 
 
 def plan_covariance(poses: ArrayLike, covariances: Array) -> Array:
-    """Right tangents ``(..., 6, 6)`` in space → ``(..., 3, 3)`` of :func:`plan_pose`, for poses that stand about level.
+    """3-D right-tangent covariances ``(..., 6, 6)`` → ``(..., 3, 3)`` of :func:`plan_pose`, for nearly level poses.
 
-    The rotation about the vertical of the world is the third component there; position is turned into the axes of the
-    plan's own heading.
+    Heading is the rotation about the world's vertical; the position is rotated to the axes of the plan's heading.
     """
     p = np.asarray(poses, dtype=np.float64)
     R = quat_to_matrix(p[..., 3:])
@@ -35,13 +34,13 @@ def plan_covariance(poses: ArrayLike, covariances: Array) -> Array:
 
 
 def plan_path(path: Trajectory) -> Trajectory:
-    """A path in space, seen from above."""
+    """Projection of a 3-D path to the horizontal plane."""
     C = None if path.covariances is None else plan_covariance(path.poses, path.covariances)
     return Trajectory(path.times, plan_pose(path.poses), C)
 
 
 def plan_submap(submap: Submap) -> Submap:
-    """A dense submap in space, seen from above: its exit and its path."""
+    """Projection of a dense 3-D submap to the horizontal plane: its exit and its path."""
     return replace(
         submap,
         exit_pose=plan_pose(submap.exit_pose),

@@ -1,6 +1,6 @@
-"""Plug-ins: parts that other distributions bring, found by entry points, and what to install where one is missing.
+"""Plug-ins of other distributions, found by entry points, and what to install if one is missing.
 
-A distribution registers what it brings under one of these groups; names are those that a user types:
+A distribution registers its parts under one of these groups; the names are those for the user:
 
 * ``graphslam.studies``: Monte-Carlo studies (:func:`graphslam.study`);
 * ``graphslam.worlds``: simulated worlds (:func:`graphslam.simulate`);
@@ -9,8 +9,8 @@ A distribution registers what it brings under one of these groups; names are tho
 * ``graphslam.frontends``: front ends (:func:`graphslam.run`);
 * ``graphslam.identities``: published identities of the landmarks of a log, by its name: a function of the observations;
 * ``graphslam.presets``: packages of recommended settings, ``SOURCE.FRONTEND.toml``;
-* ``graphslam.commands``: commands of ``graphslam``, functions as Typer takes them;
-* ``graphslam.verbs``: what ``graphslam.study``, ``open_study`` and ``find_study`` call.
+* ``graphslam.commands``: commands of ``graphslam``, Typer functions;
+* ``graphslam.verbs``: functions behind ``graphslam.study``, ``open_study`` and ``find_study``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ IN_STUDIES: dict[str, tuple[str, ...]] = {
     "graphslam.verbs": ("find_study", "open_study", "study"),
     "graphslam.worlds": ("building", "campus", "mine", "point-field"),
 }
-"""What the distribution of the studies brings, by group, so that an error can say what to install."""
+"""Parts of the studies' distribution by group, for errors that name what to install."""
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:
@@ -50,12 +50,12 @@ def plugins(group: str) -> dict[str, EntryPoint]:
 def _read_entry_points(
     find: Callable[..., Iterable[EntryPoint]], group: str, state: tuple[tuple[str, int], ...]
 ) -> dict[str, EntryPoint]:
-    """Read from all distributions, until one is installed or removed: ``state`` has the folders and their times."""
+    """Entry points of all distributions, cached until the folders or their times in ``state`` change."""
     return {e.name: e for e in sorted(find(group=group), key=lambda e: e.name)}
 
 
 def load_plugin(group: str, kind: str, name: str, own: Iterable[str] = ()) -> Any:
-    """The object that is registered under a name; ``kind`` and ``own``, names that are built in, are for messages."""
+    """The object that is registered under a name; ``kind`` and ``own`` (built-in names) are for messages."""
     found = plugins(group)
     if name not in found:
         raise unknown(group, kind, name, [*own, *found])
@@ -66,7 +66,7 @@ def load_plugin(group: str, kind: str, name: str, own: Iterable[str] = ()) -> An
 
 
 def unknown(group: str, kind: str, name: str, known: Iterable[str]) -> GraphSlamError:
-    """The error for a name that is not registered: what to install, or which names there are."""
+    """The error for an unknown name: what to install, or the known names."""
     if name in IN_STUDIES.get(group, ()):
         return MissingExtraError(
             f"{kind} {name!r} is part of {STUDIES}, which is not installed", wanted=INSTALL_STUDIES

@@ -1,8 +1,7 @@
-"""A stream of 3-D lidar scans whose points are decoded only when they are asked for.
+"""A stream of 3-D lidar scans whose points are decoded lazily.
 
-A recording holds 10⁷ points and more; a log is opened to look at its stamps far more often than at its points. The
-stream therefore keeps a *source*, which gives the points of one scan at a time, and an index into it, so that slicing
-a log copies no point.
+A recording has 10⁷ points or more, and often only its stamps are needed. The stream therefore has a *source*, which
+gives the points of one scan at a time, and an index into it, so that slicing a log copies no points.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from graphslam.core.records import check_times
 
 
 class CloudSource(Protocol):
-    """Where the points of a :class:`PointClouds` come from."""
+    """Source of the points of :class:`PointClouds`."""
 
     @property
     def counts(self) -> npt.NDArray[np.int64]:
-        """Points stored of every scan ``(n,)``, missing returns included; known without decoding any."""
+        """Number of stored points of every scan ``(n,)``, including missing returns; without decoding."""
         ...
 
     def cloud(self, k: int) -> Array:
@@ -35,18 +34,18 @@ class CloudSource(Protocol):
     def ages(self, k: int) -> Array | None:
         """Time from each point of ``cloud(k)`` to the stamp of its scan ``(m,)`` [s]; negative: measured later.
 
-        None where points have no stamps of their own: all are taken to be of the scan's.
+        None if points have no own stamps: all have that of the scan.
         """
         ...
 
     def packed(self) -> bytes:
-        """Bytes that tell these points from others, without decoding them."""
+        """Bytes that identify these points, without decoding them."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class ArrayClouds:
-    """Points held in memory.
+    """Points in memory.
 
     Parameters
     ----------
@@ -122,9 +121,9 @@ class PointClouds:
     times : (n,)
     source : CloudSource
     index : (n,) int64, optional
-        Scan of the source that each record is; all in order by default.
+        Scan of the source for each record; default: all in order.
     origin : (3,)
-        Where the beams of a scan begin, in the frame of its points [m].
+        Origin of the beams of a scan, in the frame of its points [m].
     T_base_sensor : (7,)
         Frame of the points in the base.
 
@@ -156,7 +155,7 @@ class PointClouds:
 
     @classmethod
     def from_arrays(cls, times: Any, points: Any, offsets: Any, before: Any = None, **rest: Any) -> PointClouds:
-        """Scans held in memory; see :class:`ArrayClouds` for the arguments."""
+        """Scans in memory; see :class:`ArrayClouds` for the arguments."""
         return cls(times=times, source=ArrayClouds(points, offsets, before), **rest)
 
     def __len__(self) -> int:
@@ -164,16 +163,16 @@ class PointClouds:
 
     @property
     def counts(self) -> npt.NDArray[np.int64]:
-        """Points stored of every scan ``(n,)``."""
+        """Number of stored points of every scan ``(n,)``."""
         return self.source.counts[self.index]
 
     def cloud(self, k: int) -> Array:
-        """Points ``(m, 3)`` of record ``k`` [m], sensor frame; decodes what is needed."""
+        """Points ``(m, 3)`` of record ``k`` [m], sensor frame; decoded if needed."""
         assert self.index is not None
         return self.source.cloud(int(self.index[k]))
 
     def ages(self, k: int) -> Array | None:
-        """Time from each point of record ``k`` to its stamp ``(m,)`` [s]; None: points have no stamps of their own."""
+        """Time from each point of record ``k`` to its stamp ``(m,)`` [s]; None: points have no own stamps."""
         assert self.index is not None
         return self.source.ages(int(self.index[k]))
 

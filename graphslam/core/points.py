@@ -1,4 +1,4 @@
-"""Points as a matcher wants them: finite, of one dimension, and not more than are needed."""
+"""Preparation of points for matching: finite, consistent dimension, downsampled."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from graphslam.core.log import DropCounter
 from graphslam.core.poses import SE2, SE3
 
 FARTHEST = 1e6
-"""Coordinates beyond this are no measurement [m]."""
+"""Larger coordinates are not measurements [m]."""
 
 
 def finite_points(points: Any, *, what: str = "points", drops: DropCounter | None = None) -> Array:
-    """Points ``(m, 2 | 3)`` [m] without those that are not finite or beyond :data:`FARTHEST`, which are counted."""
+    """Points ``(m, 2 | 3)`` [m] without non-finite ones or those beyond :data:`FARTHEST`, which are counted."""
     p = np.ascontiguousarray(points, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] not in (2, 3):
         raise GeometryError(f"{what} have the wrong shape", got=p.shape, wanted="(m, 2) or (m, 3)")
-    good = (np.abs(p) < FARTHEST).all(axis=1)  # NaN is not
+    good = (np.abs(p) < FARTHEST).all(axis=1)  # also excludes NaN
     if good.all():
         return p
     if drops is not None:
@@ -31,7 +31,7 @@ def finite_points(points: Any, *, what: str = "points", drops: DropCounter | Non
 
 
 def check_pose(pose: Any, dim: int, *, what: str = "pose") -> Array:
-    """One finite pose, ``(3,)`` in two dimensions and ``(7,)`` in three; its quaternion is made a unit one."""
+    """Validate a pose, ``(3,)`` in 2-D and ``(7,)`` in 3-D; its quaternion is normalised."""
     T = np.array(pose, dtype=np.float64)
     n = 3 if dim == 2 else 7
     if T.shape != (n,) or not np.all(np.isfinite(T)):
@@ -47,7 +47,7 @@ def transform_points(T_ab: Array, points: Array) -> Array:
 
 
 def voxel_downsample(points: Array, voxel: float) -> Array:
-    """One point a voxel, the mean of those in it; voxels in the order of their coordinates, x slowest.
+    """One point per voxel, the mean of those in it; voxels in the order of their coordinates, x slowest.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def voxel_downsample(points: Array, voxel: float) -> Array:
     """
     if not len(points):
         return points
-    dims = range(points.shape[1])  # an axis at a time: of a long run they are many points
+    dims = range(points.shape[1])  # one axis at a time, to save memory
 
     def cells(a: int) -> npt.NDArray[np.int64]:
         c = np.floor(points[:, a] / voxel).astype(np.int64)
@@ -70,7 +70,7 @@ def voxel_downsample(points: Array, voxel: float) -> Array:
         return c
 
     size = [int(cells(a).max()) + 1 for a in dims]
-    few = float(np.prod(np.array(size, dtype=np.float64))) <= 2.0**62  # else too many to number
+    few = float(np.prod(np.array(size, dtype=np.float64))) <= 2.0**62  # otherwise keys would overflow
 
     def numbers(a: int) -> npt.NDArray[np.int64]:
         return cells(a) if few else np.unique(cells(a), return_inverse=True)[1].ravel().astype(np.int64)

@@ -1,4 +1,4 @@
-"""Poses in two and three dimensions behind one face, gravity-aligned frames, and the mean of a cloud of poses.
+"""Common interface for 2-D and 3-D poses, gravity-aligned frames, and means of poses.
 
 A pose is ``(..., 7)`` or ``(..., 3)``; tangents as in :mod:`graphslam.core.geometry`.
 """
@@ -70,7 +70,7 @@ def group_of(poses: Any) -> Group:
 
 
 def heading_of(poses: ArrayLike) -> Array:
-    """Heading ``(...)`` [rad]: direction of the body's x axis seen from above (yaw of yaw-pitch-roll)."""
+    """Heading ``(...)`` [rad]: direction of the body's x axis in the horizontal plane (yaw of yaw-pitch-roll)."""
     p = np.asarray(poses, dtype=np.float64)
     if p.shape[-1] == 3:
         return p[..., 2]
@@ -79,21 +79,21 @@ def heading_of(poses: ArrayLike) -> Array:
 
 
 def remove_roll_pitch(poses: ArrayLike) -> Array:
-    """The same positions and headings without roll and pitch; in 2-D nothing changes."""
+    """The same positions and headings without roll and pitch; unchanged in 2-D."""
     p = np.array(poses, dtype=np.float64)
     return p if p.shape[-1] == 3 else level_poses(p[..., :3], heading_of(p))
 
 
 def frame_between(T_a_body: ArrayLike, T_b_body: ArrayLike, *, gravity: bool) -> Array:
-    """``T_a_b`` of two frames that both know the pose of one body at one instant (SegSLAM eq. 11).
+    """``T_a_b`` of two frames from the pose of one body in both at the same time (SegSLAM eq. 11).
 
     Parameters
     ----------
     T_a_body, T_b_body : (..., 7) or (..., 3)
-        For a particle that leaves segment a and begins segment b: its exit and its entry.
+        For a particle that leaves segment a and starts segment b: its exit and its entry.
     gravity : bool
-        Both frames are aligned with gravity, so only a turn about z lies between them: what else the two say of the
-        body's roll and pitch is error, and would tilt everything that comes after. The position of the body is kept.
+        Both frames are gravity-aligned, so they differ only by a rotation about z: other differences of the body's roll
+        and pitch are errors that would tilt everything after it. The position of the body is kept.
     """
     group = group_of(T_a_body)
     if group.dim == 2 or not gravity:
@@ -155,7 +155,7 @@ def pose_scatter(poses: ArrayLike, about: ArrayLike, weights: ArrayLike | None =
 
 
 def compose_increments(increments: Array) -> Array:
-    """Poses of nodes in the frame of the first ``(n + 1, 7|3)``; given, that of each in the one before ``(n, 7|3)``."""
+    """Poses of nodes in the frame of the first ``(n + 1, 7|3)`` from successive relative poses ``(n, 7|3)``."""
     g = group_of(increments)
     poses, reach = np.concatenate([g.identity[None], increments]), 1
     while reach < len(poses):  # each pose is that of the last 1, 2, 4, … increments before it

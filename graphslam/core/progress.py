@@ -1,4 +1,4 @@
-"""Progress of long work, one line on stderr: every bar of the package is a :class:`Bar`."""
+"""Progress bars on stderr: every bar of the package is a :class:`Bar`."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from typing import Any
 from tqdm import tqdm
 
 COMPILING = "compiling (first run only, ~1 min)"
-"""What a bar says while kernels are compiled."""
+"""Text of a bar while kernels are compiled."""
 
 
 def printable(text: str) -> str:
-    """Text of a file or a log on a terminal: characters that control it are replaced, lines are kept."""
+    """Text of a file or log for a terminal: control characters are replaced, line breaks are kept."""
     return "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 class Bar(tqdm):
-    """A bar of progress that is gone when the work is done, and that never ends the work.
+    """A progress bar that is removed at the end, and whose errors never stop the work.
 
-    Where stderr is closed or cannot be written to, there is no bar.
+    No bar is shown if stderr is closed or not writable.
 
     Parameters
     ----------
     steps : iterable, optional
     total : float, optional
-        Number of steps, where it cannot be told from the iterable.
+        Number of steps, if it is not known from the iterable.
     **options
-        Further ones of tqdm.
+        Other options of tqdm.
     """
 
     hidden = False
     """No bar is shown at all (``graphslam --quiet``)."""
-    monitor_interval = 0  # no thread of its own
-    _lock = threading.RLock()  # tqdm's own is a semaphore of the system, left behind by a process that is ended
+    monitor_interval = 0  # no monitor thread
+    _lock = threading.RLock()  # tqdm's default is a system semaphore, which a killed process would leave behind
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Bar(tqdm):
             self.disable = True
 
     def display(self, *args: Any, **options: Any) -> Any:
-        """Write the line, not before ``delay``; a stderr that was lost ends the bar alone."""
+        """Write the line, not before ``delay``; if stderr is lost, only the bar ends."""
         if self._time() < getattr(self, "start_t", 0.0) + self.delay:
             return False
         try:
@@ -69,7 +69,7 @@ class Bar(tqdm):
             return False
 
     def clear(self, *args: Any, **options: Any) -> None:
-        """Remove the line for a message above it; nothing where no line is written yet."""
+        """Remove the line for a message above it; no effect if no line is written yet."""
         if self._time() >= getattr(self, "start_t", 0.0) + self.delay:
             super().clear(*args, **options)
 
@@ -81,20 +81,20 @@ class Bar(tqdm):
             self.disable = True
 
     def say(self, text: str) -> None:
-        """Write a note behind the bar, at once."""
+        """Write a note after the bar immediately."""
         if not self.disable:
             self.set_postfix_str(printable(text))
 
 
 def shown_bars() -> list[Bar]:
-    """Bars that are on the terminal now, the first one first."""
+    """Bars currently on the terminal, in order."""
     with Bar.get_lock():
-        bars = [b for b in getattr(Bar, "_instances", ()) if isinstance(b, Bar) and not b.disable]  # tqdm's own apart
+        bars = [b for b in getattr(Bar, "_instances", ()) if isinstance(b, Bar) and not b.disable]  # not tqdm's
         return sorted(bars, key=lambda b: abs(b.pos))
 
 
 def say_compiling(now: bool) -> None:
-    """Have the first bar that is shown say that kernels are compiled, and no longer when they are."""
+    """Show or remove the compilation note in the first bar."""
     for bar in shown_bars()[:1]:
         if now:
             bar.say(COMPILING)
@@ -104,7 +104,7 @@ def say_compiling(now: bool) -> None:
 
 @contextmanager
 def compiling() -> Iterator[None]:
-    """While kernels are compiled: the bar that is shown says so, or one is shown for it."""
+    """Show that kernels are compiled, in the current bar or in a new one."""
     if shown_bars():
         say_compiling(True)
         yield

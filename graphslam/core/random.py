@@ -1,7 +1,7 @@
-"""One seed tree: every random number of a run hangs from one integer.
+"""Seed tree: all random numbers of a run derive from one integer.
 
-The same seed gives the same bytes whatever the number of threads or workers, and a run that is resumed at
-submap k draws the same numbers as one that was never stopped, because each submap has a branch of its own.
+The same seed gives the same bytes for any number of threads or workers, and a run that is resumed at submap k uses the
+same numbers as an uninterrupted one, because each submap has its own branch.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class SeedTree:
     seed : int
         Root entropy.
     path : tuple of int
-        Branch taken from the root.
+        Branch from the root.
 
     Examples
     --------
@@ -35,7 +35,7 @@ class SeedTree:
     path: tuple[int, ...] = ()
 
     def child(self, *names: str | int) -> SeedTree:
-        """Branch named by words or numbers. Words enter by CRC-32, so the order of use does not matter."""
+        """Branch named by strings or numbers. Strings are hashed by CRC-32, so the order of use does not matter."""
         keys = tuple(n if isinstance(n, int) else zlib.crc32(n.encode()) for n in names)
         return SeedTree(self.seed, self.path + keys)
 

@@ -1,4 +1,4 @@
-"""Scans of a range finder whose head may spin while the vehicle drives: each beam has its own time and origin."""
+"""Scans of a range finder with an optionally spinning head: each beam has its own time and direction."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graphslam.core.se3 import quat_multiply, quat_rotate
 class RangeScans:
     """Scans of one scanner.
 
-    Beam j of scan k leaves at ``times[k] + beam_times[j]``, when the head stands at the angle
+    Beam j of scan k is emitted at ``times[k] + beam_times[j]``, with the head at the angle
     ``spin[k] + spin_rate[k] · beam_times[j]`` about the x axis of its mount.
 
     Parameters
@@ -27,7 +27,7 @@ class RangeScans:
     times : (n,)
         Stamps of the first beams [s].
     ranges : (n, m)
-        Metres, float32 or float64; NaN: no reading; ≥ ``max_range``: nothing met.
+        Metres, float32 or float64; NaN: no reading; ≥ ``max_range``: no return.
     directions : (m, 3)
         Unit vectors, frame of the head.
     beam_times : (m,)
@@ -38,7 +38,7 @@ class RangeScans:
     T_base_mount : (7,)
         Mount of the head in the base.
     spin, spin_rate : (n,)
-        Angle at the stamp [rad] and its rate [rad/s]; zeros for a head that stands still.
+        Angle at the stamp [rad] and its rate [rad/s]; zeros for a fixed head.
 
     Examples
     --------
@@ -99,9 +99,9 @@ class RangeScans:
         )
 
     def beam_directions(self, record: Any, beam: Any) -> Array:
-        """Unit directions ``(..., 3)`` of beams ``beam`` of scans ``record`` (broadcast), base frame of their own time.
+        """Unit directions ``(..., 3)`` of beams ``beam`` of scans ``record`` (broadcast), base frame at their own time.
 
-        What the vehicle does between two beams is not in it.
+        Vehicle motion between beams is not included.
         """
         assert self.spin is not None
         assert self.spin_rate is not None

@@ -1,9 +1,8 @@
-"""What every reader of files is made of: bounded bytes, checked numbers, and names that stay in their folder.
+"""Common functions of file readers: size limits, checked numbers, and file names inside their folder.
 
-A file is not trusted. Its bytes are read up to a limit that the user can change, its numbers must be finite, its
-arrays (:mod:`graphslam.core.npz`) and its JSON (:mod:`graphslam.core.json_file`) must have the shapes that the reader
-declares. What does not fit is a :class:`~graphslam.core.errors.FormatError` that names the file, the place in it, what
-was found and what was wanted.
+Files are untrusted. They are read up to a size limit that the user can change, numbers must be finite, arrays
+(:mod:`graphslam.core.npz`) and JSON (:mod:`graphslam.core.json_file`) must have the declared shapes. Otherwise a
+:class:`~graphslam.core.errors.FormatError` names the file, the place in it, and the found and expected values.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ import numpy.typing as npt
 from graphslam.core.errors import ConfigError, FormatError, MissingDataError
 
 LARGEST = 1e30
-"""No number of a file may be larger: squares, products and 6×6 determinants of such numbers are still finite."""
+"""Largest allowed number in a file: squares, products and 6×6 determinants of such numbers are still finite."""
 
 MAX_SIZE = 2_000_000_000
-"""Bytes that are read of one file, after decompression, where no other limit is asked for."""
+"""Default limit of bytes per file, after decompression."""
 
 _CHUNK = 1 << 20
-_XZ_MEMORY = 1 << 28  # of the dictionary, which a header may claim to be of 4 GB
+_XZ_MEMORY = 1 << 28  # limit of the dictionary, for which a header can claim 4 GB
 _limit: ContextVar[int] = ContextVar("size_limit", default=MAX_SIZE)
 
 
@@ -40,7 +39,7 @@ _limit: ContextVar[int] = ContextVar("size_limit", default=MAX_SIZE)
 
 @contextmanager
 def size_limit(max_size: int | None) -> Iterator[None]:
-    """Read at most ``max_size`` bytes of each file, counted after decompression; None leaves the limit as it is."""
+    """Read at most ``max_size`` bytes of each file, counted after decompression; None does not change the limit."""
     if max_size is not None and max_size <= 0:
         raise ConfigError(f"max_size = {max_size}; wanted a number of bytes above 0")
     token = None if max_size is None else _limit.set(int(max_size))
@@ -52,17 +51,17 @@ def size_limit(max_size: int | None) -> Iterator[None]:
 
 
 def set_size_limit(max_size: int) -> None:
-    """The same for the rest of this process, as the command line does."""
+    """Set the limit for the rest of this process (used by the command line)."""
     _limit.set(int(max_size))
 
 
 def most_bytes() -> int:
-    """The limit in force."""
+    """The current limit."""
     return _limit.get()
 
 
 def check_size(size: int, where: str) -> None:
-    """Refuse more bytes than the limit."""
+    """Raise if ``size`` exceeds the limit."""
     limit = _limit.get()
     if size > limit:
         raise FormatError(
@@ -74,12 +73,12 @@ def check_size(size: int, where: str) -> None:
 
 
 def read_bytes(path: str | os.PathLike[str], *, first: int | None = None) -> bytes:
-    """Bytes of a file, decompressed if it begins like xz, gzip or bzip2; no more than the limit is ever held.
+    """Bytes of a file, decompressed if it starts like xz, gzip or bzip2; at most the limit is kept in memory.
 
     Parameters
     ----------
     first : int, optional
-        About so many bytes are enough.
+        Approximate number of bytes to read.
     """
     where = str(path)
     try:
@@ -137,7 +136,7 @@ _MAGIC: tuple[tuple[bytes, Callable[[], Any]], ...] = (
 
 
 def _unpacked(stream: IO[bytes], make: Callable[[], Any], where: str, step: int) -> Iterator[bytes]:
-    """Parts of the content of a compressed file, which may be several streams after each other."""
+    """Parts of the content of a compressed file, which can contain several concatenated streams."""
     try:
         data = stream.read(_CHUNK)
         while data:
@@ -157,7 +156,7 @@ def _unpacked(stream: IO[bytes], make: Callable[[], Any], where: str, step: int)
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Text of a file in UTF-8, decompressed as :func:`read_bytes` does; a byte order mark is left out."""
+    """Text of a file in UTF-8, decompressed as :func:`read_bytes` does; without a byte order mark."""
     raw = read_bytes(path)
     try:
         return raw.decode("utf-8-sig")
@@ -172,12 +171,12 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 def finite_mask(values: npt.ArrayLike) -> Any:
-    """Which numbers are finite and no larger than :data:`LARGEST`: an array of the same shape, or one truth value."""
+    """Mask of numbers that are finite and at most :data:`LARGEST`, of the same shape, or one boolean."""
     return np.abs(np.asarray(values, dtype=np.float64)) <= LARGEST
 
 
 def integer_mask(values: npt.ArrayLike) -> Any:
-    """Which numbers are whole, and no larger than a float64 counts to: identities and counts in tables of numbers."""
+    """Mask of integers in the exact range of float64: identities and counts in tables."""
     v = np.asarray(values, dtype=np.float64)
     return (np.abs(v) <= 2.0**53) & (v == np.round(v))
 
@@ -186,7 +185,7 @@ def integer_mask(values: npt.ArrayLike) -> Any:
 
 
 def safe_name(name: str, where: str) -> str:
-    """The name, if it is a plain file name: a file that a folder names lies in that folder."""
+    """Return the name if it is a plain file name without a path."""
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,200}", name):
         raise FormatError("file name leads out of its folder", where=where, got=repr(name[:80]), wanted="a file name")
     return name

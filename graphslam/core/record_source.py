@@ -1,4 +1,4 @@
-"""Where a front end takes its records from: a log that is whole, or one that is still being recorded."""
+"""Record sources of front ends: a complete log, or one that is still being recorded."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from graphslam.core.records import Stream
 
 
 class RecordSource:
-    """The records of a log that is whole.
+    """The records of a complete log.
 
-    One that grows is a :class:`graphslam.io.growing_log.GrowingLog`. What a front end makes of a feed depends on its
-    records alone, never on the portions in which they came.
+    A growing log is a :class:`graphslam.io.growing_log.GrowingLog`. The output of a front end depends only on the
+    records, not on the portions in which they arrive.
 
     Attributes
     ----------
     places : (times (q,), lever (2,)) or None
-        Where the path will be measured besides by fixes: control and check points.
+        Times and antenna lever of additional path measurements: control and check points.
     """
 
     places: tuple[Array, Array] | None = None
@@ -26,21 +26,21 @@ class RecordSource:
 
     @property
     def name(self) -> str:
-        """Of the log."""
+        """Name of the log."""
         return self._log.name
 
     @property
     def ended(self) -> bool:
-        """Will no more records come?"""
+        """Whether no more records will come."""
         return True
 
     @property
     def log(self) -> SensorLog:
-        """The log; of one that grows there is none before it has ended."""
+        """The log; a growing log has none before its end."""
         return self._log
 
     def names(self, kind: type) -> list[str]:
-        """Names of the streams of that record type, those that have come."""
+        """Names of the streams of that record type so far."""
         return [name for name, stream in self._log.streams.items() if isinstance(stream, kind)]
 
     def of_type(self, kind: type) -> str | None:
@@ -48,18 +48,18 @@ class RecordSource:
         return next(iter(self.names(kind)), None)
 
     def count(self, stream: str) -> int:
-        """Records of a stream that have come."""
+        """Number of records of a stream so far."""
         return len(self._log[stream].times)
 
     def until(self, stream: str) -> float:
-        """Stamp of the last record of a stream that has come [s]; -inf where none has."""
+        """Stamp of the last record of a stream so far [s]; -inf if there is none."""
         times = self._log[stream].times
         return float(times[-1]) if len(times) else -float("inf")
 
     def part(self, stream: str, first: int = 0, last: int | None = None) -> Stream:
-        """Records ``first … last - 1`` of a stream, by default to the last that has come."""
+        """Records ``first … last - 1`` of a stream; default: to the last one so far."""
         whole: Stream = self._log[stream]
         return whole if first == 0 and last is None else whole.take(slice(first, last))
 
     def discard_before(self, stream: str, before: int) -> None:
-        """Say that records before ``before`` will not be asked for again before the log has ended."""
+        """Allow dropping records before ``before``: they are not needed again before the end of the log."""

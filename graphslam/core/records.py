@@ -1,8 +1,8 @@
 """Sensor streams as arrays with their calibration.
 
-Every record has ``times`` ``(n,)`` [s], strictly increasing in one clock per log. Constructors validate; readers that
-meet bad records drop them with :meth:`graphslam.core.log.DropCounter.drop` *before* they build a stream.
-Extrinsics are ``T_base_sensor``: ``(3,)`` in 2-D, ``(7,)`` in 3-D.
+Every record has ``times`` ``(n,)`` [s], strictly increasing in one clock per log. Constructors validate; readers drop
+bad records with :meth:`graphslam.core.log.DropCounter.drop` *before* they make a stream. Extrinsics are
+``T_base_sensor``: ``(3,)`` in 2-D, ``(7,)`` in 3-D.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ IDENTITY3 = np.array([0.0, 0, 0, 0, 0, 0, 1])
 
 @runtime_checkable
 class Stream(Protocol):
-    """What a :class:`~graphslam.core.log.SensorLog` needs of a stream."""
+    """Interface of a stream in a :class:`~graphslam.core.log.SensorLog`."""
 
     @property
     def times(self) -> Array: ...
@@ -34,11 +34,11 @@ class Stream(Protocol):
 
 
 PLAIN: dict[str, type[Any]] = {}
-"""Records whose fields are all numbers ``(n,)``, by the name of their kind in a stored log."""
+"""Record types whose fields are all numbers ``(n,)``, by type name in a stored log."""
 
 
 def plain_record(kind: str) -> Any:
-    """Enter a class of such records: logs store it, and runs keep it with their inputs."""
+    """Register such a record type: logs and run folders store it."""
 
     def enter(cls: type[Any]) -> type[Any]:
         PLAIN[kind] = cls
@@ -126,7 +126,7 @@ class LaserScans:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AckermannGeometry:
-    """Car-like vehicle; base = middle of the rear axle.
+    """Car-like vehicle; base = centre of the rear axle.
 
     Parameters
     ----------
@@ -135,9 +135,9 @@ class AckermannGeometry:
     encoder_offset : float
         H, rear-axle centre to the wheel whose speed is measured, positive left [m]; 0 if speed is that of the centre.
     model : {"rear-axle", "front-steer"}
-        ``rear-axle``: v is the speed of the rear axle, φ̇ = v tan(α)/L. ``front-steer``: v is the speed of the
-        front wheel and the base moves along it, x' = x + v dt cos(α + φ), φ' = φ + v dt sin(α)/L (the classic
-        steering-model simulator of Combined SLAM, section B).
+        ``rear-axle``: v is the speed of the rear axle, φ̇ = v tan(α)/L. ``front-steer``: v is the speed of the front
+        wheel and the base moves along it, x' = x + v dt cos(α + φ), φ' = φ + v dt sin(α)/L (the classic steering-model
+        simulator of Combined SLAM, section B).
     """
 
     wheelbase: float
@@ -198,8 +198,8 @@ class SteeringControls:
 class VelocityControls:
     """Speed and yaw rate of a base that moves along its own x axis, held from each stamp to the next (zero-order hold).
 
-    Commanded or measured; without a covariance of its own, as :class:`SteeringControls`: the noise belongs to the
-    front end's motion model.
+    Commanded or measured; without a covariance, as :class:`SteeringControls`: the noise is part of the front end's
+    motion model.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ class Odometry:
     times : (n,)
     increments : (n, 3) or (n, 7)
     covariances : (n, d, d)
-        Right tangent at the later pose. Nothing enters a graph without a covariance.
+        Right tangent at the later pose. Required.
 
     Examples
     --------
@@ -284,8 +284,7 @@ class Gps:
     lever : (2,) or (3,)
         Antenna in the base frame [m].
     covariances : (n, c, c) or None
-        Of a fix whose coordinates are not equally sure, in the frame of the positions [m²]; they stand in place of
-        ``sigma``.
+        Covariances in the frame of the positions [m²]; they replace ``sigma``.
 
     Examples
     --------
@@ -327,12 +326,12 @@ class Gps:
     def upright(
         cls, *, times: Array, positions: Array, horizontal: npt.ArrayLike, vertical: npt.ArrayLike, lever: Array
     ) -> Gps:
-        """Fixes in space that are less sure, or more, of their height.
+        """3-D fixes with separate horizontal and vertical σ.
 
         Parameters
         ----------
         times, positions, lever
-            As in the class, in space.
+            As in the class, 3-D.
         horizontal, vertical : float or (n,)
             Standard deviations of x and y, and of z [m].
         """
@@ -348,7 +347,7 @@ class Gps:
         )
 
     def with_sigma(self, sigma: float | None) -> Gps:
-        """The same fixes with one standard deviation for all coordinates [m]; None leaves them as they are."""
+        """The same fixes with one standard deviation for all coordinates [m]; None: unchanged."""
         return self if sigma is None else replace(self, sigma=np.full(len(self.times), sigma), covariances=None)
 
     @property
@@ -368,8 +367,8 @@ class Compass:
     ----------
     times : (n,)
     headings : (n,)
-        Of the body's x axis [rad], counter-clockwise from magnetic east. A compass that counts clockwise from north has
-        ``π/2`` less its reading.
+        Of the body's x axis [rad], counter-clockwise from magnetic east. For a compass that counts clockwise from north
+        it is ``π/2`` minus its reading.
     sigma : (n,)
         Standard deviation [rad].
     """
@@ -395,7 +394,7 @@ class Compass:
 @plain_record("barometer")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Barometer:
-    """Heights of the body by air pressure, over a level that is not known.
+    """Barometric heights of the body, relative to an unknown level.
 
     Parameters
     ----------
@@ -403,7 +402,7 @@ class Barometer:
     heights : (n,)
         [m], upwards.
     sigma : (n,)
-        Standard deviation [m]; the level is constant within a log, so what the weather changes is part of it.
+        Standard deviation [m]; the level is constant in a log, so σ includes changes of the weather.
     """
 
     times: Array
@@ -431,19 +430,19 @@ class LandmarkObservations:
     Parameters
     ----------
     times : (n,)
-        Scan stamps; a scan may be empty.
+        Scan stamps; a scan can be empty.
     offsets : (n + 1,) int64
         Observations of scan k are rows ``offsets[k]:offsets[k + 1]``.
     ranges, bearings : (q,)
         Metres, radians in the sensor frame; the bearing of a range-only observation is 0.
     sigmas : (q, 2)
-        Standard deviations of range [m] and bearing [rad]; a bearing σ of ``inf`` says that the observation carries no
-        bearing (:meth:`range_only` builds such a stream).
+        Standard deviations of range [m] and bearing [rad]; a bearing σ of ``inf`` means no bearing (:meth:`range_only`
+        builds such a stream).
     ids : (q,) int64 or None
-        Known identity; -1 where unknown; None if the sensor gives none.
+        Known identity; -1 if unknown; None if the sensor gives none.
     max_range : float
     field_of_view : (2,)
-        Least and greatest bearing [rad].
+        Least and largest bearing [rad].
     T_base_sensor : (3,)
 
     Examples
@@ -515,7 +514,7 @@ class LandmarkObservations:
         range_sigma : float or (q,)
             σ of each range [m].
         **rest
-            Further fields of the class.
+            Other fields of the class.
         """
         q = len(ranges)
         sigmas = np.column_stack([np.broadcast_to(np.asarray(range_sigma, dtype=np.float64), q), np.full(q, np.inf)])
@@ -523,7 +522,7 @@ class LandmarkObservations:
 
     @property
     def has_bearing(self) -> npt.NDArray[np.bool_]:
-        """Which observations carry a bearing ``(q,)``."""
+        """Mask of the observations with a bearing ``(q,)``."""
         return np.asarray(np.isfinite(self.sigmas[:, 1]))
 
     def scan(self, k: int) -> slice:
@@ -549,19 +548,19 @@ class LandmarkObservations:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointObservations:
-    """Identified points in space that a sensor saw, several per scan (ragged): of a stereo or depth camera, say.
+    """Observations of identified 3-D points, several per scan (ragged), e.g. from a stereo or depth camera.
 
     Parameters
     ----------
     times : (n,)
-        Scan stamps; a scan may be empty.
+        Scan stamps; a scan can be empty.
     offsets : (n + 1,) int64
         Observations of scan k are rows ``offsets[k]:offsets[k + 1]``.
     points : (q, 3)
         In the sensor frame [m].
     covariances : (q, 3, 3)
     ids : (q,) int64
-        Identity of each, not negative; once in a scan.
+        Identity of each, not negative; unique in a scan.
     T_base_sensor : (7,)
 
     Examples

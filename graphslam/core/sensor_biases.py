@@ -1,10 +1,10 @@
-"""Errors of a robot's sensors that last: what a submap would be if wheels and sensor erred by constants.
+"""Constant sensor errors (biases): dependence of a submap on constant errors of wheels and sensor.
 
-A submap is smoothed as if wheels and sensor had no constant errors. If they err by ``g``, its exit and its landmarks
-are those that were smoothed plus ``S g``, and its own measurements say how likely each ``g`` is, by a score and an
-information matrix. Kept beside the submap's Gaussian, nothing is lost: a graph has g as variables that all submaps of a
-robot share, so that errors which no single submap shows are estimated together, and what is not told of them widens the
-covariances of the whole map.
+A submap is smoothed as if wheels and sensor had no constant errors. With errors ``g``, its exit and landmarks are the
+smoothed ones plus ``S g``, and its measurements give a likelihood of ``g`` by a score and an information matrix. These
+are stored with the submap's Gaussian: a graph has g as variables shared by all submaps of a robot, so that errors that
+are not observable in one submap are estimated jointly, and their uncertainty is included in the covariances of the
+whole map.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from graphslam.core.geometry import Array
 from graphslam.core.reading import finite_mask
 
 CONSTANTS = ("turn", "distance", "range", "bearing", "ahead", "left")
-"""Two of the wheels: their turns (by the second or by the metre), and the logarithm of their distances; and two of the
-sensor: the zero of its ranges, and its direction (of ranges without bearings the logarithm of their scale); and where
-it stands on the robot, ahead and to the left."""
+"""Two of the wheels: yaw (per second or per metre), and the logarithm of the distance scale; two of the sensor: range
+offset, and bearing offset (for ranges without bearings the logarithm of their scale); and the mounting position, ahead
+and to the left."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorBiases:
-    """How a submap depends on constant errors, and what it says of them.
+    """Dependence of a submap on constant errors, and its information on them.
 
     Parameters
     ----------
     names : (6,) str
-        What the constants are, in the order of :data:`CONSTANTS`; empty where one is not looked for.
+        Names of the constants, in the order of :data:`CONSTANTS`; empty if not estimated.
     sigmas : (6,)
-        What is known of them beforehand, about zero.
+        Prior σ, about zero.
     response : (3 + 2n, 6)
-        Change of exit and landmarks with each, in the plain vector of the landmark map.
+        Derivative of exit and landmarks, in the plain vector of the landmark map.
     score, information : (6,), (6, 6)
-        ``score = Λ ĝ`` and ``Λ`` of what the submap's own motion and sightings say, exit and landmarks left free.
+        ``score = Λ ĝ`` and ``Λ`` from the submap's motion and observations, with exit and landmarks marginalised out.
     path : (T, 3, 6)
-        Change of the poses of the submap's trajectory, right tangents.
+        Derivative of the poses of the submap's trajectory, right tangents.
     points : (2p, 6)
-        Change of the points of the path (:mod:`graphslam.core.path_points`) in the base frame.
+        Derivative of the points of the path (:mod:`graphslam.core.path_points`) in the base frame.
     """
 
     names: tuple[str, ...]
@@ -69,13 +69,13 @@ class SensorBiases:
             raise CovarianceError("information of systematic errors is not symmetric")
 
     def of_landmarks(self, keep: npt.NDArray[np.intp]) -> SensorBiases:
-        """The same beside fewer landmarks: ``keep`` are rows of the landmark map's vector."""
+        """The biases for a subset of landmarks: ``keep`` are rows of the landmark map's vector."""
         return replace(self, response=self.response[keep])
 
     def likelihood(self) -> tuple[Array, Array]:
-        """The submap's own word as rows ``R g - d`` of unit variance: ``(r, 6)``, ``(r,)``.
+        """The submap's likelihood of g as rows ``R g - d`` of unit variance: ``(r, 6)``, ``(r,)``.
 
-        Directions of which it says less than a millionth of what is known beforehand have no row.
+        Directions with less than a millionth of the prior information have no row.
         """
         s = self.sigmas
         w, V = np.linalg.eigh(s[:, None] * self.information * s)

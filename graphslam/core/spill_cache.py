@@ -1,8 +1,8 @@
-"""Values that are not needed now lie in a file: what a run keeps of each submap takes a bounded part of the memory.
+"""Cache that spills unused values to a file, to limit the memory of stored submaps.
 
-A :class:`SpillCache` holds values that do not change, each in a :class:`CacheEntry`. As long as they fit, all of them
-are in memory. What is beyond is written to a file, the one that was used longest ago first, and read again where it is
-asked for. The file has no name: it is gone when the process ends, however that happens.
+A :class:`SpillCache` contains immutable values, each in a :class:`CacheEntry`. As long as they fit, all are in memory.
+Otherwise the least recently used ones are written to a file, and read again when needed. The file has no name: it
+disappears when the process ends in any way.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ Arrays: TypeAlias = list[npt.NDArray[Any]]
 T = TypeVar("T")
 
 ROOM = 128_000_000
-"""Memory of :data:`SPILL_CACHE` [bytes]."""
+"""Memory limit of :data:`SPILL_CACHE` [bytes]."""
 GIVE_BACK = 32_000_000
-"""Freed heap is handed back to the system each time that so much has gone at least [bytes]."""
+"""Freed bytes after which the heap is returned to the system."""
 _FINENESS = 8
-"""Sizes of places in the file: so many to an octave, so that what was given back fits what comes."""
+"""Sizes of file slots per octave, so that freed slots fit new values."""
 
 
 class _Place:
-    """Where arrays lie in the file."""
+    """Location of arrays in the file."""
 
     __slots__ = ("at", "file", "parts", "size")
 
@@ -61,7 +61,7 @@ class _Place:
 
 
 class CacheEntry(Generic[T]):
-    """One value of a shelf; :meth:`SpillCache.put` makes it. It is forgotten with the last who holds it.
+    """One value of a cache, made by :meth:`SpillCache.put`. It is removed with its last reference.
 
     Parameters
     ----------
@@ -80,39 +80,39 @@ class CacheEntry(Generic[T]):
         self._place: _Place | None = None
 
     def get(self) -> T:
-        """The value, of the file if need be. It stays what it is for as long as somebody holds it."""
+        """The value, from the file if needed. It stays valid as long as it is referenced."""
         return self._shelf._get(self)
 
     def rows(self, first: int, last: int) -> npt.NDArray[Any]:
-        """Rows of a value that is one array and packed as it is; those alone are read."""
+        """Rows of a value that is a single array and packed unchanged; only these are read."""
         return self._shelf._rows(self, first, last)
 
     @property
     def resident(self) -> bool:
-        """Is the value in memory, for the shelf's sake?"""
+        """Whether the cache has the value in memory."""
         return self._value is not None
 
     def __del__(self) -> None:
         shelf = getattr(self, "_shelf", None)
         if shelf is not None:
-            shelf._dead.append((self._key, self._place))  # atomic; the shelf takes it from there
+            shelf._dead.append((self._key, self._place))  # atomic; the cache processes it later
 
 
 class SpillCache:
-    """Values of which so many bytes at most are in memory.
+    """Cache of values with a memory limit.
 
-    What others hold of them meanwhile counts for those. Of any number of threads.
+    Values referenced elsewhere do not count. Thread-safe.
 
     Parameters
     ----------
     room : int
-        Memory of values [bytes].
+        Memory limit [bytes].
     """
 
     def __init__(self, room: int = ROOM) -> None:
         self.room = room
         self._lock = threading.RLock()
-        self._used: OrderedDict[int, weakref.ref[CacheEntry[Any]]] = OrderedDict()  # in memory, used longest ago first
+        self._used: OrderedDict[int, weakref.ref[CacheEntry[Any]]] = OrderedDict()  # in memory, oldest use first
         self._sizes: dict[int, int] = {}
         self._bytes = 0
         self._next = 0
@@ -122,11 +122,11 @@ class SpillCache:
         self._end = 0
         self._free: dict[int, list[int]] = {}
         self._full = False
-        self._left = 0  # bytes that went since the heap was given back
+        self._left = 0  # freed bytes since the heap was returned
 
     @property
     def nbytes(self) -> int:
-        """Memory of the values that are in it now [bytes]."""
+        """Current memory of the values [bytes]."""
         with self._lock:
             self._collect()
             return self._bytes
@@ -137,15 +137,15 @@ class SpillCache:
         return self._end
 
     def put(self, value: T, nbytes: int, pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> CacheEntry[T]:
-        """Take a value that will not change.
+        """Add an immutable value.
 
         Parameters
         ----------
         value : object
         nbytes : int
-            What it takes of the memory.
+            Its memory.
         pack, unpack : callable
-            From the value to arrays, and back to one that is the same in everything that is asked of it.
+            From the value to arrays, and back to an equivalent value.
         """
         with self._lock:
             self._next += 1
@@ -176,7 +176,7 @@ class SpillCache:
             return slot._place.rows(first, last)
 
     def _keep(self, slot: CacheEntry[Any], value: Any) -> None:
-        """Hold it in memory, and let go of others for it."""
+        """Keep it in memory, and evict others."""
         self._collect()
         slot._value = value
         self._used[slot._key] = weakref.ref(slot)
@@ -189,7 +189,7 @@ class SpillCache:
                 return
             self._left += self._sizes[key]
             self._drop(key)
-        if self._left > max(self.room // 2, GIVE_BACK):  # arrays of a few MB leave holes in the heap when they go
+        if self._left > max(self.room // 2, GIVE_BACK):  # freed arrays of a few MB fragment the heap
             self._left = 0
             trim_heap()
 
@@ -209,7 +209,7 @@ class SpillCache:
         return True
 
     def _write(self, arrays: Arrays) -> _Place:
-        if self._file is None or self._owner != os.getpid():  # a process that was forked has a file of its own
+        if self._file is None or self._owner != os.getpid():  # a forked process gets its own file
             self._file, self._owner = tempfile.TemporaryFile(prefix="graphslam-"), os.getpid()  # noqa: SIM115
             self._end, self._free = 0, {}
         arrays = [np.ascontiguousarray(a) for a in arrays]
@@ -226,7 +226,7 @@ class SpillCache:
         return place
 
     def _collect(self) -> None:
-        """Give back what those left who are no more."""
+        """Free the memory and file slots of deleted entries."""
         while self._dead:
             key, place = self._dead.popleft()
             self._drop(key)
@@ -257,14 +257,14 @@ def _read(file: IO[bytes], into: npt.NDArray[Any], at: int) -> None:
 
 
 def pack_array(a: npt.NDArray[Any]) -> Arrays:
-    """How one array is packed."""
+    """Pack a single array."""
     return [a]
 
 
 def unpack_array(arrays: Arrays) -> npt.NDArray[Any]:
-    """… and unpacked."""
+    """Unpack it."""
     return arrays[0]
 
 
 SPILL_CACHE = SpillCache()
-"""The one that submaps, pieces of maps and clouds of this process share."""
+"""The cache shared by submaps, map pieces and clouds of this process."""

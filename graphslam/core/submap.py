@@ -1,7 +1,7 @@
-"""The contract between front ends and back ends: a submap is a frozen value.
+"""The interface between front ends and back ends: a submap is an immutable value.
 
-A submap is a small map in the frame of its first pose, with a Gaussian over where it ends and over the landmarks in
-it. Node k+1 of a graph is the end of submap k (Combined SLAM B5).
+A submap is a small map in the frame of its first pose, with a Gaussian over its end pose and its landmarks. Node k+1 of
+a graph is the end of submap k (Combined SLAM B5).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from graphslam.core.trajectory import Trajectory
 
 
 def turned_covariance(R: Array, covariance: Array) -> Array:
-    """Covariance ``(6, 6)`` of the turn and the shift of a pose, about axes that are turned by ``R`` ``(3, 3)``.
+    """Covariance ``(6, 6)`` of rotation and translation of a pose, in axes rotated by ``R`` ``(3, 3)``.
 
-    With ``R = R(exit)ᵀ`` the block of a landmark map in space becomes the right tangent at the exit, with ``R(exit)``
-    it goes back.
+    With ``R = R(exit)ᵀ`` the block of a 3-D landmark map becomes the right tangent at the exit; ``R(exit)`` is the
+    inverse.
     """
     both = np.kron(np.eye(2), R)
     return np.asarray(both @ covariance @ both.T)
@@ -41,17 +41,16 @@ def turned_covariance(R: Array, covariance: Array) -> Array:
 class LandmarkMap:
     """Joint Gaussian over ``[exit pose, landmark_1, …]`` in the base frame.
 
-    In 2-D the vector is ``[x, y, θ, l1x, l1y, …]``, all in the base frame. ``chart`` names what it is Gaussian in:
-    these coordinates themselves (the residual of Combined SLAM eq. 15 with the heading wrapped), or those of the exit's
-    own group, in which an error of the heading turns exit and landmarks together (:mod:`graphslam.core.charts`). Mean
-    and covariance are the same in both. In 3-D the pose block is a turn about the axes of the base frame [rad], then a
-    shift along them [m].
+    In 2-D the vector is ``[x, y, θ, l1x, l1y, …]``, all in the base frame. ``chart`` is the parametrisation in which it
+    is Gaussian: these coordinates (the residual of Combined SLAM eq. 15 with the heading wrapped), or the group chart,
+    in which a heading error rotates exit and landmarks together (:mod:`graphslam.core.charts`). Mean and covariance are
+    the same in both. In 3-D the pose block is a rotation about the axes of the base frame [rad], then a translation
+    along them [m].
 
     Parameters
     ----------
     ids : (n,) int64
-        Global landmark identities; -1 = not associated. An id may stand twice (two entries that turned out to be one
-        landmark).
+        Global landmark identities; -1 = not associated. An id can be repeated (two entries of one landmark).
     exit_pose : (3,) or (7,)
         ``T_start_end``.
     positions : (n, dim)
@@ -59,14 +58,14 @@ class LandmarkMap:
     information : sparse, same shape, or None
         Exactly one of the two is given.
     sightings : (q, 2) int64 or None
-        Which observation (index in the log's observation stream) saw which landmark of this map: for audits of the
-        association; no solver reads it.
+        Pairs (index in the log's observation stream, landmark of this map), for evaluating the association; not used by
+        solvers.
     chart : "cartesian" or "group"
-        Maps from elsewhere and those of the papers are Cartesian; our front ends make the other kind.
+        External maps and those of the papers are Cartesian; the front ends of this package use the group chart.
     path : PathPoints or None
-        Points of the path where fixes were taken, jointly Gaussian with all of this (2-D only).
+        Points of the path at fixes, jointly Gaussian with the map (2-D only).
     lasting : SensorBiases or None
-        What all of this is if wheels and sensor err by constants; the Gaussian is that of a robot without them.
+        Dependence of the map on constant errors of wheels and sensor; the Gaussian assumes that they are zero.
     """
 
     ids: npt.NDArray[np.int64]
@@ -131,11 +130,11 @@ class LandmarkMap:
 
     @property
     def mean(self) -> Array:
-        """``[exit pose, landmarks…]`` as one vector; in 3-D the pose is its seven numbers."""
+        """``[exit pose, landmarks…]`` as one vector; in 3-D the pose has seven numbers."""
         return np.concatenate([self.exit_pose, self.positions.ravel()])
 
     def dense_covariance(self) -> Array:
-        """Joint covariance, inverted from the information matrix where that is what is stored."""
+        """Joint covariance, inverted from the information matrix if that is stored."""
         if self.covariance is not None:
             return self.covariance
         assert self.information is not None
@@ -146,7 +145,7 @@ class LandmarkMap:
         return 0.5 * (P + P.T)
 
     def dense_information(self) -> Array:
-        """Joint information matrix, inverted from the covariance where that is what is stored."""
+        """Joint information matrix, inverted from the covariance if that is stored."""
         if self.information is not None:
             return np.asarray(self.information.toarray())
         assert self.covariance is not None
@@ -156,7 +155,7 @@ class LandmarkMap:
     def subset(self, keep: npt.ArrayLike) -> LandmarkMap:
         """Marginal over the exit pose and the landmarks ``keep`` (mask or integer indices)."""
         chosen = np.asarray(keep)
-        k = np.arange(len(self))[chosen if chosen.size else chosen.astype(np.intp)]  # an empty list is of floats
+        k = np.arange(len(self))[chosen if chosen.size else chosen.astype(np.intp)]  # an empty list has type float
         d = 3 if self.dim == 2 else 6
         ix = np.concatenate([np.arange(d), (d + self.dim * k[:, None] + np.arange(self.dim)).ravel()]).astype(np.intp)
         return LandmarkMap(
@@ -170,12 +169,12 @@ class LandmarkMap:
         )
 
     def with_biases(self, mean: Array, covariance: Array) -> LandmarkMap:
-        """The same map, if the constant errors of wheels and sensor are Gaussian; itself where it knows of none.
+        """The map with Gaussian constant errors of wheels and sensor included; unchanged if it has no biases.
 
         Parameters
         ----------
         mean, covariance : (6,), (6, 6)
-            Of the errors, all that the map itself says of them included.
+            Of the errors, including the information of this map.
         """
         if self.lasting is None:
             return self
@@ -189,13 +188,13 @@ class LandmarkMap:
         )  # fmt: skip
 
     def difference(self, x: Array) -> Array:
-        """What ``x``, laid out as :attr:`mean`, differs from the mean by in this map's chart ``(n,)``."""
+        """Difference of ``x`` (layout of :attr:`mean`) from the mean in this map's chart ``(n,)``."""
         return map_difference(x, self.mean, self.chart, space=self.dim == 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Match:
-    """A re-entry into an earlier submap that the front end found.
+    """A re-entry into an earlier submap, found by the front end.
 
     Parameters
     ----------
@@ -208,7 +207,7 @@ class Match:
     fitness : float
         Registration fitness in [0, 1].
     support : float
-        Share of particle weight that took this match; the null match has the rest.
+        Share of the particle weight with this match; the null match has the rest.
     """
 
     target: int
@@ -240,12 +239,12 @@ class Submap:
         In the base frame; an array ``(m, dim)`` is read as points without further data.
     matches : tuple of Match
     uses : frozenset of str
-        Streams whose information is already inside.
+        Streams whose information is already used in the submap.
     assisting_streams : frozenset of str
-        Streams that helped to find what is inside, while nothing that they tell is in its covariances: where a match
-        began, how a scan is bent. A factor may still use them.
+        Streams that were used only for preprocessing (start of a match, deskewing), not in the covariances. A factor
+        may still use them.
     report : mapping
-        Report of the front end: why the map ended, consistency values, counts. JSON-serialisable.
+        Report of the front end: reason for the end of the map, consistency values, counts. JSON-serialisable.
 
     Examples
     --------
@@ -292,7 +291,7 @@ class Submap:
     def from_landmarks(
         cls, key: int, landmarks: LandmarkMap, *, interval: tuple[float, float] | None = None, **rest: Any
     ) -> Submap:
-        """A landmark submap; its exit is derived from the joint Gaussian. Without a clock the interval is [k, k+1]."""
+        """A landmark submap; its exit is derived from the joint Gaussian. Default interval: [k, k+1]."""
         P = landmarks.dense_covariance()
         d = 3 if landmarks.dim == 2 else 6
         exit_cov = P[:d, :d]
@@ -315,13 +314,13 @@ class Submap:
         return 2 if len(self.exit_pose) == 3 else 3
 
     def with_ids(self, ids: npt.ArrayLike) -> Submap:
-        """The same submap with its landmarks identified as ``ids`` ``(n,)``."""
+        """The submap with landmark ids ``ids`` ``(n,)``."""
         if self.landmarks is None:
             raise GeometryError(f"submap {self.key} has no landmarks to identify")
         return replace(self, landmarks=replace(self.landmarks, ids=np.asarray(ids, dtype=np.int64)))
 
     def of_session(self, name: str) -> Submap:
-        """The same submap with its streams named as those of a session of several: ``name/stream``."""
+        """The submap with the stream names of one session of several: ``name/stream``."""
         uses, aids = (frozenset(f"{name}/{u}" for u in streams) for streams in (self.uses, self.assisting_streams))
         return replace(self, uses=uses, assisting_streams=aids)
 

@@ -68,9 +68,9 @@ class Trajectory:
         return len(self.times)
 
     def to_pandas(self) -> pd.DataFrame:
-        """A row an instant, indexed by ``time`` [s]: ``x, y, heading`` [m, rad], in space ``x, y, z, qx, qy, qz, qw``.
+        """One row per time, indexed by ``time`` [s]: ``x, y, heading`` [m, rad], in 3-D ``x, y, z, qx, qy, qz, qw``.
 
-        With covariances also ``sigma_…`` of each coordinate of the right tangent (rotations first in space).
+        With covariances also ``sigma_…`` of each coordinate of the right tangent (rotations first in 3-D).
         """
         import pandas as pd
 
@@ -99,7 +99,7 @@ class Trajectory:
 
     def _bracket(self, t: ArrayLike, max_gap: float | None) -> tuple[Index, Index, Array]:
         q = np.atleast_1d(np.asarray(t, dtype=np.float64))
-        if len(self) == 0 or not np.all((q >= self.times[0]) & (q <= self.times[-1])):  # nan is outside, too
+        if len(self) == 0 or not np.all((q >= self.times[0]) & (q <= self.times[-1])):  # also rejects NaN
             span = f"[{self.times[0]:.3f}, {self.times[-1]:.3f}]" if len(self) else "an empty trajectory"
             raise DataError("time outside the trajectory", got=f"[{q.min():.3f}, {q.max():.3f}]", wanted=span)
         j = np.clip(np.searchsorted(self.times, q, side="right"), 1, max(len(self) - 1, 1))

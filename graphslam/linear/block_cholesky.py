@@ -1,9 +1,8 @@
-"""Sparse Cholesky factorisation of matrices made of node blocks, with the symbolic part kept apart from the numbers.
+"""Sparse Cholesky factorisation of matrices of node blocks, with separate symbolic and numeric parts.
 
-Made for the joiners, which factorise many matrices of a few hundred to a few ten thousand scalars: nodes instead of
-scalars are ordered and analysed, only one triangle is computed, and columns of the inverse cost a forward substitution
-that visits only the way to the root. SuperLU (:mod:`~graphslam.linear.symmetric_factor`) serves matrices of other
-kinds.
+For map joining, which factorises many matrices of a few hundred to a few ten thousand scalars: nodes instead of scalars
+are ordered and analysed, only one triangle is computed, and a column of the inverse needs a forward substitution only
+along the path to the root. SuperLU (:mod:`~graphslam.linear.symmetric_factor`) is for other matrices.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from graphslam.linear import multifrontal_solve_kernels as solving
 
 Index = npt.NDArray[np.int64]
 
-# Zeros that a supernode may take in for the sake of larger dense blocks.
+# Zeros that a supernode may contain to get larger dense blocks.
 _SLACK = 48
 
 
 class BlockSymbolic:
-    """What a factorisation needs to know before the numbers: pattern, order, supernodes.
+    """Symbolic factorisation: pattern, order, supernodes.
 
     Parameters
     ----------
@@ -43,7 +42,7 @@ class BlockSymbolic:
     nnz : int
         Entries of the factor.
     size : int
-        Scalars.
+        Number of scalars.
     """
 
     def __init__(self, order: Index, width: Index, ptr: Index, neighbours: Index) -> None:
@@ -61,7 +60,7 @@ class BlockSymbolic:
 
     @cached_property
     def permutation(self) -> Index:
-        """``permutation[i]`` is the caller's number of the scalar that is eliminated i-th."""
+        """``permutation[i]`` is the caller's index of the scalar that is eliminated i-th."""
         width = np.diff(self._offset)
         begin = np.repeat(self._node_at[self._post] - self._offset[:-1], width)
         return np.asarray(begin + np.arange(self.size))
@@ -78,8 +77,8 @@ class BlockSymbolic:
         Parameters
         ----------
         block : (nb,)
-            Where the block of each pair of ``neighbours`` begins in ``value``: rows of the node whose list it is in,
-            columns of the neighbour, row-major. Of a pair the one of the node that is eliminated first is read.
+            Offset in ``value`` of the block of each pair of ``neighbours``: rows of the list's node, columns of the
+            neighbour, row-major. Of a pair, the block in the list of the node that is eliminated first is used.
         value : (k,)
         """
         L = np.empty(self._entries)
@@ -116,16 +115,16 @@ class BlockFactor:
         return out
 
     def inverse_block(self, indices: npt.ArrayLike) -> Array:
-        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹ = L⁻ᵀ L⁻¹``, never the whole inverse (Algorithm 1)."""
+        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹ = L⁻ᵀ L⁻¹``, without the whole inverse (Algorithm 1)."""
         s = self._symbolic
         unit = s._place[np.asarray(indices, dtype=np.intp)]
         W, _ = solving.solve_lower_units(*s._solve, s._parent, s._panel_ptr, self._L, unit)
         return np.asarray(W.T @ W)
 
     def inverse_diagonal_blocks(self, first: npt.ArrayLike, width: int) -> Array:
-        """Blocks ``(k, width, width)`` on the diagonal of ``A⁻¹`` that begin at the scalars ``first`` ``(k,)``.
+        """Blocks ``(k, width, width)`` on the diagonal of ``A⁻¹`` that start at the scalars ``first`` ``(k,)``.
 
-        A block lies inside one node. By selected inversion: about the work of one factorisation for all of them.
+        A block is inside one node. Selected inversion: about the cost of one factorisation for all blocks.
         """
         s = self._symbolic
         begin = s._place[np.asarray(first, dtype=np.intp)]

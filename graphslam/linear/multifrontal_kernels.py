@@ -1,12 +1,12 @@
 """Numba kernels: Cholesky factorisation of a block-sparse symmetric matrix by dense fronts. Plain arrays only.
 
-Nodes are eliminated whole (a pose is three scalars, a landmark two). Nodes with nearly the same neighbours form a
-*supernode*; its columns are one dense panel, and what its elimination leaves to the later ones is a dense square that
-is handed to its parent in the elimination tree (multifrontal method). The order of elimination is given; it is only
-refined to a postorder of the tree, which changes no fill-in and lets the squares live on a stack.
+Nodes are eliminated as blocks (a pose has three scalars, a landmark two). Nodes with nearly the same neighbours form a
+*supernode*; its columns are one dense panel, and its Schur complement (update matrix) is a dense square that is passed
+to its parent in the elimination tree (multifrontal method). The elimination order is given; it is only refined to a
+postorder of the tree, with the same fill-in.
 
-Names: node = the caller's number; position = when a node is eliminated (after postordering); scalars are numbered in
-order of elimination.
+Names: node = index of the caller; position = elimination rank of a node (after postordering); scalars are numbered in
+elimination order.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 LARGE = 64
-"""Fronts of so many rows are worked on by products of blocks."""
+"""Fronts with at least this number of rows use block products."""
 
 
 @njit
 def _earlier(position: Index, ptr: Index, idx: Index) -> tuple[Index, Index]:
-    """For every position its neighbours at earlier positions, from lists that hold each pair at least one way."""
+    """For every position its neighbours at earlier positions, from lists that contain each pair at least once."""
     N = len(position)
     count = np.zeros(N + 1, np.int64)
     for i in range(N):
@@ -67,7 +67,7 @@ def _tree(start: Index, earlier: Index) -> Index:
 
 @njit
 def _postorder(parent: Index) -> Index:
-    """Positions in postorder: children before their parent, each subtree in one piece."""
+    """Positions in postorder: children before their parent, each subtree contiguous."""
     N = len(parent)
     head = np.full(N, -1, np.int64)
     after = np.full(N, -1, np.int64)
@@ -101,13 +101,14 @@ def _postorder(parent: Index) -> Index:
 def _columns(
     start: Index, earlier: Index, turned: tuple[Index, Index], up: Index, offset: Index
 ) -> tuple[Index, Index, Index, Index, int]:
-    """Positions below each column of L, ``below[below_ptr[k] : below_ptr[k + 1]]``, their number and scalars; entries.
+    """Positions below each column of L, ``below[below_ptr[k] : below_ptr[k + 1]]``, their number and scalars; number of
+    entries.
 
-    ``turned`` leads from the postorder to the order of ``start`` and ``earlier``, and back.
+    ``turned`` maps the postorder to the order of ``start`` and ``earlier``, and back.
     """
     post, rank = turned
     N = len(up)
-    # Structure of every column of L: k belongs to all on the way from its earlier neighbours up to k.
+    # Structure of every column of L: k belongs to all on the tree path from its earlier neighbours up to k.
     count = np.zeros(N, np.int64)
     seen = np.full(N, -1, np.int64)
     for k in range(N):
@@ -148,7 +149,7 @@ def _columns(
 def _supernodes(up: Index, offset: Index, scalars: Index, slack: int) -> tuple[Index, Index]:
     """Supernode of each position, and the first position of each."""
     N = len(up)
-    # Supernodes: a node joins its child when the child's rows are its own, give or take the slack.
+    # Supernodes: a node is merged with its child if their rows are equal up to the slack.
     super_of = np.empty(N, np.int64)
     first = np.empty(N + 1, np.int64)
     S = 0
@@ -178,9 +179,9 @@ def analyse_blocks(
     width : (N,)
         Scalars of each node.
     ptr : (N + 1,); idx : (nb,)
-        Neighbours of every node; each pair at least one way, the node itself allowed.
+        Neighbours of every node; each pair at least once, the node itself allowed.
     slack : int
-        A node joins the supernode before it even if that adds this many rows of zeros to the panel.
+        A node is merged with the previous supernode if that adds at most this number of zero rows to the panel.
 
     Returns
     -------
@@ -195,9 +196,9 @@ def analyse_blocks(
     row_ptr : (S + 1,); rows : (r,)
         Positions of the nodes of each panel: the supernode's own, then those below, ascending.
     panel_ptr : (S + 1,)
-        Where each panel (columns × rows scalars) begins among the entries of the factor.
+        Offset of each panel (columns × rows scalars) in the entries of the factor.
     sizes : (3,)
-        Most rows of a front, most scalars on the stack of squares, true entries of the factor (without the slack).
+        Most rows of a front, most scalars on the stack, entries of the factor without the slack.
     """
     N = len(order)
     position = np.empty(N, np.int64)
@@ -233,7 +234,7 @@ def analyse_blocks(
     rows = np.empty(row_ptr[S], np.int64)
     sizes = np.zeros(3, np.int64)
     square = np.zeros(S, np.int64)
-    pending = np.zeros(S, np.int64)  # squares of the children, on top of the stack when their parent comes
+    pending = np.zeros(S, np.int64)  # update matrices of the children on top of the stack
     height = 0
     for s in range(S):
         q = row_ptr[s]
@@ -259,7 +260,7 @@ def analyse_blocks(
 
 @njit(fastmath={"contract"})
 def _eliminate_columns(F: Array, first: int, end: int, r: int) -> int:
-    """Cholesky of the columns ``first`` to ``end`` of a front with ``r`` rows, within themselves."""
+    """Cholesky of the columns ``first`` to ``end`` of a front with ``r`` rows, among themselves."""
     for c in range(first, end):
         d = F[c, c]
         if not d > 0.0:
@@ -290,7 +291,7 @@ def _eliminate(F: Array, w: int, r: int) -> int:
     bad = _eliminate_columns(F, 0, w, r)
     if bad:
         return bad
-    # What is left to the others: four columns at once, so that a row is read and written a quarter as often.
+    # Update of the other columns: four at once, to reduce memory access.
     k = 0
     while k + 4 <= w:
         for b in range(w, r):
@@ -308,7 +309,7 @@ def _eliminate(F: Array, w: int, r: int) -> int:
 
 
 class SymbolicAnalysis(NamedTuple):
-    """From :func:`analyse_blocks`."""
+    """Arrays from :func:`analyse_blocks`."""
 
     order: Index
     offset: Index
@@ -321,14 +322,14 @@ class SymbolicAnalysis(NamedTuple):
 
 
 class BlockMatrix(NamedTuple):
-    """A sparse matrix of blocks."""
+    """A sparse block matrix."""
 
     ptr: Index
     idx: Index
-    """Neighbours as given to :func:`analyse_blocks`; one at an earlier position is skipped (its own list has the
+    """Neighbours as given to :func:`analyse_blocks`; those at an earlier position are skipped (their lists have the
     pair)."""
     block: Index
-    """(nb,): where each pair's block begins in ``value``: rows of the node, columns of the neighbour, row-major."""
+    """(nb,): offset of each pair's block in ``value``: rows of the node, columns of the neighbour, row-major."""
     value: Array
     """(k,)"""
 
@@ -340,7 +341,7 @@ def factorise_blocks(analysis: SymbolicAnalysis, matrix: BlockMatrix, damping: f
     Parameters
     ----------
     L : (panel_ptr[-1],)
-        Out. Column by column of every panel: all its rows, those above the diagonal are rubbish.
+        Output: all rows of every panel, column by column; entries above the diagonal are undefined.
 
     Returns
     -------
@@ -356,7 +357,7 @@ def factorise_blocks(analysis: SymbolicAnalysis, matrix: BlockMatrix, damping: f
     local = np.empty(N, np.int64)  # first row of each node in the current front
     front = np.empty(sizes[0] * sizes[0])
     stack = np.empty(sizes[1])
-    waiting = np.empty(S, np.int64)  # supernodes whose squares are on the stack
+    waiting = np.empty(S, np.int64)  # supernodes whose update matrices are on the stack
     height, top = 0, 0
     for s in range(S):
         a, z = row_ptr[s], row_ptr[s + 1]
@@ -382,7 +383,7 @@ def factorise_blocks(analysis: SymbolicAnalysis, matrix: BlockMatrix, damping: f
         if damping > 0.0:
             for c in range(w):
                 F[c, c] *= 1.0 + damping
-        while top > 0 and parent[waiting[top - 1]] == s:  # extend-add of the children's squares
+        while top > 0 and parent[waiting[top - 1]] == s:  # extend-add of the children's update matrices
             t = waiting[top - 1]
             own = first[t + 1] - first[t]
             b, y = row_ptr[t] + own, row_ptr[t + 1]

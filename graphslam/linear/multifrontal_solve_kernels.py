@@ -1,6 +1,6 @@
-"""Numba kernels: what a multifrontal factor is for: solutions, and entries of the inverse. Plain arrays only.
+"""Numba kernels: solutions and entries of the inverse from a multifrontal factor. Plain arrays only.
 
-Scalars are numbered in order of elimination; ``start`` and ``row`` say which of them are the rows of each panel.
+Scalars are numbered in elimination order; ``start`` and ``row`` list the rows of each panel.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def solve_upper(own: Index, start: Index, row: Index, panel_ptr: Index, L: Array
 def solve_lower_units(
     own: Index, start: Index, row: Index, parent: Index, panel_ptr: Index, L: Array, unit: Index
 ) -> tuple[Array, Index]:
-    """``L⁻¹ E`` for unit columns ``unit`` ``(k,)``: its rows that are not zero, and which they are.
+    """``L⁻¹ E`` for unit columns ``unit`` ``(k,)``: its nonzero rows, and their indices.
 
-    Only the supernodes between a unit's own and the root are visited.
+    Only the supernodes from a unit's own to the root are visited.
     """
     S, k = len(own) - 1, len(unit)
     visited = np.zeros(S, np.bool_)
@@ -92,7 +92,7 @@ def solve_lower_units(
 
 
 class FactorPanels(NamedTuple):
-    """A factor."""
+    """Arrays of a factor."""
 
     own: Index
     start: Index
@@ -120,13 +120,13 @@ def inverse_diagonal(panels: FactorPanels, begin: Index, width: int, most: int) 
     """Diagonal blocks of the inverse without the rest of it (selected inversion, from the root down).
 
     With a panel's own scalars S and those below R, ``Y = L_RS L_SS⁻¹``: ``Z_RS = -Z_RR Y`` and
-    ``Z_SS = L_SS⁻ᵀ L_SS⁻¹ - Yᵀ Z_RS``; ``Z_RR`` lies inside the front of the parent, which is kept as long as it has
-    children to come.
+    ``Z_SS = L_SS⁻ᵀ L_SS⁻¹ - Yᵀ Z_RS``; ``Z_RR`` is inside the front of the parent, which is kept until all its children
+    are processed.
 
     Parameters
     ----------
     begin : (k,)
-        First scalar of each block; a block lies inside one supernode.
+        First scalar of each block; a block is inside one supernode.
     width : int
         Scalars of a block.
     most : int
@@ -140,11 +140,11 @@ def inverse_diagonal(panels: FactorPanels, begin: Index, width: int, most: int) 
     S = len(own) - 1
     out = np.zeros((len(begin), width, width))
     by_super = np.argsort(begin)
-    left = np.zeros(S, np.int64)  # children still to come
+    left = np.zeros(S, np.int64)  # remaining children
     for s in range(S):
         if parent[s] >= 0:
             left[parent[s]] += 1
-    base = np.zeros(S, np.int64)  # where the front of s begins on the stack
+    base = np.zeros(S, np.int64)  # offset of the front of s on the stack
     stack = np.empty(4 * most * most)
     height, q = 0, len(begin) - 1
     local = np.empty(own[S], np.int64)

@@ -1,7 +1,7 @@
 """Numba kernels: products of large dense matrices by products of small blocks. Plain arrays only.
 
-BLAS multiplies blocks of 64 × 64 two to four times as fast as compiled loops do, and products of that size never spread
-over threads: the result has the same bytes whatever the number of threads.
+BLAS multiplies 64 × 64 blocks two to four times faster than compiled loops, and products of that size use a single
+thread: the result is bitwise equal for any number of threads.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from graphslam.core.jit import njit
 Array = npt.NDArray[np.float64]
 
 BLOCK = 64
-"""Rows and columns of a block."""
+"""Rows and columns per block."""
 
 
 @njit
 def _pack(A: Array, out: Array) -> None:
-    """Blocks of columns of ``A`` ``(k, n)`` one after the other, each with its rows together."""
+    """Pack blocks of columns of ``A`` ``(k, n)`` contiguously, row-major within a block."""
     k, n = A.shape
     at = 0
     for j in range(0, n, BLOCK):
@@ -34,7 +34,7 @@ def _pack(A: Array, out: Array) -> None:
 def subtract_product(A: Array, B: Array, C: Array, upper: bool) -> None:
     """``C ← C - Aᵀ B`` for ``A`` ``(k, m)``, ``B`` ``(k, n)``, ``C`` ``(m, n)``.
 
-    With ``upper`` only the blocks on and above the diagonal of ``C``.
+    With ``upper``, only blocks on and above the diagonal of ``C`` are computed.
     """
     k, m = A.shape
     n = B.shape[1]

@@ -1,14 +1,13 @@
-"""Least squares over Gaussians of poses and points in space, each seen from one pose: submaps, and all that makes one.
+"""Least squares over Gaussians of 3-D poses and points, each relative to one pose (e.g. 3-D submaps).
 
-A step of odometry is such a map (its end, no points), a sighting is one (no pose, some points), a landmark submap is
-one (its end and its landmarks), and so is what a joiner has joined so far (the ends of many submaps and their
-landmarks). Each is a Gaussian in the frame of its base, in the chart that it names (:mod:`graphslam.core.charts`): its
-residual is
+Examples: an odometry step (its end, no points), an observation (no pose, some points), a landmark submap (its end and
+its landmarks), and a joined map (the ends of many submaps and their landmarks). Each is a Gaussian in the frame of its
+base, in a given chart (:mod:`graphslam.core.charts`): its residual is
 
     u = (w_k, V(w_k)⁻¹ (t_k - t̂_k), …, V(w_a)⁻¹ (l - l̂), …),      w_k = Log(R_k R̂_kᵀ),
 
-for all poses k and all points, a point with the turn of the pose a that it hangs on; poses and points as seen from the
-base. ``uᵀ I u`` is its share of the objective (no half), with the Cartesian information matrix I at the mean.
+for all poses k and all points, with the rotation of the anchor pose a of a point; poses and points are in the base
+frame. ``uᵀ I u`` is its part of the objective (no half), with the Cartesian information matrix I at the mean.
 
 Values are perturbed in the frame of the problem: ``R ← Exp(φ) R``, ``t ← t + τ``, ``l ← l + λ``.
 """
@@ -40,7 +39,7 @@ logger = logging.getLogger(__name__)
 Index = npt.NDArray[np.int64]
 
 ORIGIN = -1
-"""As a base: the frame of the problem itself. As an anchor: the base, so that a point is not turned."""
+"""As a base: the frame of the problem. As an anchor: the base, without rotation."""
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 _SHORTEST = 0.05
 
@@ -54,9 +53,9 @@ class SpaceMap:
     poses : (m, 7)
     points : (n, 3)
     anchors : (n,) int64
-        Row of ``poses`` on which each point hangs; :data:`ORIGIN`: on the base.
+        Row of ``poses`` that is the anchor of each point; :data:`ORIGIN`: the base.
     information : sparse (6 m + 3 n, 6 m + 3 n)
-        Of turns about the axes of the base [rad] and shifts [m], a pose after the other, then the points.
+        Of rotations about the axes of the base [rad] and translations [m], pose by pose, then the points.
     """
 
     poses: Array
@@ -68,15 +67,15 @@ class SpaceMap:
 
 @dataclass(frozen=True, eq=False)
 class PlacedMap:
-    """A map, and which unknowns of a problem it speaks of.
+    """A map, and its variables in a problem.
 
     Parameters
     ----------
     base : int
-        Pose of the problem from which it is seen, or :data:`ORIGIN`.
+        Pose of the problem that is its base, or :data:`ORIGIN`.
     poses : (m,) int64
     points : (n,) int64
-        A point may stand twice.
+        A point can be repeated.
     """
 
     map: SpaceMap
@@ -89,17 +88,17 @@ class PlacedMap:
         return self._seen(poses, points)[0]
 
     def linearise(self, poses: Array, points: Array) -> tuple[Array, sp.csr_matrix]:
-        """``u`` and its Jacobian on all unknowns of the problem ``(6 m + 3 n, 6 M + 3 N)``."""
+        """``u`` and its Jacobian with respect to all variables of the problem ``(6 m + 3 n, 6 M + 3 N)``."""
         u, seen = self._seen(poses, points)
         m, n, unknown = len(self.poses), len(self.points), 6 * len(poses)
         blocks = _Blocks()
         back, w, V, e = seen.back, seen.w, seen.V, seen.e
         if self.map.chart == "group":
-            curve = inverse_left_jacobian_slopes(seen.turn, e)  # of every position by the turn that it goes along
+            curve = inverse_left_jacobian_slopes(seen.turn, e)  # of every position by its rotation
             true = V
         else:
             curve, true = np.zeros((m + n, 3, 3)), so3_left_jacobian_inverse(w)
-        swing = true @ back  # of the turns of poses by their own φ; by the base's its negative
+        swing = true @ back  # of the rotations of poses by their own φ; negative for the base
         at = np.concatenate([6 * np.arange(m) + 3, 6 * m + 3 * np.arange(n)])  # rows of positions
         column = np.concatenate([6 * self.poses + 3, unknown + 3 * self.points])
         blocks.add(6 * np.arange(m), 6 * self.poses, swing)
@@ -140,7 +139,7 @@ class PlacedMap:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What residual and Jacobian share: rotation into the base, turns, and positions with what bends them."""
+    """Common terms of residual and Jacobian: rotation to the base, rotation residuals, positions and their factors."""
 
     back: Array
     w: Array
@@ -152,7 +151,7 @@ class _Seen:
 
 
 class _Blocks:
-    """3 × 3 blocks of a sparse matrix; blocks at one place add up."""
+    """3 × 3 blocks of a sparse matrix; blocks at the same place are added."""
 
     def __init__(self) -> None:
         self.rows: list[Index] = []
@@ -160,7 +159,7 @@ class _Blocks:
         self.values: list[Array] = []
 
     def add(self, rows: Index, columns: Index, blocks: Array) -> None:
-        """Blocks ``(b, 3, 3)`` that begin at ``rows`` and ``columns`` ``(b,)``."""
+        """Add blocks ``(b, 3, 3)`` at ``rows`` and ``columns`` ``(b,)``."""
         k = np.arange(3)
         shape = (len(rows), 3, 3)
         self.rows.append(np.broadcast_to(rows[:, None, None] + k[:, None], shape).ravel())
@@ -204,7 +203,7 @@ def normal_equations(maps: Sequence[PlacedMap], poses: Array, points: Array) -> 
 
 @dataclass(frozen=True)
 class SpaceMinimum:
-    """What :func:`minimise_space_maps` found: values, objective there, Gauss–Newton matrix there, and how it ended."""
+    """Result of :func:`minimise_space_maps`: values, objective and Gauss–Newton matrix there, and convergence."""
 
     poses: Array
     points: Array
@@ -217,7 +216,7 @@ class SpaceMinimum:
 def minimise_space_maps(
     maps: Sequence[PlacedMap], poses: Array, points: Array, *, rtol: float = 1e-12, max_iterations: int = 60
 ) -> SpaceMinimum:
-    """Damped Gauss–Newton; it ends when the decrease that the linear model promises is below ``rtol · max(f, 1)``."""
+    """Damped Gauss–Newton; it ends when the predicted decrease of the linear model is below ``rtol · max(f, 1)``."""
     from graphslam.linear.symmetric_factor import SymmetricFactor
 
     f, g, H = normal_equations(maps, poses, points)
@@ -243,7 +242,7 @@ def minimise_space_maps(
             damping = 0.0 if damping < 1e-6 else damping / 10.0
             converged = small and damping == 0.0
         elif small and damping == 0.0:
-            converged = True  # what is promised is below what the objective resolves
+            converged = True  # the predicted decrease is below the rounding error of the objective
         else:
             damping = max(10.0 * damping, 1e-5)
             if damping > 1e12:

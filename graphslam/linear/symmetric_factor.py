@@ -1,7 +1,7 @@
-"""Sparse symmetric positive-definite systems of any kind, and fill-reducing elimination orders.
+"""General sparse symmetric positive-definite systems, and fill-reducing elimination orders.
 
-SuperLU in symmetric mode (diagonal pivots, minimum degree on ``A + Aᵀ``) serves as the sparse Cholesky of matrices that
-are solved once. The joiners and the batch solver factorise the same blocks many times and take only the order from here
+SuperLU in symmetric mode (diagonal pivots, minimum degree on ``A + Aᵀ``) is used as sparse Cholesky of matrices that
+are solved once. Map joining and the batch solver factorise one pattern many times; they use only the order
 (:mod:`~graphslam.linear.block_cholesky`).
 """
 
@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 
 Index = npt.NDArray[np.intp]
 
-# Right-hand sides solved at once: 64 columns of a 10⁴ system are 5 MB, beyond which nothing is gained.
+# Right-hand sides solved at once: 64 columns of a 10⁴ system are 5 MB; more are not faster.
 _COLUMNS = 64
 
 
@@ -57,7 +57,8 @@ class SymmetricFactor:
         return np.asarray(self._lu.solve(np.asarray(rhs, dtype=np.float64)))
 
     def inverse_block(self, indices: npt.ArrayLike) -> Array:
-        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹`` by sparse solves; never the whole inverse (Algorithm 1)."""
+        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹`` by sparse solves, without the whole inverse (Algorithm
+        1)."""
         ix = np.asarray(indices, dtype=np.intp)
         block = np.empty((len(ix), len(ix)))
         for first in range(0, len(ix), _COLUMNS):
@@ -68,7 +69,7 @@ class SymmetricFactor:
         return 0.5 * (block + block.T)
 
     def inverse_diagonal_blocks(self, first: npt.ArrayLike, width: int) -> Array:
-        """Blocks ``(k, width, width)`` of ``A⁻¹`` on the diagonal that begin at ``first`` ``(k,)``."""
+        """Blocks ``(k, width, width)`` of ``A⁻¹`` on the diagonal that start at ``first`` ``(k,)``."""
         at = np.asarray(first, dtype=np.intp)
         blocks = np.zeros((len(at), width, width))
         some = max(1, _COLUMNS // width)
@@ -89,7 +90,7 @@ def elimination_order(rows: Index, columns: Index, n: int) -> Index:
     Parameters
     ----------
     rows, columns : (k,)
-        Repeated entries are welcome.
+        Entries can be repeated.
 
     Returns
     -------
@@ -99,6 +100,6 @@ def elimination_order(rows: Index, columns: Index, n: int) -> Index:
     ones = np.ones(len(rows))
     pattern = sp.csc_matrix((ones, (rows, columns)), shape=(n, n))
     pattern = sp.csc_matrix(pattern + pattern.T)
-    # Values are free as long as no pivot vanishes: make the diagonal dominant.
+    # Any values without a zero pivot are fine: make the diagonal dominant.
     dominant = np.asarray(pattern.sum(axis=0)).ravel() + 1.0
     return SymmetricFactor(sp.csc_matrix(pattern + sp.diags(dominant, format="csc"))).order

@@ -9,7 +9,7 @@ from typing import Any
 from graphslam.core.errors import ConfigError
 
 LEAST_POINTS = 20
-"""Source and target of a registration need so many points, and so many pairs must be left."""
+"""Least number of points in source and target of a registration, and of pairs."""
 
 
 def _check(config: Any, *, zero: tuple[str, ...] = ()) -> None:
@@ -24,29 +24,28 @@ def _check(config: Any, *, zero: tuple[str, ...] = ()) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationGates:
-    """What a match must have to be accepted. A false one does more harm than ten right ones do good.
+    """Acceptance limits of a match. They are strict, because a false match does more harm than ten true ones do good.
 
     Parameters
     ----------
     fitness : float
-        Least share of *all* source points with a neighbour. A source that reaches out of the map fails it.
+        Least share of *all* source points with a neighbour. A source that extends beyond the map fails it.
     fitness_alone : float
-        The same where there is no ``fitness_upright`` to go by: in two dimensions, and with hardly any such points.
+        The same without ``fitness_upright``: in 2-D, and with too few such points.
     fitness_known : float
-        Least share of the source points in known space with a neighbour; stands for ``fitness`` where the caller says
-        which space is known. Wrong matches pass it far more often: what they do not meet, they leave.
+        Least share of the source points in known space with a neighbour; replaces ``fitness`` if the caller gives the
+        known space. False matches pass it far more often, because points outside known space are ignored.
     fitness_upright : float
-        Least share of the source points on upright surfaces with a neighbour, in three dimensions; what tells a right
-        match from a wrong one best. 0 for frames whose z axis is not up.
+        Least share of the source points on upright surfaces with a neighbour, in 3-D; the best criterion for false
+        matches. 0 for frames whose z axis is not up.
     known_share : float
-        Least share of the source points that fall into known space, where the caller says which that is.
+        Least share of the source points in known space, if the caller gives it.
     degeneracy : float
-        Least ratio of the translational eigenvalues; see :mod:`~graphslam.registration.degeneracy`. Three dimensions.
+        Least ratio of the translational eigenvalues; see :mod:`~graphslam.registration.degeneracy`. 3-D.
     degeneracy_planar : float
-        The same in two dimensions.
+        The same in 2-D.
     tilt : float
-        Greatest angle between the z axes of two frames that should both stand upright [rad]; π for frames that do
-        not.
+        Largest angle between the z axes of two frames that should both be upright [rad]; π for other frames.
     """
 
     fitness: float = 0.75
@@ -64,24 +63,24 @@ class RegistrationGates:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationConfig:
-    """How a registration is done; see :func:`graphslam.registration.register.register`.
+    """Configuration of a registration; see :func:`graphslam.registration.register.register`.
 
     Parameters
     ----------
     radii : tuple of float
-        Greatest distances of a pair, stage by stage [m].
+        Largest distance of a pair, per stage [m].
     iterations : int
-        At most, a stage.
+        Most iterations per stage.
     near : float
         A source point has a neighbour if one is nearer than this [m].
     max_shift, max_turn : float
-        A result farther from its start is refused [m, rad]: it is another place than the one asked about.
+        A result farther from its start is rejected [m, rad].
     covariance_scale : float
-        Of the inverse Hessian with the noise that the pairs show; calibrated in halls, whatever the noise, the bins and
-        the number of points (docs/notes/registration.md). Three dimensions.
+        Factor on the inverse Hessian with the noise estimated from the pairs; calibrated in simulated halls for any
+        noise, bins and number of points (docs/notes/registration.md). 3-D.
     floor_sigma, floor_turn : float
-        σ added to the covariance, per axis [m, rad]: what is wrong with the map itself. The defaults are for maps whose
-        scans are placed to 2 cm and 2 mrad; for 30 m of dead reckoning 5 cm and 5 mrad fit.
+        σ added to the covariance, per axis [m, rad], for errors of the map. The defaults are for maps with scan poses
+        accurate to 2 cm and 2 mrad; for 30 m of dead reckoning use 5 cm and 5 mrad.
     """
 
     radii: tuple[float, ...] = (2.0, 0.5)

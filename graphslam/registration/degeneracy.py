@@ -1,8 +1,8 @@
 """Directions that a match does not determine: along a corridor, around a round room.
 
-A matcher that pairs each point with its nearest neighbour finds *some* place along a corridor and is then as content as
-anywhere. The Hessian tells: its least eigenvalue is small (Zhang, Kaess and Singh 2016, "On degeneracy of
-optimization-based state estimation problems"), once what pairs and noisy normals feign is taken off it.
+Matching with nearest neighbours converges at *some* place along a corridor. The Hessian shows the degeneracy: its least
+eigenvalue is small (Zhang, Kaess and Singh 2016, "On degeneracy of optimization-based state estimation problems"),
+after spurious information from pairs and noisy normals is subtracted.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from graphslam.registration.target import flat_shapes
 
 @dataclass(frozen=True, slots=True)
 class Degeneracy:
-    """Of the translational part of a Hessian.
+    """Degeneracy of the translational part of a Hessian.
 
     Parameters
     ----------
     ratio : float
-        Least eigenvalue over the greatest, 0 … 1; 0 where nothing was matched.
+        Least eigenvalue over the largest, 0 … 1; 0 without a match.
     eigenvalues : (dim,)
-        Rising.
+        Ascending.
     directions : (dim, dim)
         Column k belongs to eigenvalue k: a unit vector in the source frame.
     """
@@ -36,12 +36,12 @@ class Degeneracy:
 
     @property
     def weakest(self) -> Array:
-        """Direction ``(dim,)`` that is held least, in the source frame."""
+        """Least determined direction ``(dim,)`` in the source frame."""
         return self.directions[:, 0]
 
 
 def translation_of(dim: int) -> slice:
-    """Where the translation stands in a tangent vector: behind the rotation in 3-D, before it in 2-D."""
+    """Indices of the translation in a tangent vector: after the rotation in 3-D, before it in 2-D."""
     return slice(0, 2) if dim == 2 else slice(3, 6)
 
 
@@ -56,17 +56,17 @@ def translational_degeneracy(hessian: Array, dim: int) -> Degeneracy:
 def noise_induced_information(
     source: Array, rotation: Array, normals: tuple[Array, Array], noise: tuple[Array, Array]
 ) -> Array:
-    """The part of a Hessian that holds nothing, though it looks as if it did.
+    """The spurious part of a Hessian.
 
-    Two things feign. A pair of flat shapes, of variance 1 along each, holds even their common plane, with weight ½; but
-    the points of a surface are not the same ones when it is scanned again. And normals are noisy: in a corridor they
-    are tilted along it at random, which adds up to what looks like a weak hold. With the pair's normal m ± δ and its
-    weight w, the Hessian has ``w (m mᵀ + cov δ)`` on average where it ought to have ``w m mᵀ``.
+    It has two causes. A pair of flat shapes, with variance 1 along each, constrains even motion in the common plane,
+    with weight ½; but repeated scans do not hit the same points of a surface. And normals are noisy: in a corridor
+    their random tilts add up to spurious information along it. With the pair's normal m ± δ and its weight w, the
+    Hessian has ``w (m mᵀ + cov δ)`` on average in place of ``w m mᵀ``.
 
     Parameters
     ----------
     source : (m, dim)
-        Points that have a pair, source frame.
+        Paired points, source frame.
     rotation : (dim, dim)
         Source to target.
     normals : two of (m, dim)
@@ -77,8 +77,8 @@ def noise_induced_information(
     Returns
     -------
     (d, d)
-        ``Σ Jᵀ (½ I + w cov δ) J``, J as for the Hessian: ``R [-[p]×, I]`` (right tangent, rotation first) or, in two
-        dimensions, ``R [I, p⊥]``.
+        ``Σ Jᵀ (½ I + w cov δ) J``, with J of the Hessian: ``R [-[p]×, I]`` (right tangent, rotation first) or, in 2-D,
+        ``R [I, p⊥]``.
     """
     dim = source.shape[1]
     partners = normals[1] @ rotation  # in the source frame, as everything below
@@ -111,17 +111,15 @@ def calibrated_covariance(
     Parameters
     ----------
     information : (d, d)
-        Hessian in the right tangent, without what is feigned.
+        Hessian in the right tangent, without its spurious part.
     scale : float
-        Of the inverse: pairs are neither independent, nor is their noise the one assumed.
+        Factor on the inverse: pairs are not independent, and their noise differs from the model.
     sigma : (float, float)
-        σ of translation [m] and rotation [rad] that no number of pairs gets below: what the two clouds have in common
-        that is wrong.
+        Lower limit of σ of translation [m] and rotation [rad] for any number of pairs: common errors of the clouds.
     unknown : (float, float)
-        σ of translation and rotation before the match: no direction is known less well than that.
+        σ of translation and rotation before the match: upper limit in all directions.
     threshold : float
-        Directions of translation with less than this share of the greatest eigenvalue were not measured, and are as
-        unknown as before.
+        Translations with an eigenvalue below this share of the largest count as not measured, and keep their prior σ.
 
     Returns
     -------
@@ -137,13 +135,13 @@ def calibrated_covariance(
         return v
 
     values, vectors = np.linalg.eigh(0.5 * (information + information.T) / scale)
-    # what was feigned is an average: a little more than there was may have been taken off
+    # the spurious part is an average and can exceed the actual one: clip at 0
     held = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.diag(1.0 / per_axis(unknown))
     found = translational_degeneracy(information, dim)
     cov = np.linalg.inv(held) + np.diag(per_axis(sigma))
     for k in np.flatnonzero(found.eigenvalues < threshold * found.eigenvalues[-1]):
         axis = np.zeros(d)
         axis[move] = found.directions[:, k]
-        # no more than was unknown before, whatever the rest of the covariance has along that axis
+        # prior variance along that axis, whatever the covariance has there
         cov += max(unknown[0] ** 2 - float(axis @ cov @ axis), 0.0) * np.outer(axis, axis)
     return 0.5 * (cov + cov.T)

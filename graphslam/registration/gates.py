@@ -1,8 +1,8 @@
-"""The gates of a match between two maps, in one place: front ends and loop closures ask the same questions.
+"""Acceptance gates of a match between two maps, used by front ends and loop closures.
 
-:class:`~graphslam.registration.config.RegistrationGates` are those of a registration by itself. Here are the ones that
-need to know more: where the match was expected, and what else was found in the same map. A false match does more harm
-than ten right ones do good; so a match that fails any of them is refused, and the words say which and by how much.
+:class:`~graphslam.registration.config.RegistrationGates` are the gates of a single registration. The gates here also
+use the prediction of the match and competing matches in the same map. A false match does more harm than ten true ones
+do good; so a match that fails any gate is rejected, with a message that names the gate and the value.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from graphslam.registration.config import RegistrationConfig
 from graphslam.registration.register import Registration, failed_gates
 
 VAGUE_POSITION = 0.4
-"""A match is refused whose own σ is above this in some direction [m]: nothing holds it there …"""
+"""A match is rejected if its σ is above this in any direction [m] …"""
 VAGUE_ANGLE = 0.04
 """… or above this about some axis [rad]."""
 
 
 class MatchLimits(Protocol):
-    """What the gates are set to; see :class:`MatchGates`."""
+    """Values of the gates; see :class:`MatchGates`."""
 
     @property
     def fitness(self) -> float: ...
@@ -45,22 +45,22 @@ class MatchLimits(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchGates:
-    """Gates of a match between two maps, beside those of its registration.
+    """Gates of a match between two maps, in addition to those of its registration.
 
     Parameters
     ----------
     fitness : float
-        Least share of the points that the match explains.
+        Least share of explained points.
     fitness_upright : float
-        The same of the points on upright surfaces, where known.
+        The same for points on upright surfaces, if known.
     height : float
-        The match is no farther above or below the prediction [m].
+        Largest vertical distance from the prediction [m].
     shift : float
-        … and horizontally no farther from it than this many σ; infinite where a χ² of the whole pose is asked instead.
+        Largest horizontal distance from the prediction, in σ; infinite if a χ² test of the whole pose is used instead.
     margin : float
-        A second mode must be worse by this share of the points.
+        A second mode must have a lower share of explained points by this difference …
     mode_distance : float
-        … if it is farther off than this [m].
+        … if its distance is larger than this [m].
     """
 
     fitness: float = 0.83
@@ -84,15 +84,15 @@ def shift_between(T: ArrayLike, T_prior: ArrayLike) -> float:
 
 
 def height_between(T: ArrayLike, T_prior: ArrayLike) -> float:
-    """Vertical distance between two poses [m]; 0 in two dimensions."""
+    """Vertical distance between two poses [m]; 0 in 2-D."""
     a, b = np.asarray(T), np.asarray(T_prior)
     return float(abs(a[2] - b[2])) if len(a) == 7 else 0.0
 
 
 def tilt_between(T: ArrayLike, T_prior: ArrayLike) -> float:
-    """Angle between the verticals of two poses [rad]; 0 in two dimensions.
+    """Angle between the z axes of two poses [rad]; 0 in 2-D.
 
-    Of a match and its prediction, not of a body and a map: a body on a ramp is tilted where the match is right.
+    For a match and its prediction, not for a body and a map: a body on a ramp is correctly tilted.
     """
     if len(np.asarray(T)) == 3:
         return 0.0
@@ -112,22 +112,22 @@ def failed_match_gates(
     rise: float = 0.0,
     ask_vague: bool = True,
 ) -> list[str]:
-    """The gates that a match fails, in words; empty for one that is accepted.
+    """Messages of the failed gates of a match; empty if it is accepted.
 
     Parameters
     ----------
     T_prior : (7,) or (3,)
-        Where it was expected.
+        Prediction.
     rules : RegistrationConfig
-        Whose own gates are asked too; their tilt is that against the prediction.
+        Its gates are applied, too; their tilt is relative to the prediction.
     sigma : float
         σ of the prediction, horizontally [m].
     margin : float
         See :func:`match_margins`.
     rise : float
-        What heights may be off by besides ``limits.height`` [m].
+        Tolerance of heights in addition to ``limits.height`` [m].
     ask_vague : bool
-        Whether the registration's own σ are asked.
+        Whether the σ of the registration are tested.
     """
     at = found.T_target_source
     g = group_of(at)
@@ -138,7 +138,7 @@ def failed_match_gates(
     fitness = found.best_fitness
     if fitness < limits.fitness and not any("fitness" in f for f in fails):
         fails.append(f"fitness {fitness:.3f} < {limits.fitness:g}")
-    if found.fitness_upright < limits.fitness_upright and not any("upright" in f for f in fails):  # NaN is not
+    if found.fitness_upright < limits.fitness_upright and not any("upright" in f for f in fails):  # NaN passes
         fails.append(f"fitness of upright surfaces {found.fitness_upright:.3f} < {limits.fitness_upright:g}")
     if (off := height_between(at, T_prior)) > (height := limits.height + rise):
         fails.append(f"height {off:.2f} m > {height:g}")
@@ -153,15 +153,15 @@ def failed_match_gates(
 
 
 def match_margins(found: Sequence[Registration], maps: npt.ArrayLike, apart: float) -> Array:
-    """Fitness of each match less that of the best one in the same map ``apart`` [m] or more from it ``(m,)``.
+    """Fitness of each match minus that of the best one in the same map at least ``apart`` [m] away ``(m,)``.
 
-    1 where there is no other. Results that are no results do not compete.
+    1 if there is no other. Failed registrations are ignored.
 
     Parameters
     ----------
     found : sequence of m Registration
     maps : (m,) int
-        Which map each was matched to.
+        Map of each match.
     """
     m = len(found)
     out = np.ones(m)

@@ -9,7 +9,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.registration.config import RegistrationConfig, RegistrationGates
 from graphslam.registration.gates import MatchGates
 
-# Maps of submaps are bent by what drifts inside them, and their surroundings reach out of each other's.
+# Maps of submaps are distorted by drift inside them, and their surroundings extend beyond each other's.
 _RULES = RegistrationConfig(
     floor_sigma=0.05,
     floor_turn=0.01,
@@ -19,46 +19,46 @@ _RULES = RegistrationConfig(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairConfig:
-    """How two submaps are matched."""
+    """Configuration of matching two submaps."""
 
     radius: float = 15.0
-    """The source are occupied voxels so near to its place, horizontally [m]."""
+    """Source: occupied voxels within this horizontal distance of the place [m] …"""
     height: float = 6.0
-    """… and vertically [m]."""
+    """… and within this vertical distance [m]."""
     source_points: int = 1500
-    """At most so many of them are registered; a search takes fewer."""
+    """Most source points of a registration; a search uses fewer."""
     cloud_level: int = 1
-    """Cells of 2**level voxels, in which a map's occupied voxels are gathered."""
+    """Occupied voxels are averaged in cells of 2**level voxels."""
     grid: float = 0.8
-    """Steps of the search in position [m]; its modes are then looked at in quarters of them."""
+    """Position step of the search [m]; its modes are refined with a quarter of it."""
     field_sigma: float = 0.3
-    """σ of the distance to the map within which a point counts as explained [m]; twice that in the first look."""
+    """σ of the distance to the map for an explained point [m]; twice that in the coarse search."""
     yaw_step: float = 0.1
-    """Steps in heading [rad], and quarters of them."""
+    """Heading step [rad]; refined with a quarter of it."""
     sigmas: float = 3.0
     """Half widths of the search in σ of the prediction …"""
     least: tuple[float, float, float] = (1.5, 0.8, 0.1)
-    """… no less than this: position, height [m], heading [rad] …"""
+    """… with a lower limit: position, height [m], heading [rad] …"""
     most: tuple[float, float, float] = (30.0, 3.0, math.pi)
-    """… and no more."""
+    """… and an upper limit."""
     starts: int = 8
-    """Distinct places handed to the registration, at most."""
+    """Most places that are passed to the registration."""
     least_score: float = 0.5
-    """Places that explain less of the points in the search are not registered."""
+    """Least share of explained points in the search for a registration …"""
     score_margin: float = 0.2
-    """… nor those that score so much less than the best."""
+    """… and largest difference of the score to the best."""
     registration: RegistrationConfig = _RULES
-    """Its gates and the floor of its covariance."""
+    """Gates and covariance floor of the registration."""
     gates: MatchGates = field(default_factory=lambda: MatchGates(fitness=0.78, shift=math.inf))
-    """Beside those of the registration."""
+    """Additional gates."""
     contradiction: float = 0.05
-    """Greatest share of what one map has occupied and the other knows that the other has free."""
+    """Largest share of contradicting voxels: occupied in one map and free in the other."""
     chi2_level: float = 0.999
-    """A match is refused that the prediction contradicts with this confidence."""
+    """A match outside this confidence region of the prediction is rejected."""
     inflation: float = 1.0
     """Factor on the covariance of a match, floor included."""
     loose: bool = True
-    """Keep matches that one direction does not hold (a corridor), with the prediction's own σ along it; else refuse
+    """Keep matches with one undetermined direction (a corridor), with the prediction's σ along it; otherwise reject
     them."""
 
     def __post_init__(self) -> None:

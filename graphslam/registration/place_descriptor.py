@@ -1,13 +1,13 @@
-"""What a place looks like from above, whichever way one stands in it: for finding it again when the drift is too large.
+"""Rotation-invariant place descriptors from the top view, for place recognition after a large drift.
 
-The surroundings of a place are divided in rings and sectors. Each bin holds how much of a band of heights is occupied
-there (walls, pillars, cars, not floors or ceilings), and whether the map knows the bin at all. Two places are compared
-at all turns at once by a masked normalised correlation over the bins that both know (Padfield 2012, "Masked object
-registration in the Fourier domain"), the sectors by FFT; the layout is that of Scan Context (Kim and Kim 2018), which
-takes the greatest height instead, and that is the ceiling wherever there is one.
+The surroundings of a place are divided into rings and sectors. Each bin contains the occupied share of a height band
+(walls, pillars, cars, not floors or ceilings), and whether the bin is known. Two places are compared at all headings at
+once by a masked normalised correlation over the bins known to both (Padfield 2012, "Masked object registration in the
+Fourier domain"), the sectors by FFT; the layout is that of Scan Context (Kim and Kim 2018), which uses the largest
+height instead; indoors that is the ceiling.
 
-Buildings repeat themselves, and so do such descriptors: what looks most alike is a place to *try*, with registration,
-gates and the rest of the graph to judge it.
+Buildings are repetitive, and so are such descriptors: the most similar place is only a *candidate*, to be tested by
+registration, gates and the graph.
 """
 
 from __future__ import annotations
@@ -30,26 +30,27 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DescriptorConfig:
-    """Bins of a descriptor, and how descriptors are compared."""
+    """Bins of a descriptor, and parameters of the comparison."""
 
     radius: float = 21.0
-    """Of the outermost ring [m]."""
+    """Radius of the outermost ring [m]."""
     rings: int = 14
     sectors: int = 72
     low: float = -0.4
-    """The band of heights begins here, relative to the place [m] …"""
+    """Lower limit of the height band, relative to the place [m] …"""
     high: float = 1.6
-    """… and ends here [m]; no more in two dimensions."""
+    """… and upper limit [m]; not used in 2-D."""
     layer: float = 0.2
-    """Layers in which it is looked at [m]."""
+    """Height of the layers in the band [m]."""
     blur: float = 0.7
-    """σ in bins, along and across: places found again are not the same to the metre."""
+    """Smoothing σ in bins, radially and along the sectors: tolerance for different positions."""
     known: float = 0.6
-    """Two places are compared if both know this share of the bins that the one knows which knows fewer …"""
+    """Two places are compared if both know at least this share of the bins that the place with fewer known bins has
+    …"""
     least: int = 40
-    """… and so many."""
+    """… and at least this number."""
     shortlist: int = 200
-    """Places whose rings agree best with those of a place are compared with it, the others are not."""
+    """Number of places with the most similar ring keys that are compared."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -62,14 +63,14 @@ class DescriptorConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceDescriptors:
-    """Of many places.
+    """Descriptors of many places.
 
     Parameters
     ----------
     values : (n, rings, sectors)
-        Share of the band that is occupied, 0 where unknown.
+        Occupied share of the band; 0 if unknown.
     known : (n, rings, sectors)
-        Whether the map knows the bin, 0 … 1.
+        Whether the bin is known, 0 … 1.
     """
 
     values: Array
@@ -80,8 +81,7 @@ class PlaceDescriptors:
         return len(self.values)
 
     def ring_keys(self) -> Array:
-        """What does not depend on the heading: mean of each ring over its known bins, weighted by their share
-        ``(n, rings)``."""
+        """Rotation-invariant keys: mean of each ring over its known bins, weighted by their share ``(n, rings)``."""
         some = self.known.sum(axis=2)
         return np.asarray(self.values.sum(axis=2) / np.maximum(some, 1e-9) * np.sqrt(some / self.known.shape[2]))
 
@@ -94,9 +94,9 @@ def describe_places(
     Parameters
     ----------
     view : DenseMapView or None
-        None: a submap without a dense map, whose places know nothing.
+        None: a submap without a dense map; all bins are unknown.
     T_base_place : (n, 7) or (n, 3)
-        In the frame of the map. Roll and pitch are left out: only the heading turns the sectors.
+        In the frame of the map. Roll and pitch are ignored.
     """
     c = DescriptorConfig() if config is None else config
     T = remove_roll_pitch(np.asarray(T_base_place, dtype=np.float64))
@@ -111,7 +111,7 @@ def describe_places(
     shape = (len(T), c.rings, c.sectors)
     layers = max(round((c.high - c.low) / c.layer), 1) if g.dim == 3 else 1
     values, known = np.zeros(shape), np.zeros(shape)
-    # where the map is asked whether it knows a bin: its middle, in the middle of the band
+    # a bin is known if its centre is known, at the middle height of the band
     r = (np.arange(c.rings) + 0.5) * c.radius / c.rings
     a = (np.arange(c.sectors) + 0.5) * 2.0 * math.pi / c.sectors - math.pi
     asked = np.zeros((c.rings, c.sectors, g.dim))
@@ -137,7 +137,7 @@ def describe_places(
 
 
 def concatenate_descriptors(parts: list[PlaceDescriptors]) -> PlaceDescriptors:
-    """Descriptors of several maps, one after the other."""
+    """Concatenated descriptors of several maps."""
     return PlaceDescriptors(
         np.concatenate([d.values for d in parts]), np.concatenate([d.known for d in parts]), parts[0].config
     )
@@ -146,24 +146,24 @@ def concatenate_descriptors(parts: list[PlaceDescriptors]) -> PlaceDescriptors:
 def descriptor_similarity(
     query: PlaceDescriptors, which: int, others: PlaceDescriptors, rows: Ints
 ) -> tuple[Array, Array]:
-    """Correlation of one place with others at the turn that suits each best, −1 … 1, and that turn [rad].
+    """Correlation of one place with others at the best heading for each, −1 … 1, and that heading [rad].
 
     Parameters
     ----------
     which : int
-        A row of it.
+        Row of the query.
     rows : (m,) int
-        Of ``others``.
+        Rows of ``others``.
 
     Returns
     -------
     correlation : (m,)
-        −1 where too few bins are known to both.
+        −1 if too few bins are known to both.
     turn : (m,)
         Heading of the query's frame in that of the other.
     """
     c = query.config
-    # sums over rings, at all turns of the query: Σ_s other[s + t] query[s] = irfft(conj(F_query) F_other)
+    # sums over rings, at all rotations of the query: Σ_s other[s + t] query[s] = irfft(conj(F_query) F_other)
     a, m_a = others.values[rows], others.known[rows]
     b, m_b = query.values[which], query.known[which]
     F = [np.fft.rfft(x, axis=-1) for x in (a, a * a, m_a)]
@@ -189,7 +189,7 @@ def descriptor_similarity(
 
 
 def _bins(points: Array, c: DescriptorConfig, layers: int) -> Array:
-    """Share of the layers of the band that are occupied, by ring and sector."""
+    """Occupied share of the layers of the band, by ring and sector."""
     ring = np.floor(np.hypot(points[:, 0], points[:, 1]) * c.rings / c.radius).astype(np.int64)
     sector = np.floor((np.arctan2(points[:, 1], points[:, 0]) + math.pi) * c.sectors / (2.0 * math.pi)).astype(np.int64)
     layer = np.zeros(len(points), np.int64)

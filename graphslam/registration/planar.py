@@ -1,7 +1,7 @@
-"""Generalised ICP in two dimensions (Segal, Haehnel and Thrun 2009, eq. 2), all pairs at once.
+"""Generalised ICP in 2-D (Segal, Haehnel and Thrun 2009, eq. 2), vectorised over all pairs.
 
-In the plane z = 0 of three dimensions the surface through any points is that plane itself, and a matcher made for three
-would hold nothing in it. Here the shape of a point is a line.
+A 3-D matcher does not work for points in the plane z = 0, because their surface is that plane. Here the local shape of
+a point is a line.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graphslam.registration.target import Target
 
 @dataclass(frozen=True, slots=True)
 class PlanarAlignment:
-    """How an iterative matcher ended.
+    """Result of an iterative matcher.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class PlanarAlignment:
 def linearise_alignment(source: Target, target: Target, T: Array, radius: float) -> tuple[Array, Array, float, int]:
     """Hessian ``(3, 3)``, gradient ``(3,)``, half squared error and number of pairs nearer than ``radius`` at ``T``.
 
-    ``e = ½ Σ dᵀ M d`` with ``d = T p - q`` and ``M = (C_q + R C_p Rᵀ)⁻¹``; ``M`` is held fixed.
+    ``e = ½ Σ dᵀ M d`` with ``d = T p - q`` and ``M = (C_q + R C_p Rᵀ)⁻¹``; ``M`` is constant.
     """
     moved = se2.se2_transform(T, source.points)
     distance, which = target.tree.query(moved, distance_upper_bound=radius)
@@ -69,12 +69,12 @@ def align_planar(
     rotation_epsilon: float,
     translation_epsilon: float,
 ) -> PlanarAlignment:
-    """Gauss-Newton steps from ``T (3,)``, pairs found anew at each; a matrix that is singular ends it."""
+    """Gauss-Newton steps from ``T (3,)`` with new pairs at each step; ends at a singular matrix."""
     H, b, error, pairs = linearise_alignment(source, target, T, radius)
     for _ in range(iterations):
         if not pairs:
             break
-        # a little damping, so that a direction that is not held at all stays where it is
+        # slight damping: undetermined directions do not move
         step = -np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(3), b)
         T = se2.se2_compose(T, se2.se2_exp(step))
         H, b, error, pairs = linearise_alignment(source, target, T, radius)

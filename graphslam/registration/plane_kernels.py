@@ -1,4 +1,4 @@
-"""Numba kernels of points on planes: surface directions, residuals and their blocks. Plain arrays only."""
+"""Numba kernels of point-to-plane pairs: surface normals, residuals and Hessian blocks. Plain arrays only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Index = npt.NDArray[np.int64]
 
 
 class PlanePairs(NamedTuple):
-    """Source points on surfaces of other steps.
+    """Pairs of source points and surfaces of other steps.
 
     Parameters
     ----------
@@ -40,15 +40,15 @@ def fit_surfaces(
     ----------
     points : (q, d)
     neighbours : (k, m)
-        Rows of ``points`` near each of k points; -1 where there are none.
+        Rows of ``points`` near each of k points; -1 if there are fewer.
     least : int
-        Neighbours that a surface needs.
+        Least number of neighbours of a surface.
     out_normal : (k, d)
     out_flat : (k, 3)
-        Eigenvalues of the covariance, ascending, in 2-D the first one twice; all nan where there are too few.
+        Eigenvalues of the covariance, ascending, in 2-D the first one twice; all nan with too few neighbours.
     out_tilt : (k, d - 1, d)
-        Axes of the surface, each as long as the σ by which the normal is tilted towards it [rad]: the slope of a plane
-        through n points of variance ``σ²`` has the variance ``σ² / (n l)``, l being their own along the axis.
+        Axes of the surface, scaled with the σ of the normal's tilt towards them [rad]: the slope of a plane through n
+        points of variance ``σ²`` has the variance ``σ² / (n l)``, where l is their variance along the axis.
     """
     d = points.shape[1]
     for k in range(len(neighbours)):
@@ -115,19 +115,19 @@ def plane_residuals(pairs: PlanePairs, R: Array, t: Array, points: Array, normal
 
 
 class GroupInformation(NamedTuple):
-    """What groups of pairs hold of the motion between their two sides.
+    """Information of groups of pairs on the motion between their two sides.
 
     Parameters
     ----------
     group : (k,)
-        Of each pair.
+        Group of each pair.
     centre : (m, d)
-        Of each group, world [m].
+        Centre of each group, world [m].
     share : (m, w, w)
-        Takes the derivative of a residual by a motion of all source points about the centre, in the axes of the world
-        and in the order of a tangent, to that part of it which the group holds.
+        Projects the derivative of a residual by a motion of all source points about the centre (world axes, tangent
+        order) to the part that the group determines.
     tilts : (q, d - 1, d)
-        Of :func:`fit_surfaces`, in the frame of the step: what they pull on average is taken off the gradient.
+        Of :func:`fit_surfaces`, in the frame of the step: their mean effect is subtracted from the gradient.
     """
 
     group: Index
@@ -137,7 +137,7 @@ class GroupInformation(NamedTuple):
 
 
 def no_noise_correction(dim: int) -> GroupInformation:
-    """Pairs that hold all that they say."""
+    """No correction for noise of normals."""
     w = 6 if dim == 3 else 3
     return GroupInformation(
         np.zeros(0, np.int64), np.zeros((0, dim)), np.zeros((0, w, w)), np.zeros((0, dim - 1, dim), np.float32)
@@ -166,7 +166,7 @@ def group_information(
     H: Array,
     F: Array,
 ) -> None:
-    """Add what pairs say of the motion between the sides of their group, and what noise of normals feigns of that.
+    """Add the information of pairs on the motion between the sides of their group, and its part from noisy normals.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def group_information(
 
 @njit(fastmath={"contract"})
 def _moved(K: Array, R: Array, t: Array, centre: Array, sign: float, out: Array) -> None:
-    """A derivative by a motion about a centre, world, as one by the right tangent of a pose."""
+    """Convert a derivative by a motion about a centre (world frame) to one by the right tangent of a pose."""
     d = len(t)
     if d == 3:
         a, b, c = t[0] - centre[0], t[1] - centre[1], t[2] - centre[2]
@@ -246,19 +246,19 @@ def plane_blocks(
     H: Array,
     g: Array,
 ) -> float:
-    """Add the Gauss–Newton blocks of point-to-plane pairs; the weighted sum of squares.
+    """Add the Gauss–Newton blocks of point-to-plane pairs; returns the weighted sum of squares.
 
     Parameters
     ----------
     poses : (R, t)
     surfaces : (points, normals)
     information : (k,)
-        Of each residual, weights included.
+        Of each residual, including weights.
     slots : (first, offset, rank)
-        ``first[n]`` is where the diagonal block of step n begins in ``H``, ``offset[k]`` where the block of the two
-        steps of pair k does; its rows are those of the step with the lower ``rank``.
+        ``first[n]`` is the offset of the diagonal block of step n in ``H``, ``offset[k]`` that of the block of the two
+        steps of pair k; its rows are those of the step with the lower ``rank``.
     held : GroupInformation
-        Without groups pairs hold all that they say.
+        Without groups there is no correction.
     H : flat
         Blocks ``(w, w)``, row-major.
     g : (n, w)

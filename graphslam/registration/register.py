@@ -1,8 +1,8 @@
-"""Where one cloud lies in another: generalised ICP in two radii, an honest covariance, and reasons to refuse.
+"""Registration of two clouds: generalised ICP in two stages, a calibrated covariance, and acceptance gates.
 
-A matcher's own word that it converged is worth nothing: it says so of an empty cloud, of a corridor, and of a place one
-pillar too far. What is worth something is measured here instead: which share of the points has a neighbour, which
-directions are held, how far from the start and how tilted the result is.
+Convergence of a matcher is not a sufficient criterion: it also converges with an empty cloud, in a corridor, and one
+pillar period off. Therefore the following is measured: share of points with a neighbour, undetermined directions,
+distance from the start, and tilt.
 """
 
 from __future__ import annotations
@@ -26,55 +26,55 @@ from graphslam.registration.degeneracy import calibrated_covariance, noise_induc
 from graphslam.registration.planar import PlanarAlignment, align_planar
 from graphslam.registration.target import Target
 
-_LEAST_NOISE = 1e-4  # clouds that are copies of each other show none
+_LEAST_NOISE = 1e-4  # for identical clouds, which have no noise
 Known = npt.NDArray[np.bool_] | Callable[[Array], npt.NDArray[np.bool_]]
 ROTATION_EPSILON = 1e-4
-"""A stage of a registration ends when a step turns by less than this [rad] …"""
+"""A stage of a registration ends when a step rotates by less than this [rad] …"""
 TRANSLATION_EPSILON = 1e-4
 """… and moves by less than this [m]."""
 COVARIANCE_SCALE_PLANAR = 5.0
-"""Factor on the inverse Hessian with the noise that the pairs show, in two dimensions; calibrated in halls, whatever
-the noise, the bins and the number of points (docs/notes/registration.md)."""
+"""Factor on the inverse Hessian with the noise estimated from the pairs, in 2-D; calibrated in simulated halls for any
+noise, bins and number of points (docs/notes/registration.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registration:
-    """What came of a match.
+    """Result of a match.
 
     Parameters
     ----------
     T_target_source : (3,) or (7,)
-        The result; the start, where there is none.
+        The result; the start if there is none.
     covariance : (d, d)
-        In the right tangent (3-D: rotation first). NaN where there is no result, so that no graph takes it.
+        In the right tangent (3-D: rotation first). NaN without a result, so that it cannot be used in a graph.
     fitness : float
         Share of all source points with a neighbour nearer than ``near``.
     fitness_known : float
-        The same of the source points in known space; NaN where the caller did not say which that is.
+        The same of the source points in known space; NaN if the caller did not give it.
     fitness_upright : float
-        The same of the source points on upright surfaces, whose normal is more than 45° off the target's z axis. Floors
-        and ceilings match wherever they are level, and are most of many scans. NaN in two dimensions, and where there
-        are fewer than :data:`~graphslam.registration.config.LEAST_POINTS` of them.
+        The same of the source points on upright surfaces, whose normal is more than 45° off the target's z axis. Level
+        floors and ceilings match anywhere and are most of many scans. NaN in 2-D, and with fewer than
+        :data:`~graphslam.registration.config.LEAST_POINTS` of them.
     known_share : float
-        Share of the source points that fall into known space; NaN likewise.
+        Share of the source points in known space; NaN if not given.
     rmse : float
         Of the distances to those neighbours [m]; NaN without any.
     inliers : int
-        Pairs of the last step.
+        Number of pairs in the last step.
     degeneracy : float
-        Least over greatest eigenvalue of the translational part of the Hessian.
+        Least over largest eigenvalue of the translational part of the Hessian.
     weakest : (dim,)
-        Direction held least, a unit vector in the source frame; NaN without a result.
+        Least determined direction, a unit vector in the source frame; NaN without a result.
     weakest_sigma : float
         σ along it [m]; NaN without a result.
     tilt : float
-        Angle between the z axes of the two frames [rad]; 0 in two dimensions.
+        Angle between the z axes of the two frames [rad]; 0 in 2-D.
     shift, turn : float
         From the start to the result [m, rad].
     converged : bool
-        There is a result: finite, not far from the start, held by enough pairs. It may still be wrong.
+        There is a result: finite, not far from the start, with enough pairs. It can still be wrong.
     why : str
-        Why there is no result, or the gates it fails; empty for a match that is accepted.
+        Reason for no result, or the failed gates; empty if the match is accepted.
     """
 
     T_target_source: Array
@@ -96,12 +96,12 @@ class Registration:
 
     @property
     def accepted(self) -> bool:
-        """A result that passes all gates."""
+        """Whether the result passes all gates."""
         return not self.why
 
     @property
     def best_fitness(self) -> float:
-        """The fitness in known space where that is known, else the one over all points."""
+        """The fitness in known space if given, otherwise that over all points."""
         return self.fitness if np.isnan(self.fitness_known) else self.fitness_known
 
 
@@ -118,32 +118,30 @@ def register(
     Parameters
     ----------
     source : (m, dim) or Target
-        Points in the source frame [m]; what is not finite is left out. Prepare a ``Target`` of it to match it from
-        several starts.
+        Points in the source frame [m]; non-finite points are ignored. Use a ``Target`` to match it from several starts.
     T_target_source : (3,) or (7,)
         Start.
     known : (m,) bool, or function of points (m, dim) to (m,) bool, optional
-        Which of the source points fall into known space; a function is asked for points in the *target* frame, at the
-        result (``EvidenceGrid.known_at`` is one). A mask goes with the points of a source that was not thinned, and
-        without any that are not finite.
+        Source points in known space; a function gets points in the *target* frame at the result (e.g.
+        ``EvidenceGrid.known_at``). A mask requires a source without downsampling and without non-finite points.
 
     Returns
     -------
     Registration
-        Never an exception because a match fails: ``why`` says what is the matter.
+        No exception if a match fails: ``why`` is the reason.
 
     Notes
     -----
     Generalised ICP (Segal, Haehnel and Thrun 2009, eq. 2) in two radii: pairs up to 2 m, then up to 0.5 m. The
-    covariance is ``k s² (H - F)⁻¹`` and a floor: s² the noise that the pairs show, F what of the Hessian is feigned
-    (:func:`~graphslam.registration.degeneracy.noise_induced_information`), k calibrated; directions that are not held
-    at all are as unknown as ``max_shift`` lets them be.
+    covariance is ``k s² (H - F)⁻¹`` and a floor: s² the noise estimated from the pairs, F the spurious part of the
+    Hessian (:func:`~graphslam.registration.degeneracy.noise_induced_information`), k calibrated; undetermined
+    directions get a σ according to ``max_shift``.
 
-    Capture, measured in simulated halls of 60 m with pillars every 8 m, bare and with parked cars (share of 20 starts
-    that end within 0.3 m and 2°, the worse of the halls and directions): 0.5 m and 5° off 1.0 in three dimensions and
-    in two, 1 m and 10° 0.9 and 0.95, 2 m and 10° 0.6 and 0.75, 4 m 0. Farther off, search first
-    (:func:`~graphslam.registration.search.correlative_search`). One pillar period off it ends there, sometimes with a
-    fitness that no gate tells from the right one: match several starts.
+    Convergence range, measured in simulated halls of 60 m with pillars every 8 m, bare and with parked cars (share of
+    20 starts that end within 0.3 m and 2°, the worse of the halls and directions): 0.5 m and 5° off 1.0 in 3-D and in
+    2-D, 1 m and 10° 0.9 and 0.95, 2 m and 10° 0.6 and 0.75, 4 m 0. For larger errors, search first
+    (:func:`~graphslam.registration.search.correlative_search`). From one pillar period off it converges there,
+    sometimes with a fitness that no gate can distinguish from the true one: use several starts.
     """
     config = RegistrationConfig() if config is None else config
     start = check_pose(T_target_source, target.dim, what="start of a registration")
@@ -189,7 +187,7 @@ def register_starts(
         As for :func:`register`.
     starts : iterable of (3,) or (7,)
     apart : (float, float)
-        Results nearer than this to a better one are the same [m, rad].
+        Results nearer than this to a better one are duplicates [m, rad].
 
     Returns
     -------
@@ -219,7 +217,7 @@ def distinct_registrations(
 
 
 def failed_gates(result: Registration, config: RegistrationConfig) -> str:
-    """The gates that a result fails, in words; empty if none."""
+    """Messages of the failed gates; empty if none."""
     g, planar = config.gates, len(result.T_target_source) == 3
     fails = []
     if np.isnan(result.fitness_known):
@@ -231,7 +229,7 @@ def failed_gates(result: Registration, config: RegistrationConfig) -> str:
             fails.append(f"fitness in known space {result.fitness_known:.3f} < {g.fitness_known:g}")
         if result.known_share < g.known_share:
             fails.append(f"share in known space {result.known_share:.3f} < {g.known_share:g}")
-    if result.fitness_upright < g.fitness_upright:  # NaN is not
+    if result.fitness_upright < g.fitness_upright:  # NaN passes
         fails.append(f"fitness of upright surfaces {result.fitness_upright:.3f} < {g.fitness_upright:g}")
     least = g.degeneracy_planar if planar else g.degeneracy
     if result.degeneracy < least:
@@ -242,7 +240,7 @@ def failed_gates(result: Registration, config: RegistrationConfig) -> str:
 
 
 def _align(source: Target, target: Target, T: Array, config: RegistrationConfig) -> PlanarAlignment:
-    """Both radii."""
+    """Alignment in all stages."""
     limits = (config.iterations, ROTATION_EPSILON, TRANSLATION_EPSILON)
     if target.dim == 2:
         found = PlanarAlignment(T, np.zeros((3, 3)), 0.0, 0)
@@ -280,7 +278,7 @@ def _measure(
     config: RegistrationConfig,
     known: Known | None,
 ) -> Registration:
-    """Everything about a result but the verdict."""
+    """All measures of a result, without the gates."""
     dim, planar = target.dim, target.dim == 2
     moved = transform_points(found.T, source.points)
     reach = max(config.near, config.radii[-1])
@@ -304,7 +302,7 @@ def _measure(
     feigned = noise_induced_information(source.points[paired], rotation, (own[0], partner[0]), (own[1], partner[1]))
     information = found.hessian - feigned
     held = translational_degeneracy(information, dim)
-    # the noise that the pairs show: 1 where the variances of the shapes are right
+    # noise estimated from the pairs: 1 if the variances of the shapes are right
     freedom = max(found.pairs - len(found.hessian), 1)
     noise = max(2.0 * found.error / freedom, _LEAST_NOISE)
     factor = COVARIANCE_SCALE_PLANAR if planar else config.covariance_scale

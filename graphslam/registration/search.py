@@ -1,12 +1,11 @@
-"""Correlative search: every place on a lattice where a cloud may lie in a map, scored; the distinct best are starts.
+"""Correlative search: scores of a cloud at all poses of a lattice in a map; the distinct best are starts.
 
-Drift at a loop closure is larger than what an iterative matcher corrects, and in a place that repeats itself (pillars,
-doors) the nearest optimum is often the wrong one. So all translations and headings within what the drift allows are
-scored (Olson 2009, "Real-time correlative scan matching"), and *several* modes are given, for an iterative matcher and
-its gates to choose from.
+Drift at a loop closure can exceed the convergence range of an iterative matcher, and in repetitive places (pillars,
+doors) the nearest optimum is often wrong. So all translations and headings within the drift are scored (Olson 2009,
+"Real-time correlative scan matching"), and *several* modes are returned for an iterative matcher and its gates.
 
-Nothing is pruned: for one heading the points are rounded to cells once, after which all translations add up shifted
-rows of the field, a few tenths of a nanosecond for a point and a start.
+There is no pruning: for one heading the points are rounded to cells once; all translations then sum shifted rows of the
+field, which takes a few tenths of a nanosecond per point and start.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ MOST_STARTS = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class SearchStart:
-    """A place to start an iterative matcher from.
+    """A start pose for an iterative matcher.
 
     Parameters
     ----------
     T : (3,) or (7,)
         ``T_target_source``.
     score : float
-        Mean of the field under the points, 0 … 1.
+        Mean of the field at the points, 0 … 1.
     offset : tuple of float
-        From the pose searched around: x, y[, z] [m] in the target's axes, heading [rad].
+        Offset from the centre of the search: x, y[, z] [m] in the target's axes, heading [rad].
     """
 
     T: Array
@@ -49,17 +48,17 @@ class SearchStart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SearchConfig:
-    """How a search is done.
+    """Configuration of a search.
 
     Parameters
     ----------
     most_points : int
-        Source points used: one a cell of the field, of these so many, evenly from first to last.
+        Most source points: one per cell of the field, evenly selected.
     apart : float
-        Two starts nearer than this [m], and turned by less than ``turned`` [rad], are one mode.
+        Two starts nearer than this [m], with headings that differ by less than ``turned`` [rad], are one mode.
     refine : bool
-        Look once more around each of ``4 keep`` modes, at every cell and at quarters of the heading step, and order
-        them by what is found there: the lattice misses some modes by more than others.
+        Refine each of ``4 keep`` modes at every cell and quarters of the heading step, and sort by the refined score:
+        the distance of the lattice to the optimum differs between modes.
     """
 
     most_points: int = 300
@@ -67,9 +66,9 @@ class SearchConfig:
     turned: float = 0.35
     refine: bool = True
     coarse_points: int = 100
-    """Source points used on a coarse field, see :func:`correlative_search`."""
+    """Most source points on a coarse field, see :func:`correlative_search`."""
     coarse_modes: int = 64
-    """Modes of a coarse field that are looked at in the finer one."""
+    """Modes of a coarse field that are refined in the finer one."""
 
     def __post_init__(self) -> None:
         for name in ("most_points", "apart", "turned", "coarse_points", "coarse_modes"):
@@ -80,7 +79,7 @@ class SearchConfig:
 
 @dataclass(frozen=True, slots=True)
 class SearchLattice:
-    """Offsets searched, symmetric about zero; each ``(n,)``."""
+    """Offsets of the search, symmetric about zero; each ``(n,)``."""
 
     x: Array
     y: Array
@@ -91,11 +90,11 @@ class SearchLattice:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Headings, then z, y, x: the order of the scores."""
+        """Number of headings, z, y, x: the shape of the scores."""
         return len(self.yaw), len(self.z), len(self.y), len(self.x)
 
     def axes(self) -> list[tuple[int, bool]]:
-        """Of x, y, z: the step in cells, and whether there is more than one offset."""
+        """For x, y, z: the step in cells, and whether there is more than one offset."""
         return [(s, len(a) > 1) for s, a in zip(self.steps, (self.x, self.y, self.z))]
 
     def places(self, index: npt.NDArray[np.int64]) -> Array:
@@ -131,7 +130,7 @@ def make_lattice(
 
 
 def score_lattice(points: Array, field: SearchField, around: Array, lattice: SearchLattice) -> npt.NDArray[np.uint32]:
-    """Sum of the field, in 255ths, under all points at every offset of a lattice.
+    """Sum of the field, in 1/255, at all points for every offset of a lattice.
 
     Parameters
     ----------
@@ -147,7 +146,7 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Sea
     scores = np.zeros(lattice.shape, np.uint32)
     first = np.array([lattice.x[0], lattice.y[0], lattice.z[0]])
     counts, steps = np.array(lattice.shape[:0:-1]), np.array(lattice.steps)
-    # the cell is found at the middle of the lattice, so that it does not depend on how wide that is
+    # cells are computed at the centre of the lattice, so that they do not depend on its width
     back = np.rint(first / field.cell).astype(np.int64)
     still = np.zeros_like(lattice.yaw)
     turned = offset_pose(around, np.stack([still, still, still, lattice.yaw], -1))
@@ -157,13 +156,13 @@ def score_lattice(points: Array, field: SearchField, around: Array, lattice: Sea
 
 
 def offset_pose(around: Array, offset: ArrayLike) -> Array:
-    """The pose moved by x, y, z [m] along the target's axes and turned about the vertical through itself [rad].
+    """The pose moved by x, y, z [m] along the target's axes and rotated about the vertical axis through itself [rad].
 
     Parameters
     ----------
     around : (3,) or (7,)
     offset : (..., 4)
-        x, y, z, heading; z means nothing in two dimensions.
+        x, y, z, heading; z is ignored in 2-D.
 
     Returns
     -------
@@ -189,36 +188,36 @@ def correlative_search(
     coarse: SearchField | None = None,
     config: SearchConfig | None = None,
 ) -> list[SearchStart]:
-    """Distinct places where the source may lie in the map, best first.
+    """Distinct candidate poses of the source in the map, best first.
 
     Parameters
     ----------
     source : (m, dim)
-        Points in the source frame [m]; what is not finite is left out.
+        Points in the source frame [m]; non-finite points are ignored.
     field : SearchField
         Of the map.
     around : (3,) or (7,)
-        ``T_target_source`` in the middle of the search. Its roll and pitch are kept.
+        ``T_target_source`` at the centre of the search. Its roll and pitch are kept.
     half_widths : (x, y, z, heading), in two dimensions (x, y, heading)
-        Of the search, each side [m, rad].
+        Of the search [m, rad].
     steps : as ``half_widths``, optional
-        Of the lattice. Those of x, y, z are multiples of the field's cell; a heading step of 0 moves the farther points
-        by σ of the field. Two cells, and 0, by default.
+        Of the lattice. Those of x, y, z are multiples of the field's cell; a heading step of 0 is chosen so that
+        distant points move by σ of the field. Default: two cells, and 0.
     keep : int
-        Modes wanted. There may be fewer.
+        Most modes to return.
     coarse : SearchField, optional
-        Of the same map, with larger cells and σ, made for the steps of the lattice: few points are scored on it, and
-        only the best modes in ``field``. What is searched may then be some ten times as wide for the same time.
+        Of the same map, with larger cells and σ for the steps of the lattice: few points are scored on it, and only the
+        best modes in ``field``. The search can then be about ten times wider in the same time.
 
     Returns
     -------
     list of SearchStart
-        Local maxima of the lattice, of which none is near a better one. Empty without points, and where nothing of
-        the map lies under any point.
+        Local maxima of the lattice that are not near a better one. Empty without points, or without overlap with the
+        map.
 
     Notes
     -----
-    The same input gives the same output.
+    Deterministic.
     """
     config = SearchConfig() if config is None else config
     T = check_pose(around, field.dim, what="pose to search around")
@@ -261,7 +260,7 @@ def _shares(sums: npt.NDArray[np.uint32], points: int) -> npt.NDArray[np.float32
 def _refine(
     points: Array, field: SearchField, around: Array, lattice: SearchLattice, places: Array
 ) -> tuple[Array, Array]:
-    """The best place within half a step of each of ``places (k, 4)``: places and scores."""
+    """Best offsets within half a step of each of ``places (k, 4)``, with scores."""
     turn = lattice.yaw[1] - lattice.yaw[0] if len(lattice.yaw) > 1 else 0.0
     half: list[Array] = [
         field.cell * np.arange(-(c // 2), c // 2 + 1.0) if wide else np.zeros(1) for c, wide in lattice.axes()

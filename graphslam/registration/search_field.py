@@ -1,4 +1,4 @@
-"""What a correlative search looks into: how near a map is, in every cell around it."""
+"""Likelihood field of a map for the correlative search."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ MOST_CELLS = 200_000_000
 
 
 class SearchField:
-    """How near an occupied cell is, everywhere around a map: what a search looks into.
+    """Likelihood field around a map: a function of the distance to the nearest occupied cell.
 
     Parameters
     ----------
     points : (m, dim)
-        Of the map, dim 2 or 3: a cloud, or the centres of a grid's occupied voxels [m]. Those that are not finite are
-        left out and counted in ``dropped``.
+        Of the map, dim 2 or 3: a cloud, or the centres of a grid's occupied voxels [m]. Non-finite points are ignored
+        and counted in ``dropped``.
     cell : float
         Edge of a cell [m].
     sigma : float
         The field is ``exp(-d² / 2σ²)`` at distance d [m] from the centre of the nearest occupied cell, in 255 steps,
-        and 0 beyond 3 σ. Half the steps of the lattice to be searched, or more: what falls between them is not found.
+        and 0 beyond 3 σ. At least half the steps of the search lattice, otherwise optima between them are missed.
     """
 
     def __init__(self, points: Any, *, cell: float = 0.2, sigma: float = 0.3) -> None:
@@ -64,11 +64,11 @@ class SearchField:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the field, and of its copies for the lattices searched so far."""
+        """Memory of the field and its cached copies for lattices [bytes]."""
         return self.values.nbytes + sum(a.nbytes for a in self._phases.values())
 
     def _cells(self, points: Array) -> npt.NDArray[np.int64]:
-        """Cells ``(m, 3)`` x, y, z of points, counted from the corner of the field."""
+        """Cells ``(m, 3)`` x, y, z of points, relative to the corner of the field."""
         out = np.zeros((len(points), 3), dtype=np.int64)
         out[:, : self.dim] = np.floor(points / self.cell).astype(np.int64)
         return out - self._low

@@ -1,7 +1,7 @@
 """Compiled parts of the correlative search: the likelihood field and the scores of every start of a lattice.
 
-Arrays of space are indexed ``[z, y, x]``; in two dimensions there is one layer. Scores are integers, so that they do
-not depend on the order of adding.
+Spatial arrays are indexed ``[z, y, x]``; in 2-D there is one layer. Scores are integers, so that they do not depend on
+the order of summation.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from graphslam.core.jit import njit
 
 @njit(nogil=True)
 def splat(cells, offsets, values, field):
-    """Raise the field to ``values`` around each occupied cell: the value of the nearest one stays, for values fall with
-    distance.
+    """Set the field to the maximum of itself and ``values`` around each occupied cell; values decrease with distance.
 
     Parameters
     ----------
     cells : (m, 3) int64
-        Occupied cells x, y, z; ``offsets`` around them lie inside the field.
+        Occupied cells x, y, z; ``offsets`` around them are inside the field.
     offsets : (k, 3) int64
     values : (k,) uint8
     field : (nz, ny, nx) uint8
@@ -33,15 +32,15 @@ def splat(cells, offsets, values, field):
 
 @njit(nogil=True)
 def score_block(cells, counts, steps, phases, scores):
-    """Add up the field under all points, for every heading and every translation of a lattice.
+    """Sum the field at all points, for every heading and translation of a lattice.
 
-    The rows of x are added whole: neighbouring starts read neighbouring bytes, because the field is kept as one array
-    per phase of the lattice.
+    Rows along x are added as a whole: the field is stored as one array per phase of the lattice, so neighbouring starts
+    read neighbouring bytes.
 
     Parameters
     ----------
     cells : (headings, n, 3) int64
-        Cells x, y, z of the points at the first translation of the lattice; may lie outside the field.
+        Cells x, y, z of the points at the first translation of the lattice; can be outside the field.
     counts : (3,) int64
         Translations along x, y, z.
     steps : (3,) int64
@@ -49,7 +48,7 @@ def score_block(cells, counts, steps, phases, scores):
     phases : (steps z, steps y, steps x, nz, ny, nx) uint8
         ``phases[c, b, a, k, j, i]`` is the field at cell ``x = a + i * steps[0]``, and so on.
     scores : (headings, counts z, counts y, counts x) uint32
-        Added to; outside the field is 0.
+        Added to; 0 outside the field.
     """
     sizes = phases.shape
     block = np.empty((counts[2], counts[1], counts[0]), np.uint16)
@@ -77,7 +76,7 @@ def score_block(cells, counts, steps, phases, scores):
 
 @njit(nogil=True)
 def local_maxima(weights):
-    """Elements that none of their neighbours exceeds, nor equals before them; the order is that of the array.
+    """Local maxima in array order; of equal neighbours the first counts.
 
     Parameters
     ----------
@@ -96,7 +95,7 @@ def local_maxima(weights):
             for j in range(ny):
                 for i in range(nx):
                     w = weights[a, k, j, i]
-                    # most elements lose against one of the nearest already
+                    # quick test: most elements are below a nearest neighbour
                     if w == -np.inf or (i > 0 and weights[a, k, j, i - 1] >= w):
                         continue
                     if i + 1 < nx and weights[a, k, j, i + 1] > w:
@@ -113,7 +112,7 @@ def local_maxima(weights):
 
 @njit(nogil=True)
 def is_maximum(weights, a, k, j, i):
-    """Whether no neighbour of element ``[a, k, j, i]`` exceeds it, nor equals it before it."""
+    """Whether no neighbour of element ``[a, k, j, i]`` is larger, or equal and earlier in the array."""
     na, nz, ny, nx = weights.shape
     w = weights[a, k, j, i]
     before = True

@@ -1,9 +1,9 @@
-"""Where the surroundings of a place in one submap lie in another submap: search, registration, gates, covariance.
+"""Matching of the surroundings of a place in one submap to another submap: search, registration, gates, covariance.
 
-The source is what one submap knows around one of its places, the target the whole of the other. Where the place may lie
-is known as a Gaussian, ``T_target_source`` with a covariance in its right tangent: that is where it is searched, and a
-match that it contradicts is refused. All good places in that region are tried, because in a building that repeats
-itself the true one must be among them, or an alias wins; and one that is hardly better than the next is refused too.
+The source is the map of one submap around a place, the target is the whole other submap. The prediction is a Gaussian
+``T_target_source`` with a covariance in its right tangent: it limits the search, and matches that contradict it are
+rejected. All good modes in that region are tried, because repetitive buildings have aliases; a match that is hardly
+better than the next one is rejected, too.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from graphslam.registration.target import Target
 
 
 class PreparedMap:
-    """A submap's dense map made ready to be matched; everything is made when it is first asked for.
+    """A submap's dense map prepared for matching; all parts are computed lazily.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class PreparedMap:
 
     @cached_property
     def points(self) -> Array:
-        """Points on surfaces, gathered in cells ``(m, dim)`` [m]."""
+        """Surface points, averaged in cells ``(m, dim)`` [m]."""
         return self.view.points(self.config.cloud_level)
 
     @cached_property
@@ -55,7 +55,7 @@ class PreparedMap:
 
     @cached_property
     def fields(self) -> tuple[SearchField, SearchField]:
-        """Fine and coarse."""
+        """Fine and coarse likelihood field."""
         c = self.config
         occupied, cell = self.view.points(), c.grid / 4.0
         return (
@@ -65,14 +65,15 @@ class PreparedMap:
 
     @property
     def nbytes(self) -> int:
-        """Memory of what was made so far, about [bytes]."""
+        """Approximate memory of the computed parts [bytes]."""
         made = self.__dict__
         points = made["points"].nbytes if "points" in made else 0
         fields = sum(f.nbytes for f in made["fields"]) if "fields" in made else 0
         return fields + points * (6 if "target" in made else 1)  # the points, their tree and their shapes
 
     def around(self, T_base_place: ArrayLike) -> Array:
-        """Points ``(m, dim)`` around a place, in the frame of the place [m]; thinned evenly if there are too many."""
+        """Points ``(m, dim)`` around a place, in the frame of the place [m]; evenly subsampled if there are too
+        many."""
         T = np.asarray(T_base_place, dtype=np.float64)
         g, p = group_of(T), self.points
         near = np.hypot(*(p[:, :2] - T[:2]).T) <= self.config.radius
@@ -84,30 +85,30 @@ class PreparedMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairMatch:
-    """What came of matching a place of one submap to another.
+    """Result of matching a place of one submap to another.
 
     Parameters
     ----------
     T_target_source : (7,) or (3,)
-        The match; the prediction where there is none.
+        The match; the prediction if there is none.
     covariance : (d, d)
-        Right tangent; NaN where there is no result.
+        Right tangent; NaN without a result.
     why : str
-        The gates it fails; empty for one that is accepted.
+        Failed gates; empty if accepted.
     registration : Registration or None
-        What the match rests on.
+        The underlying registration.
     chi2 : float
-        Of the match against the prediction, both uncertain; NaN without a result.
+        Of the difference between match and prediction, with both covariances; NaN without a result.
     margin : float
-        How much better than the best rival: mean of the fitness and that of upright surfaces, where known.
+        Difference to the best alternative: mean of the fitness and that of upright surfaces, if known.
     contradiction : float
-        Share of voxels that the two maps contradict each other in; NaN without a result.
+        Share of contradicting voxels of the two maps; NaN without a result.
     modes : int
-        Distinct places that were compared.
+        Number of distinct modes.
     points : int
-        Of the source.
+        Number of source points.
     loose : bool
-        One direction is not held by the match, and is as uncertain as the prediction had it.
+        One direction is not determined by the match, and has the uncertainty of the prediction.
     half_widths : tuple of float
         Of the search: x, y[, z] [m], heading [rad].
     """
@@ -126,11 +127,11 @@ class PairMatch:
 
     @property
     def accepted(self) -> bool:
-        """Passes all gates."""
+        """Whether the match passes all gates."""
         return not self.why
 
     def gates(self) -> dict[str, Any]:
-        """The figures that were judged, ready for JSON."""
+        """The tested values, JSON-serialisable."""
         r = self.registration
         nan = math.nan
         return {
@@ -163,16 +164,16 @@ def match_pair(
     T_base_place : (7,) or (3,)
         The place in the frame of the source's base.
     T_target_place : (7,) or (3,)
-        Where it should lie in the frame of the target's base.
+        Its predicted pose in the frame of the target's base.
     covariance : (d, d)
-        Of that, right tangent.
+        Of the prediction, right tangent.
     config : PairConfig, optional
-        Of the target, by default.
+        Default: that of the target.
 
     Returns
     -------
     PairMatch
-        ``T_target_source`` is that of the place. Never an exception because a match fails.
+        ``T_target_source`` is that of the place. No exception if a match fails.
     """
     c = target.config if config is None else config
     g = group_of(T_target_place)
@@ -192,10 +193,10 @@ def match_pair(
     starts = [s.T for s in found if s.score >= max(c.least_score, best - c.score_margin)]
     if not starts:
         return _nothing(T, f"nothing: no place explains more than {best:.2f} of the points", len(points), tuple(half))
-    # a body may be tilted: what tilts against the prediction is refused later
+    # a body can be tilted: the tilt against the prediction is tested later
     rules = replace(c.registration, gates=replace(c.registration.gates, tilt=math.pi))
     cloud = Target(points)
-    known = target.view.known_at if target.view.knows_space else None  # without, all of the place must fit
+    known = target.view.known_at if target.view.knows_space else None  # without free space, all points must fit
     results = register_starts(cloud, target.target, starts, rules, known=known)
     results = [_upright_in_known(r, cloud, target, c) for r in results]
     place = np.asarray(T_base_place, dtype=np.float64)
@@ -208,7 +209,7 @@ def half_widths(T: Array, P: Array, config: PairConfig) -> list[float]:
     at = g.position
     R = rotation_matrix_of(T, g)
     s = config.sigmas * np.sqrt(np.diag(R @ P[at, at] @ R.T))
-    # heading about the vertical of the target, of a body that may be tilted
+    # heading about the vertical of the target, for a body that can be tilted
     up = R.T[:, 2] if g.dim == 3 else None
     turn = config.sigmas * math.sqrt(P[2, 2] if up is None else float(up @ P[:3, :3] @ up))
     low, high = config.least, config.most
@@ -234,7 +235,7 @@ def _judge(
     P: Array,
     c: PairConfig,
 ) -> PairMatch:
-    """The best of the modes that the prediction allows, and whether it is to be believed."""
+    """Best mode compatible with the prediction, and its gates."""
     g = group_of(T)
     modes = distinct_registrations(results)
     if not modes:
@@ -257,7 +258,7 @@ def _judge(
         return replace(out, why=f"prediction: χ² {chi2[k]:.1f} > {limit:.1f}")
     margin = _margin([modes[i] for i in allowed], loose, c)
     rules = c.registration
-    if loose:  # known to be so, and said in the covariance
+    if loose:  # accounted for in the covariance
         rules = replace(rules, gates=replace(rules.gates, degeneracy=0.0, degeneracy_planar=0.0))
     R = rotation_matrix_of(T, g)
     rise = c.sigmas * math.sqrt(float((R @ P[g.position, g.position] @ R.T)[-1, -1])) if g.dim == 3 else 0.0
@@ -268,25 +269,25 @@ def _judge(
 
 
 FREE, BESIDE = -1.0, 0.5
-"""Log-odds of this and less are free, unless something is occupied so near [m]."""
+"""Voxels with at most this log-odds are free, unless something is occupied within this distance [m]."""
 
 
 def contradiction_share(
     source: PreparedMap, T_base_place: Array, target: PreparedMap, T_target_place: Array, points: Array
 ) -> float:
-    """Share of what one map has occupied, and the other knows, that the other has free; the greater of both ways.
+    """Share of the occupied voxels of one map that are free in the other (of those known there); the larger of both.
 
     Parameters
     ----------
     T_base_place, T_target_place : (7,) or (3,)
-        The place in both.
+        The place in both base frames.
     points : (m, dim)
         Of the source, around the place and in its frame [m].
 
     Returns
     -------
     float
-        0 where the maps know nothing of each other.
+        0 without overlap.
     """
     g = group_of(T_target_place)
 
@@ -306,7 +307,7 @@ def contradiction_share(
 
 
 def _upright_in_known(r: Registration, cloud: Target, target: PreparedMap, c: PairConfig) -> Registration:
-    """With the fitness of upright surfaces over those in known space: the place may reach out of the map."""
+    """Replace the fitness of upright surfaces by that in known space: the place can extend beyond the map."""
     if cloud.dim == 2 or not target.view.knows_space:
         return r
     T, rules = r.T_target_source, c.registration
@@ -338,10 +339,10 @@ def prediction_chi2(T: ArrayLike, C: ArrayLike, T_prior: ArrayLike, P: ArrayLike
 
 
 def _covariance(r: Registration, P: Array, c: PairConfig) -> tuple[Array, bool]:
-    """Covariance of a match, and whether one direction is loose: then it says nothing along that.
+    """Covariance of a match, and whether one direction is undetermined.
 
-    The registration has such a direction as unknown as it may shift; a prediction may be worse than that. Ten of its σ
-    are so much that nothing is learnt along that axis, and the χ² of the rest is still asked.
+    The registration limits σ of such a direction by the allowed shift, which can be less than that of the prediction.
+    Therefore ten σ of the prediction are used, so that the match adds no information along that axis.
     """
     C = c.inflation * r.covariance
     dim = len(r.weakest)
@@ -356,14 +357,13 @@ def _covariance(r: Registration, P: Array, c: PairConfig) -> tuple[Array, bool]:
 
 
 def _likeness(r: Registration) -> float:
-    """What modes are compared by: the fitness, and as much that of upright surfaces, where it is known. Floors and
-    ceilings are most of the points, and fit anywhere."""
+    """Score for comparing modes: mean of the fitness and that of upright surfaces, if known. Floors and ceilings are
+    most of the points, and fit anywhere."""
     return r.best_fitness if math.isnan(r.fitness_upright) else 0.5 * (r.best_fitness + r.fitness_upright)
 
 
 def _margin(modes: list[Registration], loose: bool, c: PairConfig) -> float:
-    """Likeness of the first of the modes less that of the next place; where it may slide, what lies along that
-    direction is no rival."""
+    """Score of the first mode minus that of the next; modes along an undetermined direction are not counted."""
     modes = [replace(r, fitness_known=_likeness(r)) for r in modes]
     best = modes[0]
     if loose:

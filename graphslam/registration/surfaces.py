@@ -1,4 +1,4 @@
-"""Neighbourhoods of points as planes (in 2-D lines): which places of a cloud are surfaces, and which way they face."""
+"""Planes (in 2-D lines) through the neighbourhoods of points: surface test and normals."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ def rotations(poses: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceFitConfig:
-    """What counts as a surface."""
+    """Criteria of a surface."""
 
     radius: float = 0.8
-    """Of neighbourhoods [m]."""
+    """Radius of neighbourhoods [m]."""
     spacing: float = 0.1
-    """Points of one chunk nearer together than this are one place [m]."""
+    """Points of one chunk nearer together than this are merged [m]."""
     neighbours: int = 12
-    """Places that a surface is fitted to at most."""
+    """Most neighbours of a fit."""
     thickness: float = 0.06
-    """Greatest RMS distance from the plane [m]."""
+    """Largest RMS distance from the plane [m]."""
     flatness: float = 0.15
-    """Greatest ratio of the smallest eigenvalue to the middle one (in 2-D: to the greatest)."""
+    """Largest ratio of the smallest eigenvalue to the middle one (in 2-D: to the largest)."""
     extent: float = 0.045
     """Least RMS extent along the middle axis [m]."""
 
 
 SURFACE = SurfaceFitConfig()
-"""Of the refinement and of scan-to-window odometry: walls, floors and ground as robots meet them."""
+"""For the refinement and scan-to-window odometry: walls, floors and ground at robot scale."""
 
 
 def thin_places(W: Array, a: int, b: int, spacing: float, stands: Index) -> Index:
-    """Rows of the points ``a:b`` that stand for themselves; enters into ``stands`` who stands for the others."""
+    """Representative rows of the points ``a:b``; writes the representative of each point to ``stands``."""
     if a == b:
         return np.zeros(0, np.int64)
     cell = np.floor(W[a:b] / spacing).astype(np.int64)
@@ -64,20 +64,20 @@ def fit_places(W: Array, O: Array, own: Index, near: Index, config: SurfaceFitCo
     Parameters
     ----------
     W, O : (q, d)
-        Points and where their beams came from, world [m].
+        Points and sensor origins, world [m].
     own : (k,)
-        Rows of the places that are asked for.
+        Rows of the places to fit.
     near : (m,)
-        Rows of the places that may be neighbours, ``own`` among them.
+        Rows of the possible neighbours, including ``own``.
 
     Returns
     -------
     normals : (k, d)
-        World, towards where the beams came from.
+        World, towards the sensor.
     tilts : (k, d - 1, d)
-        Axes of the surfaces, world, each as long as the σ by which noise tilts the normal towards it [rad].
+        Axes of the surfaces, world, scaled with the σ of the normal's tilt towards them [rad].
     flat : (k,) bool
-        Is it a surface?
+        Whether it is a surface.
     """
     d = W.shape[1]
     k = min(config.neighbours, len(near))

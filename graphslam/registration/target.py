@@ -1,4 +1,4 @@
-"""A cloud prepared for matching: its k-d tree and the shape of the surface around each point, made once."""
+"""A cloud prepared for matching: its k-d tree and the local surface shape of each point."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from graphslam.core.log import DropCounter
 from graphslam.core.points import finite_points, voxel_downsample
 
 FLATNESS = 1e-3
-"""Variance across a surface over that along it, of the covariance that stands for a point (Segal 2009)."""
+"""Variance across a surface over that along it, in the covariance of a point (Segal 2009)."""
 LEAST_NEIGHBOURS = 5
-"""With fewer a point has no normal."""
+"""With fewer neighbours a point has no normal."""
 SMALLER = (5, 3)
-"""Neighbours to do with where more of them do not lie on one line."""
+"""Fallback numbers of neighbours if more are not on one line."""
 SCATTER = 9.0
-"""Neighbours whose variance across their line is more than this many times the usual one do not lie on one line."""
+"""Neighbours are not on one line if their variance across it is above this multiple of the median."""
 
 
 class Target:
-    """Points that others are matched to; also a source that is matched more than once.
+    """Target points of a registration; also a source that is matched repeatedly.
 
     Parameters
     ----------
     points : (m, dim)
-        dim 2 or 3 [m]. Those that are not finite are left out and counted in ``dropped``.
+        dim 2 or 3 [m]. Non-finite points are ignored and counted in ``dropped``.
     voxel : float, optional
-        First take the mean of the points of each voxel of this edge [m]. Without it the points are taken as they are:
-        points much denser than the distance to their neighbours in the other cloud cost time and give nothing.
+        Edge of the voxels for downsampling by the mean [m]; None: no downsampling. Points much denser than those of the
+        other cloud take time without benefit.
     neighbours : int
-        Points that the shape around a point is taken from, itself included.
+        Neighbours for the local shape of a point, including itself.
     drops : DropCounter, optional
-        Counts the points left out too.
+        Also counts the ignored points.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Target:
 
     @cached_property
     def cloud(self) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
-        """The points with their covariances, and their tree, for the matcher in three dimensions."""
+        """The points with their covariances, and their tree, for the 3-D matcher."""
         cloud = small_gicp.PointCloud(self.points)
         tree = small_gicp.KdTree(cloud)
         small_gicp.estimate_covariances(cloud, tree, self.neighbours)
@@ -76,14 +76,14 @@ class Target:
 
     @cached_property
     def covariances(self) -> Array:
-        """Shapes ``(m, 2, 2)`` in two dimensions: variance 1 along the line through the neighbours of a point,
-        :data:`FLATNESS` across it; the unit matrix where there are fewer than 5 points.
+        """Shapes ``(m, 2, 2)`` in 2-D: variance 1 along the line through the neighbours of a point, :data:`FLATNESS`
+        across it; the unit matrix with fewer than 5 points.
         """
         normals, _ = self.normals(np.arange(len(self)))
         return flat_shapes(normals)
 
     def normals(self, rows: npt.NDArray[np.intp]) -> tuple[Array, Array]:
-        """Normals of some of the points and the covariances that noise gives them.
+        """Normals of given points with their noise covariances.
 
         Parameters
         ----------
@@ -92,10 +92,10 @@ class Target:
         Returns
         -------
         normals : (k, dim)
-            Unit vectors; 0 where there are too few points around.
+            Unit vectors; 0 with too few neighbours.
         noise : (k, dim, dim)
-            Of a plane through n neighbours whose spread across it is λ₀ and along its axes λⱼ: λ₀ / (n λⱼ) about each.
-            Computed when first asked for.
+            For a plane through n neighbours with variance λ₀ across it and λⱼ along its axes: λ₀ / (n λⱼ) about each.
+            Computed lazily.
         """
         if self.dim == 2:
             return self._lines[0][rows], self._lines[1][rows]
@@ -111,7 +111,7 @@ class Target:
         return normals[rows], noise[rows]
 
     def _spread(self, points: Array, n: int) -> tuple[Array, Array]:
-        """Variances ``(k, dim)`` of the n nearest of all points around each, the least first, and their axes."""
+        """Variances ``(k, dim)`` of the n nearest points around each, ascending, and their axes."""
         around = self.points[self.tree.query(points, n)[1]]
         d = around - around.mean(axis=1, keepdims=True)
         spread, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", d, d) / n)
@@ -119,11 +119,11 @@ class Target:
 
     @cached_property
     def _lines(self) -> tuple[Array, Array]:
-        """Normals in the plane and their noise.
+        """2-D normals and their noise.
 
-        Where a scan is sparse, far down a corridor or at a corner, the neighbours of a point lie on two walls. The line
-        through them is neither, and as it follows the pattern of the beams, which moves along with the robot, a match
-        would find that nothing moved. Such a point makes do with fewer neighbours, or has no normal.
+        In sparse parts of a scan (far in a corridor, at a corner) the neighbours of a point can be on two walls. A line
+        through them follows the beam pattern, which moves with the robot, so a match would be biased towards no motion.
+        Such a point gets fewer neighbours, or no normal.
         """
         m = len(self)
         normals, noise = np.zeros((m, 2)), np.zeros((m, 2, 2))
@@ -135,7 +135,7 @@ class Target:
             spread, axes = self._spread(self.points[rows], k)
             usual = usual or float(np.median(spread[:, 0]))
             good = spread[:, 0] <= SCATTER * usual
-            across = spread[good, 0] if k == n else np.maximum(spread[good, 0], usual)  # of three, it says little
+            across = spread[good, 0] if k == n else np.maximum(spread[good, 0], usual)  # unreliable for three points
             turned = np.minimum(across / (k * spread[good, 1]), 1.0)
             along = axes[good, :, 1]
             normals[rows[good]] = axes[good, :, 0]
@@ -152,5 +152,5 @@ class Target:
 
 
 def flat_shapes(normals: Array) -> Array:
-    """Covariances ``(k, dim, dim)``: 1 along a surface, :data:`FLATNESS` across it; all 1 where a normal is 0."""
+    """Covariances ``(k, dim, dim)``: 1 along a surface, :data:`FLATNESS` across it; all 1 if the normal is 0."""
     return np.eye(normals.shape[1]) - (1.0 - FLATNESS) * normals[:, :, None] * normals[:, None, :]
