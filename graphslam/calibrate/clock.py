@@ -19,27 +19,31 @@ def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
     """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
 
     Only shifts by whole periods of the motion's records are compared: a shift by half a period averages two records,
-    so that independent noise looks smaller, and its likelihood is larger whatever the clocks are. The offset between
-    two periods is that of a parabola through the likelihood of three shifts.
+    so that independent noise looks smaller, and its likelihood is larger whatever the clocks are. Shifts that are
+    nearer to each other than the time between sightings share records, and their likelihoods differ by the
+    noise of the others: that has minima of its own, so the shifts are so far apart. The offset between two of them is
+    that of a parabola through the likelihood of three.
 
     Parameters
     ----------
     s : Smoothing
         Fitted without an offset.
     """
+    between = np.median([np.median(np.diff(w.times)) for w in s.windows])
     period = seen.period
+    stride = max(round(between / period), 1)
     scores: dict[int, float] = {}
 
     def score(k: int) -> float:
         if k not in scores:
-            moved = L.shift_motion(s, seen, k * period)
+            moved = L.shift_motion(s, seen, k * stride * period)
             moved.settle(8)
             moved.fit(budget=60, rounds=1)
             scores[k] = moved.objective()
         return scores[k]
 
     best = 0
-    while abs(best) < MOST_PERIODS:
+    while abs(best) * stride < MOST_PERIODS:
         near = min((best, best - 1, best + 1), key=score)
         if near == best:
             break
@@ -48,7 +52,7 @@ def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
     bend = max(a - 2.0 * b + c, 1e-6)
     at = float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5))
     # of a straight course every offset fits; noise of the records themselves blurs it by their spacing
-    sigma = max(period / math.sqrt(bend), 0.1 * period)
-    value = (best + at) * period
+    sigma = max(stride * period / math.sqrt(bend), 0.1 * period)
+    value = (best + at) * stride * period
     gain = score(0) - (b - 0.5 * bend * at**2)
     return Estimate(name="clock", value=value, sigma=sigma, gain=gain, other=value, other_sigma=sigma).gated()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -80,11 +80,13 @@ class Corrections:
     """The same of bearings [rad]."""
     visit_sightings: float = 1.0
     """Sightings of a usual visit, where a log has no identities to count them by."""
+    slips: tuple[tuple[float, float], ...] = ()
+    """Stretches in which the wheels slipped, in the clock of the sightings [s]: σ of the distance is all of it."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if value is not None and not isinstance(value, bool) and not math.isfinite(value):
+            if value is not None and not isinstance(value, bool) and not np.all(np.isfinite(value)):
                 raise ConfigError(f"calibration: {name} = {value}; wanted a finite number")
         for name in ("distance_scale", "turn_scale", "range_scale", "range_sigma", "bearing_sigma"):
             value = getattr(self, name)
@@ -102,7 +104,7 @@ class Corrections:
 
     def without_motion_noise(self) -> Corrections:
         """The same with the noise of the motion left as it is."""
-        return replace(self, along_metre=None, widen_only=False, **dict.fromkeys(NOISE, 0.0))
+        return replace(self, along_metre=None, widen_only=False, slips=(), **dict.fromkeys(NOISE, 0.0))
 
     def without_constants(self) -> Corrections:
         """Its noise alone."""
@@ -249,13 +251,28 @@ def _odometry(odometry: Odometry, c: Corrections) -> Odometry:
     if not np.array_equal(changed, xi):
         increments = se2_exp(changed) if planar else g.exp(changed)
         increments[0] = odometry.increments[0]
-    if c.along_metre is None:
+    if c.along_metre is None and not c.slips:
         return replace(odometry, increments=increments)
-    P = increment_covariances(c, metres, turned, seconds, g.dof)
+    P = (
+        odometry.covariances.copy()
+        if c.along_metre is None
+        else increment_covariances(c, metres, turned, seconds, g.dof)
+    )
     if c.widen_only:
         k = np.arange(g.dof)
         P[:, k, k] = np.maximum(P[:, k, k], odometry.covariances[:, k, k])
+    ahead = 0 if planar else 3
+    P[:, ahead, ahead] += slip_noise(odometry.times[: len(metres)], metres, c.slips)
     return replace(odometry, increments=increments, covariances=P)
+
+
+def slip_noise(times: Array, metres: Array, slips: Sequence[Sequence[float]]) -> Array:
+    """Variance ``(n,)`` of distances that end at times: of all of a stretch σ is its length, and 0 outside."""
+    out, begin = np.zeros(len(times)), np.concatenate([times[:1], times[:-1]])
+    for a, b in slips:
+        inside = (times > a + 1e-6) & (begin < b - 1e-6)
+        out[inside] = metres[inside] * metres[inside].sum()
+    return out
 
 
 def increment_covariances(c: Corrections, metres: Array, turned: Array, seconds: Array, dof: int) -> Array:

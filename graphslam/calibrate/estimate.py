@@ -97,11 +97,14 @@ class Prediction:
     gains : mapping of str to float
         By how much likelier they are than under what the log states [nats]: under ``all`` of the estimate, and under
         its ``noise`` without its constants, where it has any.
+    timed : float
+        The same under the offset of the clocks and the slip of the wheels alone.
     """
 
     what: str
     count: int
     gains: dict[str, float]
+    timed: float = 0.0
 
     @property
     def supported(self) -> str:
@@ -150,12 +153,19 @@ class Calibration:
     prediction: Prediction | None = None
 
     def validated(self, prediction: Prediction) -> Calibration:
-        """The same without estimates that fail the cross-validation."""
-        found = replace(self, prediction=prediction)
-        if prediction.supported == "all":
+        """The same without estimates that fail the cross-validation; clock and slip, on which few withheld sightings
+        depend, fail only where they predict worse.
+        """
+        found, supported = replace(self, prediction=prediction), prediction.supported
+        if supported == "all":
             return found
-        refused = [replace(e, why_not=prediction.text()) if e.applied else e for e in self.estimates]
-        kept = self.corrections.without_constants() if prediction.supported == "noise" else Corrections()
+        kept = self.corrections.without_constants() if supported == "noise" else Corrections()
+        if prediction.timed > -GAIN:
+            kept = replace(kept, clock=self.corrections.clock, slips=self.corrections.slips)
+        refused = [
+            replace(e, why_not=prediction.text()) if e.applied and not (e.name == "clock" and kept.clock) else e
+            for e in self.estimates
+        ]
         return replace(found, estimates=tuple(refused), corrections=kept)
 
     def findings(self) -> list[Finding]:

@@ -24,14 +24,10 @@ HEAD = CONSTANTS + 1
     BEARING,
     VISIT_RANGE,
     VISIT_BEARING,
-    RATE_SIGMA,
-    RATE_TIME,
-    SPEED_SIGMA,
-    SPEED_TIME,
     FLOOR_POSITION,
     FLOOR_HEADING,
-) = range(16)
-PARAMETERS = 16
+) = range(12)
+PARAMETERS = 12
 Data = namedtuple("Data", ["steps", "first", "sightings", "slots", "kinds"])
 """What is measured in a window."""
 Work = namedtuple("Work", ["L", "X", "C", "S", "chi2", "gone", "pivots", "order", "when", "at"])
@@ -107,12 +103,12 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     A nuisance goes with the last pose that sights it, and leaves its place in the border to another: so the border is
     as wide as there are nuisances at a time, and not as long as the window.
 
-    poses : (n, D) x, y, heading, and for D = 5 the lasting errors of yaw rate [rad/s] and speed [m/s].
+    poses : (n, D) x, y, heading; D = 3.
     nuisance : (M, 2) landmarks (x, y) and constants of visits (range, bearing), in order of their first sighting.
     g : (CONSTANTS,)
     data : Data
-        steps (n, 8): dx, dy, turn, seconds, metres into pose k; variances along, to the side and of the heading that
-            stand in place of the model's where the first is above 0; row 0 is not read.
+        steps (n, 8): dx, dy, turn, seconds, metres into pose k; variances along, and to the side and of the heading,
+            that stand in place of the model's where the first of each is above 0; row 0 is not read.
         first : (n + 1,) sightings of pose k are ``first[k]:first[k + 1]``.
         sightings : (q, 2) range and bearing; a bearing of nan is none.
         slots : (q, 2) nuisance of the landmark, and of the visit or -1.
@@ -147,17 +143,8 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     cols[0] = RHS
     here, onward = _Row(jp, zero, cols, vals), _Row(jp, jn, cols, vals)
     alone = _Row(zero, zero, cols, vals)
-    start = _Blocks(A, An, X[0], C[0], C[0], S)
     for a in range(3):
         A[a, a] = 1e12
-    if D == 5:
-        for a, s in ((3, p[RATE_SIGMA]), (4, p[SPEED_SIGMA])):
-            jp[:] = 0.0
-            jp[a] = 1.0 / s
-            vals[0] = -poses[0, a] / s
-            _add(here, 1, start)
-            chi2[5] += vals[0] * vals[0]
-            volume += math.log(s)
     last = np.zeros(M, np.int64)
     for k in range(n):
         for q in range(first[k], first[k + 1]):
@@ -239,9 +226,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                 _add(here, count, blocks)
         if k + 1 < n:
             ux, uy, turn, dt, d = steps[k + 1, 0], steps[k + 1, 1], steps[k + 1, 2], steps[k + 1, 3], steps[k + 1, 4]
-            rate = poses[k, 3] if D == 5 else 0.0
-            speed = poses[k, 4] if D == 5 else 0.0
-            less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn + rate * dt
+            less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn
             h = 0.5 * turn
             cx, cyy = math.cos(h) * ux + math.sin(h) * uy, -math.sin(h) * ux + math.cos(h) * uy
             longer = math.exp(g[DISTANCE_SCALE])  # the noise is in what was measured: it is not scaled
@@ -250,14 +235,16 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
             mx, my = poses[k + 1, 0] - x, poses[k + 1, 1] - y
             qx, qy = cp * mx + sp * my, -sp * mx + cp * my
             qx, qy = longer * qx, longer * qy
-            ex, ey = qx - cx + speed * dt, qy - cyy
+            ex, ey = qx - cx, qy - cyy
             et = wrap_residual(poses[k + 1, 2] - th - turn + less)
             var_x = p[ALONG_METRE] ** 2 * d + p[ALONG_SECOND] ** 2 * dt + p[FLOOR_POSITION] ** 2
             var_y = p[LATERAL_METRE] ** 2 * d + p[FLOOR_POSITION] ** 2
             var_t = p[HEADING_METRE] ** 2 * d + p[HEADING_RADIAN] ** 2 * abs(turn) + p[HEADING_SECOND] ** 2 * dt
             var_t += p[FLOOR_HEADING] ** 2
             if steps[k + 1, 5] > 0.0:
-                var_x, var_y, var_t = steps[k + 1, 5], steps[k + 1, 6], steps[k + 1, 7]
+                var_x = steps[k + 1, 5]
+            if steps[k + 1, 6] > 0.0:
+                var_y, var_t = steps[k + 1, 6], steps[k + 1, 7]
             volume += 0.5 * (math.log(var_x) + math.log(var_y) + math.log(var_t))
             for row in range(3):
                 jp[:] = 0.0
@@ -267,8 +254,6 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                     u = w * longer
                     jp[0], jp[1], jn[0], jn[1] = -u * cp, -u * sp, u * cp, u * sp
                     scale = qx
-                    if D == 5:
-                        jp[4] = w * dt
                 elif row == 1:
                     w, e, dphi = 1.0 / math.sqrt(var_y), ey, -qx
                     u = w * longer
@@ -280,8 +265,6 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                 jp[2] = w * dphi
                 # constants turn the chord by half of what they take from the turn, and the heading by all of it
                 part = -0.5 * dphi if row < 2 else 1.0
-                if D == 5:
-                    jp[3] = w * part * dt
                 cols[1], vals[1] = YAW_BIAS, w * part * dt
                 cols[2], vals[2] = DISTANCE_SCALE, w * scale
                 cols[3], vals[3] = TURN_PER_METRE, w * part * d
@@ -289,18 +272,6 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                 vals[0] = -w * e
                 chi2[row] += vals[0] * vals[0]
                 _add(onward, 5, blocks)
-            if D == 5:
-                for a in range(3, 5):
-                    sigma = p[RATE_SIGMA] if a == 3 else p[SPEED_SIGMA]
-                    left = math.exp(-max(dt, 1e-6) / (p[RATE_TIME] if a == 3 else p[SPEED_TIME]))
-                    new = sigma * math.sqrt(1.0 - left * left)
-                    jp[:] = 0.0
-                    jn[:] = 0.0
-                    jp[a], jn[a] = -left / new, 1.0 / new
-                    vals[0] = -(poses[k + 1, a] - left * poses[k, a]) / new
-                    chi2[5] += vals[0] * vals[0]
-                    volume += math.log(new)
-                    _add(onward, 1, blocks)
         if damping > 0.0:
             for a in range(D):
                 A[a, a] *= 1.0 + damping

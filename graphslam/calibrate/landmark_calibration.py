@@ -15,6 +15,7 @@ from graphslam.calibrate.clock import profile_clock
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, round_digits
 from graphslam.calibrate.prediction_check import predict_withheld_sightings
+from graphslam.calibrate.slips import ROUNDS, find_slips, slip_finding, with_untested
 from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Ints, Smoothing, SmoothingWindow, rebuild_window
 from graphslam.calibrate.windows import SightingLog, window_scans
 from graphslam.core.errors import DataError
@@ -118,7 +119,7 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
     named = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
     free = tuple(c for c in named if c not in held)
     count = _count(seen, SHORT, effort)
-    short, short_value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
+    seen, short, short_value = _without_slips(seen, count, free)
     wild = tuple(c for c in free if abs(short.constants[CONSTANTS.index(c)]) > RAN_AWAY * PRIOR[CONSTANTS.index(c)])
     if wild:
         held, free = (*held, *wild), tuple(c for c in free if c not in wild)
@@ -149,7 +150,22 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
         noise |= two
         if two or lasts or alike > ALIKE:
             notes.append(_lasting_note(short, long, alike))
-    return calibration_of("sightings", estimates, noise, notes, _data(short))
+    if seen.slips:
+        notes.append(slip_finding(seen.slips, seen.span[0]))
+    made = calibration_of("sightings", estimates, noise, notes, _data(short))
+    slips = () if made.contradictions() else with_untested(seen.slips, seen)
+    return replace(made, corrections=replace(made.corrections, slips=slips))
+
+
+def _without_slips(seen: SightingLog, count: int | None, free: tuple[str, ...]) -> tuple[SightingLog, Smoothing, float]:
+    """The log with the stretches in which its wheels slipped, and short windows that do not use their distances."""
+    for _ in range(ROUNDS):
+        short, value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
+        slips = find_slips(short)
+        if not slips:
+            break
+        seen = replace(seen, slips=tuple(sorted((*seen.slips, *slips))))
+    return seen, short, value
 
 
 def _again(seen: SightingLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:
@@ -262,7 +278,7 @@ def _heading_variance(s: Smoothing, step: Array) -> float:
 
 def residual_autocorrelation(s: Smoothing) -> float:
     """Correlation of residuals of one landmark from one sighting to the next, the larger of range and bearing."""
-    seen, _ = s.residuals()
+    seen = s.residuals()
     products, squares = np.zeros(2), np.zeros(2)
     for w, r in zip(s.windows, seen):
         for l in np.unique(w.slots[:, 0]):

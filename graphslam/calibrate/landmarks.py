@@ -38,7 +38,7 @@ def smooth_sightings(
 
 def trim_outliers(s: Smoothing, limit: float) -> Smoothing:
     """The smoothing without sightings whose residual is above ``limit`` standard deviations."""
-    seen, _ = s.residuals()
+    seen = s.residuals()
     good = [np.nan_to_num(np.abs(r), nan=0.0).max(axis=1, initial=0.0) < limit for r in seen]
     return s if all(g.all() for g in good) else keep_sightings(s, good)
 

@@ -83,7 +83,9 @@ def predict_withheld_sightings(
     gains = {"all": before - every}
     if c.without_constants() != c:
         gains["noise"] = before - score(c.without_constants())[0]
-    return Prediction(what="withheld observations", count=n, gains=gains)
+    timed = Corrections(clock=c.clock, slips=c.slips)
+    gain = 0.0 if timed.neutral else before - score(timed)[0]
+    return Prediction(what="withheld observations", count=n, gains=gains, timed=gain)
 
 
 LEAST = 20

@@ -44,21 +44,16 @@ SIGMAS = (
     "bearing",
     "visit_range",
     "visit_bearing",
-    "rate_sigma",
-    "rate_time",
-    "speed_sigma",
-    "speed_time",
     "floor_position",
     "floor_heading",
 )
-"""In the order of the kernels: m/√m, m/√s, m/√m, rad/√m, rad/√rad, rad/√s, m, rad, m, rad, rad/s, s, m/s, s, m, rad."""
-CHI2_CLASS = dict(zip(SIGMAS, (0, 0, 1, 2, 2, 2, 3, 4, 3, 4, 5, 5, 5, 5, 0, 2)))
+"""In the order of the kernels: m/√m, m/√s, m/√m, rad/√m, rad/√rad, rad/√s, m, rad, m, rad, m, rad."""
+CHI2_CLASS = dict(zip(SIGMAS, (0, 0, 1, 2, 2, 2, 3, 4, 3, 4, 0, 2)))
 """Class of the residuals that each one weights, as the kernels count them."""
 START = {
     **{"along_metre": 0.05, "along_second": 0.02, "lateral_metre": 0.03, "heading_metre": 0.01},
     **{"heading_radian": 0.02, "heading_second": 0.005, "range": 0.2, "bearing": 0.02},
-    **{"visit_range": 0.1, "visit_bearing": 0.01, "rate_sigma": 0.03, "rate_time": 5.0},
-    **{"speed_sigma": 0.05, "speed_time": 5.0, "floor_position": 1e-3, "floor_heading": 1e-4},
+    **{"visit_range": 0.1, "visit_bearing": 0.01, "floor_position": 1e-3, "floor_heading": 1e-4},
 }
 WIDTH = 2.0
 """σ of the logarithm of a standard deviation before the log was looked at, about its start."""
@@ -85,7 +80,7 @@ class SmoothingWindow:
         0 a landmark, 1 a visit.
     rows : (q,) int64
         Of the sightings in the stream.
-    poses : (n, 3 or 5)
+    poses : (n, 3)
     nuisance : (M, 2)
     """
 
@@ -124,7 +119,6 @@ class Smoothing:
     constants: Array = field(default_factory=lambda: np.zeros(K.CONSTANTS))
     sigmas: dict[str, float] = field(default_factory=lambda: dict(START))
     covariance: Array = field(default_factory=lambda: np.full((K.CONSTANTS, K.CONSTANTS), np.nan))
-    evaluations: int = 0
     _memory: list[K.Work] = field(default_factory=list)
 
     def copy(self, **changes: object) -> Smoothing:
@@ -161,7 +155,6 @@ class Smoothing:
             logdet, volume = logdet + a, volume + b
             S += work.S[: K.HEAD, : K.HEAD]
             chi2 += work.chi2
-        self.evaluations += 1
         return logdet, volume, np.triu(S) + np.triu(S, 1).T, chi2
 
     def _with_prior(self, S: Array) -> tuple[Array, Array, float]:
@@ -194,6 +187,24 @@ class Smoothing:
         _, _, _, chi2 = self._eliminated(self._parameters())
         i = self._index
         return float(chi2.sum() + np.sum((self.constants[i] / PRIOR[i]) ** 2))
+
+    def gain_without_distances(self, count: int, every: int = 1) -> list[Array]:
+        """χ²(count) if the noise is right: what goes if ``count`` distances, from each ``every`` steps on, are free."""
+        p, out = self._parameters(), []
+        for w, work in zip(self.windows, self._buffers()):
+
+            def chi2(steps: Array, w: SmoothingWindow = w, work: K.Work = work) -> float:
+                data = K.Data(steps, w.first, w.sightings, w.slots, w.kinds)
+                K.eliminate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, 0.0, work)
+                return float(work.S[K.RHS, K.RHS])
+
+            whole, gain = chi2(w.steps), []
+            for k in range(0, len(w.poses) - count, every):
+                steps = w.steps.copy()
+                steps[k + 1 : k + 1 + count, 5] = 1e6
+                gain.append(whole - chi2(steps))
+            out.append(np.array(gain))
+        return out
 
     def settle(self, iterations: int = 20, tolerance: float = 1e-3) -> float:
         """Gauss-Newton with Levenberg's damping where a step fails; returns χ²."""
@@ -281,10 +292,10 @@ class Smoothing:
         if len(i):
             self.covariance[np.ix_(i, i)] = np.linalg.inv(H)
 
-    def residuals(self) -> tuple[list[Array], list[Array]]:
-        """Whitened residuals of sightings ``(q, 2)``, NaN without a bearing, and of turns ``(n,)``, by window."""
+    def residuals(self) -> list[Array]:
+        """Whitened residuals of sightings ``(q, 2)``, NaN without a bearing, by window."""
         g, s = self.constants, self.sigmas
-        seen, moved = [], []
+        seen = []
         for w in self.windows:
             k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))
             x = w.poses[k]
@@ -296,15 +307,7 @@ class Smoothing:
             b = np.arctan2(d[:, 1], d[:, 0]) - x[:, 2] - self.sensor[2] - g[K.SENSOR_YAW] + visit[:, 1]
             b = np.pi - np.mod(np.pi - (b - w.sightings[:, 1]), 2 * np.pi)
             seen.append(np.column_stack([(r - w.sightings[:, 0]) / s["range"], b / s["bearing"]]))
-            u = w.steps[1:]
-            less = g[K.YAW_BIAS] * u[:, 3] + g[K.TURN_PER_METRE] * u[:, 4] + g[K.TURN_SCALE] * u[:, 2]
-            if w.poses.shape[1] == 5:
-                less = less + w.poses[:-1, 3] * u[:, 3]
-            e = np.diff(w.poses[:, 2]) - u[:, 2] + less
-            v = s["heading_metre"] ** 2 * u[:, 4] + s["heading_radian"] ** 2 * np.abs(u[:, 2])
-            v = v + s["heading_second"] ** 2 * u[:, 3] + s["floor_heading"] ** 2
-            moved.append((np.pi - np.mod(np.pi - e, 2 * np.pi)) / np.sqrt(v))
-        return seen, moved
+        return seen
 
 
 def most_open_nuisances(w: SmoothingWindow) -> int:

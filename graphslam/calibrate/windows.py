@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.corrections import Corrections, apply_corrections, corrected_sightings, visits_of
+from graphslam.calibrate.corrections import Corrections, apply_corrections, corrected_sightings, slip_noise, visits_of
 from graphslam.calibrate.smoothing import Ints, SmoothingWindow, rebuild_window, renumber_slots
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_compose, se2_transform
@@ -38,6 +38,8 @@ class SightingLog:
         Sightings that no window has; None: all are there.
     stated : MotionNoise, optional
         Windows have the variances of the motion that the log states, with this noise of controls; None: no variances.
+    slips : tuple of (float, float)
+        Stretches in which the wheels slipped, in the clock of the motion [s].
     """
 
     log: SensorLog
@@ -46,6 +48,7 @@ class SightingLog:
     clock: Array
     withheld: npt.NDArray[np.bool_] | None = None
     stated: MotionNoise | None = None
+    slips: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def of(cls, log: SensorLog, name: str, sightings: LandmarkObservations) -> SightingLog:
@@ -92,6 +95,8 @@ class SightingLog:
         out[1:, :3] = odometry.increments[1:]
         for column in (1, 2):
             out[1:, 2 + column] = np.diff(np.interp(t, self.clock[0], self.clock[column]))
+        if self.slips:
+            out[:, 5] = np.maximum(out[:, 5], slip_noise(t, out[:, 4], self.slips))
         return out
 
     def breaks(self) -> Array:

@@ -33,9 +33,6 @@ def residuals(s: Smoothing, states: np.ndarray) -> tuple[np.ndarray, float]:
         at += 2 * len(w.nuisance)
         for a in range(3):  # the first pose is the frame
             out.append(1e6 * (poses[0, a] - w.poses[0, a]))
-        if D == 5:
-            add(poses[0, 3], p["rate_sigma"])
-            add(poses[0, 4], p["speed_sigma"])
         for kind, value in zip(w.kinds, nuisance):
             if kind == 1:
                 add(value[0], p["visit_range"])
@@ -56,9 +53,6 @@ def residuals(s: Smoothing, states: np.ndarray) -> tuple[np.ndarray, float]:
             ux, uy, turn, dt, d, *given = w.steps[k + 1]
             less = g["yaw_bias"] * dt + g["turn_per_metre"] * d + g["turn_scale"] * turn
             chord = _rotation(-turn / 2) @ [ux, uy]
-            if D == 5:
-                less += poses[k, 3] * dt
-                chord = chord - [poses[k, 4] * dt, 0.0]
             moved = _rotation(-(th + turn / 2 - less / 2)) @ (poses[k + 1, :2] - poses[k, :2])
             moved = np.exp(g["distance_scale"]) * moved
             along = p["along_metre"] ** 2 * d + p["along_second"] ** 2 * dt + p["floor_position"] ** 2
@@ -70,10 +64,6 @@ def residuals(s: Smoothing, states: np.ndarray) -> tuple[np.ndarray, float]:
             add(moved[0] - chord[0], np.sqrt(along))
             add(moved[1] - chord[1], np.sqrt(side))
             add(_wrap(poses[k + 1, 2] - th - turn + less), np.sqrt(head))
-            if D == 5:
-                for a, what in ((3, "rate"), (4, "speed")):
-                    left = np.exp(-dt / p[f"{what}_time"])
-                    add(poses[k + 1, a] - left * poses[k, a], p[f"{what}_sigma"] * np.sqrt(1 - left**2))
     return np.array(out), float(np.sum(np.log(sigmas)))
 
 
