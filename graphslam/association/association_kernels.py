@@ -34,12 +34,12 @@ class PairingArrays(NamedTuple):
 
 
 class AcceptedPairings(NamedTuple):
-    """Accepted pairings of every start: out."""
+    """Accepted pairings of every start (output)."""
 
     pairs: Index
-    """(k, most): in order."""
+    """(k, most): Indices of the pairings, in the order of acceptance."""
     number: Index
-    """(k,): how many."""
+    """(k,): Number of accepted pairings."""
     score: Array
     """(k,): ``Σ (gate - d²)``."""
     cost: Array
@@ -50,10 +50,10 @@ class AcceptedPairings(NamedTuple):
 def joint_compatibility(
     pairings: PairingArrays, seeds: Index, gate: float, joint_limit: Array, persistent: bool, accepted: AcceptedPairings
 ) -> None:
-    """From every seed pairing, add the best compatible pairing, conditioned on those taken, until none is left.
+    """From every seed pairing, add the best compatible pairing, conditional on the accepted ones, until none is left.
 
     The conditional innovation of a pairing given the accepted ones comes from an incremental Cholesky factor whose
-    columns are made for accepted pairings only, so an addition costs O(accepted · pairings).
+    columns are computed for accepted pairings only, so an addition costs O(accepted · pairings).
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def joint_compatibility(
     joint_limit : (most + 1,)
         χ² limit of the joint distance with 1, 2, … pairings (index = number of pairings).
     persistent : bool
-        A pairing that would break the joint limit is passed over for the next likely one, instead of ending the start.
+        A pairing that would break the joint limit is skipped for the next likely one, instead of ending the search.
     """
     observed, target, nu, C = pairings
     out_pairs, out_count, out_score, out_cost = accepted
@@ -116,7 +116,7 @@ def joint_compatibility(
                 D[j, 1] -= W[w0, x] * W[w0, y] + W[w1, x] * W[w1, y]
                 D[j, 2] -= W[w0, y] * W[w0, y] + W[w1, y] * W[w1, y]
             count += 1
-            # most likely next pairing: d² + ln|S|, so that a sharp prediction beats a vague one
+            # most likely next pairing: d² + ln|S|, so that a precise prediction is preferred to an uncertain one
             pick = -1
             best = np.inf
             if count == out_pairs.shape[1]:

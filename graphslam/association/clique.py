@@ -1,8 +1,8 @@
-"""Maximum clique: exactly by branch and bound where that is feasible, else greedily with a bound on what was missed.
+"""Maximum clique: exact by branch and bound where that is feasible, else the best one found and an upper bound.
 
 Branch and bound with the greedy-colouring bound of Tomita & Seki (2003, MCQ): the vertices of a clique all have
-different colours, so a set that k colours colour holds no clique larger than k. Sets are Python integers used as bit
-strings.
+different colours, so a set that can be coloured with k colours contains no clique larger than k. Sets are Python
+integers used as bit sets.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Clique:
-    """The largest clique that was found.
+    """The largest clique found.
 
     Parameters
     ----------
@@ -44,15 +44,14 @@ def maximum_clique(adjacent: npt.ArrayLike, *, budget: int = 200_000) -> Clique:
     Parameters
     ----------
     adjacent : (n, n) bool
-        Symmetric; the diagonal is not looked at.
+        Symmetric; the diagonal is ignored.
     budget : int
-        Branches after which the search is given up; the best clique so far and a bound are returned then. The greedy
-        clique alone costs no branch.
+        Maximum number of branches; then the best clique so far and a bound are returned. The greedy clique uses none.
 
     Returns
     -------
     Clique
-        Of several maximum cliques always the same one.
+        Deterministic, also if there are several maximum cliques.
     """
     A = np.array(adjacent, dtype=np.bool_)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or not (A == A.T).all():
@@ -78,7 +77,7 @@ def maximum_clique(adjacent: npt.ArrayLike, *, budget: int = 200_000) -> Clique:
 
 
 def _degeneracy_order(A: Mask) -> npt.NDArray[np.intp]:
-    """Repeatedly the vertex with the fewest neighbours left, which then goes to the front of the rest."""
+    """Degeneracy order: repeatedly remove the vertex with the fewest remaining neighbours."""
     degree = A.sum(axis=1).astype(np.int64)
     order = np.empty(len(A), dtype=np.intp)
     for k in range(len(A)):
@@ -90,7 +89,8 @@ def _degeneracy_order(A: Mask) -> npt.NDArray[np.intp]:
 
 
 def _greedy(rows: list[int], n: int) -> int:
-    """From each of the best-connected vertices: add the candidate with most neighbours among the candidates."""
+    """Greedy clique from each of the vertices of highest degree: add the candidate with most neighbouring
+    candidates."""
     best = 0
     for start in sorted(range(n), key=lambda v: -rows[v].bit_count())[: min(n, 20)]:
         clique, candidates = 1 << start, rows[start]

@@ -1,8 +1,8 @@
-"""Which of many candidate pairings hold together: the core of landmark association, on plain arrays.
+"""Jointly compatible subsets of candidate pairings: the core of landmark association, on plain arrays.
 
-A pairing says that observation ``i`` is the known landmark ``j``; its innovation and the joint covariance of all
-innovations are given. Nearest neighbour takes pairings one by one; joint compatibility (Neira and Tardós 2001) asks
-whether a whole set can be true at once, which sees the common error of everything that hangs from one pose.
+A pairing assigns observation ``i`` to the known landmark ``j``; its innovation and the joint covariance of all
+innovations are given. Nearest neighbour takes pairings one by one; joint compatibility (Neira and Tardós 2001) tests a
+whole set at once and so accounts for the error common to all observations from one pose.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def mahalanobis2(nu: Array, S: Array) -> Array:
 
 
 def nearest_neighbour_pairs(d2: Array, i: Ints, j: Ints) -> Index:
-    """Exclusive nearest neighbours: the smallest distance of all is taken first, then the next that is still free.
+    """Exclusive nearest neighbours: pairings in the order of distance, each accepted if both its members are unused.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def nearest_neighbour_pairs(d2: Array, i: Ints, j: Ints) -> Index:
     Returns
     -------
     (k,)
-        Pairings taken, in that order.
+        Accepted pairings, in that order.
     """
     seen: set[int] = set()
     used: set[int] = set()
@@ -59,12 +59,12 @@ def nearest_neighbour_pairs(d2: Array, i: Ints, j: Ints) -> Index:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """What a search found from each of its starts.
+    """Result of a search from each of its starts.
 
     Parameters
     ----------
     pairings : (k, most)
-        Accepted pairings of each start in order; the first ``count`` are meant.
+        Accepted pairings of each start in order; the first ``count`` are valid.
     count : (k,)
     score : (k,)
         ``Σ (gate - d²)``.
@@ -87,22 +87,22 @@ def search_compatible_sets(
 ) -> SearchResult:
     """Grow a jointly compatible set from every seed pairing.
 
-    Again and again the likeliest pairing (least ``d² + ln det S``) is added that passes its gate given those taken.
+    Each step adds the most likely pairing (least ``d² + ln det S``) that passes its gate given the accepted ones.
 
     Parameters
     ----------
     i, j : (p,)
-        Observation and landmark of each pairing; in a set each stands once.
+        Observation and landmark of each pairing; each occurs at most once in a set.
     nu : (p, 2)
     C : (2p, 2p)
     seeds : (k,)
         First pairing of each start.
     gate : float
-        χ² gate of one pairing given those taken.
+        χ² gate of one pairing given the accepted ones.
     limits : (most + 1,)
-        χ² limits of 0 (unused), 1, … pairings together; ``most`` ends the growth.
+        χ² limits of 0 (unused), 1, … pairings together; a set has at most ``most`` pairings.
     persistent : bool
-        A pairing that would break the joint limit is passed over for the next one; otherwise it ends the growth.
+        A pairing that would break the joint limit is skipped in favour of the next one; otherwise it ends the search.
     """
     starts, most = len(seeds), len(limits) - 1
     out = np.zeros((starts, most), dtype=np.int64)
@@ -117,7 +117,7 @@ def search_compatible_sets(
 
 
 def most_pairings(i: Ints, j: Ints) -> int:
-    """No exclusive set has more pairings than this."""
+    """Upper bound on the number of pairings in an exclusive set."""
     return min(len(np.unique(i)), len(np.unique(j)))
 
 

@@ -1,22 +1,22 @@
-"""Which loops of a chain agree with each other? Pairwise consistency maximisation (Mangelson et al. 2018, PCM).
+"""Mutually consistent loops of a chain: pairwise consistency maximisation (PCM, Mangelson et al. 2018).
 
 Two loops (a, b) and (c, d) and the two pieces of the chain between their ends form a cycle,
 
     ``E = T_ab B_bd T_cd⁻¹ B_ca``,  ``B_ij = X_i⁻¹ X_j`` along the chain,
 
-which is the identity if all four are right. ``r = Log E`` is a right tangent at a; to first order its covariance is
+the identity if both loops are correct, up to noise. ``r = Log E`` is a right tangent at a; to first order its
+covariance is
 
     ``S = A_ab P_ab A_abᵀ + A_cd P_cd A_cdᵀ + M ΔC_bd Mᵀ + N ΔC_ca Nᵀ ± (M ΔC_both Nᵀ + N ΔC_both Mᵀ)``,
 
-where ``C_k = Σ_{i<k} Ad(X_{i+1}) Q_i Ad(X_{i+1})ᵀ`` is the covariance of the chain summed in the frame of its start (so
-that any piece of it is a difference of two), ``M = Ad(B_ac T_cd X_d⁻¹)`` and ``N = Ad(X_a⁻¹)`` carry it to a, and the
-last term, of the stretch that both pieces run over, keeps what they share from being counted as independent.
-``D² = rᵀ S⁻¹ r`` is χ² of 3 (SE(2)) or 6 (SE(3)) degrees of freedom if both loops are right. Nothing is linearised
-about a solution: there need not be one.
+where ``C_k = Σ_{i<k} Ad(X_{i+1}) Q_i Ad(X_{i+1})ᵀ`` is the covariance of the chain summed in the frame of its start
+(that of any piece is a difference of two sums), ``M = Ad(B_ac T_cd X_d⁻¹)`` and ``N = Ad(X_a⁻¹)`` transform it to a,
+and the last term accounts for the correlation of the two pieces where they overlap. ``D² = rᵀ S⁻¹ r`` is χ² of 3
+(SE(2)) or 6 (SE(3)) degrees of freedom if both loops are correct. No linearisation about a solution is needed.
 
-The largest set of loops that agree two by two is the maximum clique of the graph of agreements. That graph is wrong
-about a right pair with probability ``1 - level``; a clique of many loops forgives none of its pairs, so loops that
-contradict no more of the clique than chance would have it are taken back in (``readmit``).
+The largest set of pairwise consistent loops is the maximum clique of the consistency graph. A pair of correct loops
+fails the test with probability ``1 - level``, and one failed pair excludes a loop from the clique, so loops that are
+inconsistent with no more of the clique than expected by chance are readmitted (``readmit``).
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from graphslam.core.geometry import Array
 
 Ints = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
-# Pairs that are worked out at a time.
+# Pairs that are evaluated at a time.
 CHUNK = 20_000
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryChain:
-    """A dead-reckoned chain and its covariance, summed from its start.
+    """A dead-reckoned chain and its covariance, accumulated from its start.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class OdometryChain:
     spread : (n, d, d)
         ``C_k``: covariance of ``T_0_k`` as a *left* tangent, in the frame of the start.
     part : (n,) int64
-        Nodes with the same number hang together. Between parts nothing is known.
+        Nodes with the same number are connected; between parts there is no information.
     """
 
     poses: Array
@@ -70,7 +70,7 @@ class OdometryChain:
         covariances : (n - 1, d, d)
             Of their right tangents.
         known : (n - 1,) bool, optional
-            Increments that were measured; the chain is cut at the others, whose numbers are not looked at.
+            Increments that were measured; the chain is cut at the others, whose values are ignored.
         """
         z, Q = np.array(increments, dtype=np.float64), np.array(covariances, dtype=np.float64)
         d = _tangent(z)
@@ -99,7 +99,7 @@ class OdometryChain:
 
 @dataclass(frozen=True, slots=True)
 class LoopArrays:
-    """Loops with the earlier node first.
+    """Loop constraints with the earlier node first.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class LoopArrays:
     def of(
         cls, chain: OdometryChain, ends: npt.ArrayLike, measured: npt.ArrayLike, covariance: npt.ArrayLike
     ) -> LoopArrays:
-        """Loops (i, j) in any direction, checked and turned."""
+        """Loops (i, j) in either direction, validated and inverted where j < i."""
         e = np.array(ends, dtype=np.int64).reshape(-1, 2)
         d = chain.tangent_dim
         z = np.array(measured, dtype=np.float64).reshape(len(e), chain.poses.shape[1])
@@ -145,9 +145,9 @@ class LoopArrays:
 
 
 def chain_chi2(chain: OdometryChain, loops: LoopArrays) -> Array:
-    """``D²`` of every loop against the chain alone ``(l,)``; ``nan`` where the chain does not join its ends.
+    """``D²`` of every loop against the chain alone ``(l,)``; ``nan`` where the chain does not connect its ends.
 
-    ``E = T_ab B_ba``: χ² of 3 or 6 degrees of freedom for a right loop.
+    ``E = T_ab B_ba``: χ² of 3 or 6 degrees of freedom for a correct loop.
     """
     a, b = loops.ends.T
     X = chain.poses
@@ -162,7 +162,7 @@ def chain_chi2(chain: OdometryChain, loops: LoopArrays) -> Array:
 def pair_chi2(chain: OdometryChain, loops: LoopArrays, first: npt.ArrayLike, second: npt.ArrayLike) -> Array:
     """``D²`` of the cycles through the loops ``first[k]`` and ``second[k]``, ``(k,)``.
 
-    ``nan`` where the chain does not join a with c, or b with d.
+    ``nan`` where the chain does not connect a with c, or b with d.
     """
     one, two = np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)
     out = np.empty(len(one))
@@ -179,7 +179,7 @@ def _pair_chi2(chain: OdometryChain, loops: LoopArrays, one: Ints, two: Ints) ->
     ac = _between(X[a], X[c])
     a_to_d = _compose(ac, T_cd)  # over c
     M = _compose(a_to_d, _inverse(X[d]))
-    ahead = _compose(M, X[b])  # what follows T_ab in E, inverted: a → b over c and d
+    ahead = _compose(M, X[b])  # the factor after T_ab in E, inverted: a → b over c and d
     r = _log(_compose(T_ab, _inverse(ahead)))
     A_ab, A_cd, M, N = _adjoint(ahead), _adjoint(a_to_d), _adjoint(M), _adjoint(_inverse(X[a]))
     S = A_ab @ loops.covariance[one] @ np.swapaxes(A_ab, 1, 2)
@@ -190,7 +190,7 @@ def _pair_chi2(chain: OdometryChain, loops: LoopArrays, one: Ints, two: Ints) ->
     low, high = np.maximum(low_bd, low_ca), np.minimum(high_bd, high_ca)
     both = np.flatnonzero(low < high)
     if len(both):
-        # B_bd is run forwards if b < d, B_ca if c < a: the same noise enters with the sign of the direction
+        # B_bd is traversed forwards if b < d, B_ca if c < a: the same noise enters with the sign of the direction
         sign = np.where((b < d) == (c < a), 1.0, -1.0)[both]
         cross = M[both] @ (C[high[both]] - C[low[both]]) @ np.swapaxes(N[both], 1, 2)
         S[both] += sign[:, None, None] * (cross + np.swapaxes(cross, 1, 2))
@@ -200,7 +200,7 @@ def _pair_chi2(chain: OdometryChain, loops: LoopArrays, one: Ints, two: Ints) ->
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConsistentSet:
-    """The largest set of loops that agree with each other.
+    """The largest set of mutually consistent loops.
 
     Parameters
     ----------
@@ -209,13 +209,13 @@ class ConsistentSet:
         Accepted by the clique itself; the others were readmitted.
     chi2 : (l, l)
         ``D²`` of every pair; on the diagonal, of every loop against the chain alone. ``nan`` where the chain does not
-        join the ends.
+        connect the ends.
     limit : float
-        What ``D²`` was compared with.
+        χ² limit of ``D²``.
     bound : int
-        No clique is larger; equal to the size of the clique where it is proved to be a maximum.
+        No clique is larger; equal to the size of the clique if that is proved to be a maximum.
     reasons : tuple of str
-        Of every loop, in words.
+        Reason for the decision on every loop.
     """
 
     accepted: Mask
@@ -244,7 +244,7 @@ def consistent_loops(
     readmit: float = 0.05,
     budget: int = 200_000,
 ) -> ConsistentSet:
-    """Loops that agree with each other and with the chain.
+    """Loops that are consistent with each other and with the chain.
 
     Parameters
     ----------
@@ -256,18 +256,18 @@ def consistent_loops(
         Ends ``(l, 2)``, relative poses ``T_ij`` ``(l, 3)`` or ``(l, 7)``, covariances of their right tangents
         ``(l, d, d)``. All pairs are compared: memory and time grow with the square (2000 loops: two million pairs).
     level : float
-        A pair of right loops agrees with this probability.
+        Probability that a pair of correct loops passes the test.
     against_chain : bool
-        Also refuse loops that contradict the chain alone.
+        Also reject loops that are inconsistent with the chain alone.
     readmit : float
-        A loop outside the clique is taken back in if it contradicts at most this share of the clique, 0 to keep to
-        the clique. The expected share of a right loop is ``1 - level``.
+        A loop outside the clique is readmitted if it is inconsistent with at most this share of the clique; 0 readmits
+        none. A correct loop's expected share is ``1 - level``.
     budget : int
         Branches of the exact search (:func:`~graphslam.association.clique.maximum_clique`).
 
     Notes
     -----
-    What it cannot see: wrong loops that agree with each other better than the right ones do are the larger clique.
+    Limitation: false loops are accepted if they form a larger mutually consistent set than the correct ones.
     """
     if not 0.0 < level < 1.0:
         raise ConfigError(f"level must lie between 0 and 1, got {level}")
@@ -289,7 +289,7 @@ def largest_consistent_set(
 ) -> ConsistentSet:
     """Largest set of loops whose pairwise ``D²`` are within a limit, from the matrix of ``D²`` (diagonal: the chain).
 
-    ``nan`` counts as agreement: what cannot be compared contradicts nothing.
+    ``nan`` counts as consistent: such a pair cannot be compared.
     """
     D = np.asarray(chi2, dtype=np.float64)
     conflict = limit < D
@@ -337,7 +337,7 @@ def _check(poses: Array, covariances: Array, what: str) -> None:
 
 
 def _mahalanobis(r: Array, S: Array) -> Array:
-    # units of the diagonal first: metres and radians of very different σ
+    # scaled by the diagonal first: metres and radians of very different σ
     u = np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), np.finfo(float).tiny))
     y, C = r / u, S / (u[:, :, None] * u[:, None, :])
     d = C.shape[-1]

@@ -1,14 +1,14 @@
-"""Landmark identities that cannot be right: a test of every sighting against the whole of the map, at the optimum.
+"""Wrong landmark identities: a test of every observation against the whole map, at the optimum.
 
-A barcode misread three times in a row, or a wrong association, puts a landmark of one submap where another one stands.
-Inside that submap nothing contradicts it; the map does. The test is that of Baarda (1968, "data snooping"): were
-landmark i of a submap displaced by an unknown amount, by how much would the objective fall if that were allowed?
+A barcode misread three times in a row, or a wrong association, gives a landmark of a submap the identity of another.
+Only the whole map reveals it. The test is that of Baarda (1968, "data snooping"): by how much does the objective
+decrease if landmark i of a submap may be displaced by an unknown amount?
 With the submap's residual r, its information Ω and the covariance of the residual ``S = Ω⁻¹ - J P Jᵀ``::
 
     T_i = (Ω r)_iᵀ [(Ω S Ω)_ii]⁻¹ (Ω r)_i      ~ χ² with 2 degrees of freedom if nothing is wrong
 
-A sighting that fails is split off into a landmark of its own (:meth:`FactorGraph.split_landmark`): nothing is thrown
-away, the submap keeps all its information about itself, and the event log says so.
+An observation that fails is split off into a landmark of its own (:meth:`FactorGraph.split_landmark`): the submap keeps
+all its internal information, and the event log records the split.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from graphslam.graph.factors.sensor_biases import sensor_biases_at
 
 @dataclass(frozen=True, slots=True)
 class AssociationOutlier:
-    """A sighting whose identity contradicts the map.
+    """An observation whose landmark identity is inconsistent with the map.
 
     Parameters
     ----------
     factor_id, entry : int
-        Factor, and place of the landmark in its submap.
+        Factor, and index of the landmark in its submap.
     statistic : float
-        By how much the objective would fall.
+        Decrease of the objective if the landmark were free.
     """
 
     factor_id: int
@@ -42,9 +42,9 @@ class AssociationOutlier:
 
 
 def identity_statistics(graph: FactorGraphState, record: SubmapRecord) -> Array:
-    """``T_i`` of every landmark ``(n,)`` of one submap factor at the graph's values; nan where only it sees one.
+    """``T_i`` of every landmark ``(n,)`` of one submap factor at the graph's values; nan where no other submap has it.
 
-    The values must be the optimum: the residuals are judged by what the optimum leaves of them.
+    The values must be the optimum: ``S`` is the covariance of the residuals there.
     """
     ids = record.landmark_ids
     n = len(ids)
@@ -72,7 +72,7 @@ def identity_statistics(graph: FactorGraphState, record: SubmapRecord) -> Array:
     C = omega - JtO.T @ P @ JtO  # Ω S Ω
     rows = 3 + 2 * np.arange(n)[:, None] + np.arange(2)
     blocks = C[rows[:, :, None], rows[:, None, :]]
-    # a landmark that only this submap holds in place has no redundancy: its block vanishes
+    # a landmark that only this submap constrains has no redundancy: its block vanishes
     share = np.linalg.eigvalsh(blocks)[:, 0] / np.maximum(np.trace(omega[3 : 3 + 2 * n, 3 : 3 + 2 * n]) / n, 1e-300)
     testable = ~lonely & (share > 1e-9)
     out = np.full(n, np.nan)
@@ -83,9 +83,9 @@ def identity_statistics(graph: FactorGraphState, record: SubmapRecord) -> Array:
 
 
 def find_association_outliers(graph: FactorGraphState, gate: float) -> list[AssociationOutlier]:
-    """Sightings beyond ``gate``, the worst first.
+    """Observations whose statistic exceeds ``gate``, the largest first.
 
-    One wrong sighting makes others look wrong, too: split off the worst alone, solve again, and ask again.
+    One wrong identity raises the statistics of others, too: split off the largest only, solve and test again.
     """
     found = []
     for record in graph.records.values():

@@ -1,9 +1,9 @@
-"""Which landmarks of a new submap are already in the graph.
+"""Data association of the landmarks of a new submap with those of the graph.
 
 Every decision uses the *joint* covariance of the pose where the submap starts and of the candidates (Combined SLAM
-Algorithm 1): after a long loop the pose may be off by metres, but all its landmarks are then off together, and only a
-joint test can see that. The default is a joint-compatibility search from several starts; nearest neighbour by
-Mahalanobis distance is the plain alternative.
+Algorithm 1): after a long loop the pose may be off by metres, but the errors of all its landmarks are then correlated,
+which only a joint test takes into account. The default is a joint-compatibility search from several starts; nearest
+neighbour by Mahalanobis distance is the plain alternative.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class AssociationConfig:
     ----------
     method : {"joint-compatibility", "nearest-neighbour"}
     gate : float
-        χ² gate (2 dof) of each pairing; 11.8 is three sigma.
+        χ² gate (2 dof) of each pairing; 11.8 corresponds to three sigma.
     joint_probability : float
         Confidence of the χ² test of all pairings together.
     starts : int
-        Seeds of the search.
+        Number of seed pairings of the search.
     covariance_scale : float
         Factor on the submap's covariance, the same as in :meth:`FactorGraph.add_submap`.
     max_distance : float
@@ -97,14 +97,14 @@ def associate_landmarks(graph: FactorGraph, submap: Submap, config: AssociationC
     Parameters
     ----------
     graph : FactorGraph
-        Its values and covariance are used as they stand: update the solver first.
+        Its current values and covariance are used: update the solver first.
     submap : Submap
         Entries whose id is not -1 keep it.
 
     Returns
     -------
     (n,) int64
-        -1 = new. No id is given twice.
+        -1 = new. No id occurs twice.
     """
     cfg = config or AssociationConfig()
     if submap.landmarks is None:
@@ -130,7 +130,7 @@ def find_pairings(
     config: AssociationConfig,
     exclude: set[int] | frozenset[int] = frozenset(),
 ) -> CompatiblePairings:
-    """Pairings that pass the gate one by one, with the joint covariance of their innovations.
+    """Pairings that pass the gate individually, with the joint covariance of their innovations.
 
     With pose ``x`` (node of the submap's base), landmark ``l`` and entry ``z``: ``ν = z - R(θ)ᵀ (l - p)``,
     ``S = J Σ_{x,l} Jᵀ + P_z`` where ``Σ`` is the graph's joint covariance and ``P_z`` the submap's own.
@@ -147,7 +147,7 @@ def find_pairings(
     p, R = v.poses[node, :2], rotation2(v.poses[node, 2])
     q = (v.landmarks - p) @ R  # predictions of every graph landmark in the base frame
     free = ~np.isin(v.landmark_ids, np.fromiter(exclude, dtype=np.int64, count=len(exclude)))
-    # cheap cut first: nothing beyond max_distance of every entry
+    # cheap preselection: nothing beyond max_distance of every entry
     low, high = z.min(0) - config.max_distance, z.max(0) + config.max_distance
     near = np.flatnonzero(free & np.all((q >= low) & (q <= high), axis=1))
     if len(near) == 0:
@@ -164,7 +164,7 @@ def find_pairings(
     obs, tar = np.nonzero((d2 <= config.gate) & (np.sum(nu**2, axis=2) <= config.max_distance**2))
     if len(obs) == 0:
         return none
-    # joint covariance over the candidates that are left
+    # joint covariance over the remaining candidates
     used, slot = np.unique(tar, return_inverse=True)
     columns = np.concatenate(
         [pose_columns, (lay.landmark_start + 2 * near[used][:, None] + np.arange(2)).ravel()]
@@ -185,7 +185,7 @@ def find_pairings(
 
 
 def _jacobians(q: Array, R: Array, *, fixed: bool) -> tuple[Array, Array]:
-    """Of ``R(θ)ᵀ (l - p)`` on the pose's right tangent ``(c, 2, 3)`` and on the landmark ``(2, 2)``."""
+    """Jacobians of ``R(θ)ᵀ (l - p)`` in the pose's right tangent ``(c, 2, 3)`` and in the landmark ``(2, 2)``."""
     J_x = np.zeros((len(q), 2, 0 if fixed else 3))
     if not fixed:
         J_x[:, 0, 0] = J_x[:, 1, 1] = -1.0
@@ -212,7 +212,7 @@ def _search(pairs: CompatiblePairings, cfg: AssociationConfig) -> npt.NDArray[np
     """Best of the beam search: the start with the greatest ``Σ (gate - d²)``."""
     seeds = _seeds(pairs, cfg.starts)
     limits = joint_limits(cfg.joint_probability, most_pairings(pairs.observed, pairs.target))
-    limits[1] = max(limits[1], cfg.gate)  # a single pairing is judged by its own gate
+    limits[1] = max(limits[1], cfg.gate)  # a single pairing is tested by its own gate
     found = search_compatible_sets(
         pairs.observed, pairs.target, pairs.innovation, pairs.covariance, seeds, cfg.gate, limits, persistent=False
     )
@@ -222,8 +222,8 @@ def _search(pairs: CompatiblePairings, cfg: AssociationConfig) -> npt.NDArray[np
 def _seeds(pairs: CompatiblePairings, starts: int) -> npt.NDArray[np.int64]:
     """First pairings: all candidates of the least ambiguous entries, the closest first.
 
-    Taking every candidate of an entry before the next entry makes sure that, if the entry is in the map at all, one
-    start is right however wrong the prediction is; the nearest pairing of every entry would all share one error.
+    Taking every candidate of an entry before the next entry ensures that, if the entry is in the map at all, one start
+    is correct even with a large error of the prediction; the nearest pairings of all entries would share that error.
     """
     d2 = pairs.distance2()
     _, inverse, counts = np.unique(pairs.observed, return_inverse=True, return_counts=True)

@@ -1,9 +1,9 @@
-"""Landmarks that turned out to be one.
+"""Detection of duplicate landmarks.
 
-Two tests with different blind spots. The Mahalanobis test believes the covariances and never merges two landmarks of
-one submap, so it cannot repair a duplicate that a front end made inside a submap, nor a split from an overconfident
-covariance. The Euclidean test knows only how close two things of the kind can stand (trees do not grow within 0.7 m
-of each other, and the detector isolates them by metres) and repairs both.
+Two tests with different limitations. The Mahalanobis test relies on the covariances and never merges two landmarks of
+one submap, so it cannot repair a duplicate within a submap, nor one due to an overconfident covariance. The Euclidean
+test uses only the minimum distance between two landmarks (trees do not grow within 0.7 m of each other, and the
+detector separates them by metres) and repairs both.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ def euclidean_merges(graph: FactorGraph, distance: float = 0.7, *, within_submap
     Parameters
     ----------
     within_submap : bool
-        Also merge two landmarks that one submap holds apart.
+        Also merge two landmarks that occur in one submap.
 
     Returns
     -------
     list of (int, int)
-        Ready for :meth:`FactorGraph.merge_landmarks` in this order. Closest pairs first; the one seen more often (then
-        the older) is kept. A landmark that already moved into another is compared from where it went, so a row of
-        near ones does not collapse into one: every dropped landmark lies within ``distance`` of the one that is kept.
+        Ready for :meth:`FactorGraph.merge_landmarks` in this order. Closest pairs first; the one observed more often
+        (then the older) is kept. Every dropped landmark lies within ``distance`` of the one that is kept, so a row of
+        close landmarks does not collapse into one.
     """
     pairs = cKDTree(graph.values.landmarks).query_pairs(distance, output_type="ndarray")
     if len(pairs) == 0:
@@ -38,7 +38,7 @@ def euclidean_merges(graph: FactorGraph, distance: float = 0.7, *, within_submap
 
 
 def mahalanobis_merges(graph: FactorGraph, gate: float = 11.8, *, distance: float = 5.0) -> list[tuple[int, int]]:
-    """Landmarks of different submaps that the joint covariance cannot tell apart, as (keep, drop).
+    """Landmarks of different submaps that the joint covariance does not distinguish, as (keep, drop).
 
     ``d² = δᵀ (P_ii + P_jj - P_ij - P_ji)⁻¹ δ < gate`` with the graph's joint covariance, closest in d² first.
 
@@ -47,7 +47,7 @@ def mahalanobis_merges(graph: FactorGraph, gate: float = 11.8, *, distance: floa
     gate : float
         χ² with two degrees of freedom.
     distance : float
-        Pairs further apart [m] are not looked at.
+        Pairs further apart [m] are not considered.
     """
     pairs = cKDTree(graph.values.landmarks).query_pairs(distance, output_type="ndarray")
     ids = graph.values.landmark_ids
@@ -67,7 +67,7 @@ def mahalanobis_merges(graph: FactorGraph, gate: float = 11.8, *, distance: floa
 
 
 def _share(graph: FactorGraph, i: int, j: int) -> bool:
-    """Does one submap hold both?"""
+    """Whether one submap contains both."""
     return bool(graph.sightings(i) & graph.sightings(j))
 
 

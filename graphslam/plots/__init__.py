@@ -1,4 +1,4 @@
-"""Layer 8: figures: data in, matplotlib axes out."""
+"""Layer 8: figures, from data to matplotlib axes."""
 
 from graphslam.core.lazy_exports import lazy_exports
 

@@ -1,4 +1,4 @@
-"""Methods side by side."""
+"""Comparison figure of several methods."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from graphslam.plots import style
 
 BEFORE, AFTER = "the method's own map", "after refinement"
 GAP = 1e-3
-"""Of χ²: below it an objective is drawn as the optimum."""
+"""χ² gap below which an objective is plotted as optimal."""
 
 
 def comparison_figure(comparison: pd.DataFrame) -> Axes:
-    """The same submaps joined in every way, before and after refinement: what filtering costs, at a glance.
+    """The same submaps joined by every method, before and after refinement: shows the cost of filtering.
 
     Parameters
     ----------
     comparison : DataFrame
-        Of :func:`graphslam.compare`. Panels without figures (NEES and CI without a truth) are left out.
+        Of :func:`graphslam.compare`. Panels without values (NEES and CI without ground truth) are left out.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def comparison_figure(comparison: pd.DataFrame) -> Axes:
         for y, x in zip(at, before):
             text = f"{x:.3g}" if k or x > GAP else "0"
             ax.annotate(text, (x, y), xytext=(0, 8), textcoords="offset points", ha="center", fontsize="small")
-        if k == 0:  # gaps of filters span decades, and that of the optimum is none
+        if k == 0:  # gaps of filters span decades, and that of the optimum is zero
             ax.set_xscale("symlog", linthresh=GAP)
             ax.set_xlim(left=-0.5 * GAP)
         ax.margins(x=0.15)

@@ -1,4 +1,4 @@
-"""Consistency curves: is an estimator honest, submap after submap?"""
+"""Consistency curves of an estimator over the submaps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def plot_consistency(
     log: bool | None = None,
     title: str | None = None,
 ) -> Axes:
-    """Mean normalised NEES (or CI) over the runs against the submap, with the two-sided bounds of a consistent one.
+    """Mean normalised NEES (or CI) over the runs against the submap number, with the two-sided consistency bounds.
 
     Parameters
     ----------

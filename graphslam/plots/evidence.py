@@ -1,4 +1,4 @@
-"""Evidence grids: sections and views from above."""
+"""Plots of evidence grids: sections and height maps."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ def plot_section(
 def plot_heights(
     grid: EvidenceGrid, ax: Axes | None = None, *, below: float | None = None, title: str | None = None
 ) -> Axes:
-    """Draw the highest occupied voxel of each column, coloured by its height, over where anything is known (grey).
+    """Draw the highest occupied voxel of each column, coloured by its height, over all known columns (grey).
 
     Parameters
     ----------
     grid : EvidenceGrid
         3-D.
     below : float, optional
-        Leave out voxels above this height [m]: takes the roof off a building.
+        Leave out voxels above this height [m]: removes the roof of a building.
     """
     if grid.dim != 3:
         raise ConfigError("a 2-D grid has no heights; use plot_section")

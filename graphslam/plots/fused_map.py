@@ -1,4 +1,4 @@
-"""Fused maps: each storey as a plan with the path on it, and a cut from the side."""
+"""Plots of fused maps: each floor as a plan with the path on it, and a vertical cut."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from graphslam.maps.export import floor_plan
 from graphslam.plots import style
 from graphslam.plots.evidence import plot_section, probability, voxel_bounds
 
-# Walls are black here, which in other figures is the colour of the truth: that is light blue in these.
+# Walls are black here, which in other figures is the colour of the ground truth: that is light blue here.
 BELOW = 1.5
-"""A path is drawn on a storey's plan from this far below its band [m]."""
+"""A path is drawn on a floor's plan down to this distance below its band [m]."""
 
 
 def plot_storey(
@@ -31,7 +31,7 @@ def plot_storey(
     truth: Trajectory | None = None,
     title: str | None = None,
 ) -> Axes:
-    """What stands in a band of heights: of columns the most occupied voxel; white free, black occupied, grey unknown.
+    """Plan of a band of heights: the most occupied voxel of every column; white free, black occupied, grey unknown.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def plot_storey(
     path : Trajectory, optional
         ``T_world_body``; drawn where it is in the band, or less than 1.5 m below.
     truth : Trajectory, optional
-        The true path in the same frame, drawn in the same way.
+        Ground-truth path in the same frame, drawn in the same way.
     """
     ax = plot_section(floor_plan(grid, low, high), ax, title=title or f"{low:.1f} to {high:.1f} m")
     for way, color, label in ((truth, style.SKY, "truth"), (path, style.VERMILION, "path")):
@@ -57,9 +57,9 @@ def plot_storey(
 
 
 def cut_plane(path: Trajectory) -> tuple[int, float]:
-    """Where to cut a map so that most is seen: the horizontal axis across the cut (0 or 1), and where on it [m].
+    """Vertical cut that shows most of the map: its horizontal normal (0 or 1) and its position on that axis [m].
 
-    Along the longer side of the path, through the middle of where it climbs; where it does not, of all of it.
+    Along the longer side of the path, through the middle of its climbing parts or, if there are none, of the path.
     """
     p = path.positions
     across = 1 if np.ptp(p[:, 0]) >= np.ptp(p[:, 1]) else 0
@@ -114,9 +114,9 @@ def plot_cut(
     truth: Trajectory | None = None,
     title: str | None = None,
 ) -> Axes:
-    """A slab of the map of 2 m from the side, along the longer way of the path and through where it climbs.
+    """A slab of the map of 2 m from the side, along the longer side of the path and through its climbing parts.
 
-    Heights are drawn twice as large.
+    Heights are exaggerated by a factor of 2.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def plot_cut(
     path : Trajectory
         ``T_world_body``.
     truth : Trajectory, optional
-        The true path in the same frame.
+        Ground-truth path in the same frame.
     """
     if path.dim != 3:
         raise DataError("a path in the plane has no side", got=f"{path.dim}-D", wanted="3-D")
@@ -140,7 +140,7 @@ def plot_cut(
             q = way.positions
             ax.plot(q[:, 1 - axis], q[:, 2], color=color, lw=0.9, label=label)
     with np.errstate(invalid="ignore"):
-        rows = np.flatnonzero((p >= 0.5).any(axis=1))  # the sky is known, too, and says nothing
+        rows = np.flatnonzero((p >= 0.5).any(axis=1))  # the sky is known, too, but of no interest
     if len(rows):
         size = grid.voxel_size
         ax.set_ylim(extent[2] + size * rows[0] - 0.5, extent[2] + size * (rows[-1] + 1) + 0.5)

@@ -1,4 +1,4 @@
-"""The loops of a run drawn over its path: what ties it, and what was refused."""
+"""Plot of the loops of a run over its path: accepted, rejected and removed ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, ArrayLike
 from graphslam.plots import style
 
-# verdict -> colour, line, width: what is in the graph stands out
+# verdict -> colour, line, width: loops in the graph are emphasised
 _LINES = {
     "rejected": (style.GREY, ":", 0.9),
     "undone": (style.PURPLE, "--", 1.4),
@@ -41,7 +41,7 @@ def plot_loops(
     loops : sequence of (i, j, verdict)
         Nodes and ``accepted``, ``rejected``, ``switched-off`` or ``undone``.
     names : sequence, optional
-        One a loop, written beside those that are in the graph or were.
+        One per loop, written beside those that are, or were, in the graph.
     """
     p, x = np.asarray(path, dtype=np.float64), np.asarray(nodes, dtype=np.float64)
     for i, j, verdict in loops:
@@ -60,7 +60,7 @@ def plot_loops(
         lines = LineCollection(list(segments), colors=colour, linestyles=line, linewidths=width, zorder=3 + k)
         lines.set_label(f"{verdict} ({len(ends)})")
         ax.add_collection(lines)
-        points = segments.reshape(-1, 2)  # where i and j lie on each other the line has no length
+        points = segments.reshape(-1, 2)  # where i and j coincide the line has no length
         ax.plot(points[:, 0], points[:, 1], "o", color=colour, ms=4.0, mfc="none", mew=1.0, zorder=3 + k)
     for (i, j, verdict), name in zip(loops, names or ()):
         if verdict != "rejected":

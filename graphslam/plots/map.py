@@ -1,4 +1,4 @@
-"""The map: path, landmarks with their uncertainty, GPS, truth."""
+"""Map figure: path, landmarks with their uncertainty, GPS, ground truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graphslam.plots import style
 
 Path = Trajectory | npt.ArrayLike
 POSE_ELLIPSES = 12
-"""Position ellipses along the path of a map."""
+"""Number of position ellipses along the path of a map."""
 
 
 def positions_of(path: Path) -> Array:
@@ -79,9 +79,9 @@ def plot_ellipses(
         zorder=2.5,
     )
     ax.add_collection(ellipses, autolim=False)
-    if label is not None:  # legends have no handler for ellipse collections: an empty scatter stands for it
+    if label is not None:  # legends have no handler for ellipse collections: an empty scatter represents it
         ax.scatter([], [], s=60, marker="o", fc=_with_alpha(colour, alpha), ec=_with_alpha(colour, 0.9), label=label)
-    # a collection with offsets does not enter the data limits by its size: say the box of each ellipse
+    # a collection with offsets does not enter the data limits by its size: add the bounding box of each ellipse
     half = np.sqrt(chi2_quantile(confidence, 2) * np.einsum("nii->ni", np.asarray(covariances, dtype=np.float64)))
     if len(c):
         ax.update_datalim(np.concatenate([c - half, c + half]))
@@ -95,7 +95,7 @@ def _with_alpha(colour: str, alpha: float) -> tuple[float, float, float, float]:
 
 
 def landmark_blocks(covariances: npt.ArrayLike, n: int, *, offset: int = 0) -> Array:
-    """Marginals ``(n, 2, 2)`` out of ``(n, 2, 2)`` blocks, or out of a joint covariance ``(offset + 2n, …)``."""
+    """Marginals ``(n, 2, 2)`` from ``(n, 2, 2)`` blocks or from a joint covariance ``(offset + 2n, …)``."""
     P = np.asarray(covariances, dtype=np.float64)
     if P.ndim == 3:
         return P

@@ -1,4 +1,4 @@
-"""Several paths in one map."""
+"""Paths of several sessions in one map."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def plot_merged(
     ----------
     paths : mapping of str to Trajectory or (n, ≥ 2)
     landmarks, covariances : (n, 2), (n, 2, 2)
-        The covariances may be those of the map's shape: in the frame of one base everything is as uncertain as that
-        base's heading.
+        Preferably of the map's shape: in the frame of one base, all covariances include the heading uncertainty of that
+        base.
     seen_by : (n,)
-        Sessions that saw each landmark; those of one alone are hollow.
+        Number of sessions that observed each landmark; landmarks of a single session are hollow.
     """
     ax = style.new_axes(ax)
     points, seen = np.asarray(landmarks, dtype=np.float64).reshape(-1, 2), np.asarray(seen_by)

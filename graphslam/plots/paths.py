@@ -1,4 +1,4 @@
-"""Several paths over each other, with what they claim to know, in two or three dimensions."""
+"""Comparison of several paths with their reported covariances, in two or three dimensions."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ def plot_paths(
         Those of :data:`graphslam.plots.style.NAMES`, "RBPF" and "SegSLAM" have colours of their own.
     truth : Trajectory or (n, ≥ dim), optional
     ellipses : int
-        Of each path that has covariances, spread over its length.
+        Number per path that has covariances, distributed over its length.
     plane : {"xy", "xz", "yz"}
-        Seen from above, or from the side.
+        Plane of projection: view from above or from the side.
     """
     if plane not in ("xy", "xz", "yz"):
         raise ConfigError(f"plane {plane!r}; known: xy, xz, yz")

@@ -19,12 +19,12 @@ def plot_before_after(
     *,
     truth: Trajectory | None = None,
 ) -> Axes:
-    """Errors of both paths over time, each aligned as a whole; without truth how far the refinement moved the path.
+    """Errors of both paths, each aligned, over time; without ground truth the correction made by the refinement.
 
     Parameters
     ----------
     graph, refined : Trajectory
-        Where the refinement began, and its result. Covariances of the result are drawn as the σ that it claims.
+        Start of the refinement, and its result. Covariances of the result are drawn as its reported σ.
     """
     ax = style.new_axes(ax, (8.0, 3.2))
     begin = refined.times[0]
@@ -41,7 +41,7 @@ def plot_before_after(
     if refined.covariances is not None:
         P = position_covariances(refined.poses, refined.covariances)
         sigma = np.sqrt(np.maximum(np.trace(P, axis1=1, axis2=2), 0.0))
-        keep = sigma > 1e-4  # the first position is held
+        keep = sigma > 1e-4  # the first position is fixed
         label = "refined, σ of the position"
         ax.plot(refined.times[keep] - begin, sigma[keep], color=style.GREY, lw=1.0, ls="--", label=label)
     ax.set_yscale("log")

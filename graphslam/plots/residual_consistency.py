@@ -1,4 +1,4 @@
-"""What can be said of a map without truth: loops against each other, and withheld GPS against its prediction."""
+"""Consistency of a map without ground truth: loops against each other, and withheld GPS against its prediction."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from graphslam.plots import style
 def plot_loop_matrix(ax: Axes | None, loops: LoopConsistency) -> Axes:
     """``D²/3`` of every pair of loops (off the diagonal) and of every loop against the chain (on it).
 
-    White is expected of a consistent map. A false loop is a dark cross, an overconfident front end a dark page, a
-    conservative one a pale blue page.
+    A consistent map gives white. A false loop appears as a dark cross, an overconfident front end as a dark matrix, a
+    conservative one as a pale blue matrix.
     """
     ax = style.new_axes(ax, (6.5, 5.5))
     ax.grid(False)

@@ -1,4 +1,4 @@
-"""Segments of a path: where their maps stop foretelling, how they fit together, which sample is the clearest map."""
+"""Plot of the segments of a path and of the matches between them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ REASON_STYLES = ("-", "--", ":", "-.")
 
 @dataclass(frozen=True, slots=True)
 class DrawnMatch:
-    """A re-entry, drawn between where a segment began and where the entered one passed.
+    """A match by re-entry, drawn between the start of a segment and the matching point of the entered one.
 
     Parameters
     ----------
     here, there : (dim,)
-        Positions of the body in the frame of the figure [m]. Far apart, the sample does not agree with the match.
+        Positions of the body in the frame of the figure [m]. If far apart, the sample disagrees with the match.
     """
 
     here: Array
@@ -53,10 +53,10 @@ def plot_segments(
     ties : sequence of DrawnMatch
         Matches.
     labels : sequence of str, optional
-        What is written where each begins; default its number.
+        Text at the start of each; default its number.
     truth : Trajectory or (n, dim), optional
     plane : {"xy", "xz", "yz"}
-        Seen from above, or from the side.
+        Plane of projection: view from above or from the side.
     """
     if not paths:
         raise DataError("no segment to draw")

@@ -1,6 +1,6 @@
-"""Colours, sizes and the frame of every figure: the one place to change how graphslam's figures look.
+"""Colours, sizes and axes of every figure: the appearance of graphslam's figures is defined here.
 
-The palette is Okabe and Ito's (2008), which readers with any common colour vision tell apart. Meaning is never
+The palette is that of Okabe and Ito (2008), distinguishable with any common type of colour vision. Meaning is never
 carried by colour alone: reference data are dashed or have a marker of their own.
 """
 
@@ -22,7 +22,7 @@ PURPLE = "#CC79A7"
 GREY = "#6B6B6B"
 PALE = "#D9D9D9"
 
-# what a thing is -> its colour, in every figure
+# quantity -> its colour, in every figure
 ESTIMATE = BLUE
 LANDMARK = VERMILION
 TRUTH = BLACK
@@ -54,11 +54,11 @@ TERRAIN = {
     "obstacle": "#C8102E",
     "hole": "#202020",
 }
-"""Of the classes of terrain: what can be driven is green and blue, what cannot is warm or black."""
+"""Colours of the terrain classes: green and blue are traversable, warm colours and black are not."""
 
 
 def ellipses(of: str, confidence: float = 0.95) -> str:
-    """Name of the ellipses of something, for legends: ``95 % ellipses of the path``."""
+    """Name of the ellipses of a quantity, for legends: ``95 % ellipses of the path``."""
     return f"{100 * confidence:.3g} % ellipses of {'the ' if of == 'path' else ''}{of}"
 
 
@@ -72,7 +72,7 @@ DPI = 150
 
 
 def use_palette() -> None:
-    """Make the palette matplotlib's own, so that what a notebook draws by hand has the colours of all other figures.
+    """Make the palette matplotlib's own, so that figures drawn directly in a notebook have the same colours.
 
     Examples
     --------
@@ -109,14 +109,14 @@ def new_axes(ax: Axes | None, size: tuple[float, float] = FIGURE_SIZE) -> Axes:
 
 
 def metric_axes(ax: Axes, x: str = "x", y: str = "y") -> None:
-    """Equal scales in metres: an angle on the map is an angle on the figure."""
+    """Equal scales in metres: angles are preserved."""
     ax.set_aspect("equal", adjustable="box")
     ax.set_xlabel(f"{x} [m]")
     ax.set_ylabel(f"{y} [m]")
 
 
 def legend(ax: Axes, *, outside: bool = True, **options: Any) -> None:
-    """Legend, if there is anything to name; to the right of the axes, where it hides no data."""
+    """Legend, if there are labels; to the right of the axes, where it covers no data."""
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0} if outside else {}

@@ -1,4 +1,4 @@
-"""The chain of submaps: each map in its own colour, its frame, and where it says it ends."""
+"""Plot of the chain of submaps: each map in its own colour, with its frame and its exit pose."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from graphslam.plots.map import landmark_blocks, plot_ellipses
 
 
 def chain_poses(submaps: Sequence[Submap]) -> Array:
-    """Base poses ``(m + 1, 3)`` by composing the exits: what the submaps say before any loop is closed."""
+    """Base poses ``(m + 1, 3)`` by composing the exits: the chain before any loop closure."""
     poses = np.zeros((len(submaps) + 1, 3))
     for k, s in enumerate(submaps):
         poses[k + 1] = se2_compose(poses[k], s.exit_pose)
@@ -39,7 +39,7 @@ def plot_submap_chain(
     ellipse_scale: float = 1.0,
     title: str | None = None,
 ) -> Axes:
-    """Draw 2-D submaps at the poses of their bases; ellipses of exits are relative to the own base of each.
+    """Draw 2-D submaps at the poses of their bases; ellipses of exits are relative to the base of the submap.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def plot_submap_chain(
     landmark_ellipses : bool
         Also draw each landmark's ellipse within its submap.
     ellipse_scale : float
-        Enlarge every ellipse by this factor, and say so in the legend: good submaps end within centimetres.
+        Enlarge every ellipse by this factor, stated in the legend: the σ of exits of good submaps is a few centimetres.
     """
     if not submaps:
         raise DataError("no submaps to draw")
@@ -66,7 +66,7 @@ def plot_submap_chain(
         colour = style.colour(k)
         if s.trajectory is not None:
             p = se2_transform(base, s.trajectory.positions)
-        else:  # all that is known is where it begins and ends
+        else:  # only its start and end are known
             p = se2_transform(base, np.array([[0.0, 0.0], s.exit_pose[:2]]))
         ax.plot(p[:, 0], p[:, 1], color=colour, lw=1.6, ls="-" if s.trajectory is not None else "--", zorder=2)
         exits[k] = se2_transform(base, s.exit_pose[:2])
@@ -89,7 +89,7 @@ def plot_submap_chain(
 
 
 def _plot_frames(ax: Axes, poses: Array) -> None:
-    """x axes long and y axes short, so that a frame reads without colour."""
+    """x axes long and y axes short, so that a frame can be recognised without colour."""
     extent = float(np.max(np.ptp(poses[:, :2], axis=0), initial=0.0))
     size = max(0.025 * extent, 0.5)
     x = poses[:, :2] + size * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], -1)

@@ -1,4 +1,4 @@
-"""A surface seen from aslant, shaded, its colours a value."""
+"""Shaded oblique view of a surface, coloured by a value."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphslam.core.geometry import Array
 from graphslam.plots import style
 
 WIDTH = 1400
-"""Of the picture [pixels] at most; a pixel is never smaller than a triangle."""
+"""Maximum width of the picture [pixels]; it is smaller if pixels would be smaller than the typical triangle."""
 _LIGHT = np.array([0.35, -0.5, 0.79])
 _EDGE = 0.6
 """Cosine between neighbouring normals below which an edge is drawn dark."""
@@ -29,7 +29,7 @@ def vertex_colours(values: Array, palette: str = "viridis") -> npt.NDArray[np.ui
 
 
 def session_colours(session: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """Colours ``(v, 4)`` of sessions, as their paths have them; grey where there is none (−1)."""
+    """Colours ``(v, 4)`` of sessions, the same as of their paths; grey where there is none (−1)."""
     cycle = np.array([to_rgba(c) for c in style.CYCLE])
     out = np.asarray(255.0 * cycle[session % len(cycle)]).astype(np.uint8)
     out[session < 0] = (128, 128, 128, 255)
@@ -47,9 +47,9 @@ def plot_surface(
     slant: float = 40.0,
     edges: bool = False,
 ) -> Axes:
-    """Draw triangles in parallel projection from the south, the nearest in front; back sides are left out.
+    """Draw triangles in parallel projection from the south with hidden surfaces removed; back faces are left out.
 
-    The model and, with `edges`, its edges alone are the two halves of urban mapping's Fig. 5.
+    The surface and, with `edges`, its edges alone correspond to the two parts of Fig. 5 of urban mapping.
 
     Parameters
     ----------
@@ -57,11 +57,11 @@ def plot_surface(
     triangles : (t, 3)
         Counter-clockwise as seen from the free side.
     values : (v,)
-        That the colours show; grey where they are not finite.
+        Shown by colour; grey where they are not finite.
     slant : float
-        Of the view below the vertical [deg]: 0 is from above.
+        Angle of the view from the vertical [deg]: 0 is from above.
     edges : bool
-        Only lines, where the surface folds or ends, on white; of the values nothing is shown.
+        Draw only creases and boundaries of the surface, on white, without the values.
     """
     ax = style.new_axes(ax)
     a, b, c = (vertices[triangles[:, k]] for k in range(3))

@@ -1,4 +1,4 @@
-"""Terrain from above: what a vehicle can drive over, what it cannot, and what is not known."""
+"""Plan of the terrain classes: traversable, not traversable and unknown."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plot_terrain(
     Parameters
     ----------
     path : (n, 2), optional
-        Way of the vehicle, drawn over it [m].
+        Path of the vehicle, drawn over it [m].
     plain : bool
         Three colours only: green free, red a hazard, white unknown.
     """

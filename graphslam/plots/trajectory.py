@@ -1,4 +1,4 @@
-"""Errors along a trajectory: against GPS, against a reference."""
+"""Plots of the errors of a trajectory against GPS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Things that stand about: parked cars, crates, barrels; never in the way of the robot."""
+"""Movable obstacles: parked cars, crates, barrels; always clear of the robot's route."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from graphslam.core.geometry import Array
 from graphslam.sim.mesh import MeshBuilder, Rectangle
 from graphslam.sim.route import Route
 
-# Things on one floor stand in the way of another only if their heights are nearer than this [m].
+# Two points belong to the same floor if their heights differ by less than this [m].
 _SAME_FLOOR = 2.4
 
 
 class KeepClear:
-    """Says whether a thing would stand in the way.
+    """Tests whether an obstacle keeps clear of the route.
 
     Parameters
     ----------
     way : Route or (n, 3)
-        The way, or points close together on all ways there are [m].
+        The route, or closely spaced points on all routes [m].
     margin : float
-        Free space on either side of the way's middle line [m].
+        Free space on either side of the route's centre line [m].
     """
 
     def __init__(self, way: Route | Array, margin: float = 1.2) -> None:
@@ -30,7 +30,7 @@ class KeepClear:
         self.margin = margin
 
     def distance(self, centre: Sequence[float], size: Sequence[float], yaw: float, floor: float) -> float:
-        """From the way to a box in the plan [m]; infinite if the way never comes to that floor."""
+        """Plan distance from the route to a box [m]; infinite if the route does not visit that floor."""
         p = self._points[np.abs(self._points[:, 2] - floor) < _SAME_FLOOR, :2]
         if len(p) == 0:
             return float("inf")
@@ -41,7 +41,7 @@ class KeepClear:
         return float(np.hypot(outside[:, 0], outside[:, 1]).min())
 
     def allows(self, centre: Sequence[float], size: Sequence[float], yaw: float, floor: float) -> bool:
-        """Whether a box keeps off the way."""
+        """Whether a box is clear of the route."""
         return self.distance(centre, size, yaw, floor) > self.margin
 
 
@@ -55,7 +55,7 @@ def park_cars(
 ) -> int:
     """Park cars in some of the bays ``(n, 3)``: x, y, yaw. Returns how many.
 
-    Every bay draws the same numbers whether it is taken or not, so that one more bay changes no other.
+    Every bay consumes the same random numbers whether occupied or not, so that an additional bay changes no other.
     """
     count = 0
     for x, y, yaw in bays:
@@ -80,9 +80,9 @@ def scatter_obstacles(
     tallest: float = 1.6,
     forbidden: Sequence[Rectangle] = (),
 ) -> int:
-    """Stand crates, barrels and boards in an area ``(x0, y0, x1, y1)``, off the way and off forbidden rectangles.
+    """Place crates, barrels and boards in an area ``(x0, y0, x1, y1)``, clear of the route and of forbidden rectangles.
 
-    Returns how many of ``count`` found a place; each has one try.
+    Returns how many of ``count`` were placed; each is tried once.
     """
     placed = 0
     for _ in range(count):

@@ -1,8 +1,8 @@
-"""A robot like Cave Crawler drives through a world of triangles.
+"""Simulation of a robot like Cave Crawler in a triangle-mesh world.
 
-A planar scanner whose head spins about the roll axis while the robot drives (every beam has a time, an origin and a
-direction of its own), an IMU with noise, bias and walk that also gives roll and pitch, and wheels with a wrong scale.
-The dominant error is the bias of the yaw rate.
+A planar scanner whose head spins about the roll axis while the robot drives (every beam has its own time, origin and
+direction), an IMU with noise, bias and random walk that also gives roll and pitch, and wheels with a scale error. The
+dominant error is the bias of the yaw rate.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ def start_frame(motion: RouteMotion) -> Array:
 
 
 def simulate_crawler(world: World, seed: int, config: CrawlerConfig = DEFAULTS, *, progress: bool = False) -> SensorLog:
-    """Drive through a world and record it.
+    """Simulate the drive through a world and record the sensors.
 
     Parameters
     ----------
     seed : int
-        Of every error drawn.
+        Of all random errors.
     progress : bool
         Show a progress bar on stderr.
 
     Returns
     -------
     SensorLog
-        Streams ``scanner`` (RangeScans; ``scanner2``, which looks back, if there are two), ``imu`` (Imu) and ``wheels``
-        (VelocityControls). Truth at the rate of the IMU, in the frame of the first base made level; ``meta`` holds
-        every figure, the errors that were drawn, and ``T_world_frame`` (7,), that frame in the world's.
+        Streams ``scanner`` (RangeScans; ``scanner2``, facing backwards, if there are two), ``imu`` (Imu) and ``wheels``
+        (VelocityControls). Ground truth at the rate of the IMU, in the levelled frame of the first base; ``meta``
+        contains all parameters, the realised errors, and ``T_world_frame`` (7,), that frame in the world frame.
     """
     caster = RayCaster.of(world)
     motion = crawler_motion(world, config, caster)
@@ -105,7 +105,7 @@ def simulate_crawler(world: World, seed: int, config: CrawlerConfig = DEFAULTS, 
 
 
 def _noise(config: CrawlerConfig) -> dict[str, float]:
-    """Stated σ of everything that is drawn."""
+    """Nominal σ of all random errors."""
     names = (
         *("range_sigma", "drop_out", "gyro", "gyro_bias_across", "gyro_walk", "accelerometer", "accelerometer_bias"),
         *("accelerometer_walk", "attitude_sigma", "attitude_time", "attitude_bias", "wheel_scale", "wheel_sigma"),

@@ -1,4 +1,4 @@
-"""The crawler's sensors and their noise: every figure, with its limits checked."""
+"""Configuration of the crawler's sensors and their noise, with range checks."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _NOT_NEGATIVE = (
 class CrawlerConfig:
     """A robot like Cave Crawler: a planar scanner whose head spins while it drives, an IMU, and wheels.
 
-    The defaults give the drift that SegSLAM's experiments live on: what spoils dead reckoning is a bias of the gyro's
-    yaw rate; all else is small beside it.
+    The defaults give the drift of SegSLAM's experiments: the dominant error of dead reckoning is a bias of the gyro's
+    yaw rate; all others are small in comparison.
     """
 
     # scanner
     scanners: int = 1
-    """1: looking forward; 2: one looking back as well."""
+    """1: facing forward; 2: an additional one facing backwards."""
     beams: int = 61
     """Beams of a scan, evenly over the fan."""
     fan: float = math.pi
@@ -44,32 +44,32 @@ class CrawlerConfig:
     spin_rate: float = 0.25
     """Turns of the head about its x axis per second [Hz]."""
     max_range: float = 30.0
-    """Beams that meet nothing nearer are reported with this range [m]."""
+    """Range reported for beams without a hit within it [m]."""
     min_range: float = 0.1
-    """Nearer things give no reading [m]."""
+    """Nearer surfaces give no reading [m]."""
     range_sigma: float = 0.025
     """σ of a range, independent per beam [m]."""
     drop_out: float = 0.005
-    """Probability of a beams without a reading, independent per beam."""
+    """Probability of a missing reading, independent per beam."""
     mount: Pose = (0.3, 0.0, 0.7, 0.0, 0.0, 0.0, 1.0)
     """T_base_mount of the forward scanner: x y z qx qy qz qw."""
     rear_mount: Pose = (-0.3, 0.0, 0.7, 0.0, 0.0, 1.0, 0.0)
-    """T_base_mount of the scanner that looks back."""
+    """T_base_mount of the scanner facing backwards."""
 
     # inertial measurement unit
     imu_rate: float = 100.0
-    """Records per second, and poses of the truth [Hz]."""
+    """Records per second, and poses of the ground truth [Hz]."""
     imu_mount: Pose = (0.0, 0.0, 0.4, 0.0, 0.0, 0.0, 1.0)
     """T_base_imu."""
     drift: float = 0.03
-    """Error at the end of the way that the yaw bias alone brings about, relative to the way's length: the bias is
-    chosen for it, with a random sign. A constant bias b of a drive of T seconds ends b · T · |end - mean position|
-    off, so one bias would hide in a way that ends near its middle, and ruin another."""
+    """Position error at the end due to the yaw bias alone, relative to the route's length; the bias is computed from
+    it, with a random sign. A constant bias b over T seconds gives an end error of b · T · |end - mean position|, so the
+    effect of a fixed bias would depend strongly on the route."""
     drift_spread: float = 0.1
     """Relative σ of that error from seed to seed, cut at 2 σ."""
     most_turned: float = 1.0
-    """Limit of the yaw bias, as the heading it has turned by at the end [rad]; a way that ends near its middle hides
-    any bias, and gets this one. It varies with the seed as the drift does."""
+    """Limit of the yaw bias, as the heading error at the end [rad]; reached for a route that ends near its mean
+    position, where a bias has little effect. It varies with the seed as the drift does."""
     gyro: float = 1e-4
     """White noise of the angular rates [rad/s/√Hz]."""
     gyro_bias_across: float = 2e-4
@@ -95,7 +95,7 @@ class CrawlerConfig:
     wheel_scale: float = 0.005
     """σ of the relative error of all speeds of a log."""
     wheel_sigma: float = 0.02
-    """σ of a speed, independent per record [m/s]."""
+    """σ of a measured speed, independent per record [m/s]."""
     turn_scale: float = 0.05
     """σ of the relative error of all yaw rates of the wheels."""
     turn_sigma: float = 0.02
@@ -105,7 +105,7 @@ class CrawlerConfig:
     wheelbase: float = 0.6
     """Changes of slope and curvature are smoothed over it [m]."""
     track: float = 0.5
-    """Distance of the wheels to the left and right: the floor under them gives the roll [m]."""
+    """Distance of the wheels to the left and right: the roll follows from the floor under them [m]."""
     ramp: float = 2.0
     """Time from rest to cruise [s]."""
     most_turn_rate: float = 0.6
@@ -114,7 +114,7 @@ class CrawlerConfig:
     """Time at rest before the start [s]."""
 
     noise_scale: float = 1.0
-    """Every drawn error is multiplied by it, the stated figures are not; 0 gives exact data."""
+    """Factor on every random error, but not on the nominal σ; 0 gives exact data."""
 
     def __post_init__(self) -> None:
         for name in ("mount", "rear_mount", "imu_mount"):  # a configuration file gives lists
@@ -152,7 +152,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def crawler_preset(name: str = "light", **changes: Any) -> CrawlerConfig:
-    """A preset with figures changed."""
+    """A preset with some parameters changed."""
     if name not in PRESETS:
         raise UnknownNameError("preset of the crawler", name, PRESETS)
     known = {f.name for f in dataclasses.fields(CrawlerConfig)}

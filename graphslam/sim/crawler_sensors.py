@@ -1,4 +1,4 @@
-"""What the crawler's sensors say of a true motion."""
+"""Simulated measurements of the crawler's sensors along a true motion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Nearer: TypeAlias = Callable[[int, Array, Array, Array], Array]
 
 
 class PoseSource(Protocol):
-    """Something whose pose in the world is known at every time."""
+    """A source of world poses at any time."""
 
     def poses(self, t: ArrayLike) -> Array:
         """``(n, 7)`` at times ``(n,)``."""
@@ -42,7 +42,7 @@ def scan_world(
     *,
     progress: bool = False,
 ) -> RangeScans:
-    """Scans of a spinning head: each beam leaves from where the robot is at its own time.
+    """Scans of a spinning head: each beam starts from the pose of the robot at its own time.
 
     Parameters
     ----------
@@ -80,15 +80,15 @@ def cast_scans(
     nearer: Nearer | None = None,
     progress: bool = False,
 ) -> RangeScans:
-    """Scans with the ranges that their beams measure, with the noise, losses and limits of a configuration.
+    """Scans with simulated ranges, including the noise, losses and limits of a configuration.
 
     Parameters
     ----------
     scans : RangeScans
-        Stamps, directions and angles of the head; its ranges are not read.
+        Stamps, directions and angles of the head; its ranges are ignored.
     nearer : callable, optional
         Given the first scan of a part, its rays ``(k · m, 6)``, their times and their exact ranges, both ``(k · m,)``
-        (NaN: nothing met), returns the ranges where something that moves is in front.
+        (NaN: no hit), returns the ranges with moving objects in front taken into account.
     progress : bool
         Show a progress bar on stderr.
     """
@@ -135,12 +135,12 @@ def measure_imu(
     yaw_bias : float
         Constant bias of the rate about the unit's z axis [rad/s].
     nominal_bias : float
-        What the unit's data sheet says of it, a σ [rad/s].
+        Nominal σ of it, as in a data sheet [rad/s].
 
     Returns
     -------
     dict
-        The constants that were drawn.
+        The realised constant biases.
     """
     c = config
     n = int(np.floor(motion.duration * c.imu_rate + 1e-9)) + 1
@@ -195,7 +195,7 @@ def true_inertia(motion: RouteMotion, times: Array, mount: ArrayLike) -> tuple[A
     lever, to_unit = T[:3], T[3:] * [-1.0, -1.0, -1.0, 1.0]
     q = motion.poses(times)[:, 3:]
     omega, alpha = motion.rotation(times)
-    # of the point at the lever, base frame: a + ω' × l + ω × (ω × l); what the unit feels besides is -g
+    # of the point at the lever, base frame: a + ω' × l + ω × (ω × l); the unit also measures -g
     world = motion.accelerations(times) + [0.0, 0.0, GRAVITY]
     felt = quat_rotate(q * [-1.0, -1.0, -1.0, 1.0], world)
     felt = felt + np.cross(alpha, lever) + np.cross(omega, np.cross(omega, lever))
@@ -246,7 +246,7 @@ def measure_wheels(motion: RouteMotion, config: CrawlerConfig, seeds: SeedTree) 
     turning = mean(motion.rotation(at)[0][:, 2].reshape(inner.shape))
     scales = c.noise_scale * np.array([c.wheel_scale, c.turn_scale]) * rng.standard_normal(2)
     noise = c.noise_scale * np.array([c.wheel_sigma, c.turn_sigma])[:, None] * rng.standard_normal((2, n))
-    moving = np.abs(speed) > 1e-6  # a wheel that stands still says so
+    moving = np.abs(speed) > 1e-6  # a wheel at rest measures exactly zero
     controls = VelocityControls(
         times=edges[:-1],
         speed=(1.0 + scales[0]) * speed + np.where(moving, noise[0], 0.0),
@@ -274,9 +274,9 @@ def end_error(motion: RouteMotion, yaw_bias: ArrayLike, *, step: float = 0.2) ->
 
 
 def yaw_bias_for(motion: RouteMotion, error: float, sign: float, most: float) -> float:
-    """The least yaw bias [rad/s] that makes dead reckoning miss the end by ``error`` [m], at most ``most``.
+    """The smallest yaw bias [rad/s] that gives dead reckoning an end error of ``error`` [m], at most ``most``.
 
-    A way that comes back to its middle hides any bias: then it is ``most``, or what comes nearest below it.
+    If no bias up to ``most`` gives that error, the result is the one with the greatest end error.
     """
     if error <= 0:
         return 0.0

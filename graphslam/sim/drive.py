@@ -1,4 +1,4 @@
-"""A robot drives its way through a world: where it is, and how it moves, at any time."""
+"""True motion of a robot along its route through a world, at any time."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from graphslam.sim.raycast import RayCaster
     from graphslam.sim.world import World
 
-_STEP = 0.02  # m between the samples of a way
-_FLOOR_ABOVE = 0.5  # m: rays down to the floor begin so high above the way
-_FLOOR_OFF = 0.2  # m: what lies farther from the way's height is not the floor under a wheel
+_STEP = 0.02  # m between the samples of a route
+_FLOOR_ABOVE = 0.5  # m: height above the route at which rays down to the floor start
+_FLOOR_OFF = 0.2  # m: a hit farther from the route's height is not the floor under a wheel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveConfig:
-    """How a robot drives."""
+    """Parameters of the robot's drive."""
 
     rate: float = 100.0
     """Poses per second of the trajectory [Hz]."""
     wheelbase: float = 0.6
     """Length over which changes of slope and curvature are smoothed [m]."""
     track: float = 0.5
-    """Distance of left and right wheels [m]: what lies under them gives the roll."""
+    """Distance of left and right wheels [m]: the roll follows from the floor under them."""
     ramp: float = 2.0
     """Time from rest to cruise, and back at the end [s]."""
     most_turn_rate: float = 0.6
@@ -51,7 +51,7 @@ class DriveConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampledRoute:
-    """A way over the floor, sampled evenly along its length.
+    """A route over the floor, sampled evenly along its length.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class SampledRoute:
 
 def sample_route(route: Route) -> SampledRoute:
     """Samples of a route; pitch is its slope, roll is 0."""
-    s = route.every(min(_STEP, route.length / 16.0))  # a spline wants some samples of the shortest way, too
+    s = route.every(min(_STEP, route.length / 16.0))  # a spline needs enough samples of a short route, too
     positions = route.positions(s)
     rise = np.gradient(positions[:, 2], s)  # central: a slope that jumps at a sample would be half a sample late
     return SampledRoute(
@@ -85,10 +85,10 @@ def sample_route(route: Route) -> SampledRoute:
 
 
 def smooth_route(way: SampledRoute, width: float) -> SampledRoute:
-    """The same way without corners in slope or curvature: everything is averaged over ``width`` metres.
+    """The same route without discontinuities of slope or curvature: everything is averaged over ``width`` metres.
 
-    A robot stands on the floor with a wheelbase: where the slope changes, its pitch changes over that length. The
-    average is a triangle (two running means), so that pitch and yaw have a continuous rate.
+    The pitch of a robot with a wheelbase changes gradually where the slope changes. The average is a triangle (two
+    running means), so that pitch and yaw have a continuous rate.
     """
     half = round(0.5 * width / way.step) // 2 * 2 + 1  # samples of one running mean, odd
     if half < 3:
@@ -97,7 +97,7 @@ def smooth_route(way: SampledRoute, width: float) -> SampledRoute:
 
     def smooth(a: Array, *, straight: bool = False) -> Array:
         first, last = np.repeat(a[:1], pad, axis=0), np.repeat(a[-1:], pad, axis=0)
-        if straight:  # go on as the way begins and ends, or the mean would pull its ends in
+        if straight:  # extrapolate linearly, or the mean would shorten the route
             k = np.arange(1, pad + 1)[:, None]
             first, last = first - (k * (a[1] - a[0]))[::-1], last + k * (a[-1] - a[-2])
         wide = np.concatenate([first, a, last])
@@ -115,7 +115,7 @@ def smooth_route(way: SampledRoute, width: float) -> SampledRoute:
 
 
 class RouteMotion:
-    """Position, attitude and their derivatives along a way of ``length`` [m], at any time from 0 to ``duration`` [s].
+    """Position, attitude and their derivatives along a route of ``length`` [m], at any time from 0 to ``duration`` [s].
 
     Parameters
     ----------
@@ -135,12 +135,12 @@ class RouteMotion:
         self._way: BSpline = make_interp_spline(u, columns, k=5)
         self._way1, self._way2 = self._way.derivative(1), self._way.derivative(2)
 
-        # cruise time τ(u) = ∫ du / pace, the pace less than the speed where the way turns fast
+        # cruise time τ(u) = ∫ du / pace, the pace less than the speed where the route turns fast
         turning = np.abs(self._way1(u)[:, 3])
         pace = np.minimum(speed, config.most_turn_rate / np.maximum(turning, 1e-9))
         window = max(round(1.0 / way.step), 1)
         pace = minimum_filter1d(pace, window, mode="nearest")
-        for _ in range(2):  # the running means stay inside what the minimum has widened: never faster than allowed
+        for _ in range(2):  # the running means stay within the widened minimum: never faster than allowed
             pace = uniform_filter1d(pace, max(window // 2, 1), mode="nearest")
         slowness = 1.0 / pace
         tau = np.concatenate([[0.0], np.cumsum(0.5 * (slowness[1:] + slowness[:-1]) * way.step)])
@@ -165,7 +165,7 @@ class RouteMotion:
         rate = fa + fb - 1.0
         acceleration = (6.0 * a * (1.0 - a) - 6.0 * b * (1.0 - b)) / r
         before = r * (a**3 - 0.5 * a**4) + np.maximum(s - r, 0.0)
-        lost = r * ((1.0 - b) - (0.5 - (b**3 - 0.5 * b**4)))  # what the ramp at the end falls short of the cruise
+        lost = r * ((1.0 - b) - (0.5 - (b**3 - 0.5 * b**4)))  # distance lost to the cruise by the ramp at the end
         return before - lost, rate, acceleration
 
     def _progress(self, t: ArrayLike) -> tuple[Array, Array, Array]:
@@ -235,10 +235,10 @@ def euler_to_quat(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Array:
 
 
 def roll_by_floor(way: SampledRoute, caster: RayCaster, track: float) -> SampledRoute:
-    """The way with the roll of the floor under the wheels of a robot ``track`` metres wide.
+    """The route with the roll of the floor under the wheels of a robot ``track`` metres wide.
 
-    Rays go down on either side of the way. Where one of them meets no floor near the height of the way, the roll stays
-    what it is.
+    Rays are cast downwards on either side of the route. Where one of them hits no floor near the height of the route,
+    the roll is unchanged.
     """
     left = np.column_stack([-np.sin(way.yaw), np.cos(way.yaw), np.zeros_like(way.yaw)])
     heights = []
@@ -254,7 +254,7 @@ def roll_by_floor(way: SampledRoute, caster: RayCaster, track: float) -> Sampled
 
 
 def drive_motion(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> RouteMotion:
-    """The motion of a robot that drives through a world on its way; see :func:`drive_through_world`."""
+    """The motion of a robot that drives through a world along its route; see :func:`drive_through_world`."""
     way = sample_route(world.route())
     if caster is not None:
         way = roll_by_floor(way, caster, config.track)

@@ -1,7 +1,7 @@
 """A parking garage of two levels: in below, up a ramp, out above, down a road outside and in below again.
 
-Pillars and ceiling beams stand at one period on both levels, so that a map shifted by a period, or by a storey, looks
-much the same; parked cars tell the places apart.
+Pillars and ceiling beams have the same period on both levels, so that a map shifted by a period or by a level looks
+similar; parked cars distinguish the places.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def garage(layout: str = "A", *, seed: int = 0) -> World:
     Parameters
     ----------
     layout : str
-        "A", "B" or "C"; "D" is kept for tests that nothing was tuned on; "drawn-17" is drawn by that number.
+        "A", "B" or "C"; "D" is held out for tests: nothing was tuned on it; "drawn-17" is generated from that number.
     seed : int
-        Moves parked cars and clutter; building and way stay.
+        Of parked cars and clutter; building and route do not depend on it.
     """
     g = garage_layout(layout)
     mesh = MeshBuilder()
@@ -76,7 +76,7 @@ def garage(layout: str = "A", *, seed: int = 0) -> World:
 
 
 def _placed(points: Array, g: GarageLayout) -> Array:
-    """Mirrored and turned as the layout wants it."""
+    """Points mirrored and turned as specified by the layout."""
     x, y, z = points.T
     if g.mirrored:
         y = g.width - y
@@ -115,7 +115,7 @@ def _levels(mesh: MeshBuilder, g: GarageLayout) -> None:
         for x in g.columns:
             for y in g.rows:
                 mesh.box((x - half, y - half, floor), (x + half, y + half, ceiling))
-            # a beam of the lower level would hang in the robot's way where the ramp comes through the ceiling
+            # a beam of the lower level would obstruct the robot's route where the ramp comes through the ceiling
             cut = level == 0 and x0 - 0.5 < x < x1 + 0.5
             for a, b in [(0.0, y0), (y1, g.width)] if cut else [(0.0, g.width)]:
                 if b > a:
@@ -128,7 +128,7 @@ def _levels(mesh: MeshBuilder, g: GarageLayout) -> None:
 def _inner_ramp(mesh: MeshBuilder, g: GarageLayout) -> None:
     foot, top, y = g.ramp
     start, end = (foot, y, 0.0), (top, y, STOREY)
-    # the surface goes as wide as the hole: nothing falls, and no beam, between ramp and parapet
+    # the surface is as wide as the hole: no gap for a beam between ramp and parapet
     mesh.ramp(start, end, g.ramp_width, 0.0)
     mesh.ramp_sides(start, end, g.ramp_width, _RAIL, 0.0, thickness=0.2)
     x0, y0, x1, y1 = _ramp_rectangle(g, 0.3)
@@ -151,7 +151,7 @@ def _road(mesh: MeshBuilder, g: GarageLayout) -> None:
 
 
 def _surroundings(mesh: MeshBuilder, g: GarageLayout) -> None:
-    """What is seen from the road and the yard: a façade with buttresses, a fence, masts, trees, a kiosk."""
+    """Structures visible from the road and the yard: a façade with buttresses, a fence, masts, trees, a kiosk."""
     south, west = g.yard - 9.0, g.road - 12.0
     mesh.wall((west, south), (34.0, south), 0.0, 7.5, thickness=0.4, openings=[(8.0, 10.0, 0.0, 2.3)])
     for k, x in enumerate((-13.0, -7.5, 1.0, 4.5, 12.0, 21.5, 27.0)):
@@ -173,7 +173,7 @@ def _surroundings(mesh: MeshBuilder, g: GarageLayout) -> None:
 def _bays(g: GarageLayout) -> Array:
     """Parking bays ``(n, 3)``: three between two pillars, none in the cross aisles or where the ramp is."""
     pillars, width = g.columns, (g.pitch - _PILLAR) / 3
-    # one way of giving the ramp room: its rectangle with a car's half length
+    # free space for the ramp: its rectangle enlarged by half a car's length
     x0, y0, x1, y1 = _ramp_rectangle(g, 2.4)
     bays = []
     for y in g.bays:

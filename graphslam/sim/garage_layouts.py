@@ -1,4 +1,4 @@
-"""Measures of the garages: the numbers that make one differ from another."""
+"""Dimensions of the garage layouts."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ STOREY = 3.2
 SLAB = 0.3
 CORNER_RADIUS = 3.0
 RETRACED = 28.0
-"""The first stretch of the way, driven again at its end [m]."""
+"""Length of the first part of the route that is driven again at its end [m]."""
 ROOM = 1.0
-"""From the way to the middle of a pillar, at least, where a plan is drawn [m]."""
+"""Minimum distance from the route to the centre of a pillar in a generated layout [m]."""
 _ROAD_RUN = 23.5
 """Plan length of the outdoor ramp [m]."""
 
@@ -34,27 +34,27 @@ class GarageLayout:
     length, width : float
         Along x and y.
     pitch, first : float
-        Pillars and ceiling beams stand every ``pitch`` along x, from ``first`` on, the same on both levels.
+        Positions of pillars and ceiling beams: every ``pitch`` along x, from ``first`` on, the same on both levels.
     rows : tuple of float
         y of the rows of pillars.
     bays : tuple of float
-        y of the middles of the rows of parking bays; cars stand across.
+        y of the centres of the rows of parking bays; cars are parked across.
     west, east : float
         x of the cross aisles driven on the lower level; ``west`` is driven on the upper one, too.
     low_aisle : float
         y of the aisle driven on the lower level.
     ramp : (foot, top, y)
-        x of its foot and top, y of its middle line; the foot is the eastern end.
+        x of its foot and top, y of its centre line; the foot is the eastern end.
     first_aisle, turn, last_aisle : float
-        Upper level: y of the first aisle, x where the way turns, y of the last aisle, which leads out to the west.
+        Upper level: y of the first aisle, x where the route turns, y of the last aisle, which leads out to the west.
     road : float
         x of the road outside, which comes down southwards from the upper exit.
     yard : float
-        y of the yard south of the building, from where the way enters by the lower entrance.
+        y of the yard south of the building, from where the route enters by the lower entrance.
     cores : tuple of (x0, y0, x1, y1)
         Stairwells, through both levels.
     mirrored, turned : bool
-        Mirror y, then turn by a quarter to the left: what was a left turn is a right one.
+        Mirror y, then turn by 90° to the left; mirroring turns left turns into right ones.
     """
 
     name: str
@@ -94,7 +94,7 @@ class GarageLayout:
         return self.road_top - _ROAD_RUN
 
     def waypoints(self) -> list[tuple[float, float, float]]:
-        """The way: in from the yard, up the inner ramp, out at the upper exit, down the road, in again."""
+        """The route: in from the yard, up the inner ramp, out at the upper exit, down the road, in again."""
         h = STOREY
         foot, top, ramp_y = self.ramp
         outside = [
@@ -149,11 +149,11 @@ LAYOUTS = {
         turned=True,
     ),
 }  # fmt: skip
-"""A and B to develop with, C to look at now and then; D is held out: nothing is tuned on it."""
+"""A and B to develop with, C for occasional checks; D is held out: nothing is tuned on it."""
 
 
 def garage_layout(name: str) -> GarageLayout:
-    """The layout of that name, or the one that is drawn by the number in ``drawn-17``."""
+    """The layout of that name, or, for a name such as ``drawn-17``, the one generated from that number."""
     if number := layout_number(name):
         return drawn_layout(number)
     if name not in LAYOUTS:
@@ -162,8 +162,8 @@ def garage_layout(name: str) -> GarageLayout:
 
 
 def drawn_layout(number: int) -> GarageLayout:
-    """A garage drawn by a number: one of the four plans stretched in both directions, its pillars, road and yard at
-    other places, mirrored and turned by chance."""
+    """A garage generated from a number: one of the four plans stretched in both directions, with its pillars, road and
+    yard displaced, randomly mirrored and turned."""
     rng = SeedTree(number).child("garage-layout").generator()
     while True:
         g = LAYOUTS[str(rng.choice(list(LAYOUTS)))]
@@ -181,7 +181,7 @@ def drawn_layout(number: int) -> GarageLayout:
         )  # fmt: skip
         end = found.waypoints()[-1][1]
         if not found.yard + CORNER_RADIUS + 1.0 < end < found.low_aisle:
-            continue  # the way ends on the straight that it began with
+            continue  # the route ends on its first straight
         way = plan_route(np.array(found.waypoints()), CORNER_RADIUS, where=found.name)
         pillars = np.array([(x, y) for x in found.columns for y in found.rows])
         if float(cKDTree(pillars).query(way.positions(way.every(0.1))[:, :2])[0].min()) > ROOM:

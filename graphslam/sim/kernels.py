@@ -22,7 +22,7 @@ def follow_route_kernel(
     """Drive a front-steered vehicle after a carrot on a closed polyline.
 
     route : (m, 2) closed polyline (first point not repeated), densely sampled against ``look_ahead``.
-    stride : way of a step [m]. max_step : steering rate times dt [rad].
+    stride : distance per step [m]. max_step : steering rate times dt [rad].
     poses : (n + 1, 3) out, poses[0] given; headings are left unwrapped.
     steering : (n,) out, held constant during step k.
     """

@@ -1,4 +1,4 @@
-"""World, vehicle, sensors and noise of the landmark field: every figure, with its limits checked."""
+"""Configuration of world, vehicle, sensors and noise of the landmark field, with range checks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LandmarkFieldConfig:
     lap_length: float = 2230.0
     """Length of one lap of the route [m]."""
     laps: float = 2.0
-    """Distance driven / lap_length; more than 1 closes the loop."""
+    """Distance driven / lap_length; above 1 the loop is closed."""
     route_waves: int = 9
     """Waves per lap: r(θ) = R (1 + route_amplitude · sin(route_waves · θ))."""
     route_amplitude: float = 0.05
@@ -37,18 +37,18 @@ class LandmarkFieldConfig:
     lateral_max: float = 20.0
     """Greatest lateral distance of a feature from the route [m]; uniform between the two."""
     pair_fraction: float = 0.0
-    """Share of ``landmarks`` that stand in close pairs (a stem with its twin), in [0, 1]."""
+    """Share of ``landmarks`` that form close pairs (a stem and its twin), in [0, 1]."""
     pair_distance: float = 1.5
     """Distance between the two of a pair [m], in any direction that does not bring the twin nearer to the route."""
     row_spacing: float = 0.0
-    """An avenue of trees beside the features above: one on either side of the route every so many metres [m], adjusted
-    so that whole periods fit into the lap; 0 = none. A map shifted by one period looks the same."""
+    """An avenue of trees in addition to the features above: spacing of the trees on either side of the route [m],
+    adjusted to a whole number of periods per lap; 0 = none. A map shifted by one period looks the same."""
     row_lateral: float = 6.0
     """Lateral distance of either row from the route [m]."""
     row_jitter: float = 0.1
     """σ of each tree of a row along and across the row [m]."""
     layout_seed: int | None = None
-    """Seed of the feature layout. None: the run's own seed. A number holds the layout over Monte-Carlo runs."""
+    """Seed of the feature layout. None: the run's own seed. A number keeps the layout fixed over Monte-Carlo runs."""
 
     wheelbase: float = 4.0
     """L of φ' = φ + V dt sin(G)/L [m]."""
@@ -61,12 +61,12 @@ class LandmarkFieldConfig:
     steering_rate: float = math.radians(20.0)
     """Limit of its rate: |ΔG| ≤ steering_rate · dt [rad/s]."""
     look_ahead: float = 6.0
-    """Distance to the point of the route that the vehicle steers at [m]."""
+    """Distance to the point of the route that the vehicle steers towards [m]."""
 
     max_range: float = 30.0
-    """Features farther than this are not seen [m]."""
+    """Features farther than this are not observed [m]."""
     min_range: float = 1.0
-    """Features nearer than this are not seen [m]."""
+    """Features nearer than this are not observed [m]."""
     field_of_view: float = math.pi
     """Full opening angle, centred on the heading: |bearing| ≤ field_of_view/2 [rad]."""
     scan_rate: float = 5.0
@@ -85,12 +85,12 @@ class LandmarkFieldConfig:
     sigma_bearing: float = math.radians(5.0)
     """σ of a measured bearing, independent per observation [rad]."""
     speed_factor: float = 1.0
-    """Measured over true speed, a miscalibrated wheel: a systematic error that no stated σ covers."""
+    """Ratio of measured to true speed (miscalibrated wheel): a systematic error not covered by the nominal σ."""
     steering_bias: float = 0.0
     """Added to every measured steering angle [rad]; systematic as well."""
     noise_scale: float = 1.0
-    """Every drawn error is multiplied by it, the stated σ are not: 1 is honest, 0 gives exact data to check models
-    with, 2 a vehicle whose data sheet lies by a factor of 2."""
+    """Factor on every random error, but not on the nominal σ: 1 is consistent, 0 gives exact data to check models with,
+    2 errors twice as large as their nominal σ."""
 
     gps_rate: float = 0.0
     """GPS fixes per second [Hz]; 0 is no GPS. Divides control_rate."""

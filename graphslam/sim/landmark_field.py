@@ -1,11 +1,11 @@
 """The landmark field of Combined SLAM (2012), section 5: a car drives a closed loop through point features.
 
-Controls arrive at 40 Hz with white noise on speed and steering; a forward range-bearing sensor looks 180° and 30 m
-at 5 Hz. Truth is exact: the vehicle moves with the true controls, only what it *measures* is noisy, independently
-per record. Everything is in the frame of the first base pose, so no result needs an alignment.
+Controls arrive at 40 Hz with white noise on speed and steering; a forward range-bearing sensor covers 180° and 30 m at
+5 Hz. The ground truth is exact: the vehicle moves with the true controls, only its measurements are noisy,
+independently per record. Everything is in the frame of the first base pose, so no result needs an alignment.
 
-The paper's figures (554 features, 126 submaps of about 15 features, 2 km × 2 km, one loop) do not fit into one
-world. Worlds ``A`` (two laps, enough features per submap) and ``B`` (one lap as large as the paper's field) take
+The paper's parameters (554 features, 126 submaps of about 15 features, 2 km × 2 km, one loop) do not fit into one
+world. Worlds ``A`` (two laps, enough features per submap) and ``B`` (one lap as large as the paper's field) reproduce
 one half of them each; ``C`` is ``A`` with the sensor of the classic simulator.
 """
 
@@ -35,7 +35,7 @@ __all__ = ["PRESETS", "LandmarkFieldConfig", "landmark_field_preset", "landmark_
 
 @dataclass(slots=True)
 class _World:
-    """What is true, and the stamps at which it is looked at."""
+    """Ground truth and the stamps of the measurements."""
 
     config: LandmarkFieldConfig
     seeds: SeedTree
@@ -74,7 +74,7 @@ def visible_landmarks(
     i, j = near["i"], near["j"]
     d = np.einsum("ij,ijk->ik", landmarks[j] - poses[i, :2], rotation2(poses[i, 2]))  # Rᵀ (l - p)
     rng_m, bearing = np.hypot(d[:, 0], d[:, 1]), np.arctan2(d[:, 1], d[:, 0])
-    # the tree finds what lies within max_range up to rounding; the limits are the configuration's
+    # the tree query is exact up to rounding only; the limits are the configuration's
     seen = (rng_m <= c.max_range) & (rng_m >= c.min_range) & (np.abs(bearing) <= c.field_of_view / 2)
     return i[seen], j[seen], rng_m[seen], bearing[seen]
 
@@ -105,13 +105,13 @@ def observe_landmarks(
     landmarks : (m, 2)
         Their rows are the identities.
     seeds : SeedTree
-        Its branches ``noise/landmarks`` and ``noise/clutter`` draw.
+        Its branches ``noise/landmarks`` and ``noise/clutter`` are used.
     hidden : callable, optional
         Given the plan position of a sensor ``(q, 2)`` and the row of a landmark ``(q,)``: is the line of sight blocked?
     """
     rng, clutter = (seeds.child("noise", name).generator() for name in ("landmarks", "clutter"))
     scan, ids, ranges, bearings = visible_landmarks(c, poses, landmarks)
-    # the tree's order is its own affair: sort, so that the draws below belong to the same features everywhere
+    # sorted (the tree query has no defined order), so that random numbers belong to the same features everywhere
     order = np.lexsort((ids, scan))
     if hidden is not None:
         order = order[~hidden(poses[scan[order], :2], ids[order])]
@@ -168,14 +168,14 @@ def simulate_landmark_field(config: LandmarkFieldConfig, seed: int) -> SensorLog
     Parameters
     ----------
     seed : int
-        Same seed, same bytes. Layout and each stream's noise hang from branches of their own, so switching GPS or
-        clutter on does not change the rest, and ``config.layout_seed`` holds the features over runs.
+        Same seed, same bytes. Layout and noise of each stream have their own branches, so enabling GPS or clutter
+        changes nothing else; ``config.layout_seed`` keeps the features fixed over runs.
 
     Returns
     -------
     SensorLog
-        Streams ``controls`` (measured, zero-order hold), ``landmarks`` (true ids, -1 for clutter) and, if asked
-        for, ``gps``; truth at the control rate, one pose more than controls. ``meta`` states every figure.
+        Streams ``controls`` (measured, zero-order hold), ``landmarks`` (true ids, -1 for clutter) and, if enabled,
+        ``gps``; ground truth at the control rate, one pose more than controls. ``meta`` contains all parameters.
     """
     route, landmarks = landmark_layout(config, seed)
     poses, steering = follow_route(
@@ -208,7 +208,7 @@ def simulate_landmark_field(config: LandmarkFieldConfig, seed: int) -> SensorLog
 
 
 def _meta(config: LandmarkFieldConfig, seed: int) -> dict[str, Any]:
-    """Figures of the world as JSON can hold them."""
+    """Parameters of the world as JSON-compatible values."""
     plain = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(config).items()}
     return {
         "source": "simulation",

@@ -1,4 +1,4 @@
-"""Where the features of the landmark field stand: anywhere, in close pairs, in two rows along the route."""
+"""Feature positions of the landmark field: scattered, in close pairs, in two rows along the route."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _pair(config: LandmarkFieldConfig, route: Array, points: Array, rng: np.rand
     angle = rng.uniform(-np.pi, np.pi, pairs)
     step = config.pair_distance * np.stack([np.cos(angle), np.sin(angle)], -1)
     stems = points[0 : 2 * pairs : 2]
-    # a twin that would stand nearer to the route than its stem goes to the other side of it, away from the road
+    # a twin nearer to the route than its stem is moved to the other side of the stem, away from the road
     tree = cKDTree(route)
     inward = tree.query(stems + step)[0] < tree.query(stems)[0]
     points[1 : 2 * pairs : 2] = stems + np.where(inward[:, None], -step, step)

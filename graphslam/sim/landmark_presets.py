@@ -1,4 +1,4 @@
-"""Named landmark fields: the paper's figures, small worlds for tests, and worlds that confuse an association."""
+"""Named landmark fields: the paper's parameters, small worlds for tests, and worlds with difficult association."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _AVENUE = dataclasses.replace(
     scan_rate=1.0,
 )
 PRESETS: Mapping[str, LandmarkFieldConfig] = {
-    # two laps of 2.23 km, 0.5 m / 5° (the stated noise), about 15 features per 35 m of way
+    # two laps of 2.23 km, 0.5 m / 5° (the nominal noise), about 15 features per 35 m of path
     "A": _A,
     # one lap of 5.3 km (1.65 km across, as the paper's field) and 5.5 % overlap, about 7 features per 44 m
     "B": dataclasses.replace(_A, lap_length=5300.0, laps=1.055),
     # A with the sensor of the classic simulator
     "C": dataclasses.replace(_A, sigma_range=0.1, sigma_bearing=math.radians(1.0)),
-    # 480 m and a fifth of it again: closes a loop, the whole pipeline takes seconds
+    # 480 m and a fifth of it again: closes a loop, the whole pipeline runs in seconds
     "demo": dataclasses.replace(
         _A,
         lap_length=480.0,
@@ -57,10 +57,10 @@ PRESETS: Mapping[str, LandmarkFieldConfig] = {
     ),
     # one lap of 600 m and 30 % of it again, 0.25 features a metre as A; a third of what the sensor reports is false
     "clutter": _LOOP_OF_CLUTTER,
-    # the same lap, every feature has a twin 1.5 m away: nearer than a bearing of 5° can tell apart beyond 17 m
+    # the same lap, every feature has a twin 1.5 m away: not distinguishable by a bearing of 5° beyond 17 m
     "pairs": dataclasses.replace(_LOOP, pair_fraction=1.0, pair_distance=1.5),
-    # an avenue with few other features and a good sensor at 1 Hz, but a wheel that slips: 1 m along the way between two
-    # scans, a quarter of the distance between trees, so that now and then the next tree is the nearer one
+    # an avenue with few other features and a good sensor at 1 Hz, but a slipping wheel: σ of 1 m along the path between
+    # two scans, a quarter of the distance between trees, so that now and then the next tree is the nearer one
     "rows": _AVENUE,
     # the avenue with everything at once: pairs, clutter, missed detections
     "hard": dataclasses.replace(

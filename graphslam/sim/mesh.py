@@ -1,7 +1,7 @@
-"""Triangles of simple solids, gathered into one mesh.
+"""Triangles of simple solids, combined into one mesh.
 
 Solids may touch or overlap: a range finder sees the nearest surface only. Neighbouring pieces of one wall or floor
-share their corners exactly, so that no beam slips through between them.
+share their corners exactly, so that no beam passes between them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Rectangle = tuple[float, float, float, float]
 
 
 class MeshBuilder:
-    """Gathers solids; :meth:`build` gives the mesh."""
+    """Collects solids; :meth:`build` returns the mesh."""
 
     def __init__(self) -> None:
         self._vertices: list[Array] = []
@@ -83,7 +83,7 @@ class MeshBuilder:
         Parameters
         ----------
         start, end : (2,)
-            Of its middle line in the plan [m].
+            Of its centre line in the plan [m].
         low, high : float
             Heights of its foot and of its top [m].
         openings : iterable of (from, to, bottom, top)
@@ -119,7 +119,7 @@ class MeshBuilder:
         Parameters
         ----------
         start, end : (3,)
-            Of the middle line of its surface [m].
+            Of the centre line of its surface [m].
         """
         a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
         along = (b - a)[:2] / np.linalg.norm((b - a)[:2])
@@ -173,7 +173,7 @@ class MeshBuilder:
 
 
 def _cells(area: Rectangle, holes: Iterable[Rectangle]) -> list[Rectangle]:
-    """Rectangles ``(u0, u1, v0, v1)`` that cover an area but for its holes; neighbours share their corners."""
+    """Rectangles ``(u0, u1, v0, v1)`` that cover an area except its holes; neighbours share their corners."""
     u0, u1, v0, v1 = area
     clipped = [(max(h[0], u0), min(h[1], u1), max(h[2], v0), min(h[3], v1)) for h in holes]
     clipped = [h for h in clipped if h[0] < h[1] and h[2] < h[3]]

@@ -1,4 +1,4 @@
-"""Worlds of triangles by name."""
+"""Triangle-mesh worlds by name."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from graphslam.sim.world import DRAWN, World, layout_number
 
 @dataclass(frozen=True, slots=True)
 class MeshWorld:
-    """A world of triangles that a robot drives through.
+    """A triangle-mesh world that a robot drives through.
 
     Parameters
     ----------
     module, function : str
-        What builds it; imported when used.
+        Function that builds it; imported when used.
     layouts : tuple of str
-        Buildings to choose from, the default first; empty where there is one only. Where there are any, others are
-        drawn: ``drawn-17`` by that number.
+        Named layouts, the default first; empty if there is only one. If not empty, others are generated: ``drawn-17``
+        from that number.
     """
 
     module: str
@@ -28,7 +28,7 @@ class MeshWorld:
     layouts: tuple[str, ...] = ()
 
     def build(self, name: str, layout: str | None, seed: int) -> World:
-        """The world; the seed moves what can be moved in it."""
+        """The world; the seed determines its movable objects."""
         if layout is not None and layout not in self.layouts and not (self.layouts and layout_number(layout)):
             if not self.layouts:
                 raise ConfigError(f"world {name!r} has one layout only: leave {layout!r} out")
@@ -48,17 +48,17 @@ MESH_WORLDS: dict[str, MeshWorld] = {
 
 
 def mesh_world(name: str, *, layout: str | None = None, seed: int = 0) -> World:
-    """A world of triangles by name.
+    """A triangle-mesh world by name.
 
     Parameters
     ----------
     name : str
-        ``garage``, ``mine`` or ``building``.
+        ``garage``, ``court``, or a world of a plug-in (group ``graphslam.worlds``) such as ``mine`` or ``building``.
     layout : str, optional
         Of the garage: ``A``, ``B``, ``C`` or ``D``. Of the mine: ``once`` or ``twice`` round. Of these and of the
-        building: ``drawn-17``, drawn by that number.
+        building: ``drawn-17``, generated from that number.
     seed : int
-        Of what can be moved in it.
+        Of its movable objects.
     """
     found = MESH_WORLDS[name] if name in MESH_WORLDS else load_plugin("graphslam.worlds", "world", name, MESH_WORLDS)
     if not isinstance(found, MeshWorld):

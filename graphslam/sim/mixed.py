@@ -1,16 +1,16 @@
-"""A building in a park, in the plane: walls inside, trees outside, and a robot with every kind of sensor.
+"""A planar world of a building in a park: walls inside, trees outside, and a robot with every kind of sensor.
 
-The route goes through the building and round through the park, at least twice each. Layout, route and noise levels
-are random: another seed is another world.
+The route goes through the building and round through the park, at least twice each. Layout, route and noise levels are
+random: another seed is another world.
 
 - ``wheels``: :class:`~graphslam.core.records.Odometry`, noise independent per increment, growing with the distance;
 - ``imu``: :class:`~graphslam.core.imu.Imu`, level, z up: yaw rate and two accelerations, with biases that drift slowly;
 - ``gps``: :class:`~graphslam.core.records.Gps` in the plane; no fix under the roof and near the walls;
-- ``laser``: :class:`~graphslam.core.records.LaserScans`, which sees walls and trunks;
-- ``landmarks``: :class:`~graphslam.core.records.LandmarkObservations` of the trees. Their ``ids`` are the truth for an
-  evaluation; association ``likelihood`` does not read them.
+- ``laser``: :class:`~graphslam.core.records.LaserScans`, which measures walls and trunks;
+- ``landmarks``: :class:`~graphslam.core.records.LandmarkObservations` of the trees. Their ``ids`` are ground truth for
+  an evaluation; association ``likelihood`` does not use them.
 
-Laser and landmark sensor are two instruments, a range finder and a camera with a tree detector of its own, say: the
+Laser and landmark sensor are two instruments, for example a range finder and a camera with its own tree detector: the
 observation of a tree is not computed from the scan that shows its trunk. Their noise is independent, so that a graph
 may use both.
 """
@@ -59,7 +59,7 @@ _FLOOR = (1e-3, 1e-3, 2e-4)  # σ of an increment of the wheels at rest [m, m, r
 _WHEEL_RATE, _IMU_RATE = 10.0, 50.0
 
 NOISE: Mapping[str, Range] = {
-    "wheel": (0.01, 0.03),  # along the way after one metre, growing with the root of the distance [m/√m]
+    "wheel": (0.01, 0.03),  # along the path after one metre, growing with the root of the distance [m/√m]
     "lateral": (0.003, 0.01),  # across it [m/√m]
     "turn": (0.003, 0.01),  # of the heading [rad/√m]
     "laser": (0.01, 0.03),  # of a range [m]
@@ -73,7 +73,7 @@ NOISE: Mapping[str, Range] = {
     "accelerometer_bias": (0.02, 0.1),  # [m/s²]
     "accelerometer_walk": (5e-5, 3e-4),  # [m/s²/√s]
 }
-"""σ of every sensor, as a range that the seed draws from: logarithms are uniform."""
+"""Range of the σ of every sensor; a value is sampled log-uniformly with the seed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,11 +85,11 @@ class MixedConfig:
     width: Range = (19.0, 23.0)
     """Of the building [m]."""
     park: Range = (16.0, 26.0)
-    """How far the route through the park leads away from the building [m]."""
+    """Distance from the building of the route through the park [m]."""
     trees: int = 60
-    """Trees in the park, fewer where they find no place 3 m apart."""
+    """Number of trees in the park; fewer if there is no room for them 3 m apart."""
     laps: int = 2
-    """Times through the building and the park, at least 2."""
+    """Number of passes through the building and the park, at least 2."""
     speed: float = 1.25
     """[m/s]"""
     layout_seed: int | None = None
@@ -107,7 +107,7 @@ class MixedConfig:
     gps_rate: float = 1.0
     """Fixes per second in the open [Hz]; divides 10."""
     noise_scale: float = 1.0
-    """Every random error is multiplied by it, the stated σ are not; 0 gives exact data."""
+    """Factor on every random error, but not on the nominal σ; 0 gives exact data."""
 
     def __post_init__(self) -> None:
         for name, least in (("length", 18.0), ("width", 15.0), ("park", 8.0)):
@@ -141,7 +141,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def draw_log_uniform(ranges: Mapping[str, Range], tree: SeedTree) -> dict[str, float]:
-    """A figure out of every range, each from the branch of its name: logarithms are uniform."""
+    """A log-uniform random value from every range, each from the branch of its name."""
     return {
         name: float(np.exp(tree.child(name).generator().uniform(*np.log(limits)))) for name, limits in ranges.items()
     }
@@ -154,7 +154,7 @@ def true_intervals(times: Array, inside: Array) -> list[list[float]]:
 
 
 def mixed_preset(name: str = "full", **changes: Any) -> MixedConfig:
-    """A preset with figures changed."""
+    """A preset with some parameters changed."""
     if name not in PRESETS:
         raise UnknownNameError("preset of the mixed world", name, PRESETS)
     known = {f.name for f in dataclasses.fields(MixedConfig)}
@@ -171,7 +171,7 @@ class MixedPlace:
     Parameters
     ----------
     caster : RayCaster
-        Walls, things in the corridors and trunks.
+        Walls, obstacles in the corridors and trunks.
     trees : (n, 3)
         Plan position of each trunk and its radius [m].
     building : (x0, y0, x1, y1)
@@ -189,7 +189,7 @@ class MixedPlace:
         return np.asarray(np.hypot(out[:, 0], out[:, 1]))
 
     def hidden(self, eyes: Array, rows: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
-        """Which of the trees ``rows`` (q,) stand behind something, seen from ``eyes`` (q, 2)."""
+        """Which of the trees ``rows`` (q,) are occluded as seen from ``eyes`` (q, 2)."""
         if not len(rows):
             return np.zeros(0, dtype=bool)
         step = self.trees[rows, :2] - eyes
@@ -200,7 +200,7 @@ class MixedPlace:
 
 
 def mixed_place(config: MixedConfig, seed: int) -> MixedPlace:
-    """Draw building, route and trees."""
+    """Generate building, route and trees."""
     tree = SeedTree(seed).child("mixed", "layout")
     rng = tree.child("plan").generator()
     w, h = (float(rng.uniform(*r)) for r in (config.length, config.width))
@@ -208,7 +208,7 @@ def mixed_place(config: MixedConfig, seed: int) -> MixedPlace:
     x1, x2, y1, y2 = rooms[3] + _HALF, w - rooms[1] - _HALF, rooms[0] + _HALF, h - rooms[2] - _HALF
     flip = -1.0 if rng.random() < 0.5 else 1.0  # mirrored: left turns become right turns
 
-    # a closed way: from the park in by the western door, along the ring of corridors, out by the eastern one
+    # a closed route: from the park in by the western door, along the ring of corridors, out by the eastern one
     away = rng.uniform(*config.park, 3)
     park = [(w + 7.0, y2), (w + 7.0 + 4.0 * rng.random(), h + away[0]), (w * rng.uniform(0.35, 0.65), h + away[1])]
     park += [(-7.0 - 4.0 * rng.random(), h + away[2]), (-7.0, y1)]
@@ -314,7 +314,7 @@ def _wheels(times: Array, poses: Array, noise: Mapping[str, float], scale: float
 def _imu(
     motion: RouteMotion, noise: Mapping[str, float], scale: float, seeds: SeedTree
 ) -> tuple[Imu, dict[str, list[float]]]:
-    """A level unit above the base, and its biases at the start."""
+    """A level unit above the base, and its initial biases."""
     config = CrawlerConfig(
         imu_rate=_IMU_RATE,
         gyro_bias_across=noise["gyro_bias"],
@@ -334,7 +334,7 @@ def _imu(
 def _laser(
     motion: RouteMotion, place: MixedPlace, c: MixedConfig, noise: Mapping[str, float], seeds: SeedTree
 ) -> LaserScans:
-    """Scans of a planar laser whose beams leave at one instant."""
+    """Scans of a planar laser whose beams are simultaneous."""
     bearings = np.linspace(-2.0 * math.pi / 3.0, 2.0 * math.pi / 3.0, c.beams)
     times = np.arange(int(motion.duration * c.laser_rate + 1e-9) + 1) / c.laser_rate
     empty = RangeScans(
@@ -352,7 +352,7 @@ def _laser(
 
 
 def simulate_mixed(config: MixedConfig, seed: int) -> SensorLog:
-    """Drive through the building and the park and record it.
+    """Simulate the drive through the building and the park and record the sensors.
 
     Parameters
     ----------
@@ -362,10 +362,10 @@ def simulate_mixed(config: MixedConfig, seed: int) -> SensorLog:
     Returns
     -------
     SensorLog
-        Streams as in the module's text. Truth in the frame of the first base, in the plane: path at the rate of the
-        IMU, trees as landmarks. ``meta``: ``datum``, pose of that frame in the frame of the fixes (E, N, heading)
-        [m, rad]; ``noise``, every σ; ``drawn``, the biases of the IMU at the start; ``indoor``, times ``[from, to]``
-        under the roof; ``radii``, of the trunks [m].
+        Streams as in the module docstring. Planar ground truth in the frame of the first base: path at the rate of the
+        IMU, trees as landmarks. ``meta``: ``datum``, pose of that frame in the frame of the fixes (E, N, heading) [m,
+        rad]; ``noise``, every σ; ``drawn``, the biases of the IMU at the start; ``indoor``, times ``[from, to]`` under
+        the roof; ``radii``, of the trunks [m].
     """
     c = config
     layout_seed = int(seed) if c.layout_seed is None else int(c.layout_seed)

@@ -1,4 +1,4 @@
-"""Ranges from points of view inside a mesh."""
+"""Ray casting into a triangle mesh."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class RayCaster:
     """A triangle mesh that rays are cast into, in double precision, on one core.
 
-    Coordinates are taken from the middle of the mesh, so that one far from the origin is as exact.
+    Coordinates are relative to the centre of the mesh, so that a mesh far from the origin loses no precision.
 
     Parameters
     ----------
@@ -52,11 +52,11 @@ class RayCaster:
 
     @classmethod
     def of(cls, world: World) -> RayCaster:
-        """Into the mesh of a world."""
+        """Ray caster of the mesh of a world."""
         return cls(world.vertices, world.triangles)
 
     def ranges(self, rays: ArrayLike) -> Array:
-        """Distances to the first triangle ``(n,)`` [m], NaN where a ray meets none.
+        """Distances to the first triangle ``(n,)`` [m], NaN where a ray hits none.
 
         Parameters
         ----------
@@ -75,7 +75,7 @@ class RayCaster:
         return out
 
     def distances(self, points: ArrayLike) -> Array:
-        """Distances of points ``(n, 3)`` to the nearest place of the mesh ``(n,)`` [m]."""
+        """Distances of points ``(n, 3)`` to the nearest point of the mesh ``(n,)`` [m]."""
         p = np.asarray(points, dtype=np.float64)
         out = np.empty(len(p))
         distances_kernel(p - self._centre, *self._tree, out)

@@ -1,9 +1,9 @@
-"""Compiled rays into triangles: a tree of boxes, the first triangle along each ray, the nearest place to each point.
+"""Compiled ray casting: a bounding-box tree, the first triangle along each ray, the nearest point of the mesh.
 
-Arrays of the tree, depth first: ``boxes`` (m, 6) low and high corners, a little too wide so that rounding loses no
-triangle; ``first`` and ``count`` (m,): a leaf holds ``count`` triangles from ``first`` on; an inner node has count 0,
-its left child behind it and its right child at ``first``. ``triangles`` (t, 9): a corner and the two edges from it, in
-the order of the leaves. All in double precision; the same numbers whatever runs beside.
+Arrays of the tree, depth first: ``boxes`` (m, 6) low and high corners, slightly enlarged so that rounding misses no
+triangle; ``first`` and ``count`` (m,): a leaf contains ``count`` triangles from ``first`` on; an inner node has count
+0, its left child directly after it and its right child at ``first``. ``triangles`` (t, 9): a corner and the two edges
+from it, in the order of the leaves. All in double precision and deterministic.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graphslam.evidence.kernels import kernel
 _LEAF = 4  # triangles of a leaf
 _BINS = 12  # places where a box may be cut, along each axis
 _DEPTH = 128
-_MARGIN = 1e-9  # relative to the size of the mesh: what a box is wider, and how far over its edge a triangle is met
+_MARGIN = 1e-9  # relative to the size of the mesh: enlargement of a box, and tolerance at the edges of a triangle
 
 
 @kernel(error_model="numpy")
@@ -59,7 +59,7 @@ def build_kernel(low, high, boxes, first, count, order):
                 middle_low[axis], middle_high[axis] = min(middle_low[axis], m), max(middle_high[axis], m)
         for axis in range(3):
             boxes[node, axis], boxes[node, 3 + axis] = a[axis] - margin, b[axis] + margin
-        # the cut with the least expected number of triangles that a ray must be tried on
+        # the cut with the least expected number of triangles that a ray must be tested against
         best, best_axis, best_bin = math.inf, -1, 0
         for axis in range(3):
             width = middle_high[axis] - middle_low[axis]
@@ -122,7 +122,7 @@ def _enters(box, x, y, z, ix, iy, iz, until):
 
 @kernel(error_model="numpy")
 def _inverse(d):
-    # a number in place of infinity: 0 × ∞ is none
+    # a finite number instead of infinity, because 0 × ∞ is undefined
     return 1.0 / d if abs(d) > 1e-200 else 1e200
 
 
@@ -165,7 +165,7 @@ def ranges_kernel(rays, boxes, first, count, triangles, out):
             left, right = node + 1, first[node]
             a = _enters(boxes[left], x, y, z, ix, iy, iz, best)
             b = _enters(boxes[right], x, y, z, ix, iy, iz, best)
-            if a > b:  # the nearer one lies on top and is looked at first
+            if a > b:  # the nearer one is on top of the stack and is visited first
                 left, right, a, b = right, left, b, a
             if b < math.inf:
                 stack[top], enter[top] = right, b
@@ -186,7 +186,7 @@ def _box_distance2(box, x, y, z):
 
 @kernel(error_model="numpy")
 def _segment_distance2(wx, wy, wz, ex, ey, ez):
-    """From w, seen from the segment's start, to the segment e."""
+    """Squared distance from w, relative to the segment's start, to the segment e."""
     length2 = ex * ex + ey * ey + ez * ez
     s = min(max((wx * ex + wy * ey + wz * ez) / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
     a, b, c = wx - s * ex, wy - s * ey, wz - s * ez
@@ -214,7 +214,7 @@ def _triangle_distance2(t, x, y, z):
 
 @kernel(error_model="numpy")
 def distances_kernel(points, boxes, first, count, triangles, out):
-    """Distance of points (n, 3) to the nearest place of any triangle."""
+    """Distance of points (n, 3) to the nearest point of any triangle."""
     stack, away = np.empty(_DEPTH, np.int64), np.empty(_DEPTH)
     for r in range(len(points)):
         x, y, z = points[r, 0], points[r, 1], points[r, 2]

@@ -1,7 +1,7 @@
-"""A small world: a hall with a block in its middle, driven round nearly one and a half times in about a minute.
+"""A small world: a hall with a block in its centre, circled nearly one and a half times in about a minute.
 
-It is to the garage what a puddle is to a lake: dead reckoning drifts, the way comes back to where it was, and two
-corridors lie side by side, so that whatever is meant for the large worlds can be tried in seconds.
+A small counterpart of the garage: dead reckoning drifts, the route revisits places, and two corridors are parallel, so
+that methods for the large worlds can be tested in seconds.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _CORNERS = ((12.0, 0.0), (12.0, 8.0), (0.0, 8.0), (0.0, 0.0))
 
 
 def ring_hall(*, seed: int = 0) -> World:
-    """The court.
+    """The world ``court``.
 
     Parameters
     ----------
     seed : int
-        Moves what stands about; walls, cupboards and way stay.
+        Of the movable obstacles; walls, cupboards and route do not depend on it.
     """
     mesh = MeshBuilder()
     (x0, y0), (x1, y1) = _LOW, _HIGH

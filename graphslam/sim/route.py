@@ -1,4 +1,4 @@
-"""Ways made of straight lines and arcs."""
+"""Routes made of straight lines and arcs."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy.typing as npt
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array, ArrayLike, wrap_angle
 
-# Turns smaller than this [rad] are none: a waypoint on a straight line, where only the slope changes.
+# Smaller turns [rad] are ignored: a waypoint on a straight line, where only the slope changes.
 _NO_TURN = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Pieces of a way, each a straight line or an arc of constant slope.
+    """Pieces of a route, each a straight line or an arc of constant slope.
 
     Parameters
     ----------
     starts : (m + 1,)
-        Arc length, along the slope, at which each piece begins, and the length of all [m].
+        Arc length, along the slope, at which each piece begins, and the total length [m].
     points : (m + 1, 3)
-        Where the pieces begin, and the end.
+        Start points of the pieces, and the end.
     heading : (m,)
         Direction in the plan where each piece begins [rad].
     curvature : (m,)
@@ -40,7 +40,7 @@ class Route:
 
     @property
     def length(self) -> float:
-        """Of the way, along the slopes [m]."""
+        """Length of the route along the slopes [m]."""
         return float(self.starts[-1])
 
     def _piece(self, s: ArrayLike) -> tuple[npt.NDArray[np.intp], Array]:
@@ -56,7 +56,7 @@ class Route:
         k, share = self._piece(s)
         u = share * self.plan[k]
         turn = self.curvature[k] * u
-        # chord of an arc: length u · sinc(turn/2), direction half-way round; sinc(0) = 1 serves the lines
+        # chord of an arc: length u · sinc(turn/2), direction half-way round; sinc(0) = 1 covers the lines
         chord = u * np.sinc(turn / (2.0 * np.pi))
         direction = self.heading[k] + turn / 2.0
         rise = share * (self.points[k + 1, 2] - self.points[k, 2])
@@ -78,13 +78,12 @@ class Route:
 
 
 def plan_route(waypoints: ArrayLike, corner_radius: float, *, where: str = "way") -> Route:
-    """Join waypoints by straight lines, their corners rounded.
+    """Connect waypoints by straight lines with rounded corners.
 
     Parameters
     ----------
     waypoints : (k, 3)
-        z is linear between waypoints. A corner that lies on a slope bends the floor along its arc linearly
-        between the two tangent points.
+        z is linear between waypoints. On the arc of a corner, z is linear between the two tangent points.
     corner_radius : float
         In the plan [m].
     where : str

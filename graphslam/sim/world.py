@@ -1,4 +1,4 @@
-"""A simulated place: what stands there, and the way a robot drives through it."""
+"""A simulated place: its geometry and the route of a robot through it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from graphslam.core.geometry import Array, wrap_angle
 from graphslam.sim.route import Route, plan_route
 
 DRAWN = "drawn-"
-"""Begin of the names of layouts that are drawn; the rest is their number, from 1 on."""
+"""Prefix of the names of generated layouts; the rest is their number, from 1 on."""
 
 
 def layout_number(layout: str) -> int:
-    """The number of a layout that is drawn, such as ``drawn-17``; 0 of every other."""
+    """The number of a generated layout such as ``drawn-17``; 0 for every other."""
     number = layout.removeprefix(DRAWN)
     return int(number) if layout.startswith(DRAWN) and number.isdecimal() else 0
 
 
-# An earlier visit is followed while the place on it moves by no more than this from one point to the next [m].
-_STEP = 0.5  # between the points of a way that are looked at [m]
+# An earlier visit is tracked while its matched arc length changes by no more than _JUMP from one point to the next [m].
+_STEP = 0.5  # between the tested points of a route [m]
 _JUMP = 3.0
 
 Triangles = npt.NDArray[np.int32]
@@ -32,25 +32,24 @@ Triangles = npt.NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """Geometry of a place and the way to drive through it; world frame, z up, metres.
+    """Geometry of a place and the route through it; world frame, z up, metres.
 
     Parameters
     ----------
     vertices : (v, 3)
     triangles : (t, 3) int32
-        Rows of ``vertices``. Not watertight and without a meaning of their winding, but without slits between
-        neighbouring surfaces.
+        Rows of ``vertices``. Not watertight and with arbitrary winding, but without gaps between neighbouring surfaces.
     waypoints : (k, 3)
         Points on the floor that the robot drives over, in order; z is the height of the floor there.
     corner_radius : float
-        Waypoints are joined by straight lines, their corners rounded by arcs of this radius [m].
+        Waypoints are connected by straight lines with corners rounded by arcs of this radius [m].
     speed : float
-        Along the way [m/s].
+        Along the route [m/s].
     meta : mapping
-        JSON: ``length`` of the way [m]; ``levels``, heights of the floors [m]; ``loops``, pairs ``[s1, s2]`` of arc
-        lengths at the same place; ``revisits``, the stretches they stand for (see :func:`find_revisits`);
-        ``parallel``, pairs of stretches ``[[s1a, s1b], [s2a, s2b]]`` that are different places and must never be
-        taken for one; and what else describes the world.
+        JSON: ``length`` of the route [m]; ``levels``, heights of the floors [m]; ``loops``, pairs ``[s1, s2]`` of arc
+        lengths at the same place; ``revisits``, the corresponding stretches (see :func:`find_revisits`); ``parallel``,
+        pairs of stretches ``[[s1a, s1b], [s2a, s2b]]`` that are different places and must not be confused; and further
+        descriptions of the world.
     """
 
     name: str
@@ -83,12 +82,12 @@ class World:
         plan_route(self.waypoints, self.corner_radius, where=where)
 
     def route(self) -> Route:
-        """The way as straight lines and arcs."""
+        """The route as straight lines and arcs."""
         return plan_route(self.waypoints, self.corner_radius, where=f"world {self.name}")
 
 
 def find_revisits(route: Route, *, shortest: float = 0.0) -> list[dict[str, Any]]:
-    """Stretches of a way that lie where it has been before: within a metre, and 20 m of driving or more earlier.
+    """Stretches of a route that revisit an earlier part of it: within a metre, and at least 20 m of driving later.
 
     Parameters
     ----------
@@ -99,7 +98,7 @@ def find_revisits(route: Route, *, shortest: float = 0.0) -> list[dict[str, Any]
     -------
     list of dict
         In the order driven: ``first`` and ``again``, arc lengths ``[from, to]`` [m] of the earlier and of the later
-        visit, the places of ``again[0]`` and ``first[0]`` (and of the two ends) being the same; ``same_heading``.
+        visit, where ``again[0]`` and ``first[0]`` (and the two ends) are the same place; ``same_heading``.
     """
     s = np.linspace(0.0, route.length, max(round(route.length / _STEP), 1) + 1)
     p, h = route.positions(s), route.headings(s)
@@ -109,7 +108,7 @@ def find_revisits(route: Route, *, shortest: float = 0.0) -> list[dict[str, Any]
         near = np.flatnonzero(d < 1.0)
         if len(near):
             before = match[k - 1]
-            # of several earlier visits the one that is being followed, else one in the same direction, else the nearest
+            # of several earlier visits the one being tracked, else one in the same direction, else the nearest
             follows = near[np.abs(near - before) * _STEP <= _JUMP] if before >= 0 else near[:0]
             alike = near[np.cos(h[near] - h[k]) > 0.0]
             choice = follows if len(follows) else alike if len(alike) else near
