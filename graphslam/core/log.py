@@ -153,8 +153,7 @@ class SensorLog:
         return replace(self, streams=cut, read={})  # the counts are those of the whole log
 
     def events(self) -> Iterator[tuple[float, str, int]]:
-        """Merge the streams in time order: yields (time, stream, record index); equal times in order of the streams'
-        names."""
+        """Merge the streams in time order: yields (time, stream, record index); equal times by stream name."""
         names = sorted(self.streams)
         times = np.concatenate([self.streams[n].times for n in names])
         which = np.concatenate([np.full(len(self.streams[n].times), k) for k, n in enumerate(names)])

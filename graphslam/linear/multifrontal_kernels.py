@@ -101,8 +101,7 @@ def _postorder(parent: Index) -> Index:
 def _columns(
     start: Index, earlier: Index, turned: tuple[Index, Index], up: Index, offset: Index
 ) -> tuple[Index, Index, Index, Index, int]:
-    """Positions below each column of L, ``below[below_ptr[k] : below_ptr[k + 1]]``, their number and scalars; number of
-    entries.
+    """Positions below each column of L, ``below[below_ptr[k] : below_ptr[k + 1]]``, counts and scalars; total entries.
 
     ``turned`` maps the postorder to the order of ``start`` and ``earlier``, and back.
     """

@@ -57,8 +57,7 @@ class SymmetricFactor:
         return np.asarray(self._lu.solve(np.asarray(rhs, dtype=np.float64)))
 
     def inverse_block(self, indices: npt.ArrayLike) -> Array:
-        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹`` by sparse solves, without the whole inverse (Algorithm
-        1)."""
+        """Rows and columns ``indices`` ``(k,)`` of ``A⁻¹`` by sparse solves, not the whole inverse (Algorithm 1)."""
         ix = np.asarray(indices, dtype=np.intp)
         block = np.empty((len(ix), len(ix)))
         for first in range(0, len(ix), _COLUMNS):

@@ -254,7 +254,7 @@ def roll_by_floor(way: SampledRoute, caster: RayCaster, track: float) -> Sampled
 
 
 def drive_motion(world: World, config: DriveConfig = DriveConfig(), caster: RayCaster | None = None) -> RouteMotion:
-    """The motion of a robot that drives through a world along its route; see :func:`drive_through_world`."""
+    """The motion of a robot that drives through a world along its route; with a caster the roll follows the floor."""
     way = sample_route(world.route())
     if caster is not None:
         way = roll_by_floor(way, caster, config.track)

@@ -1,7 +1,7 @@
 """Triangles of simple solids, combined into one mesh.
 
 Solids may touch or overlap: a range finder sees the nearest surface only. Neighbouring pieces of one wall or floor
-share their corners exactly, so that no beam passes between them.
+share their corners exactly, so that there is no gap for a beam.
 """
 
 from __future__ import annotations

@@ -86,8 +86,7 @@ class Collapse:
 
 
 def number_by_first_sighting(landmark: npt.ArrayLike) -> tuple[Labels, int]:
-    """Number landmarks of measurements in pose order ``(M,)`` by first observation; labels are arbitrary integers ≥
-    0."""
+    """Number landmarks of measurements in pose order ``(M,)`` by first observation; any integer labels ≥ 0."""
     label = np.array(landmark, dtype=np.int32)
     table = np.full(int(label.max(initial=-1)) + 1, -1, dtype=np.int32)
     return label, int(kernels.renumber(label, table))
