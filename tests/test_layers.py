@@ -196,18 +196,11 @@ def test_importing_graphslam_imports_nothing_heavy() -> None:
 MOST_ARGUMENTS = 8
 MORE_ARGUMENTS = {
     "evidence/cast_kernels.py": {"cast_rays"},
-    "evidence/cube_kernels.py": {
-        *("fill_cube", "build_tree", "uniform_cube", "share_cubes", "add_brick", "make_path", "find_states"),
-        "finalise_occupied",
-    },
     "evidence/mark_kernels.py": {"mark_grids"},
-    "evidence/merge_kernels.py": {"sample_bricks"},
-    "evidence/octomap_kernels.py": {"write_tree", "tree_node_state", "write_brick", "read_tree"},
-    "evidence/query_kernels.py": {"look_up_values", "count_private"},
-    "evidence/tree_kernels.py": {"write_bricks", "unique_parent", "unique_roots"},
+    "evidence/query_kernels.py": {"look_up_values"},
     "evidence/update_kernels.py": {"resolve_writes", "apply_grids", "finalise_writes"},
 }
-"""Kernels on the trees of evidence grids that have more arguments still; no others."""
+"""Kernels called for every scan, which named tuples would make slower; no others have more arguments."""
 
 
 def test_kernels_group_their_arrays() -> None:

@@ -119,7 +119,7 @@ def insert_scan(grids: Sequence[GridTree], poses: Array, scan: Scan, threads: in
         for begin in range(0, n, size):
             work(grids[0], roots[begin : begin + size], poses[begin : begin + size], scan, True, threads, tally)
     finally:  # not before the end: what is shared must not depend on the size of a batch
-        release_sources(shared.left, pool.brick_ref, pool.brick_free, pool.counters)
+        release_sources(shared.left, pool.tree.brick_ref, pool.tree.brick_free, pool.tree.counters)
     return tally
 
 
@@ -142,9 +142,7 @@ def write_packed(grid: GridTree, keys: npt.NDArray[np.int64], values: npt.NDArra
     with pool.lock, defer_interrupts():
         make_unique((grid,), pool)  # first: it may take a node itself
         pool.reserve(len(keys) * (pool.levels - 1), len(keys))
-        write_bricks(
-            grid.root, keys, values, grid.model.threshold_step, pool.levels, *pool.tree_arrays(), *pool.store_arrays()
-        )
+        write_bricks(grid.root, keys, values, grid.model.threshold_step, pool.tree)
 
 
 def _insert_serial(
@@ -166,16 +164,17 @@ def _insert_serial(
     slots = 0
 
     def finish() -> None:
+        t = pool.tree
         apply_grids(
-            0, n, roots, ends, levels, grid.model.steps, s.slot_key, s.marks, s.marks64, s.work, pool.children,
-            pool.node_occupied, pool.bricks, pool.brick_lines,
+            0, n, roots, ends, levels, grid.model.steps, s.slot_key, s.marks, s.marks64, s.work, t.children,
+            t.node_occupied, t.bricks, t.brick_lines,
         )  # fmt: skip
         finalise_writes(
-            0, n, roots, ends, levels, s.slot_key, s.work, pool.children, pool.node_occupied, pool.brick_lines, s.left,
-            pool.counters,
+            0, n, roots, ends, levels, s.slot_key, s.work, t.children, t.node_occupied, t.brick_lines, s.left,
+            t.counters,
         )  # fmt: skip
         if not share:
-            release_sources(s.left, pool.brick_ref, pool.brick_free, pool.counters)
+            release_sources(s.left, pool.tree.brick_ref, pool.tree.brick_free, pool.tree.counters)
 
     try:
         while not mark_grids(
@@ -187,17 +186,18 @@ def _insert_serial(
         # every touched brick may need itself and a path of its own; the root is there
         pool.reserve(slots * (levels - 1), slots)
         s.reserve_left(slots)
+        t = pool.tree
         resolve_writes(
             0, n, roots, ends, levels, s.slot_key, s.marks64, s.work, share, s.table, s.made, s.made_marks,
-            pool.children, pool.node_ref, pool.node_occupied, pool.brick_ref, pool.node_free, pool.brick_free,
-            pool.counters,
+            t.children, t.node_ref, t.node_occupied, t.brick_ref, t.node_free, t.brick_free,
+            t.counters,
         )  # fmt: skip
         finish()
     except BaseException:  # Ctrl-C may fall between any two calls
-        if pool.counters[PENDING]:
+        if pool.tree.counters[PENDING]:
             finish()
         elif not share:
-            release_sources(s.left, pool.brick_ref, pool.brick_free, pool.counters)
+            release_sources(s.left, pool.tree.brick_ref, pool.tree.brick_free, pool.tree.counters)
         s.reset()
         raise
     tally += count
@@ -233,10 +233,10 @@ def _insert_threads(
             counts[i][:] = 0
 
     def apply(i: int) -> None:
-        s = scratches[i]
+        s, t = scratches[i], pool.tree
         apply_grids(
             cuts[i], cuts[i + 1], roots, ends, pool.levels, grid.model.steps, s.slot_key, s.marks, s.marks64, s.work,
-            pool.children, pool.node_occupied, pool.bricks, pool.brick_lines,
+            t.children, t.node_occupied, t.bricks, t.brick_lines,
         )  # fmt: skip
 
     try:
@@ -249,17 +249,18 @@ def _insert_threads(
         for s in scratches:
             s.reset()
         raise
+    t = pool.tree
     for i, s in enumerate(scratches):
         resolve_writes(
             cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.marks64, s.work, share, shared.table,
-            shared.made, shared.made_marks, pool.children, pool.node_ref, pool.node_occupied, pool.brick_ref,
-            pool.node_free, pool.brick_free, pool.counters,
+            shared.made, shared.made_marks, t.children, t.node_ref, t.node_occupied, t.brick_ref,
+            t.node_free, t.brick_free, t.counters,
         )  # fmt: skip
     _in_threads(apply, threads)
     for i, s in enumerate(scratches):
         finalise_writes(
-            cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.work, pool.children, pool.node_occupied,
-            pool.brick_lines, shared.left, pool.counters,
+            cuts[i], cuts[i + 1], roots, ends, pool.levels, s.slot_key, s.work, t.children, t.node_occupied,
+            t.brick_lines, shared.left, t.counters,
         )  # fmt: skip
     for count in counts:
         tally += count

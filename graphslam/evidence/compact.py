@@ -15,7 +15,7 @@ import numpy.typing as npt
 from graphslam.core.errors import GridError
 from graphslam.core.interrupt import defer_interrupts
 from graphslam.evidence.batch import make_unique
-from graphslam.evidence.cube_kernels import UNSEEN, build_tree, find_states, list_pieces, share_cubes
+from graphslam.evidence.cube_kernels import UNSEEN, States, build_tree, find_states, list_pieces, share_cubes
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import BRICK_EDGE, FAN, MAX_LEVELS, UNKNOWN
 from graphslam.evidence.pool import GridPool
@@ -43,23 +43,14 @@ class CompactReport:
     bricks: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class UniformStates:
-    """Tables of what is of one value below the roots of some grids of a pool (:mod:`cube_kernels`)."""
-
-    brick: npt.NDArray[np.int32]
-    node: npt.NDArray[np.int32]
-    brick_max: npt.NDArray[np.int16]
-    node_max: npt.NDArray[np.int16]
-
-
 def find_all_states(
     grids: Sequence[GridTree], *, classes: bool = False, threshold: int = 0, maxima: bool = False
-) -> UniformStates:
+) -> States:
     """States of everything the grids (of one pool) hold; keep the pool's lock for as long as they are used."""
     pool = grids[0].pool
-    b, n = int(pool.counters[BRICKS_USED]), int(pool.counters[NODES_USED])  # ids beyond were never used
-    states = UniformStates(
+    counters = pool.tree.counters
+    b, n = int(counters[BRICKS_USED]), int(counters[NODES_USED])  # ids beyond were never used
+    states = States(
         np.full(b, UNSEEN, np.int32),
         np.full(n, UNSEEN, np.int32),
         np.full(b if maxima else 0, UNKNOWN, np.int16),
@@ -67,10 +58,7 @@ def find_all_states(
     )
     for g in grids:
         if g.root and states.node[g.root] == UNSEEN:
-            find_states(
-                g.root, pool.levels, classes, threshold, pool.children, pool.bricks,
-                states.brick, states.node, states.brick_max, states.node_max,
-            )  # fmt: skip
+            find_states(g.root, classes, threshold, pool.tree, states)
     return states
 
 
@@ -104,10 +92,7 @@ def compact_grids(grids: GridTree | Sequence[GridTree]) -> CompactReport:
             seen = np.zeros(len(states.node), np.uint8)
             for g in several:
                 if g.root and g.model.threshold_step == threshold and not seen[g.root]:
-                    share_cubes(
-                        g.root, pool.levels, states.brick, states.node, seen, shared,
-                        pool.children, pool.node_ref, pool.brick_ref, *pool.store_arrays(),
-                    )  # fmt: skip
+                    share_cubes(g.root, states, seen, shared, pool.tree)
         return CompactReport(nodes - pool.used_nodes, bricks - pool.used_bricks)
 
 
@@ -144,7 +129,7 @@ def grid_pieces(grid: GridTree) -> GridPieces:
         mixed, cubes = list_grid(grid)
         mixed = mixed[np.argsort(mixed[:, 0])]
         cubes = cubes[np.argsort(cubes[:, 0])]
-        values = pool.bricks[mixed[:, 1]]
+        values = pool.tree.bricks[mixed[:, 1]]
     return GridPieces(
         _unpack(mixed[:, 0]) - half, values, _unpack(cubes[:, 0]) - half, 3 + 2 * cubes[:, 1], cubes[:, 2]
     )
@@ -159,7 +144,7 @@ def list_grid(grid: GridTree) -> tuple[Ints, Ints]:
     if grid.root:
         for _ in range(2):  # count, then list
             mixed, cubes = np.empty((found[0], 2), np.int64), np.empty((found[1], 3), np.int64)
-            list_pieces(grid.root, pool.levels, pool.children, states.brick, states.node, mixed, cubes, found)
+            list_pieces(grid.root, pool.levels, pool.tree.children, states, mixed, cubes, found)
     return mixed, cubes
 
 
@@ -179,10 +164,8 @@ def fill_grid(grid: G, pieces: GridPieces) -> G:
         pool.collect()
         pool.reserve(nodes, len(pieces.bricks) + values)
         make_unique((grid,), pool)
-        build_tree(
-            grid.root, pieces.bricks + half, pieces.values, cubes, grid.model.threshold_step, pool.levels, uniform,
-            *pool.tree_arrays(), *pool.store_arrays(),
-        )  # fmt: skip
+        threshold = grid.model.threshold_step
+        build_tree(grid.root, pieces.bricks + half, pieces.values, cubes, threshold, uniform, pool.tree)
     return grid
 
 

@@ -16,6 +16,7 @@ from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.layout import STEP
 from graphslam.evidence.query_kernels import count_boxes, count_voxel_values, list_occupied, walk_once
 from graphslam.evidence.scan import point_rows
+from graphslam.evidence.tree_kernels import BRICKS_USED, NODES_USED
 
 Ints = npt.NDArray[np.int64]
 
@@ -92,7 +93,7 @@ def box_query(grid: GridTree, lower: Any, upper: Any) -> BoxCounts:
     counts = np.empty((len(low), 2), np.int64)
     with pool.lock:
         count_boxes(
-            grid.root, low, high, pool.levels, grid.model.threshold_step, pool.children, pool.bricks, counts
+            grid.root, low, high, pool.levels, grid.model.threshold_step, pool.tree.children, pool.tree.bricks, counts
         )  # fmt: skip
     return BoxCounts(counts[:, 0], counts[:, 1], np.prod(high - low, axis=1))
 
@@ -102,7 +103,7 @@ def bounding_box(grid: GridTree) -> tuple[Array, Array] | None:
     pool = grid.pool
     bounds = np.empty(6, np.int64)
     with pool.lock:
-        known_box(grid.root, pool.levels, pool.children, pool.bricks, bounds)
+        known_box(grid.root, pool.levels, pool.tree.children, pool.tree.bricks, bounds)
     if bounds[3] <= bounds[0]:
         return None
     corners = np.stack([bounds[:3], bounds[3:]]) - pool.half
@@ -118,8 +119,9 @@ def occupied_voxels(grid: GridTree) -> tuple[npt.NDArray[np.int32], npt.NDArray[
     pool = grid.pool
     with pool.lock:
         rows = grid.packed_bricks()
-        rows = rows[pool.brick_lines[rows[:, 1]] != 0]
-        args = rows, pool.half, grid.model.threshold_step, pool.bricks, pool.brick_lines
+        tree = pool.tree
+        rows = rows[tree.brick_lines[rows[:, 1]] != 0]
+        args = rows, pool.half, grid.model.threshold_step, tree.bricks, tree.brick_lines
         n = list_occupied(*args, np.empty((0, 3), np.int32), np.empty(0, np.int16))
         voxels, values = np.empty((n, 3), np.int32), np.empty(n, np.int16)
         list_occupied(*args, voxels, values)
@@ -180,14 +182,14 @@ def value_counts(grid: GridTree) -> Ints:
     with pool.lock:
         if grid.root == 0:
             return counts
-        n, b = int(pool.counters[0]), int(pool.counters[2])  # ids beyond were never used
+        n, b = int(pool.tree.counters[NODES_USED]), int(pool.tree.counters[BRICKS_USED])  # ids beyond were never used
         times = np.zeros(b, np.int64)
         bricks = np.empty(b, np.int64)
         found = walk_once(
-            np.array([grid.root], np.int64), pool.levels, pool.children, np.zeros(n, np.int64), times,
+            np.array([grid.root], np.int64), pool.levels, pool.tree.children, np.zeros(n, np.int64), times,
             np.empty(n, np.int64), bricks, np.empty(pool.levels + 1, np.int64),
         )  # fmt: skip
-        count_voxel_values(bricks[:found], times, pool.bricks, counts)
+        count_voxel_values(bricks[:found], times, pool.tree.bricks, counts)
     counts[0] = 0
     return counts
 

@@ -1,20 +1,46 @@
 """Compiled work on cubes of equal voxels: find them, share them, list them, fill them.
 
-The *state* of a brick or node is the value all its voxels have, or MIXED. States are kept in tables by id, so that a
-part of a tree that is shared many times (also within one grid) is looked at once: ``brick_state (B,) int32``,
-``node_state (N,) int32``, UNSEEN to begin with. Where only classes matter, the values are reduced to FREE_STATE and
-OCCUPIED_STATE first. The *size* s of a cube: 0 a brick, s a node of level s - 1; its edge is ``8·4**s`` voxels.
+The *state* of a brick or node is the value all its voxels have, or MIXED. Where only classes matter, the values are
+reduced to FREE_STATE and OCCUPIED_STATE first. The *size* s of a cube: 0 a brick, s a node of level s - 1; its edge is
+``8·4**s`` voxels.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.evidence.kernels import kernel
-from graphslam.evidence.tree_kernels import drop_brick, occupied_lines, release_roots, take_brick, take_node
+from graphslam.evidence.tree_kernels import (
+    child_index,
+    drop_brick,
+    occupied_lines,
+    release_roots,
+    take_brick,
+    take_node,
+)
 
 MIXED, UNSEEN = 1 << 20, 1 << 21  # no value of a voxel
 FREE_STATE, OCCUPIED_STATE = -1, 1
+
+
+class States(NamedTuple):
+    """What is of one value below some roots, by ids: a part that is shared many times is looked at once.
+
+    Parameters
+    ----------
+    brick, node : (B,), (N,) int32
+        States, UNSEEN to begin with.
+    brick_max, node_max : (B,), (N,) int16
+        Largest known value, -32768 where there is none; both (0,) where not wanted.
+    """
+
+    brick: npt.NDArray[np.int32]
+    node: npt.NDArray[np.int32]
+    brick_max: npt.NDArray[np.int16]
+    node_max: npt.NDArray[np.int16]
 
 
 @kernel()
@@ -46,14 +72,21 @@ def voxels_state(row, classes, threshold):
 
 
 @kernel()
-def find_states(
-    root, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
-):  # fmt: skip
-    """States of everything below a root, and the root's own.
+def child_state(child, level, states):
+    """State and largest known value of a child of a node of some level."""
+    want_max = states.brick_max.shape[0] > 0
+    if child == 0:
+        return np.int64(-32768), np.int64(-32768)
+    if level == 0:
+        return np.int64(states.brick[child]), (np.int64(states.brick_max[child]) if want_max else np.int64(-32768))
+    return np.int64(states.node[child]), (np.int64(states.node_max[child]) if want_max else np.int64(-32768))
 
-    ``brick_max (B,), node_max (N,) int16`` take the largest known value (-32768: none); empty if not wanted.
-    """
-    want_max = brick_max.shape[0] > 0
+
+@kernel()
+def find_states(root, classes, threshold, tree, states):
+    """States of everything below a root, and the root's own."""
+    levels, children = tree.levels, tree.children
+    want_max = states.brick_max.shape[0] > 0
     node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)
     for k in range(9):  # np.zeros would take longer to compile
         cursor[k] = 0
@@ -64,16 +97,12 @@ def find_states(
         if c == 64:
             state, top = 1 << 21, -32768
             for k in range(64):
-                child = np.int64(children[n, k])
-                s = -32768
-                if child != 0:
-                    s = np.int64(brick_state[child]) if level == 0 else np.int64(node_state[child])
-                    if want_max:
-                        top = max(top, np.int64(brick_max[child]) if level == 0 else np.int64(node_max[child]))
+                s, largest = child_state(np.int64(children[n, k]), level, states)
+                top = max(top, largest)
                 state = s if state == 1 << 21 or state == s else 1 << 20
-            node_state[n] = state
+            states.node[n] = state
             if want_max:
-                node_max[n] = top
+                states.node_max[n] = top
             level += 1
             continue
         cursor[level] += 1
@@ -81,22 +110,20 @@ def find_states(
         if child == 0:
             continue
         if level > 0:
-            if node_state[child] == 1 << 21:
+            if states.node[child] == 1 << 21:
                 level -= 1
                 node[level], cursor[level] = child, 0
-        elif brick_state[child] == 1 << 21:
-            brick_state[child] = voxels_state(bricks[child], classes, threshold)
+        elif states.brick[child] == 1 << 21:
+            states.brick[child] = voxels_state(tree.bricks[child], classes, threshold)
             if want_max:
                 top = -32768
                 for j in range(512):
-                    top = max(top, int(bricks[child, j]))
-                brick_max[child] = top
+                    top = max(top, int(tree.bricks[child, j]))
+                states.brick_max[child] = top
 
 
 @kernel()
-def share_cubes(
-    root, levels, brick_state, node_state, seen, shared, children, node_ref, brick_ref, node_free, brick_free, counters
-):  # fmt: skip
+def share_cubes(root, states, seen, shared, tree):
     """Point every parent of a cube of one value at one brick or node, and at nothing where nothing is known.
 
     The contents of no grid change, so nodes that have several parents are written as well: all of them gain.
@@ -105,17 +132,17 @@ def share_cubes(
     """
     one = np.empty(1, np.int64)
     stack = np.empty((64 * 8, 2), np.int64)
-    stack[0, 0], stack[0, 1] = root, levels - 1
+    stack[0, 0], stack[0, 1] = root, tree.levels - 1
     n = 1
     seen[root] = 1
     while n > 0:
         n -= 1
         node, level = stack[n, 0], stack[n, 1]
         for c in range(64):
-            child = np.int64(children[node, c])
+            child = np.int64(tree.children[node, c])
             if child == 0:
                 continue
-            state = np.int64(brick_state[child]) if level == 0 else np.int64(node_state[child])
+            state = np.int64(states.brick[child]) if level == 0 else np.int64(states.node[child])
             if state != 1 << 20:
                 keep = 0
                 if state != -32768:
@@ -124,14 +151,17 @@ def share_cubes(
                         shared[level, state + 32768] = child
                         keep = child
                 if keep != child:
-                    children[node, c] = keep
+                    tree.children[node, c] = keep
                     if level == 0:
-                        brick_ref[keep] += 1 if keep != 0 else 0
-                        drop_brick(child, brick_ref, brick_free, counters)
+                        tree.brick_ref[keep] += 1 if keep != 0 else 0
+                        drop_brick(child, tree.brick_ref, tree.brick_free, tree.counters)
                     else:
-                        node_ref[keep] += 1 if keep != 0 else 0
+                        tree.node_ref[keep] += 1 if keep != 0 else 0
                         one[0] = child
-                        release_roots(one, level, children, node_ref, brick_ref, node_free, brick_free, counters)
+                        release_roots(
+                            one, level, tree.children, tree.node_ref, tree.brick_ref, tree.node_free, tree.brick_free,
+                            tree.counters,
+                        )  # fmt: skip
                     continue
             if level > 0 and seen[child] == 0:
                 seen[child] = 1
@@ -140,7 +170,7 @@ def share_cubes(
 
 
 @kernel()
-def list_pieces(root, levels, children, brick_state, node_state, mixed, cubes, found):
+def list_pieces(root, levels, children, states, mixed, cubes, found):
     """List what is known: mixed bricks as [packed offset coordinates, id] in ``mixed (n, 2)``, the largest cubes of one
     value as [packed offset coordinates of their first brick, size, value] in ``cubes (m, 3)``.
 
@@ -160,7 +190,7 @@ def list_pieces(root, levels, children, brick_state, node_state, mixed, cubes, f
             child = np.int64(children[node, c])
             if child == 0:
                 continue
-            state = np.int64(brick_state[child]) if level == 0 else np.int64(node_state[child])
+            state = np.int64(states.brick[child]) if level == 0 else np.int64(states.node[child])
             if state == -32768:
                 continue
             cx, cy, cz = x + ((c & 3) << shift), y + (((c >> 2) & 3) << shift), z + ((c >> 4) << shift)
@@ -183,25 +213,21 @@ def list_pieces(root, levels, children, brick_state, node_state, mixed, cubes, f
 
 
 @kernel()
-def make_path(root, bx, by, bz, size, levels, children, node_ref, node_occupied, node_free, counters):
-    """Node whose children are cubes of a size, over a brick; missing nodes are made."""
+def make_path(root, bx, by, bz, size, tree):
+    """Node whose children are cubes of a size, over a brick, and its child the brick is in; missing nodes are made."""
     node = root
-    for level in range(levels - 1, size, -1):
-        shift = 2 * level
-        c = (((bz >> shift) & 3) << 4) | (((by >> shift) & 3) << 2) | ((bx >> shift) & 3)
-        child = np.int64(children[node, c])
+    for level in range(tree.levels - 1, size, -1):
+        c = child_index(bx, by, bz, level)
+        child = np.int64(tree.children[node, c])
         if child == 0:
-            child = take_node(children, node_ref, node_occupied, node_free, counters)
-            children[node, c] = child
+            child = take_node(tree.children, tree.node_ref, tree.node_occupied, tree.node_free, tree.counters)
+            tree.children[node, c] = child
         node = child
-    return node
+    return node, child_index(bx, by, bz, size)
 
 
 @kernel()
-def uniform_cube(
-    size, value, threshold, uniform, children, node_ref, node_occupied, bricks, brick_ref, brick_lines, node_free,
-    brick_free, counters,
-):  # fmt: skip
+def uniform_cube(size, value, threshold, uniform, tree):
     """Brick or node all of whose voxels have a value, made where ``uniform (levels, 65536) int32`` has none yet.
 
     Its count of parents is the caller's to raise.
@@ -209,121 +235,85 @@ def uniform_cube(
     k = value + 32768
     occupied = value >= threshold
     if uniform[0, k] == 0:
-        b = take_brick(brick_ref, brick_free, counters)
-        brick_ref[b] = 0
+        b = take_brick(tree.brick_ref, tree.brick_free, tree.counters)
+        tree.brick_ref[b] = 0
         for j in range(512):
-            bricks[b, j] = value
-        brick_lines[b] = 0xFFFF if occupied else 0
+            tree.bricks[b, j] = value
+        tree.brick_lines[b] = 0xFFFF if occupied else 0
         uniform[0, k] = b
     for s in range(1, size + 1):
         if uniform[s, k] == 0:
-            n = take_node(children, node_ref, node_occupied, node_free, counters)
-            node_ref[n] = 0
+            n = take_node(tree.children, tree.node_ref, tree.node_occupied, tree.node_free, tree.counters)
+            tree.node_ref[n] = 0
             child = int(uniform[s - 1, k])
             for c in range(64):
-                children[n, c] = child
+                tree.children[n, c] = child
             if s == 1:
-                brick_ref[child] += 64
+                tree.brick_ref[child] += 64
             else:
-                node_ref[child] += 64
+                tree.node_ref[child] += 64
             if occupied:
-                node_occupied[n] = ~np.uint64(0)
+                tree.node_occupied[n] = ~np.uint64(0)
             uniform[s, k] = n
     return int(uniform[size, k])
 
 
 @kernel()
-def fill_cube(
-    root, bx, by, bz, log_edge, value, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
-    brick_lines, node_free, brick_free, counters,
-):  # fmt: skip
-    """Give a cube of ``2**log_edge`` (≥ 8) voxels one value; bx, by, bz are the offset coordinates of its first brick.
-
-    A cube of an even ``log_edge`` is eight children of a node, one of an odd ``log_edge`` is one child.
-    """
-    size = (log_edge - 3) >> 1
-    parts = 1 if log_edge & 1 else 2
-    shift = 2 * size
-    child = uniform_cube(
-        size, value, threshold, uniform, children, node_ref, node_occupied, bricks, brick_ref, brick_lines, node_free,
-        brick_free, counters,
-    )  # fmt: skip
-    for iz in range(parts):
-        for iy in range(parts):
-            for ix in range(parts):
-                x, y, z = bx + (ix << shift), by + (iy << shift), bz + (iz << shift)
-                node = make_path(root, x, y, z, size, levels, children, node_ref, node_occupied, node_free, counters)
-                c = (((z >> shift) & 3) << 4) | (((y >> shift) & 3) << 2) | ((x >> shift) & 3)
-                children[node, c] = child
-                if size == 0:
-                    brick_ref[child] += 1
-                else:
-                    node_ref[child] += 1
-
-
-@kernel()
-def add_brick(
-    root, bx, by, bz, levels, children, node_ref, node_occupied, brick_ref, node_free, brick_free, counters
-):  # fmt: skip
-    """A brick of one's own at a place that is empty; its voxels are whatever they were."""
-    lowest = levels - levels  # 0, but no literal, for which make_path would be compiled once more
-    node = make_path(root, bx, by, bz, lowest, levels, children, node_ref, node_occupied, node_free, counters)
-    b = take_brick(brick_ref, brick_free, counters)
-    children[node, ((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3)] = b
-    return b
-
-
-@kernel()
-def finalise_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines):
+def finalise_occupied(root, threshold, tree):
     """Write the flags of occupied voxels of a tree just built; parts with several parents have theirs already."""
     node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)
     for k in range(9):  # np.zeros would take longer to compile
         cursor[k] = 0
-    level = levels - 1
+    level = tree.levels - 1
     node[level] = root
-    while level < levels:
+    while level < tree.levels:
         n, c = node[level], cursor[level]
         if c == 64:
             flags = np.uint64(0)
             for k in range(64):
-                child = np.int64(children[n, k])
+                child = np.int64(tree.children[n, k])
                 if child == 0:
                     continue
-                if (level == 0 and brick_lines[child] != 0) or (level > 0 and node_occupied[child] != np.uint64(0)):
+                if tree.brick_lines[child] != 0 if level == 0 else tree.node_occupied[child] != np.uint64(0):
                     flags |= np.uint64(1) << np.uint64(k)
-            node_occupied[n] = flags
+            tree.node_occupied[n] = flags
             level += 1
             continue
         cursor[level] += 1
-        child = np.int64(children[n, c])
+        child = np.int64(tree.children[n, c])
         if child == 0:
             continue
         if level > 0:
-            if node_ref[child] == 1:
+            if tree.node_ref[child] == 1:
                 level -= 1
                 node[level], cursor[level] = child, 0
-        elif brick_ref[child] == 1:
-            brick_lines[child] = occupied_lines(child, threshold, bricks)
+        elif tree.brick_ref[child] == 1:
+            tree.brick_lines[child] = occupied_lines(child, threshold, tree.bricks)
 
 
 @kernel()
-def build_tree(
-    root, corners, values, cubes, threshold, levels, uniform, children, node_ref, node_occupied, bricks, brick_ref,
-    brick_lines, node_free, brick_free, counters,
-):  # fmt: skip
+def build_tree(root, corners, values, cubes, threshold, uniform, tree):
     """Fill an empty grid with bricks (offset coordinates ``corners (n, 3) int64``, ``values (n, 512) int16``) and cubes
-    ``(m, 5) int64`` [offset coordinates of the first brick, log2 of the edge in voxels, value]; none overlaps another.
+    ``(m, 5) int64`` [offset coordinates of the first brick, log2 of the edge ≥ 8 in voxels, value]; none overlaps
+    another. A cube whose log2 is even is eight children of a node, one whose log2 is odd is one child.
     """
     for k in range(corners.shape[0]):
-        b = add_brick(
-            root, corners[k, 0], corners[k, 1], corners[k, 2], levels, children, node_ref, node_occupied, brick_ref,
-            node_free, brick_free, counters,
-        )  # fmt: skip
+        lowest = tree.levels - tree.levels  # 0, but no literal, for which make_path would be compiled once more
+        node, c = make_path(root, corners[k, 0], corners[k, 1], corners[k, 2], lowest, tree)
+        b = take_brick(tree.brick_ref, tree.brick_free, tree.counters)
+        tree.children[node, c] = b
         for j in range(512):
-            bricks[b, j] = values[k, j]
+            tree.bricks[b, j] = values[k, j]
     for k in range(cubes.shape[0]):
-        fill_cube(
-            root, cubes[k, 0], cubes[k, 1], cubes[k, 2], cubes[k, 3], cubes[k, 4], threshold, levels, uniform,
-            children, node_ref, node_occupied, bricks, brick_ref, brick_lines, node_free, brick_free, counters,
-        )  # fmt: skip
-    finalise_occupied(root, levels, threshold, children, node_ref, node_occupied, bricks, brick_ref, brick_lines)
+        size = (cubes[k, 3] - 3) >> 1
+        child = uniform_cube(size, cubes[k, 4], threshold, uniform, tree)
+        for part in range(1 if cubes[k, 3] & 1 else 8):
+            x = cubes[k, 0] + ((part & 1) << 2 * size)
+            y = cubes[k, 1] + (((part >> 1) & 1) << 2 * size)
+            node, c = make_path(root, x, y, cubes[k, 2] + ((part >> 2) << 2 * size), size, tree)
+            tree.children[node, c] = child
+            if size == 0:
+                tree.brick_ref[child] += 1
+            else:
+                tree.node_ref[child] += 1
+    finalise_occupied(root, threshold, tree)

@@ -65,7 +65,7 @@ def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
     pool = grid.pool
     box = np.empty(6, np.int64)
     with pool.lock:
-        known_box(grid.root, pool.levels, pool.children, pool.bricks, box)
+        known_box(grid.root, pool.levels, pool.tree.children, pool.tree.bricks, box)
     if box[3] <= box[0]:
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     return box[:3] - pool.half, box[3:] - pool.half
@@ -99,12 +99,12 @@ def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: 
         pool, first = grid.pool, low + grid.pool.half
         values = np.empty(shape[::-1], kind)
         if kind == np.int16:
-            dense_values(grid.root, first, pool.levels, pool.children, pool.bricks, values)
+            dense_values(grid.root, first, pool.levels, pool.tree.children, pool.tree.bricks, values)
         else:  # a few layers at a time, which the cache holds
             layers = np.empty((BRICK_EDGE, *values.shape[1:]), np.int16)
             for z in range(0, len(values), BRICK_EDGE):
                 part = layers[: len(values) - z]
-                dense_values(grid.root, first + [0, 0, z], pool.levels, pool.children, pool.bricks, part)
+                dense_values(grid.root, first + [0, 0, z], pool.levels, pool.tree.children, pool.tree.bricks, part)
                 dense_log_odds(part.reshape(-1), values[z : z + BRICK_EDGE].reshape(-1))
     out = values.transpose(2, 1, 0)
     return DenseGrid(out if grid.dim == 3 else out[:, :, 0], low[: grid.dim], grid.voxel_size)

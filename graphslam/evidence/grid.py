@@ -139,7 +139,7 @@ class EvidenceGrid(GridTree):
         with self.pool.lock:
             ids = self.packed_bricks()[:, 1]
             out = np.empty((len(ids), BRICK_VOXELS), np.int16)
-            gather_bricks(np.ascontiguousarray(ids), self.pool.bricks, out)
+            gather_bricks(np.ascontiguousarray(ids), self.pool.tree.bricks, out)
         return out
 
     def brick_blocks(self, size: int = 4096) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.int16]]]:
@@ -149,7 +149,7 @@ class EvidenceGrid(GridTree):
         with pool.lock:
             ids = self.packed_bricks()[:, 1]
             for k in range(0, len(ids), size):
-                yield coordinates[k : k + size], pool.bricks[ids[k : k + size]]
+                yield coordinates[k : k + size], pool.tree.bricks[ids[k : k + size]]
 
     # --- queries ---------------------------------------------------------------------------------------------
 

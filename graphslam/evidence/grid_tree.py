@@ -111,9 +111,9 @@ class GridTree:
         pool = self.pool
         if self.root == 0:
             return np.zeros((0, 2), np.int64)
-        n = list_bricks(self.root, pool.levels, pool.children, np.zeros((0, 2), np.int64))
+        n = list_bricks(self.root, pool.levels, pool.tree.children, np.zeros((0, 2), np.int64))
         out = np.empty((n, 2), np.int64)
-        list_bricks(self.root, pool.levels, pool.children, out)
+        list_bricks(self.root, pool.levels, pool.tree.children, out)
         return out[np.argsort(out[:, 0])]
 
     def brick_coordinates(self) -> npt.NDArray[np.int64]:
@@ -128,9 +128,8 @@ class GridTree:
         known, outside the addressable cube, and for points that are not finite."""
         p = point_rows(points, self.dim, self.voxel_size)
         out = np.empty(len(p), np.int16)
-        with self.pool.lock:
-            read_values(
-                self.root, p, 1.0 / self.voxel_size, self.pool.half, self.pool.levels, self.pool.children,
-                self.pool.bricks, out,
-            )  # fmt: skip
+        pool = self.pool
+        with pool.lock:
+            children, bricks = pool.tree.children, pool.tree.bricks
+            read_values(self.root, p, 1.0 / self.voxel_size, pool.half, pool.levels, children, bricks, out)
         return out

@@ -13,6 +13,7 @@ from graphslam.core.errors import GridError
 from graphslam.evidence.grid_tree import GridTree
 from graphslam.evidence.pool import BRICK_BYTES, NODE_BYTES
 from graphslam.evidence.query_kernels import count_private, walk_once
+from graphslam.evidence.tree_kernels import BRICKS_USED, NODES_USED
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,14 +72,12 @@ def measure_memory(grids: GridTree | Sequence[GridTree]) -> MemoryUse:
                 # handles that were copied from each other hold one box: Python counts them, and the argument itself
                 free[g.root] = sys.getrefcount(g._box) - 1 == mine[g.root]
         roots = np.array(list(free), np.int64)
-        n, b = int(pool.counters[0]), int(pool.counters[2])  # ids beyond were never used
+        n, b = int(pool.tree.counters[NODES_USED]), int(pool.tree.counters[BRICKS_USED])  # ids beyond were never used
         nodes, bricks = np.empty(n, np.int64), np.empty(b, np.int64)
         begins = np.empty(pool.levels + 1, np.int64)
         found = walk_once(
-            roots, pool.levels, pool.children, np.zeros(n, np.int64), np.zeros(b, np.int64), nodes, bricks, begins
+            roots, pool.levels, pool.tree.children, np.zeros(n, np.int64), np.zeros(b, np.int64), nodes, bricks, begins
         )  # fmt: skip
-        private = count_private(
-            nodes, begins, np.array(list(free.values()), np.bool_), pool.levels, pool.children, pool.node_ref,
-            pool.brick_ref, np.zeros(n, np.int32), np.zeros(b, np.int32),
-        )  # fmt: skip
+        given_back = np.array(list(free.values()), np.bool_)
+        private = count_private(nodes, begins, given_back, np.zeros(n, np.int32), np.zeros(b, np.int32), pool.tree)
     return MemoryUse(int(begins[-1]), found, int(private[0]), int(private[1]))

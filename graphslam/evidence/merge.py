@@ -47,7 +47,7 @@ def merge_grids(grid: GridTree, other: GridTree, pose: Any = None) -> int:
     T_inverse = np.concatenate([R.T.ravel(), -R.T @ t])
     keys = _touched(grid, source.brick_coordinates(), R, t)
     work = grid.copy()  # the grid itself changes when all is done, or not at all
-    pool, scale = grid.pool, 1.0 / grid.voxel_size
+    pool = grid.pool
     with pool.lock:
         bricks = grid.packed_bricks()  # stay what they are while the work goes on: the grid is not written
     found = 0
@@ -56,26 +56,14 @@ def merge_grids(grid: GridTree, other: GridTree, pose: Any = None) -> int:
         values = np.empty((len(part), BRICK_VOXELS), np.int16)
         theirs = source.pool
         with theirs.lock:
-            known = sample_bricks(
-                part,
-                T_inverse,
-                scale,
-                grid.voxel_size,
-                pool.half,
-                theirs.half,
-                source.root,
-                theirs.levels,
-                theirs.children,
-                theirs.bricks,
-                values,
-            )
+            known = sample_bricks(part, T_inverse, grid.voxel_size, pool.half, source.root, theirs.tree, values)
         if known == 0:
             continue
         found += known
         some = (values != UNKNOWN).any(axis=1)
         part, values = part[some], values[some]
         with pool.lock:
-            old = pool.bricks[_ids(bricks, part)]
+            old = pool.tree.bricks[_ids(bricks, part)]
         write_packed(work, part, _sum(old, values, *grid.model.clamp_steps))
     grid.replace_contents(work)
     return found

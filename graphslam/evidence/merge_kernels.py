@@ -13,13 +13,14 @@ from graphslam.evidence.tree_kernels import find_node
 
 
 @kernel()
-def sample_bricks(keys, T, scale, voxel, half, source_half, root, levels, children, bricks, values):
+def sample_bricks(keys, T, voxel, half, root, source, values):
     """Source values ``(n, 512)`` at the voxel centres of target bricks ``keys (n,)``; returns how many are known.
 
-    ``T (12,)`` takes target coordinates to the source's [m]; ``half`` of the target's cube, ``source_half`` of the
-    source's, whose tree follows.
+    ``T (12,)`` takes target coordinates to the source's [m]; ``half`` is of the target's cube, ``source`` the other's
+    tree.
     """
-    edge = 2 * source_half
+    children, bricks, levels, source_half = source.children, source.bricks, source.levels, source.half
+    scale, edge = 1.0 / voxel, 2 * source_half
     found = 0
     for k in range(keys.shape[0]):
         key = keys[k]

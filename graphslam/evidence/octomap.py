@@ -33,6 +33,7 @@ from graphslam.evidence.octomap_kernels import (
     RECORD,
     TOO_DEEP,
     TRUNCATED,
+    TreeRecords,
     read_tree,
     write_tree,
 )
@@ -63,12 +64,10 @@ class _Header:
     resolution: float
     start: int  # byte the records begin at
 
-
-@dataclass(frozen=True, slots=True)
-class _Records:
-    codes: npt.NDArray[np.uint16]
-    values: npt.NDArray[np.int16]
-    width: int  # bytes of one
+    @property
+    def width(self) -> int:
+        """Bytes of a record."""
+        return 2 if self.binary else FULL_RECORD.itemsize
 
 
 def read_octomap(
@@ -154,9 +153,9 @@ def _read_header(data: bytes, where: str) -> _Header:
     return _Header(binary, int(size), resolution, start)
 
 
-def _read_records(data: bytes, head: _Header, where: str) -> _Records:
+def _read_records(data: bytes, head: _Header, where: str) -> TreeRecords:
     """The bytes after the header as arrays; their structure is not looked at yet."""
-    width = 2 if head.binary else FULL_RECORD.itemsize
+    width, tally = head.width, np.zeros(6, np.int64)
     number, rest = divmod(len(data) - head.start, width)
     if rest:
         raise FormatError(
@@ -164,7 +163,7 @@ def _read_records(data: bytes, head: _Header, where: str) -> _Records:
         )
     if head.binary:
         codes = np.frombuffer(data, "<u2", number, head.start)
-        return _Records(codes.astype(np.uint16), np.zeros(0, np.int16), width)
+        return TreeRecords(codes.astype(np.uint16), np.zeros(0, np.int16), tally)
     rows = np.frombuffer(data, FULL_RECORD, number, head.start)
     floats = np.ascontiguousarray(rows["value"])
     bad = np.flatnonzero(~np.isfinite(floats))
@@ -179,26 +178,26 @@ def _read_records(data: bytes, head: _Header, where: str) -> _Records:
     if cut:
         log.warning("%s: log-odds of %d leaves cut at ±%g", where, cut, LIMIT * STEP)
     values = np.rint(np.clip(floats, -LIMIT * STEP, LIMIT * STEP) * np.float32(1 / STEP)).astype(np.int16)
-    return _Records(rows["code"].astype(np.uint16), values, width)
+    return TreeRecords(rows["code"].astype(np.uint16), values, tally)
 
 
-def _pieces_of(records: _Records, head: _Header, model: BeamModel, where: str) -> tuple[GridPieces, int]:
+def _pieces_of(records: TreeRecords, head: _Header, model: BeamModel, where: str) -> tuple[GridPieces, int]:
     """What the records say, and how far it reaches [voxels]; their structure is checked before room is made."""
-    stack, tally = np.zeros((8 * 17, 5), np.int64), np.zeros(6, np.int64)
+    tally = records.tally
     bricks, cubes = np.zeros((0, 3), np.int64), np.zeros((0, 5), np.int64)
     values = np.zeros((0, BRICK_VOXELS), np.int16)
     low, high = model.clamp_steps
-    read_tree(records.codes, records.values, low, high, stack, bricks, values, cubes, tally)
-    _check_tree(records, head, tally, where)
+    read_tree(records, low, high, bricks, values, cubes)
+    _check_tree(records, head, where)
     bricks, cubes = np.empty((tally[BRICKS], 3), np.int64), np.empty((tally[CUBES], 5), np.int64)
     values = np.full((len(bricks), BRICK_VOXELS), UNKNOWN, np.int16)
-    read_tree(records.codes, records.values, low, high, stack, bricks, values, cubes, tally)
+    read_tree(records, low, high, bricks, values, cubes)
     return GridPieces(bricks, values, cubes[:, :3], cubes[:, 3], cubes[:, 4]), int(tally[REACH])
 
 
-def _check_tree(records: _Records, head: _Header, tally: Ints, where: str) -> None:
-    record = int(tally[RECORD])
-    place = f"{where}, byte {head.start + records.width * record}"
+def _check_tree(records: TreeRecords, head: _Header, where: str) -> None:
+    tally, record = records.tally, int(records.tally[RECORD])
+    place = f"{where}, byte {head.start + head.width * record}"
     if tally[ERROR] == TRUNCATED:
         raise FormatError("tree is truncated", where=place, got=f"{record} records", wanted="more")
     if tally[ERROR] == TOO_DEEP:
@@ -206,7 +205,7 @@ def _check_tree(records: _Records, head: _Header, tally: Ints, where: str) -> No
     if tally[ERROR] == CHILDLESS:
         raise FormatError("an inner node has no children", where=place)
     if record < len(records.codes):
-        left = (len(records.codes) - record) * records.width
+        left = (len(records.codes) - record) * head.width
         raise FormatError("bytes are left over behind the tree", where=place, got=f"{left} bytes")
     if tally[NODES] != head.nodes:
         raise FormatError(
@@ -259,17 +258,13 @@ def _records_of(
         while tally[RECORD] > len(codes):  # once, or twice where the guess was short
             codes = np.empty(int(tally[RECORD]), np.uint16)
             values = np.empty(0 if binary else len(codes), np.int16)
-            write_tree(
-                grid.root, pool.levels, binary, threshold, pool.children, pool.bricks, states.brick, states.node,
-                states.brick_max, states.node_max, ORDER, np.zeros((8 * 17, 5), np.int64), codes, values, tally,
-            )  # fmt: skip
+            write_tree(grid.root, binary, threshold, states, ORDER, pool.tree, TreeRecords(codes, values, tally))
     return codes[: tally[RECORD]], values[: tally[RECORD]], int(tally[NODES])
 
 
 def _check_middle(grid: EvidenceGrid, states: npt.NDArray[np.int32], where: str) -> None:
     """Refuse a grid of 7 levels that holds anything outside the middle eight of its root's children."""
-    pool = grid.pool
-    children = pool.children[grid.root]
+    children = grid.pool.tree.children[grid.root]
     inner = np.zeros((4, 4, 4), bool)
     inner[1:3, 1:3, 1:3] = True
     outer = children[(children != 0) & ~inner.ravel()]

@@ -10,9 +10,12 @@ A *record* is what the file holds of a node: in a ``.bt`` two bits for each chil
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from graphslam.evidence.cube_kernels import voxel_state
+import numpy as np
+import numpy.typing as npt
+
+from graphslam.evidence.cube_kernels import child_state, voxel_state
 from graphslam.evidence.kernels import kernel
 
 # what reading found, and where it stands in a tally
@@ -20,18 +23,35 @@ TRUNCATED, TOO_DEEP, CHILDLESS = 1, 2, 3
 ERROR, RECORD, NODES, REACH, BRICKS, CUBES = 0, 1, 2, 3, 4, 5
 
 
+class TreeRecords(NamedTuple):
+    """Records of a file.
+
+    Parameters
+    ----------
+    codes : (r,) uint16
+        Bits of the children.
+    values : (r,) int16 or (0,)
+        Log-odds of a ``.ot``, none of a ``.bt``.
+    tally : (6,) int64
+        Error, records, nodes, voxels from the centre to the farthest face, bricks, cubes; the numbers of what is
+        written also where the arrays for it are too short.
+    """
+
+    codes: npt.NDArray[np.uint16]
+    values: npt.NDArray[np.int16]
+    tally: npt.NDArray[np.int64]
+
+
 @kernel()
-def read_tree(codes, values, low, high, stack, bricks, brick_values, cubes, tally):
+def read_tree(records, low, high, bricks, brick_values, cubes):
     """Go through a file's records; list its bricks and its leaves of at least a brick's size.
 
-    codes : (r,) uint16 bits of the children; values : (r,) int16 log-odds of a ``.ot``, (0,) of a ``.bt``.
     low, high : values of the free and occupied leaves of a ``.bt``.
-    stack : (n, 5) int64 scratch, at least 8·17 rows.
     bricks : (b, 3) int64 out, signed coordinates; brick_values : (b, 512) int16 out, all unknown before.
     cubes : (c, 5) int64 out, signed coordinates of the first brick, m, value.
-    tally : (6,) int64 out: error, records read, nodes, voxels from the centre to the farthest face, bricks, cubes; the
-    last two also where the arrays are too short.
     """
+    codes, values, tally = records
+    stack = np.empty((8 * 17, 5), np.int64)
     binary = values.shape[0] == 0
     record, nodes, reach, found, large = 0, 0, 0, 0, 0
     # level, corner, and what the parent said: 1 free, 2 occupied, 3 see the next record
@@ -123,27 +143,15 @@ def child_of(m, node, part, i, levels, children):
 
 
 @kernel()
-def tree_node_state(
-    m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
-):  # fmt: skip
-    """State of a node of the octree, and its largest known value where ``brick_max`` is not empty."""
-    if node == 0:
-        return -32768, -32768
-    want_max = brick_max.shape[0] > 0
-    if m == 3:
-        return np.int64(brick_state[node]), (np.int64(brick_max[node]) if want_max else 0)
-    if m == 16 or (m & 1 == 1 and m < 2 * levels + 2):
-        return np.int64(node_state[node]), (np.int64(node_max[node]) if want_max else 0)
+def tree_node_state(m, node, part, levels, children, states):
+    """State of a node of the octree, and its largest known value where it is wanted."""
+    if node == 0 or m == 3 or m == 16 or (m & 1 == 1 and m < 2 * levels + 2):
+        return child_state(node, m - 3, states)
     state, largest = 1 << 21, -32768
     level = min(m, 2 * levels + 2)
     for i in range(8):
         child, _ = child_of(level, node, part, i, levels, children)
-        s, v = -32768, -32768
-        if child != 0:
-            if level == 4:
-                s, v = np.int64(brick_state[child]), (np.int64(brick_max[child]) if want_max else 0)
-            else:
-                s, v = np.int64(node_state[child]), (np.int64(node_max[child]) if want_max else 0)
+        s, v = child_state(child, level - 4, states)
         largest = max(largest, v)
         state = s if state == 1 << 21 or state == s else 1 << 20
     if m > level and state != -32768:
@@ -152,12 +160,14 @@ def tree_node_state(
 
 
 @kernel()
-def write_brick(row, order, classes, threshold, states, maxima, codes, values, record, tally):
+def write_brick(row, order, classes, threshold, record, records):
     """Records of a brick ``row (512,)`` that is not of one value, from ``record`` on; returns the end of them.
 
     order : (512,) int64, the brick's voxels as the octree has them, so that eight in a row are a cube of 2³ and 64 one
-    of 4³. states, maxima : (73,) int64 scratch: the 64 of the former, the 8 of the latter, the brick.
+    of 4³.
     """
+    codes, values, tally = records
+    states, maxima = np.empty(73, np.int64), np.empty(73, np.int64)  # cubes of 2³, cubes of 4³, the brick
     for q in range(73):
         state, largest = 1 << 21, -32768
         for c in range(8):
@@ -208,23 +218,18 @@ def write_brick(row, order, classes, threshold, states, maxima, codes, values, r
 
 
 @kernel()
-def write_tree(
-    root, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max, order, stack,
-    codes, values, tally,
-):  # fmt: skip
+def write_tree(root, classes, threshold, states, order, tree, records):
     """Records of a grid's tree with all that is of one value (``classes``: of one class, a ``.bt``) pruned.
 
-    order : see :func:`write_brick`. codes : (r,) uint16 out; values : (r,) int16 out, not used with ``classes``.
-    tally : (6,) int64 out, numbers of records and nodes, also where the arrays are too short.
+    order : see :func:`write_brick`.
     """
-    # by way of the stack: for literals look_at would be compiled once more
+    codes, values, tally = records
+    stack = np.empty((8 * 17, 5), np.int64)
+    # by way of the stack: for literals tree_node_state would be compiled once more
     stack[0, 0], stack[0, 1], stack[0, 2] = 16, root, 0
     m, node, part = stack[0, 0], stack[0, 1], stack[0, 2]
-    state, largest = tree_node_state(
-        m, node, part, levels, classes, threshold, children, bricks, brick_state, node_state, brick_max, node_max
-    )  # fmt: skip
+    state, largest = tree_node_state(m, node, part, tree.levels, tree.children, states)
     room = codes.shape[0]
-    states, maxima = np.empty(73, np.int64), np.empty(73, np.int64)
     tally[RECORD], tally[NODES] = 0, 0
     record = tally[RECORD]  # no literal either
     n = 0
@@ -235,7 +240,7 @@ def write_tree(
         n -= 1
         m, node, part, state, largest = stack[n, 0], stack[n, 1], stack[n, 2], stack[n, 3], stack[n, 4]
         if m == 3 and state == 1 << 20:
-            record = write_brick(bricks[node], order, classes, threshold, states, maxima, codes, values, record, tally)
+            record = write_brick(tree.bricks[node], order, classes, threshold, record, records)
             continue
         tally[NODES] += 1
         leaf = state != 1 << 20
@@ -245,11 +250,8 @@ def write_tree(
         if not leaf:
             for k in range(8):
                 i = 7 - k
-                child, where = child_of(m, node, part, i, levels, children)
-                s, v = tree_node_state(
-                    m - 1, child, where, levels, classes, threshold, children, bricks, brick_state, node_state,
-                    brick_max, node_max,
-                )  # fmt: skip
+                child, where = child_of(m, node, part, i, tree.levels, tree.children)
+                s, v = tree_node_state(m - 1, child, where, tree.levels, tree.children, states)
                 if s == -32768:
                     continue
                 if classes:

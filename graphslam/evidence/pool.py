@@ -12,7 +12,6 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from graphslam.core.errors import GridError
 from graphslam.evidence.jit_notice import announce_compilation
@@ -23,12 +22,15 @@ from graphslam.evidence.tree_kernels import (
     BRICKS_USED,
     NODES_FREE,
     NODES_USED,
+    Tree,
     release_roots,
     unique_roots,
 )
 
 NODE_BYTES = 4 * CHILDREN + 4 + 8
 BRICK_BYTES = 2 * BRICK_VOXELS + 4 + 2
+OF_NODES = ("children", "node_ref", "node_occupied", "node_free")
+OF_BRICKS = ("bricks", "brick_ref", "brick_lines", "brick_free")
 
 
 class RootBox:
@@ -63,29 +65,25 @@ class GridPool:
         self.levels = levels
         self.half = half_edge(levels)
         self.lock = threading.RLock()
-        # node 0 and brick 0 are "absent"; the last one is up while an update is between its phases
-        self.counters = np.array([1, 0, 1, 0, 0], np.int64)
-        self.children = aligned_zeros((64, CHILDREN), np.int32)
-        self.node_ref = np.zeros(64, np.int32)
-        self.node_occupied = np.zeros(64, np.uint64)
-        self.node_free = np.zeros(64, np.int32)
-        self.bricks = aligned_zeros((64, BRICK_VOXELS), np.int16)
-        self.bricks[:] = UNKNOWN
-        self.brick_ref = np.zeros(64, np.int32)
-        self.brick_lines = np.zeros(64, np.uint16)
-        self.brick_free = np.zeros(64, np.int32)
+        """Hold it while `tree` is used."""
+        self.tree = Tree(
+            children=aligned_zeros((64, CHILDREN), np.int32),
+            node_ref=np.zeros(64, np.int32),
+            node_occupied=np.zeros(64, np.uint64),
+            node_free=np.zeros(64, np.int32),
+            bricks=aligned_zeros((64, BRICK_VOXELS), np.int16),
+            brick_ref=np.zeros(64, np.int32),
+            brick_lines=np.zeros(64, np.uint16),
+            brick_free=np.zeros(64, np.int32),
+            counters=np.array([1, 0, 1, 0, 0], np.int64),  # node 0 and brick 0 are "absent"
+            levels=levels,
+            half=self.half,
+        )
+        self.tree.bricks[:] = UNKNOWN
         self.dead: deque[int] = deque()
         self._scratches: list[Scratch] = []
         self.kept: RootBox | None = None
         """A tree that lives as long as the pool (:mod:`graphslam.evidence.spilled_grid`)."""
-
-    def tree_arrays(self) -> tuple[Any, ...]:
-        """``(children, node_ref, node_occupied, bricks, brick_ref, brick_lines)``; hold `lock` while they are used."""
-        return self.children, self.node_ref, self.node_occupied, self.bricks, self.brick_ref, self.brick_lines
-
-    def store_arrays(self) -> tuple[Any, ...]:
-        """``(node_free, brick_free, counters)``: what taking and dropping needs besides."""
-        return self.node_free, self.brick_free, self.counters
 
     def scratch(self, thread: int) -> Scratch:
         """Scratch memory of a thread of an update."""
@@ -102,42 +100,34 @@ class GridPool:
 
     def reserve(self, nodes: int, bricks: int) -> None:
         """Make room for so many new nodes and bricks. All of it or, if memory is short, nothing."""
-        c = self.counters
-        more_nodes = nodes - (len(self.node_ref) - c[NODES_USED] + c[NODES_FREE])
-        more_bricks = bricks - (len(self.brick_ref) - c[BRICKS_USED] + c[BRICKS_FREE])
+        c = self.tree.counters
+        more_nodes = nodes - (len(self.tree.node_ref) - c[NODES_USED] + c[NODES_FREE])
+        more_bricks = bricks - (len(self.tree.brick_ref) - c[BRICKS_USED] + c[BRICKS_FREE])
         if more_nodes > 0:
-            self.children, self.node_ref, self.node_occupied, self.node_free = _grown(
-                (self.children, self.node_ref, self.node_occupied, self.node_free), int(more_nodes), c[NODES_USED]
-            )
+            self.tree = _grown(self.tree, OF_NODES, int(more_nodes), c[NODES_USED])
         if more_bricks > 0:
-            self.bricks, self.brick_ref, self.brick_lines, self.brick_free = _grown(
-                (self.bricks, self.brick_ref, self.brick_lines, self.brick_free), int(more_bricks), c[BRICKS_USED]
-            )
+            self.tree = _grown(self.tree, OF_BRICKS, int(more_bricks), c[BRICKS_USED])
 
     def fit(self) -> None:
         """Give back the room for what may come: for a pool that nobody will write to."""
         with self.lock:
-            n, b = int(self.counters[NODES_USED]), int(self.counters[BRICKS_USED])
-            self.children, self.node_ref, self.node_occupied, self.node_free = (
-                _longer(a, n, n) for a in (self.children, self.node_ref, self.node_occupied, self.node_free)
-            )
-            self.bricks, self.brick_ref, self.brick_lines, self.brick_free = (
-                _longer(a, b, b) for a in (self.bricks, self.brick_ref, self.brick_lines, self.brick_free)
-            )
+            for names, used in ((OF_NODES, NODES_USED), (OF_BRICKS, BRICKS_USED)):
+                n = int(self.tree.counters[used])
+                self.tree = _resized(self.tree, names, n, n)
 
     @property
     def used_nodes(self) -> int:
         """Nodes of living grids."""
         with self.lock:
             self.collect()
-            return int(self.counters[NODES_USED] - 1 - self.counters[NODES_FREE])
+            return int(self.tree.counters[NODES_USED] - 1 - self.tree.counters[NODES_FREE])
 
     @property
     def used_bricks(self) -> int:
         """Bricks of living grids."""
         with self.lock:
             self.collect()
-            return int(self.counters[BRICKS_USED] - 1 - self.counters[BRICKS_FREE])
+            return int(self.tree.counters[BRICKS_USED] - 1 - self.tree.counters[BRICKS_FREE])
 
     @property
     def used_bytes(self) -> int:
@@ -147,7 +137,7 @@ class GridPool:
     @property
     def nbytes(self) -> int:
         """Memory set aside [bytes]; what was never used of it is not in the machine's memory yet."""
-        return sum(a.nbytes for a in (*self.tree_arrays(), *self.store_arrays()))
+        return sum(a.nbytes for a in self.tree if isinstance(a, np.ndarray))
 
     # --- ownership -------------------------------------------------------------------------------------------
 
@@ -159,16 +149,11 @@ class GridPool:
             roots = []
             while self.dead:
                 roots.append(self.dead.popleft())
+            t = self.tree
             release_roots(
-                np.array(roots, np.int64),
-                self.levels,
-                self.children,
-                self.node_ref,
-                self.brick_ref,
-                self.node_free,
-                self.brick_free,
-                self.counters,
-            )
+                np.array(roots, np.int64), self.levels, t.children, t.node_ref, t.brick_ref, t.node_free, t.brick_free,
+                t.counters,
+            )  # fmt: skip
 
     def own(self, boxes: list[RootBox]) -> list[RootBox]:
         """Boxes that may be written to, one for each: the same, or a new one with a copied root. Hold `lock`.
@@ -189,16 +174,9 @@ class GridPool:
                 box.root = new if new != old else 0
 
         try:
+            t = self.tree
             unique_roots(
-                roots,
-                np.ones(len(foreign), np.uint8),
-                self.levels,
-                self.children,
-                self.node_ref,
-                self.node_occupied,
-                self.brick_ref,
-                self.node_free,
-                self.counters,
+                roots, self.levels, t.children, t.node_ref, t.node_occupied, t.brick_ref, t.node_free, t.counters
             )
             hand_over()
         except BaseException:  # Ctrl-C, after the roots were taken and before somebody owned them
@@ -216,21 +194,24 @@ class GridPool:
         )
 
 
-def _grown(arrays: tuple[Any, ...], more: int, used: int) -> tuple[Any, ...]:
-    """All arrays with room for ``more`` rows at least; far more where the machine has it.
+def _grown(tree: Tree, names: tuple[str, ...], more: int, used: int) -> Tree:
+    """A tree whose arrays of these names have room for ``more`` rows at least; far more where the machine has it.
 
     What is set aside costs nothing before it is used, while every growth is a copy into memory that was never touched,
     which can be dearer than all that is done in it.
     """
-    size = len(arrays[1])
+    size = len(getattr(tree, names[0]))
     try:
-        return tuple(_longer(a, size + max(more, 3 * size), used) for a in arrays)
+        return _resized(tree, names, size + max(more, 3 * size), used)
     except MemoryError:
-        return tuple(_longer(a, size + max(more, size // 4), used) for a in arrays)
+        return _resized(tree, names, size + max(more, size // 4), used)
 
 
-def _longer(a: npt.NDArray[Any], n: int, used: int) -> npt.NDArray[Any]:
-    """A copy with room for n rows. Rows that were never used are not touched, so they take no memory yet."""
-    grown = aligned_empty((n, *a.shape[1:]), a.dtype)
-    grown[:used] = a[:used]
-    return grown
+def _resized(tree: Tree, names: tuple[str, ...], n: int, used: int) -> Tree:
+    """Arrays of n rows in place of some. Rows that were never used are not touched, so they take no memory yet."""
+    arrays: dict[str, Any] = {}
+    for name in names:
+        a = getattr(tree, name)
+        arrays[name] = aligned_empty((n, *a.shape[1:]), a.dtype)
+        arrays[name][:used] = a[:used]
+    return tree._replace(**arrays)

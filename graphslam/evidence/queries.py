@@ -182,13 +182,13 @@ def _cast(
     ends = np.empty((*shape, 3), np.int32) if voxels else _NO_VOXELS
     pool = first.pool
     with pool.lock:
-        roots = np.array([g.root for g in grids], np.int64)
+        roots, t = np.array([g.root for g in grids], np.int64), pool.tree
 
         def run(begin: int, end: int) -> None:
             cast_rays(
                 begin, end, roots, rows, o, units, limit, first.voxel_size, pool.half, pool.levels,
-                first.model.threshold_step, not ignore_unknown, pool.children, pool.node_occupied, pool.bricks,
-                pool.brick_lines, ranges, status, ends,
+                first.model.threshold_step, not ignore_unknown, t.children, t.node_occupied, t.bricks,
+                t.brick_lines, ranges, status, ends,
             )  # fmt: skip
 
         _share(run, len(grids), threads)
@@ -265,12 +265,12 @@ def _look_up(
     out = np.empty((len(grids), len(p)), np.float32)
     pool = first.pool
     with pool.lock:
-        roots = np.array([g.root for g in grids], np.int64)
+        roots, t = np.array([g.root for g in grids], np.int64), pool.tree
 
         def run(begin: int, end: int) -> None:
             look_up_values(
                 begin, end, roots, rows, p, 1.0 / first.voxel_size, pool.half, pool.levels, trilinear, table,
-                pool.children, pool.bricks, out,
+                t.children, t.bricks, out,
             )  # fmt: skip
 
         _share(run, len(grids), threads)

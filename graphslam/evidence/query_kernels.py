@@ -1,6 +1,6 @@
 """Compiled queries: voxels at points, counts in boxes, occupied voxels, and what grids share.
 
-Arrays of the tree as in :mod:`~graphslam.evidence.tree_kernels`, read only; poses ``(12,)`` are R row by row, then t
+Arrays of the :class:`~graphslam.evidence.tree_kernels.Tree` are read only; poses ``(12,)`` are R row by row, then t
 [m]. Lists of bricks are ``rows (n, 2) int64`` [packed offset coordinates, brick], as ``list_bricks`` gives them.
 """
 
@@ -230,29 +230,29 @@ def count_voxel_values(ids, times, bricks, counts):
 
 
 @kernel()
-def count_private(nodes, begins, free_roots, levels, children, node_ref, brick_ref, node_left, brick_left):
+def count_private(nodes, begins, free_roots, node_left, brick_left, tree):
     """Nodes and bricks that would be freed with some roots, as (nodes, bricks).
 
     ``nodes, begins`` are from :func:`walk_once`; ``free_roots (R,)`` says which of the roots nobody else holds.
     ``node_left (N,)``, ``brick_left (B,)`` int32 are all 0; written: parents that would go.
     """
     freed_nodes, freed_bricks = 0, 0
-    for step in range(levels):
+    for step in range(tree.levels):
         for q in range(begins[step], begins[step + 1]):
             node = nodes[q]
             if step == 0:
                 if not free_roots[q]:
                     continue
-            elif node_left[node] < node_ref[node]:
+            elif node_left[node] < tree.node_ref[node]:
                 continue
             freed_nodes += 1
             for c in range(64):
-                child = np.int64(children[node, c])
+                child = np.int64(tree.children[node, c])
                 if child == 0:
                     continue
-                if step == levels - 1:
+                if step == tree.levels - 1:
                     brick_left[child] += 1
-                    freed_bricks += brick_left[child] == brick_ref[child]
+                    freed_bricks += brick_left[child] == tree.brick_ref[child]
                 else:
                     node_left[child] += 1
     return freed_nodes, freed_bricks

@@ -74,7 +74,7 @@ def floor_plan(grid: EvidenceGrid, low: float, high: float) -> EvidenceGrid:
     bottom = BRICK_EDGE * coordinates[:, 2]
     near = np.flatnonzero((bottom < last) & (bottom + BRICK_EDGE > first))
     with pool.lock:
-        values = pool.bricks[grid.packed_bricks()[near, 1]].reshape(-1, BRICK_EDGE, BRICK_EDGE**2)
+        values = pool.tree.bricks[grid.packed_bricks()[near, 1]].reshape(-1, BRICK_EDGE, BRICK_EDGE**2)
     coordinates = coordinates[near]
     z = BRICK_EDGE * coordinates[:, 2, None] + np.arange(BRICK_EDGE)
     tops = np.where(((z >= first) & (z < last))[:, :, None], values, np.int16(UNKNOWN)).max(axis=1)  # unknown is least

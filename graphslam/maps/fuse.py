@@ -371,10 +371,10 @@ class FusedMap:
             pool = self._grid.pool
             with pool.lock:
                 before, after = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
-                find_bricks(self._counted.root, keys, pool.levels, pool.children, before)
-                find_bricks(self._grid.root, keys, pool.levels, pool.children, after)
+                find_bricks(self._counted.root, keys, pool.levels, pool.tree.children, before)
+                find_bricks(self._grid.root, keys, pool.levels, pool.tree.children, after)
                 counts = self._counts.copy()  # the array may be shared with a copy
-                count_changes(before, after, pool.bricks, counts)
+                count_changes(before, after, pool.tree.bricks, counts)
             counts[0] = 0  # the unknown
             self._counts, self._counted, self._uncounted = counts, self._grid.copy(), []
         return self._counts

@@ -80,9 +80,9 @@ def map_increment(
     counts = np.zeros(3, np.int64)
     with pool.lock:
         rows = grid.packed_bricks()
-        keys, new = np.ascontiguousarray(rows[:, 0]), pool.bricks[rows[:, 1]]
+        keys, new = np.ascontiguousarray(rows[:, 0]), pool.tree.bricks[rows[:, 1]]
         difference = np.empty_like(new)
-        tree = before.root, pool.levels, pool.children, pool.bricks
+        tree = before.root, pool.levels, pool.tree.children, pool.tree.bricks
         subtract_bricks(keys, new, tree, slack, grid.dim == 2, difference, counts)
     some = (difference != UNKNOWN).any(axis=1)
     out = grid.empty()

@@ -164,11 +164,11 @@ class PieceTransformer:
         begins = offset + np.concatenate([nothing, *(p.starts[a:b] for p, a, b in near)])[hit]
         after = offset + np.concatenate([nothing, *(p.starts[a + 1 : b + 1] for p, a, b in near)])[hit]
         ids = np.empty(len(keys), np.int64)
-        find_bricks(root, keys, pool.levels, pool.children, ids)
+        find_bricks(root, keys, pool.levels, pool.tree.children, ids)
         if len(self._sums) < len(keys) + 1:
             self._sums = np.empty((5 * len(keys) // 4 + 1, BRICK_VOXELS), np.int16)
         changed = np.empty(len(keys) + 1, np.int64)
-        n = sum_bricks((starts, begins, after), self._sources, clamp, ids, pool.bricks, self._sums, changed)
+        n = sum_bricks((starts, begins, after), self._sources, clamp, ids, pool.tree.bricks, self._sums, changed)
         empty = changed[:n] < 0
         return keys[np.where(empty, ~changed[:n], changed[:n])], self._sums[:n], int(empty.sum())
 

@@ -17,7 +17,7 @@ from graphslam.evidence import pool as pool_module
 from graphslam.evidence import scratch as scratch_module
 from graphslam.evidence.batch import update_grids
 from graphslam.evidence.compact import compact_grids
-from graphslam.evidence.pool import GridPool
+from graphslam.evidence.pool import OF_BRICKS, OF_NODES, GridPool
 from tests.reference.evidence_pool import assert_same, check_pool
 from tests.reference.evidence_twin import EvidenceTwin
 from tests.reference.evidence_world import ORIGIN, World
@@ -120,7 +120,7 @@ def test_when_memory_is_short(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
             return allocate
 
         with monkeypatch.context() as patch:
-            patch.setattr(pool_module, "_longer", counted(pool_module._longer))
+            patch.setattr(pool_module, "aligned_empty", counted(pool_module.aligned_empty))
             patch.setattr(scratch_module.Scratch, "resize", counted(scratch_module.Scratch.resize))
             went_through = False
             try:
@@ -143,13 +143,11 @@ def test_when_memory_is_short(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def _shrink(pool: GridPool, spare: int = 0) -> None:
     """Leave a pool room for no more than ``spare`` nodes and bricks and what lies on its stacks."""
-    nodes, bricks = int(pool.counters[0]) + spare, int(pool.counters[2]) + spare
-    for names, n in (
-        (("children", "node_ref", "node_occupied", "node_free"), nodes),
-        (("bricks", "brick_ref", "brick_lines", "brick_free"), bricks),
-    ):
-        for name in names:
-            setattr(pool, name, getattr(pool, name)[:n].copy())
+    tree = pool.tree
+    nodes, bricks = int(tree.counters[0]) + spare, int(tree.counters[2]) + spare
+    shorter = {name: getattr(tree, name)[:nodes].copy() for name in OF_NODES}
+    shorter |= {name: getattr(tree, name)[:bricks].copy() for name in OF_BRICKS}
+    pool.tree = tree._replace(**shorter)
 
 
 @pytest.mark.parametrize("spare", range(9))

@@ -287,7 +287,7 @@ def test_pose_and_origin_move_the_beams(rng: np.random.Generator) -> None:
 
 def test_uncompiled_kernel_agrees(rng: np.random.Generator) -> None:
     grid = scanned(rng)
-    pool = grid.pool
+    pool, t = grid.pool, grid.pool.tree
     units = np.empty((40, 3))
     unit_directions(rng.normal(0, 1, (40, 3)), units)
     origins = rng.normal(0, 0.7, (40, 3))
@@ -296,8 +296,8 @@ def test_uncompiled_kernel_agrees(rng: np.random.Generator) -> None:
         ranges, status = np.empty((1, 40)), np.empty((1, 40), np.int8)
         kernel(
             0, 1, np.array([grid.root]), np.array([[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]]), origins, units, 3.0, 0.1,
-            pool.half, pool.levels, grid.model.threshold_step, stop, pool.children, pool.node_occupied, pool.bricks,
-            pool.brick_lines, ranges, status, np.empty((0, 0, 0), np.int32),
+            pool.half, pool.levels, grid.model.threshold_step, stop, t.children, t.node_occupied, t.bricks,
+            t.brick_lines, ranges, status, np.empty((0, 0, 0), np.int32),
         )  # fmt: skip
         compiled = cast_beams(grid, origins, units, 3.0, ignore_unknown=not stop)
         assert (compiled.status == status[0]).all()

@@ -18,9 +18,9 @@ def reached(grids: list[EvidenceGrid]) -> tuple[int, int]:
     layer = {g.root for g in grids if g.root}
     nodes = set(layer)
     for _ in range(pool.levels - 1):
-        layer = {int(c) for n in layer for c in pool.children[n] if c}
+        layer = {int(c) for n in layer for c in pool.tree.children[n] if c}
         nodes |= layer
-    return len(nodes), len({int(c) for n in layer for c in pool.children[n] if c})
+    return len(nodes), len({int(c) for n in layer for c in pool.tree.children[n] if c})
 
 
 def family(rng: np.random.Generator) -> list[EvidenceGrid]:

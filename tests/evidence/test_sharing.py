@@ -116,10 +116,10 @@ def test_voxels_begin_where_cache_lines_do(rng: np.random.Generator) -> None:
     grid = EvidenceGrid(0.2, pool=pool)
     for _ in range(3):  # the pool grows
         grid.insert_scan(rng.normal(size=(100, 3)) * 12)
-        for a in (pool.bricks, pool.children, pool.scratch(0).marks):
+        for a in (pool.tree.bricks, pool.tree.children, pool.scratch(0).marks):
             assert a.ctypes.data % LINE == 0
             assert a.flags.c_contiguous
-    assert len(pool.bricks) > 64
+    assert len(pool.tree.bricks) > 64
     zeros, empty = aligned_zeros((3, 5), np.int16), aligned_empty((0, 7), np.float64)
     assert zeros.shape == (3, 5)
     assert zeros.dtype == np.int16

@@ -25,8 +25,7 @@ def check_pool(pool: Any, grids: Iterable[Any]) -> None:
     grids = list(grids)
     assert all(g.pool is pool for g in grids)
     thresholds = {g.root: g.model.threshold_step for g in grids if g.root}
-    children, node_ref, node_occupied, bricks, brick_ref, brick_lines = pool.tree_arrays()
-    node_free, brick_free, counters = pool.store_arrays()
+    children, node_ref, node_occupied, node_free, bricks, brick_ref, brick_lines, brick_free, counters = pool.tree[:9]
 
     # references, level by level from the roots: a root has its owner, everything else its parents
     nodes: Counter[int] = Counter(thresholds.keys())
