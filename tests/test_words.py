@@ -1,4 +1,4 @@
-"""Plain words: private idioms in what users read (texts, public docstrings, pages) only get fewer.
+"""Plain words: private idioms in what users and developers read (texts, docstrings, comments, pages) only get fewer.
 
 ``PATTERNS`` are idioms that a reader has to read twice, each with what to write instead. ``words_ratchet.toml`` holds
 how often they occur in each file; a file may have neither more nor fewer than that. After a text was made plainer, or a
@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import ast
 import functools
+import io
 import json
 import re
 import sys
+import tokenize
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,50 +88,25 @@ _CODE = re.compile(r"``[^`]*``|`[^`\n]*`|\]\([^)\n]*\)|^ *(>>>|\.\.\.) .*$|\b\w+
 _COMMAND = "python tests/test_words.py --write"
 
 
-def _texts_of_code(path: Path, public: set[str]) -> Iterator[tuple[int, str]]:
-    """String literals with a space in them, and the docstrings of public names and of commands, each with its line."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    inside = {id(part) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for part in n.values}
-    bare = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+def _texts_of_code(path: Path, *, docstrings: bool) -> Iterator[tuple[int, str]]:
+    """String literals with a space in them, each with its line; with ``docstrings`` also these, and comments."""
+    source = path.read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    skipped = {id(part) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for part in n.values}
+    if not docstrings:
+        skipped |= {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
     for n in ast.walk(tree):
         text = ""
         if isinstance(n, ast.JoinedStr):
             text = "".join(str(v.value) if isinstance(v, ast.Constant) else "{}" for v in n.values)
-        elif isinstance(n, ast.Constant) and isinstance(n.value, str) and not {id(n)} & (inside | bare):
+        elif isinstance(n, ast.Constant) and isinstance(n.value, str) and id(n) not in skipped:
             text = n.value
         if " " in text:
             yield n.lineno, text
-    commands = path.parent.name == "cli"
-    for top in tree.body:
-        if not isinstance(top, ast.FunctionDef | ast.ClassDef) or not (commands or top.name in public):
-            continue
-        parts = top.body if isinstance(top, ast.ClassDef) else []
-        methods = [m for m in parts if isinstance(m, ast.FunctionDef) and not m.name.startswith("_")]
-        for n in (top, *methods):
-            if doc := ast.get_docstring(n):
-                yield n.lineno, doc
-
-
-def _public_names() -> dict[Path, set[str]]:
-    """Names that ``import graphslam`` and the faces of its packages offer, by the file that defines them."""
-    out: dict[Path, set[str]] = {}
-
-    def add(module: str, names: set[str]) -> None:
-        stem = ROOT.joinpath(*module.split("."))
-        for file in (stem.with_suffix(".py"), stem / "__init__.py"):
-            if file.is_file():
-                out.setdefault(file, set()).update(names)
-
-    import graphslam
-
-    for name, module in graphslam._NAMES.items():
-        add(module, {name})
-    for init in (ROOT / "graphslam").rglob("__init__.py"):
-        for n in ast.parse(init.read_text(encoding="utf-8")).body:
-            if isinstance(n, ast.Assign) and isinstance(n.targets[0], ast.Name) and n.targets[0].id == "_EXPORTS":
-                for module, names in ast.literal_eval(n.value).items():
-                    add(".".join(init.parent.relative_to(ROOT).parts) + "." + module, set(names.split()))
-    return out
+    if docstrings:
+        for token in tokenize.generate_tokens(io.StringIO(source).readline):
+            if token.type == tokenize.COMMENT:
+                yield token.start[0], token.string
 
 
 def _texts_of_page(path: Path) -> Iterator[tuple[int, str]]:
@@ -146,11 +123,11 @@ def _texts_of_notebook(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _texts() -> Iterator[tuple[Path, int, str]]:
-    """All that users read: file, line, text."""
-    public = _public_names()
+    """All that users and developers read: file, line, text."""
     for folder in ("graphslam", "frontends", "notebooks"):
         for path in sorted((ROOT / folder).rglob("*.py")):
-            yield from ((path, line, text) for line, text in _texts_of_code(path, public.get(path, set())))
+            found = _texts_of_code(path, docstrings=folder != "notebooks" or path.parent.name == "cli")
+            yield from ((path, line, text) for line, text in found)
     for path in [ROOT / f"{n}.md" for n in ("README", "CHANGELOG", "CONTRIBUTING")] + sorted(ROOT.glob("docs/**/*.md")):
         yield from ((path, line, text) for line, text in _texts_of_page(path))
     for path in sorted(ROOT.glob("notebooks/*.ipynb")):
@@ -183,7 +160,7 @@ def test_no_file_has_more_idioms_than_recorded() -> None:
     found, allowed = _found(), recorded()
     more = [f"{name}: {len(f)} > {allowed.get(name, 0)}\n  " + "\n  ".join(f) for name, f in found.items()
             if len(f) > allowed.get(name, 0)]  # fmt: skip
-    assert not more, "private idioms in texts that users read; write plainer ones:\n" + "\n".join(more)
+    assert not more, "private idioms; write plainer words:\n" + "\n".join(more)
 
 
 def test_counts_are_those_recorded() -> None:
@@ -206,8 +183,9 @@ def test_an_idiom_is_found(tmp_path: Path) -> None:
     code.write_text('def f(x):\n    """Honest."""\n    raise ValueError(f"{x} is honest")\n', encoding="utf-8")
     honest = next(p for p in _COMPILED if "honest" in p.pattern)
     assert [len(honest.findall(_CODE.sub("", t))) for _, t in _texts_of_page(page)] == [1]
-    assert [t for _, t in _texts_of_code(code, set())] == ["{} is honest"]
-    assert len(list(_texts_of_code(code, {"f"}))) == 2
+    assert [t for _, t in _texts_of_code(code, docstrings=False)] == ["{} is honest"]
+    code.write_text('x = 1  # honest\n"""Honest words."""\n', encoding="utf-8")
+    assert [t for _, t in _texts_of_code(code, docstrings=True)] == ["Honest words.", "# honest"]
 
 
 if __name__ == "__main__":

@@ -108,8 +108,8 @@ class LoopLedger:
     Examples
     --------
     >>> ledger = LoopLedger()
-    >>> ledger.write(Decision(loop=0, verdict="accepted", why="", i=3, j=40, factor_id=77))
-    >>> ledger.write(Decision(loop=0, verdict="undone", why="asked for", i=3, j=40))
+    >>> ledger.write(LoopDecision(loop=0, verdict="accepted", why="", i=3, j=40, factor_id=77))
+    >>> ledger.write(LoopDecision(loop=0, verdict="undone", why="asked for", i=3, j=40))
     >>> ledger.current()[0].verdict
     'undone'
     """
