@@ -1,4 +1,4 @@
-"""Which calibration a log can have, by what is in it."""
+"""Registry of the calibration methods: from landmark observations or from scan matches."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ CALIBRATIONS: dict[str, Callable[[SensorLog, Any, CalibrationBudget, int], Calib
     "sightings": _of_sightings,
     "scans": _of_scans,
 }
-"""How noise and systematic errors are estimated from a log without ground truth, by what is used beside the motion.
+"""Calibration methods by the data that they use in addition to the motion; none needs ground truth.
 
-The arguments are the log, the configuration of a front end (how landmarks are detected, how scans become steps), the
-effort, and the seed.
+The arguments are the log, the configuration of a front end (landmark detector, conversion of scans to steps), the
+budget, and the random seed.
 """

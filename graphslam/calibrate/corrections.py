@@ -1,4 +1,4 @@
-"""What a calibration says of a log, as figures, and the log with them applied."""
+"""Corrections of systematic errors and of noise, their options, and their application to a log."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ from graphslam_frontends.odometry.motion import (
 _LEAST = (1e-9, 1e-10)
 _MOVING = 1e-9
 CERTAIN = 3.3
-"""σ that a normal variable exceeds once in a thousand cases."""
+"""Multiple of σ that the absolute value of a normal variable exceeds with probability 0.001."""
 VISIT = 5.0
-"""A landmark that was out of sight for longer is visited anew [s]."""
+"""A landmark that is not observed for longer starts a new visit [s]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corrections:
-    """Errors of a robot that are taken out of its log, and the noise that it is then given.
+    """Systematic errors that are removed from a log, and the noise that is assigned to it.
 
-    What is left at its default is left as the log has it. The noise of the motion is that of random walks: each
-    variance grows with the way, with what is turned, and with the time in motion.
+    A value at its default changes nothing. The noise of the motion is a random walk: each variance grows with the
+    distance driven, the angle turned, and the time in motion.
     """
 
     yaw_bias: float = 0.0
-    """The yaw rate of the motion is too high by it, while the robot moves [rad/s]."""
+    """Bias of the yaw rate while the robot moves [rad/s]; it is subtracted."""
     distance_scale: float = 1.0
-    """Distances of the motion are too long by this factor."""
+    """Distances of the motion are divided by this factor."""
     turn_per_metre: float = 0.0
-    """The motion turns too much by it for each metre driven [rad/m]."""
+    """Turn error of the motion per metre driven [rad/m]; it is subtracted."""
     turn_scale: float = 1.0
     """Turns of the motion are too large by this factor."""
     clock: float = 0.0
-    """Stamps of the motion are late by it, compared with those of the sightings [s]."""
+    """Delay of the time stamps of the motion relative to those of the observations [s]; it is subtracted."""
     range_scale: float = 1.0
-    """Ranges of landmarks are too long by this factor."""
+    """Ranges of landmarks are divided by this factor, after the offset is subtracted."""
     range_offset: float = 0.0
-    """… and then by this length [m]."""
+    """Offset of the ranges [m]; it is subtracted."""
     sensor_yaw: float = 0.0
-    """The sensor is turned to the left by it, beside what the log says [rad]."""
+    """Rotation of the sensor to the left relative to the mounting in the log [rad]."""
     along_metre: float | None = None
-    """σ of the distance after one metre [m/√m]; None: the log's or the front end's own noise."""
+    """σ of the distance after one metre [m/√m]; None: noise of the log or of the front end."""
     along_second: float = 0.0
     """σ of the distance after one second [m/√s]."""
     lateral_metre: float = 0.0
@@ -67,21 +67,21 @@ class Corrections:
     heading_second: float = 0.0
     """σ of the heading after one second in motion [rad/√s]."""
     widen_only: bool = False
-    """The noise of the motion is at least what the log or the front end states of it: matches of scans over a metre or
-    two do not see errors of wheels that come seldom or last."""
+    """The noise of the motion is at least that of the log or of the front end: scan matches over a metre or two do not
+    observe rare or time-correlated errors of wheels."""
     range_sigma: float | None = None
-    """σ of a range [m]; None: the log's own."""
+    """σ of a range [m]; None: σ of the log."""
     bearing_sigma: float | None = None
-    """σ of a bearing [rad]; None: the log's own."""
+    """σ of a bearing [rad]; None: σ of the log."""
 
     range_visit: float = 0.0
-    """σ of an error that all ranges of one visit of a landmark share [m]."""
+    """σ of a range error that is common to all observations of one visit of a landmark [m]."""
     bearing_visit: float = 0.0
-    """The same of bearings [rad]."""
+    """The same for bearings [rad]."""
     visit_sightings: float = 1.0
-    """Sightings of a usual visit, where a log has no identities to count them by."""
+    """Typical number of observations per visit, for logs without landmark identities."""
     slips: tuple[tuple[float, float], ...] = ()
-    """Stretches in which the wheels slipped, in the clock of the sightings [s]: σ of the distance is all of it."""
+    """Intervals of wheel slip, in the clock of the observations [s]: σ of the distance is the whole distance."""
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -103,15 +103,15 @@ class Corrections:
         return self == Corrections()
 
     def without_motion_noise(self) -> Corrections:
-        """The same with the noise of the motion left as it is."""
+        """Copy that does not change the noise of the motion."""
         return replace(self, along_metre=None, widen_only=False, slips=(), **dict.fromkeys(NOISE, 0.0))
 
     def without_constants(self) -> Corrections:
-        """Its noise alone."""
+        """Copy without systematic errors: noise and slip only."""
         return replace(self, **{k: getattr(Corrections(), k) for k in CONSTANT})
 
     def without_sensor_noise(self) -> Corrections:
-        """The same with the σ of the sightings left as they are."""
+        """Copy that does not change the σ of the observations."""
         return replace(self, range_sigma=None, bearing_sigma=None, range_visit=0.0, bearing_visit=0.0)
 
 
@@ -124,15 +124,15 @@ NOISE = ("along_second", "lateral_metre", "heading_metre", "heading_radian", "he
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrateConfig:
-    """Noise and lasting errors from the log itself, before a run."""
+    """Calibration of noise and systematic errors from the log itself, before a run."""
 
     use: Literal["auto", "always", "none"] = "auto"
-    """``auto``: where no preset was made for this very set; ``always``; ``none``. Figures that are given stand, and
-    then nothing is estimated."""
+    """``auto``: only if no preset was made for this data set; ``always``; ``none``. If ``given`` is set, its values are
+    used and nothing is estimated."""
     given: Corrections | None = None
-    """Figures to be applied, as ``graphslam calibrate`` writes them."""
+    """Corrections to apply, as ``graphslam calibrate`` writes them."""
     budget: float = 1.0
-    """Share of the usual work that an estimate inside a run may take; 1: a few seconds."""
+    """Computing effort of the calibration in a run, relative to the default; 1: a few seconds."""
 
     def __post_init__(self) -> None:
         if not 0 < self.budget <= 100:
@@ -140,13 +140,13 @@ class CalibrateConfig:
 
 
 def apply_corrections(log: SensorLog, c: Corrections) -> SensorLog:
-    """The log with the corrections applied: motion, sightings and their stated noise; its truth is left alone."""
+    """The log with corrected motion and observations and their noise; ground truth is unchanged."""
     if c.neutral:
         return log
     name, motion = motion_stream(log)
     streams: dict[str, Stream] = {
         name: corrected_motion(motion, c)
-    }  # first: of two odometries it is the one that counts
+    }  # first: with two odometry streams, the first one is used
     for other, stream in log.streams.items():
         if other != name:
             streams[other] = corrected_sightings(stream, c) if isinstance(stream, LandmarkObservations) else stream
@@ -154,12 +154,12 @@ def apply_corrections(log: SensorLog, c: Corrections) -> SensorLog:
 
 
 def moved_end(log: SensorLog, corrected: SensorLog, noise: MotionNoise) -> tuple[float, float]:
-    """How far corrections move the end of the dead-reckoned path, and how far the noise of both paths allows [m].
+    """Displacement of the end of the dead-reckoned path by the corrections, and its limit from the noise of both [m].
 
     Parameters
     ----------
     noise : MotionNoise
-        Of controls; recorded odometry brings its own covariances.
+        Noise of controls; recorded odometry has its own covariances.
     """
     ends, covariances = [], []
     for each in (log, corrected):
@@ -180,12 +180,12 @@ def moved_end(log: SensorLog, corrected: SensorLog, noise: MotionNoise) -> tuple
 
 
 def corrected_sightings(s: LandmarkObservations, c: Corrections) -> LandmarkObservations:
-    """Sightings with their ranges, their mounting and their σ put right; those whose range vanishes are left out."""
+    """Observations with corrected ranges, mounting and σ."""
     if (c.range_scale, c.range_offset, c.sensor_yaw) == (1.0, 0.0, 0.0) and c.range_sigma is c.bearing_sigma is None:
         return s
     ranges = (s.ranges - c.range_offset) / c.range_scale
     sigmas = s.sigmas.copy()
-    # n sightings that share an error of σ_v tell no more than σ² / n + σ_v²: white ones with this σ tell as much
+    # mean of n observations with common error σ_v: variance σ² / n + σ_v², as with white noise of σ² + n σ_v²
     n = visit_counts(s) if s.ids is not None else np.full(len(ranges), c.visit_sightings)
     if c.range_sigma is not None:
         sigmas[:, 0] = np.sqrt(c.range_sigma**2 + n * c.range_visit**2) / c.range_scale
@@ -195,14 +195,14 @@ def corrected_sightings(s: LandmarkObservations, c: Corrections) -> LandmarkObse
 
 
 def visit_counts(s: LandmarkObservations) -> Array:
-    """Sightings ``(q,)`` of the visit that each sighting belongs to, by the log's identities."""
+    """Number of observations ``(q,)`` in the visit of each observation, by the identities of the log."""
     assert s.ids is not None
     visit = visits_of(s.ids, np.repeat(s.times, np.diff(s.offsets)))
     return np.where(s.ids >= 0, np.bincount(visit)[visit] if len(visit) else 1, 1).astype(np.float64)
 
 
 def visits_of(landmark: npt.NDArray[np.int64], times: Array) -> npt.NDArray[np.int64]:
-    """Number of the visit of each sighting ``(q,)``, in order of time: out of sight for long is visited anew."""
+    """Index of the visit of each observation ``(q,)``; a gap longer than :data:`VISIT` starts a new visit."""
     out = np.full(len(landmark), -1, dtype=np.int64)
     count = 0
     for l in np.unique(landmark):
@@ -214,7 +214,7 @@ def visits_of(landmark: npt.NDArray[np.int64], times: Array) -> npt.NDArray[np.i
 
 
 def corrected_motion(motion: Any, c: Corrections) -> Any:
-    """A stream of motion put right; with noise of its own it becomes recorded odometry, record for record."""
+    """Corrected motion; controls become odometry at the same stamps if the corrections set the motion noise."""
     if c.clock:
         motion = replace(motion, times=motion.times - c.clock)
     if isinstance(motion, Odometry):
@@ -267,7 +267,7 @@ def _odometry(odometry: Odometry, c: Corrections) -> Odometry:
 
 
 def slip_noise(times: Array, metres: Array, slips: Sequence[Sequence[float]]) -> Array:
-    """Variance ``(n,)`` of distances that end at times: of all of a stretch σ is its length, and 0 outside."""
+    """Variance ``(n,)`` of the distances that end at ``times``: σ of a whole slip interval is its distance; else 0."""
     out, begin = np.zeros(len(times)), np.concatenate([times[:1], times[:-1]])
     for a, b in slips:
         inside = (times > a + 1e-6) & (begin < b - 1e-6)
@@ -276,7 +276,7 @@ def slip_noise(times: Array, metres: Array, slips: Sequence[Sequence[float]]) ->
 
 
 def increment_covariances(c: Corrections, metres: Array, turned: Array, seconds: Array, dof: int) -> Array:
-    """Covariances ``(n, dof, dof)`` of increments, right tangent."""
+    """Covariances ``(n, dof, dof)`` of increments in the right tangent space."""
     along = (c.along_metre or 0.0) ** 2 * metres + c.along_second**2 * seconds + _LEAST[0]
     side = c.lateral_metre**2 * metres + _LEAST[0]
     heading = c.heading_metre**2 * metres + c.heading_radian**2 * turned + c.heading_second**2 * seconds + _LEAST[1]

@@ -1,4 +1,4 @@
-"""What a calibration found: constants with their gates, noise, and the sentences that say so."""
+"""Result of a calibration: constants with their acceptance tests, noise, cross-validation, and lines of the verdict."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from graphslam.core.config import options_dict
 from graphslam.core.findings import Finding
 
 SURE = 3.0
-"""A constant is applied where it is so many σ from what changes nothing,"""
+"""A constant is applied if it differs from its neutral value by more than this many σ,"""
 GAIN = 5.0
-"""… gains so much likelihood over noise alone [nats],
-and the whole estimate gains so much on withheld data over what the log states."""
+"""… increases the log-likelihood by more than this over a fit without it [nats],
+and the whole estimate increases it by more than this on withheld data, compared with the noise of the log."""
 AGREE = 2.0
-"""… and differs by less than so many σ between the two lengths of windows."""
+"""… and its estimates from the two window lengths differ by at most this many σ."""
 VAGUE = 0.05
-"""A scale with a larger σ is not corrected: wheels and rangefinders are better than that without it."""
+"""A scale with a larger σ is not corrected: uncalibrated wheels and rangefinders have smaller scale errors."""
 LASTS = 1.5
-"""Noise that is so much larger in long windows than in short ones lasts."""
+"""If σ in long windows exceeds σ in short ones by more than this factor, the noise is time-correlated."""
 ALIKE = 0.3
-"""… and so does that whose whitened residuals are so alike from one to the next."""
+"""… and also if the autocorrelation of whitened residuals exceeds this."""
 
 
 LARGEST = {"distance_scale": 0.15, "turn_scale": 0.5, "range_scale": 0.15}
-"""Wear, load and slip of wheels stay below these. More is a wrong unit, a wrong sign, a mounting or a sensor that does
-not measure what it says, and matches cannot tell which stream is wrong."""
+"""Wear, load and slip of wheels cause smaller errors than these. A larger one means a wrong unit, sign or mounting, or
+a faulty sensor; scan matches cannot identify which stream is wrong."""
 LARGEST_NOISE = {"along_metre": 0.3, "heading_metre": 0.5}
-"""Odometry that is worse than this tells nothing of the way: streams contradict each other [m/√m, rad/√m]."""
+"""Larger odometry noise means that the streams contradict each other [m/√m, rad/√m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """One constant.
+    """Estimate of one constant.
 
     Parameters
     ----------
     name : str
-        As in :class:`~graphslam.calibrate.corrections.Corrections`; logarithms and shares as the kernels have them.
+        As in :class:`~graphslam.calibrate.corrections.Corrections`; here distance_scale is ln, other scales factor - 1.
     gain : float
-        Likelihood that it gains over noise alone [nats]; NaN where that was not worth a fit.
+        Log-likelihood with it minus that without it [nats]; NaN if not significant and therefore not fitted.
     other, other_sigma : float
-        The same in windows of another length; NaN where there are none.
+        Value and σ from windows of another length; NaN if there are none.
     why_not : str
-        Why it is not applied; empty where it is.
+        Why it is not applied; empty if it is applied.
     """
 
     name: str
@@ -60,18 +60,18 @@ class Estimate:
 
     @property
     def applied(self) -> bool:
-        """Is the log corrected by it?"""
+        """Is the log corrected by this estimate?"""
         return not self.why_not
 
     @property
     def contradiction(self) -> bool:
-        """Is it too large for an error of a sensor that works, and known well enough to say so?"""
+        """Is it significantly larger than the plausible limit in :data:`LARGEST`?"""
         if self.name.endswith("_scale") and self.sigma > VAGUE:
             return False
         return abs(self.value) - SURE * self.sigma > LARGEST.get(self.name, math.inf)
 
     def gated(self) -> Estimate:
-        """The same with the verdict of the gates."""
+        """Copy with ``why_not`` set by the acceptance tests."""
         why = ""
         if not abs(self.value) > SURE * self.sigma:
             why = "not significant"
@@ -86,19 +86,19 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """How data that an estimate was not made from fit it, and fit what the log states.
+    """Cross-validation: log-likelihood of withheld data under an estimate, relative to the noise of the log.
 
     Parameters
     ----------
     what : str
-        Of what.
+        Kind of withheld data.
     count : int
-        How many.
+        Number of withheld data.
     gains : mapping of str to float
-        By how much likelier they are than under what the log states [nats]: under ``all`` of the estimate, and under
-        its ``noise`` without its constants, where it has any.
+        Increase of the log-likelihood [nats]: with ``all`` of the estimate, and with its ``noise`` without its
+        constants, if it has any.
     timed : float
-        The same under the offset of the clocks and the slip of the wheels alone.
+        The same with the clock offset and the wheel slip only.
     """
 
     what: str
@@ -108,7 +108,7 @@ class Prediction:
 
     @property
     def supported(self) -> str:
-        """What of the estimate the held-out data support, and so what is used: ``all``, ``noise`` or ``nothing``."""
+        """Part of the estimate that the held-out data support and that is used: ``all``, ``noise`` or ``nothing``."""
         best = max(self.gains, key=lambda k: self.gains[k])
         return best if self.gains[best] > GAIN else "nothing"
 
@@ -135,7 +135,7 @@ class Calibration:
     corrections : Corrections
         Corrections to apply.
     noise : mapping of str to float
-        Standard deviations, as they were fitted.
+        Fitted standard deviations.
     notes : tuple of Finding
         Further findings.
     data : str
@@ -153,8 +153,8 @@ class Calibration:
     prediction: Prediction | None = None
 
     def validated(self, prediction: Prediction) -> Calibration:
-        """The same without estimates that fail the cross-validation; clock and slip, on which few withheld sightings
-        depend, fail only where they predict worse.
+        """Copy without estimates that fail the cross-validation. Few withheld observations depend on clock and slip, so
+        these are rejected only if they reduce the log-likelihood by :data:`GAIN` or more.
         """
         found, supported = replace(self, prediction=prediction), prediction.supported
         if supported == "all":
@@ -169,7 +169,7 @@ class Calibration:
         return replace(found, estimates=tuple(refused), corrections=kept)
 
     def findings(self) -> list[Finding]:
-        """Lines of a verdict: corrections that are applied, those that are not, and why."""
+        """Lines of the verdict: corrections that are applied, and those that are not, with the reason."""
         against = self.contradictions()
         if against:
             text = (
@@ -209,13 +209,13 @@ class Calibration:
         return [*out, *self.notes]
 
     def contradictions(self) -> list[str]:
-        """Implausibly large estimates, in words; with any of them nothing of the calibration is used."""
+        """Implausibly large estimates as text; with any of them nothing of the calibration is used."""
         out = [estimate_text(e.name, e.value, e.sigma) for e in self.estimates if e.contradiction]
         large = {k: v for k, v in self.noise.items() if v > LARGEST_NOISE.get(k, math.inf)}
         return out + ([f"noise {noise_text(large)}"] if large else [])
 
     def config(self) -> dict[str, Any]:
-        """Options ``calibrate.…`` of a run that uses it, and estimates nothing anew."""
+        """Options ``calibrate.…`` of a run that uses this calibration and makes no new one."""
         return {"use": "none", "given": options_dict(self.corrections)}
 
     def as_dict(self) -> dict[str, Any]:
@@ -261,7 +261,7 @@ CORRECTION_VERBS = {
 
 
 def estimate_text(name: str, value: float, sigma: float) -> str:
-    """A constant with its σ as a sentence without an end."""
+    """A constant with its σ as text without a full stop."""
     deg = np.rad2deg
     if name == "yaw_bias":
         return f"yaw rate {deg(abs(value)):.3f} ± {deg(sigma):.3f} deg/s too {'high' if value > 0 else 'low'}"
@@ -307,7 +307,7 @@ def noise_text(noise: dict[str, float]) -> str:
 
 
 def round_digits(x: float) -> float:
-    """Five digits: what is written is what is used, on every machine."""
+    """Round to five digits, so that the applied value is the written one on every machine."""
     return float(f"{x:.5g}")
 
 

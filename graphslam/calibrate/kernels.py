@@ -1,4 +1,4 @@
-"""Compiled elimination of one window of a log: a chain of poses, and landmarks, visits and constants that border it."""
+"""Compiled elimination of one window of a log: a chain of poses, bordered by landmarks, visits and constants."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ HEAD = CONSTANTS + 1
 ) = range(12)
 PARAMETERS = 12
 Data = namedtuple("Data", ["steps", "first", "sightings", "slots", "kinds"])
-"""What is measured in a window."""
+"""Measurements of a window."""
 Work = namedtuple("Work", ["L", "X", "C", "S", "chi2", "gone", "pivots", "order", "when", "at"])
-"""What an elimination leaves."""
+"""Output of :func:`eliminate_window`."""
 _Row = namedtuple("_Row", ["jp", "jn", "cols", "vals"])
 _Blocks = namedtuple("_Blocks", ["A", "An", "B", "C", "Cn", "S"])
-_FAR = 1e-8  # information of where a landmark is before it is seen [1/m²]
+_FAR = 1e-8  # prior information of a landmark position [1/m²]
 
 
 @njit(error_model="numpy", nogil=True)
@@ -45,7 +45,7 @@ def wrap_residual(a):
 
 @njit(error_model="numpy", nogil=True)
 def _add(row, n, blocks):
-    """Add one whitened residual row: blocks of this pose, the next one, and ``n`` border columns."""
+    """Add one whitened residual row to the blocks of this pose, of the next one, and of ``n`` border columns."""
     jp, jn, cols, vals = row
     A, An, B, C, Cn, S = blocks
     D = len(jp)
@@ -70,7 +70,7 @@ def _add(row, n, blocks):
 
 @njit(error_model="numpy", nogil=True)
 def _leave(at, active, A, C, S, gone):
-    """Eliminate a border column that one pose alone still knows; its row goes to ``gone``. Returns the pivot."""
+    """Eliminate a border column without later observations; its row goes to ``gone``. Returns the pivot."""
     D, m = C.shape
     pivot = S[at, at]
     gone[:] = 0.0
@@ -98,35 +98,35 @@ def _leave(at, active, A, C, S, gone):
 
 @njit(error_model="numpy", nogil=True)
 def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
-    """Linearise a window, and eliminate its poses and nuisances onto the constants.
+    """Linearise a window and marginalise its poses and nuisances, so that the constants remain.
 
-    A nuisance goes with the last pose that sights it, and leaves its place in the border to another: so the border is
-    as wide as there are nuisances at a time, and not as long as the window.
+    A nuisance is eliminated with the last pose that observes it, and its border columns are reused. So the width of the
+    border is given by the nuisances that are active at the same time, not by the length of the window.
 
     poses : (n, D) x, y, heading; D = 3.
-    nuisance : (M, 2) landmarks (x, y) and constants of visits (range, bearing), in order of their first sighting.
+    nuisance : (M, 2) landmarks (x, y) and constants of visits (range, bearing), in order of their first observation.
     g : (CONSTANTS,)
     data : Data
-        steps (n, 8): dx, dy, turn, seconds, metres into pose k; variances along, and to the side and of the heading,
-            that stand in place of the model's where the first of each is above 0; row 0 is not read.
-        first : (n + 1,) sightings of pose k are ``first[k]:first[k + 1]``.
-        sightings : (q, 2) range and bearing; a bearing of nan is none.
+        steps (n, 8): dx, dy, turn, seconds, metres from pose k - 1 to k; then variances: column 5 (along) if > 0, and
+            columns 6 and 7 (lateral, heading) if column 6 > 0, replace those of the noise model; row 0 is not read.
+        first : (n + 1,) observations of pose k are ``first[k]:first[k + 1]``.
+        ``sightings`` : (q, 2) range and bearing; NaN: no bearing.
         slots : (q, 2) nuisance of the landmark, and of the visit or -1.
         kinds (M,): 0 landmark, 1 visit.
-    sensor : (3,) sensor in the base.
-    p : (PARAMETERS,) standard deviations and times.
-    damping : share added to every diagonal, Levenberg-Marquardt.
+    sensor : (3,) pose of the sensor in the base frame.
+    p : (PARAMETERS,) standard deviations.
+    damping : Levenberg-Marquardt factor; diagonals of poses and nuisances are multiplied by 1 + damping.
     work : Work
         L (n, D, D), X (n, D, D), C (n, D, m), S (m, m), chi2 (6,), gone (2 M, m + D), pivots (2 M,), order (M,),
-        when (M,), at (M,) out, m = HEAD + 2 times the most nuisances at a time: what :func:`substitute_window` needs.
-        ``order`` has the nuisances in the order in which they went, ``when`` the poses with which, ``at`` their places
-        in the border. S[:HEAD, :HEAD] holds the information of the constants, with the right side and χ² in row RHS;
-        chi2 is that at the linearisation point: along, lateral, heading, range, bearing, priors.
+        when (M,), at (M,): output for :func:`substitute_window`; m = HEAD + 2 · maximal number of active nuisances.
+        ``order`` lists the nuisances in elimination order, ``when`` the pose of each elimination, ``at`` the index in
+        the border. S[:HEAD, :HEAD] is the information of the constants, with the right-hand side and χ² in row RHS;
+        chi2 is χ² at the linearisation point by class: along, lateral, heading, range, bearing, priors.
 
     Returns
     -------
     (float, float)
-        ln det of all that was eliminated, and the sum of ln σ of all residuals.
+        ln det of the eliminated blocks, and the sum of ln σ of all residuals.
     """
     steps, first, sightings, slots, kinds = data
     L, X, C, S, chi2, gone, pivots, order, when, at = work
@@ -163,7 +163,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
         ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
         for q in range(first[k], first[k + 1]):
             j, v = slots[q, 0], slots[q, 1]
-            for new in (j, v):  # seen for the first time: what is known of it beforehand
+            for new in (j, v):  # first observation: add the prior
                 if new < 0 or at[new] >= 0:
                     continue
                 place = 0
@@ -187,7 +187,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
             grow = 1.0 + g[RANGE_SCALE]
             w = 1.0 / p[RANGE]
             volume += math.log(p[RANGE])
-            # residual: predicted less measured
+            # residual: predicted minus measured
             e = grow * r + g[RANGE_OFFSET] - sightings[q, 0]
             jp[:] = 0.0
             jp[0], jp[1] = -w * grow * dx / r, -w * grow * dy / r
@@ -229,7 +229,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
             less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn
             h = 0.5 * turn
             cx, cyy = math.cos(h) * ux + math.sin(h) * uy, -math.sin(h) * ux + math.cos(h) * uy
-            longer = math.exp(g[DISTANCE_SCALE])  # the noise is in what was measured: it is not scaled
+            longer = math.exp(g[DISTANCE_SCALE])  # the prediction is scaled, not the measurement with its noise
             phi = th + h - 0.5 * less
             cp, sp = math.cos(phi), math.sin(phi)
             mx, my = poses[k + 1, 0] - x, poses[k + 1, 1] - y
@@ -263,7 +263,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                     w, e, dphi, scale = 1.0 / math.sqrt(var_t), et, -1.0, 0.0
                     jn[2] = w
                 jp[2] = w * dphi
-                # constants turn the chord by half of what they take from the turn, and the heading by all of it
+                # a change of the turn by the constants rotates the chord by half of it, the heading by all of it
                 part = -0.5 * dphi if row < 2 else 1.0
                 cols[1], vals[1] = YAW_BIAS, w * part * dt
                 cols[2], vals[2] = DISTANCE_SCALE, w * scale
@@ -275,7 +275,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
         if damping > 0.0:
             for a in range(D):
                 A[a, a] *= 1.0 + damping
-        # nuisances that are not seen again, then Cholesky of the pose, and what it leaves to the next and to the border
+        # eliminate nuisances without later observations, then Cholesky of the pose, then update next pose and border
         active = HEAD + 2 * known
         for q in range(first[k], first[k + 1]):
             for j in slots[q]:
@@ -339,7 +339,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
 
 @njit(error_model="numpy", nogil=True)
 def substitute_window(work, dg, d_poses, d_nuisance):
-    """Steps of poses (n, D) and nuisances (M, 2) that belong to a step ``dg`` of the constants."""
+    """Back-substitution: updates of poses (n, D) and nuisances (M, 2) for an update ``dg`` of the constants."""
     L, X, C, _, _, gone, pivots, order, when, at = work
     n, D = d_poses.shape
     m = C.shape[2]
@@ -361,7 +361,7 @@ def substitute_window(work, dg, d_poses, d_nuisance):
             for b in range(a + 1, D):
                 t += L[k, b, a] * d_poses[k, b]
             d_poses[k, a] = -t / L[k, a, a]
-        while last >= 0 and when[last] == k:  # those that went with it, the last one first
+        while last >= 0 and when[last] == k:  # nuisances eliminated with pose k, in reverse order
             j = order[last]
             for a in range(2):
                 t = 0.0

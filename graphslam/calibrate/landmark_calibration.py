@@ -1,4 +1,4 @@
-"""Calibration of logs with landmarks: of range and bearing in windows, of ranges alone over one stretch."""
+"""Calibration of logs with landmarks: range and bearing in many windows, range-only logs in one window."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ from graphslam_frontends.odometry.motion import MotionNoise, motion_stream
 SHORT, LONG = 15.0, 60.0
 """Lengths of the windows [s]."""
 VISITS = 240.0
-"""… and of those that hold several visits of a landmark."""
+"""Length of the windows that contain several visits of a landmark [s]."""
 FEW = 40
-"""Landmarks of a log that is looked at for errors of visits in any case: it costs little."""
+"""With at most this many landmarks, visit errors are always estimated: it costs little."""
 RAN_AWAY = 5.0
-"""A constant so many σ from what was known of it beforehand was not found, but ran away: noise so large that the wheels
-say nothing, and wheels so wrong that they need not, are likely together wherever sightings are sparse."""
+"""A constant that is more than this many prior σ from zero has diverged and is fixed at zero: with sparse observations
+the likelihood has a spurious maximum with very large motion noise and a very large motion error."""
 PERHAPS = 0.15
-"""Residuals that are so alike from one to the next are looked at for errors that last as long as a visit."""
+"""If the autocorrelation of residuals exceeds this, errors common to a visit are estimated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationBudget:
-    """How much of a log is looked at, and how hard."""
+    """Limits of the data and of the computing effort of a calibration."""
 
     windows: int | None = 20
-    """Short windows at most; a quarter as many long ones. None: all of the log."""
+    """Maximal number of short windows; a quarter of it for long ones. None: all of the log."""
     poses: int = 2000
-    """Poses of all short windows together; of the one stretch of ranges alone."""
+    """Total number of poses in the short windows, or in the one window of a range-only log."""
     clock: bool = True
-    """Is the offset of the clocks looked for?"""
+    """Estimate the clock offset?"""
     again: bool = False
-    """Is an estimate of ranges and bearings made once more, of all data, when withheld ones have tested it? That of
-    ranges alone always is."""
+    """Repeat the range-bearing estimate with all data after the test on withheld data? Range-only estimates are always
+    repeated."""
 
 
 QUICK = CalibrationBudget()
@@ -59,12 +59,12 @@ FULL = CalibrationBudget(windows=60, poses=6000, again=True)
 def calibrate_sightings(
     seen: SightingLog, effort: CalibrationBudget = QUICK, *, seed: int = 0, noise: MotionNoise | None = None
 ) -> Calibration:
-    """What wheels and sightings say of their own noise and lasting errors, as far as it foretells what was withheld.
+    """Estimate noise and systematic errors of motion and observations; parts that fail the cross-validation are unused.
 
     Parameters
     ----------
     noise : MotionNoise, optional
-        Of controls, as it is without a calibration.
+        Noise of controls without a calibration, for comparison.
     """
     held, noise = seen.holding(), noise or MotionNoise()
     blind = not np.any(seen.sightings.has_bearing)
@@ -78,13 +78,13 @@ def calibrate_sightings(
         found = _range_and_bearing(held, effort)
         foretell = partial(predict_withheld_sightings, held, found, _tested(held, effort), noise)
     prediction = None if found.contradictions() else foretell()
-    if blind or effort.again:  # what was withheld is data like the rest once it has tested
+    if blind or effort.again:  # after the test, the withheld data are used, too
         found = _ranges_alone(seen, effort, seed)[0] if blind else _range_and_bearing(seen, effort)
     return found if prediction is None or found.contradictions() else found.validated(prediction)
 
 
 def _tested(held: SightingLog, effort: CalibrationBudget) -> list[Ints]:
-    """Scans of long windows in which something is withheld, spread over the log."""
+    """Scans of long windows with withheld observations, spread over the log."""
     s = held.sightings
     assert held.withheld is not None
     hidden = np.concatenate([[0], np.cumsum(held.withheld)])[s.offsets]
@@ -94,7 +94,7 @@ def _tested(held: SightingLog, effort: CalibrationBudget) -> list[Ints]:
 
 
 def _along(whole: Smoothing, ids: Ints | None, w: SmoothingWindow) -> SmoothingWindow | None:
-    """A window of ranges with its states where those of a fitted one are; None where that has none of its beacons."""
+    """A range-only window with initial states from a fitted smoothing; None if they have no beacon in common."""
     first = whole.windows[0]
     if ids is None:
         return None
@@ -109,12 +109,12 @@ def _along(whole: Smoothing, ids: Ints | None, w: SmoothingWindow) -> SmoothingW
 
 
 def _rate(seen: SightingLog) -> float:
-    """Scans a second."""
+    """Mean rate of the scans [Hz]."""
     return len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
 
 
 def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple[str, ...] = ()) -> Calibration:
-    """``held``: constants that ran away before."""
+    """Calibrate a log with bearings; ``held`` are constants that diverged before and are fixed at zero."""
     steers = isinstance(motion_stream(seen.log)[1], SteeringControls)
     named = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
     free = tuple(c for c in named if c not in held)
@@ -158,7 +158,7 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
 
 
 def _without_slips(seen: SightingLog, count: int | None, free: tuple[str, ...]) -> tuple[SightingLog, Smoothing, float]:
-    """The log with the stretches in which its wheels slipped, and short windows that do not use their distances."""
+    """The log with its intervals of wheel slip, and a fit of short windows that does not use distances there."""
     for _ in range(ROUNDS):
         short, value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
         slips = find_slips(short)
@@ -169,7 +169,7 @@ def _without_slips(seen: SightingLog, count: int | None, free: tuple[str, ...]) 
 
 
 def _again(seen: SightingLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:
-    """The calibration with the motion's clock put right."""
+    """The calibration repeated with the corrected clock of the motion."""
     found = _range_and_bearing(
         seen.mended(Corrections(clock=round_digits(clock.value))), replace(effort, clock=False), held
     )
@@ -205,8 +205,8 @@ def _ranges_alone(seen: SightingLog, effort: CalibrationBudget, seed: int) -> tu
 
 
 def cross_check_windows(s: Smoothing, value: float, other: Smoothing) -> tuple[list[Estimate], Smoothing, Smoothing]:
-    """The constants of a smoothing, held against those of windows of another length; and both with none but those that
-    are applied.
+    """Compare the constants of a smoothing with those from windows of another length; refit both with only the
+    constants that are applied.
     """
     out = []
     first = s
@@ -248,7 +248,7 @@ def _estimate(name: str, s: Smoothing, other: Smoothing, gain: float) -> Estimat
 
 
 def combine_noise(short: Smoothing, long: Smoothing) -> tuple[dict[str, float], bool]:
-    """The larger of two σ, the motion's as one model; and whether noise of either kind lasts."""
+    """For each part of the noise, the larger σ of the two; and whether range or bearing errors are time-correlated."""
     pairs = [(s, _typical(s)) for s in (short, long)]
     heading = [_heading_variance(s, t) for s, t in pairs]
     best = long if heading[1] >= heading[0] else short
@@ -266,7 +266,7 @@ def combine_noise(short: Smoothing, long: Smoothing) -> tuple[dict[str, float], 
 
 
 def _typical(s: Smoothing) -> Array:
-    """Metres, radians and seconds of a typical step."""
+    """Mean metres, absolute radians and seconds of a step."""
     steps = np.concatenate([w.steps[1:] for w in s.windows])
     return np.array([steps[:, 4].mean(), np.abs(steps[:, 2]).mean(), steps[:, 3].mean()])
 
@@ -277,7 +277,7 @@ def _heading_variance(s: Smoothing, step: Array) -> float:
 
 
 def residual_autocorrelation(s: Smoothing) -> float:
-    """Correlation of residuals of one landmark from one sighting to the next, the larger of range and bearing."""
+    """Lag-1 autocorrelation of the residuals per landmark; the larger of range and bearing."""
     seen = s.residuals()
     products, squares = np.zeros(2), np.zeros(2)
     for w, r in zip(s.windows, seen):
@@ -292,10 +292,10 @@ def residual_autocorrelation(s: Smoothing) -> float:
 def fit_two_level_noise(
     seen: SightingLog, long: Smoothing, effort: CalibrationBudget, estimates: list[Estimate]
 ) -> tuple[dict[str, float], list[Estimate]]:
-    """Noise of sightings with a constant for each landmark and visit; nothing where the log is no likelier with it.
+    """Observation noise with an additional error per visit of a landmark; empty unless it gains :data:`GAIN` nats.
 
-    The windows hold several visits of a landmark, or its place could not be told from the constant. Constants that
-    passed the gates must pass them again: errors of visits may have feigned them.
+    The windows contain several visits of a landmark; otherwise its position and the error could not be separated.
+    Constants that passed the acceptance tests are tested again, because visit errors may have caused them.
     """
     count = max(int(effort.poses / max(_rate(seen) * VISITS, 1.0)), 1)
     values, fits = [], []
@@ -332,19 +332,19 @@ def fit_two_level_noise(
 
 
 def motion_noise(s: Smoothing) -> dict[str, float]:
-    """Noise of the motion of one smoothing."""
+    """σ of the motion of a smoothing."""
     return {k: s.sigmas[k] for k in L.WHEELS}
 
 
 def sightings_of_a_visit(windows: Sequence[SmoothingWindow]) -> float:
-    """Sightings of the visit that a sighting, drawn at random, belongs to."""
+    """Expected number of observations in the visit of a randomly chosen observation: Σn² / Σn."""
     n = np.concatenate([np.bincount(w.slots[w.slots[:, 1] >= 0, 1]) for w in windows])
     n = n[n > 0]
     return float((n**2).sum() / max(n.sum(), 1))
 
 
 def _count(seen: SightingLog, seconds: float, effort: CalibrationBudget) -> int | None:
-    """Windows that keep the number of poses within bounds."""
+    """Number of windows that keeps the number of poses within the budget; None: all."""
     if effort.windows is None:
         return None
     return int(np.clip(effort.poses / max(_rate(seen) * seconds, 1.0), 6, effort.windows))
@@ -373,7 +373,7 @@ def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
 def calibration_of(
     kind: str, estimates: Sequence[Estimate], noise: dict[str, float], notes: Sequence[Finding], data: str
 ) -> Calibration:
-    """A calibration with what is applied of it: nothing where streams contradict each other."""
+    """A calibration with its corrections; without any if an estimate is implausibly large."""
     found = Calibration(
         kind=kind,
         corrections=replace(_corrections(estimates, noise), widen_only=kind == "scans"),
@@ -386,7 +386,7 @@ def calibration_of(
 
 
 def _corrections(estimates: Sequence[Estimate], noise: dict[str, float]) -> Corrections:
-    """What is applied: constants that passed the gates, and the noise."""
+    """Corrections from constants that passed the acceptance tests, and from the noise."""
     applied = {e.name: e.value for e in estimates if e.applied}
     values: dict[str, Any] = {}
     for name, value in applied.items():

@@ -1,4 +1,4 @@
-"""Noise and constants of wheels and of a sensor that sights landmarks, by greatest likelihood of smoothed windows."""
+"""Maximum-likelihood noise and constants of wheels and of a landmark sensor, from smoothed windows."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from graphslam.core.random import SeedTree
 
 WHEELS = ("along_metre", "along_second", "lateral_metre", "heading_metre", "heading_radian", "heading_second")
 TRIMS = (5.0, 4.0)
-"""Sightings with a whitened residual above are left out, with a new fit after each."""
+"""Observations with a larger whitened residual are removed; a new fit follows each limit."""
 
 
 def smoothing_of(
     windows: Sequence[SmoothingWindow], sensor: Array, free: Sequence[str], *, visits: bool = False
 ) -> Smoothing:
-    """Windows with the noise that is to be found in them."""
+    """Smoothing of windows that estimates the noise of the motion and of the measured quantities."""
     bearings = any(np.isfinite(w.sightings[:, 1]).any() for w in windows)
     fitted = [*WHEELS, "range"] + ["bearing"] * bearings
     fitted += (["visit_range"] + ["visit_bearing"] * bearings) if visits else []
@@ -31,13 +31,13 @@ def smoothing_of(
 def smooth_sightings(
     seen: SightingLog, seconds: float, count: int | None, free: Sequence[str], *, visits: bool = False
 ) -> Smoothing:
-    """Smoothing of windows of range and bearing, where the odometry starts it."""
+    """Smoothing of windows of range and bearing, initialised by odometry."""
     windows = cut_windows(seen, seconds, count, visits=visits)
     return smoothing_of(windows, seen.sightings.T_base_sensor, free, visits=visits)
 
 
 def trim_outliers(s: Smoothing, limit: float) -> Smoothing:
-    """The smoothing without sightings whose residual is above ``limit`` standard deviations."""
+    """The smoothing without observations whose residual is above ``limit`` standard deviations."""
     seen = s.residuals()
     good = [np.nan_to_num(np.abs(r), nan=0.0).max(axis=1, initial=0.0) < limit for r in seen]
     return s if all(g.all() for g in good) else keep_sightings(s, good)
@@ -46,7 +46,7 @@ def trim_outliers(s: Smoothing, limit: float) -> Smoothing:
 def fit_noise(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
     """Fit, trim and fit again; the smoothing and its objective."""
     s.settle(8)
-    s = trim_outliers(s, 12.0)  # a wrong identity by metres would make its noise that of all
+    s = trim_outliers(s, 12.0)  # a false association by metres would inflate the noise of all
     value = s.fit(budget=budget, rounds=2 if trims else 4)
     for limit in trims:
         less = trim_outliers(s, limit)
@@ -58,24 +58,24 @@ def fit_noise(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS
 
 
 def fit_without(s: Smoothing, constant: str) -> tuple[Smoothing, float]:
-    """The smoothing with a constant left out, its noise fitted anew, and its objective."""
+    """The smoothing with one constant fixed at zero, its noise fitted again, and its objective."""
     alone = s.copy(free=tuple(c for c in s.free if c != constant))
     alone.constants[CONSTANTS.index(constant)] = 0.0
     return alone, alone.fit(budget=150, rounds=3)
 
 
 def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Smoothing, Smoothing] | None:
-    """One window of ranges alone, from a dead start: 16 layouts of beacons over its beginning, then ever more of it.
+    """Smooth one range-only window without an initial guess: best of 16 random beacon layouts, then longer windows.
 
     Parameters
     ----------
     until : float
-        Seconds of the log that are used.
+        Length of the used part of the log [s].
 
     Returns
     -------
     (Smoothing, Smoothing) or None
-        Of the whole stretch, and of about half of it.
+        Smoothing of the whole part, and of about its first half.
     """
     free = ("yaw_bias", "range_scale", "range_offset")
     rng = SeedTree(seed).child("calibrate", "ranges").generator()
@@ -90,7 +90,7 @@ def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Sm
     constants, sigmas = np.zeros(K.CONSTANTS), {**START, "range": 1.0}
     poses = np.zeros((0, 3))
     made: list[Smoothing] = []
-    for end in ends:  # a bias of a third of a degree a second is half a turn over the whole log
+    for end in ends:  # in steps: dead reckoning of a whole log may turn by π with a small yaw bias
         n = int(np.searchsorted(whole.times, begin + end, side="right"))
         if n < 20:
             continue
@@ -116,7 +116,7 @@ def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Sm
 
 
 def _names(whole: SmoothingWindow, w: SmoothingWindow) -> Array:
-    """Landmark of the whole window that each of a part's is."""
+    """Landmark index in the whole window for each landmark of a part of it."""
     of_row = dict(zip(whole.rows.tolist(), whole.slots[:, 0].tolist()))
     out = np.full(len(w.nuisance), -1)
     for row, (l, _) in zip(w.rows.tolist(), w.slots.tolist()):
@@ -125,7 +125,7 @@ def _names(whole: SmoothingWindow, w: SmoothingWindow) -> Array:
 
 
 def _extended(whole: SmoothingWindow, poses: Array, n: int, g: Array) -> Array:
-    """Path of ``n`` poses that goes on from those known by steps without what the constants take away."""
+    """Path of ``n`` poses: the given ones, extended by dead reckoning corrected for the yaw bias."""
     u = whole.steps[:n].copy()
     u[:, 2] -= g[K.YAW_BIAS] * u[:, 3]
     out = np.zeros((n, 3))
@@ -137,7 +137,7 @@ def _extended(whole: SmoothingWindow, poses: Array, n: int, g: Array) -> Array:
 
 
 def _part(whole: SmoothingWindow, path: Array, places: dict[int, Array], rng: np.random.Generator) -> SmoothingWindow:
-    """The first poses of a window, beacons without a place put anywhere on their first circle that fits."""
+    """The first poses of a window; beacons without a position are initialised by :func:`_anywhere`."""
     n = len(path)
     q = int(whole.first[n])
     slots, order = renumber_slots(whole.slots[:q])
@@ -164,7 +164,7 @@ def _part(whole: SmoothingWindow, path: Array, places: dict[int, Array], rng: np
 
 
 def _anywhere(at: Array, r: Array, rng: np.random.Generator) -> Array:
-    """A place that explains ranges from places on a path: one of the two best of 24 on a circle, by chance."""
+    """Beacon position from ranges: random choice of the best two of 24 solutions from the circle of the shortest one."""
     i = int(np.argmin(r))
     angle = np.arange(24) * (2 * np.pi / 24)
     found = []
@@ -183,6 +183,6 @@ def _anywhere(at: Array, r: Array, rng: np.random.Generator) -> Array:
 
 
 def shift_motion(s: Smoothing, seen: SightingLog, shift: float) -> Smoothing:
-    """The smoothing with its motion cut at stamps that are later by ``shift``."""
+    """The smoothing with its motion evaluated at stamps that are later by ``shift`` [s]."""
     windows = [replace(w, steps=seen.steps(w.times, shift)) for w in s.windows]
     return s.copy(windows=windows)

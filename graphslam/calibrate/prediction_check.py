@@ -1,7 +1,7 @@
-"""Withheld sightings as an estimate foretells them, and as what the log states does.
+"""Cross-validation with withheld observations: likelihood under an estimate and under the noise of the log.
 
-With the parameters held, the likelihood of withheld data given the rest is that of all of the data over that of the
-rest: two smoothings of the same windows.
+With fixed parameters, the likelihood of withheld data given the rest is the likelihood of all data divided by that of
+the rest; each is from one smoothing of the same windows.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graphslam.calibrate.windows import SightingLog, make_window
 from graphslam_frontends.odometry.motion import MotionNoise
 
 TRIM = 4.0
-"""Sightings that are more σ off, by the larger of what is stated and what was found, count for neither."""
+"""Observations with a larger residual are ignored for both [σ, the larger one of log and estimate]."""
 SETTLE = 12
 
 
@@ -31,25 +31,25 @@ def predict_withheld_sightings(
     noise: MotionNoise,
     start: Callable[[SmoothingWindow], SmoothingWindow | None] = lambda w: w,
 ) -> Prediction | None:
-    """How likely withheld sightings are under a calibration, over what the log states.
+    """Log-likelihood of withheld observations under a calibration, relative to the noise of the log.
 
     Parameters
     ----------
     seen : SightingLog
-        As the log has it, with what was withheld.
+        The uncorrected log, with its withheld observations marked.
     found : Calibration
-        Made without them.
+        Estimated without the withheld observations.
     scans : list of (n,) int64
-        Of the windows in which they are foretold.
+        Scans of the windows in which they are predicted.
     noise : MotionNoise
-        Of controls, as the front end states it.
+        Noise of controls in the front end.
     start : function
-        Puts the states of a window where they are begun; None: the window tells nothing.
+        Sets the initial states of a window; returns None if the window cannot be used.
 
     Returns
     -------
     Prediction or None
-        None: hardly anything was withheld.
+        None if fewer than :data:`LEAST` observations were withheld.
     """
     assert seen.withheld is not None
     hidden, c = seen.withheld, found.corrections
@@ -58,7 +58,7 @@ def predict_withheld_sightings(
     kept: Ints | None = None
 
     def score(c: Corrections) -> tuple[float, int]:
-        """Of the withheld sightings [nats], and their number; the first one chooses what counts."""
+        """Negative log-likelihood of the withheld observations [nats], and their number; the first call trims."""
         nonlocal kept
         own = _sigmas(c, stated)
         s = _smoothing(seen.mended(c), scans, start, visits=own["visit_range"] > 0.0)
@@ -89,11 +89,11 @@ def predict_withheld_sightings(
 
 
 LEAST = 20
-"""Fewer withheld sightings say nothing."""
+"""Minimal number of withheld observations for a test."""
 
 
 def _stated(seen: SightingLog) -> dict[str, float]:
-    """σ of the sightings as the log has them."""
+    """Median σ of the observations in the log."""
     s = seen.sightings
     out = {"range": float(np.median(s.sigmas[:, 0])), "visit_range": 0.0, "visit_bearing": 0.0}
     blind = not np.any(s.has_bearing)
@@ -101,7 +101,7 @@ def _stated(seen: SightingLog) -> dict[str, float]:
 
 
 def _sigmas(c: Corrections, stated: dict[str, float]) -> dict[str, float]:
-    """σ of the sightings of a log to which corrections were applied."""
+    """σ of the observations after corrections are applied."""
     out = {"range": (c.range_sigma or stated["range"]) / c.range_scale, "bearing": c.bearing_sigma or stated["bearing"]}
     return out | {"visit_range": c.range_visit / c.range_scale, "visit_bearing": max(c.bearing_visit, 1e-6)}
 
@@ -109,7 +109,7 @@ def _sigmas(c: Corrections, stated: dict[str, float]) -> dict[str, float]:
 def _smoothing(
     seen: SightingLog, scans: list[Ints], start: Callable[[SmoothingWindow], SmoothingWindow | None], *, visits: bool
 ) -> Smoothing:
-    """Windows with all their sightings; nothing is estimated but their states."""
+    """Smoothing of windows with all their observations; only the states are estimated."""
     begin, end = seen.span
     t = seen.sightings.times
     inside = [k for k in scans if t[k[0]] >= begin and t[k[-1]] <= end]

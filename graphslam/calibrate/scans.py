@@ -1,7 +1,7 @@
-"""Calibration of logs with scans: what odometry says between key scans, less what matches of the scans say.
+"""Calibration of logs with scans: regression of odometry minus scan match between key scans.
 
-Each key scan is matched with the next and with the third next (in space also with the eighth). The noise of a match
-does not depend on how far apart they are, that of the odometry grows: so one regression tells them apart.
+Each key scan is matched with the next and with the third next (in 3-D also with the eighth). The noise of a match does
+not depend on the distance between the scans, that of the odometry grows with it: one regression separates the two.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from graphslam.registration.target import Target
 from graphslam_frontends.odometry.steps import Steps
 
 KEY = (0.4, 0.3)
-"""A scan so far from the last key scan, or turned so far, is a key scan [m, rad]."""
+"""A scan farther than this from the last key scan, in metres driven or angle turned, is a key scan [m, rad]."""
 APART = {2: (1, 3), 3: (1, 3, 8)}
-"""Key scans between those of a pair."""
+"""Differences of key-scan index in a pair, by dimension."""
 HELD = (0.06, 0.03)
-"""A match that holds its weakest direction, or its heading, worse than this is left out [m, rad]: corridors."""
+"""A match with a larger σ in its weakest direction [m] or in heading [rad] is rejected, as in corridors."""
 BLOCK = 10
-"""Matches, one after the other, that are held out together."""
+"""Number of consecutive matches in a block of the cross-validation."""
 _MATCHES = (math.log(1e-4), math.log(0.3))
 FREEDOM = 4.0
-"""Of Student's distribution of the errors."""
+"""Degrees of freedom of the Student distribution of the errors."""
 ALIKE = 0.9
-"""Constants whose errors are correlated more than this are one."""
+"""Of two constants with a larger correlation of their errors, only one is estimated."""
 LEAST = 30
 LEAST_SHARE = 0.5
-"""Share of the neighbouring pairs that must match. Where most do not, as along a street, matches are a biased sample,
-and the half of them that is held out is biased alike."""
+"""Fraction of the neighbouring pairs that must match. Otherwise, as along a street, matches are a biased sample, and
+cross-validation cannot detect it, because the withheld half has the same bias."""
 MATCHING = {
     2: RegistrationConfig(radii=(1.0, 0.3), near=0.15),
     3: RegistrationConfig(radii=(1.0, 0.5), near=0.4),
@@ -49,7 +49,7 @@ MATCHING = {
 FITNESS = 0.6
 VOXEL = {2: None, 3: 0.3}
 POINTS = 20000
-"""Points of a scan in space that are looked at: sparse clouds have no normals."""
+"""Minimal limit of the points per 3-D cloud: normals cannot be estimated in sparse clouds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,15 +59,15 @@ class ScanPairs:
     Parameters
     ----------
     apart : (n,)
-        Key scans from one to the other.
+        Difference of their key-scan indices.
     seconds, metres, turn : (n,)
-        In motion, driven, and turned (with its sign), by the odometry between them; ``turned`` without sign.
+        Time in motion, distance and signed angle of the odometry between them; ``turned``: sum of absolute angles.
     chord : (n,)
-        Way between them by the match, in the direction of the odometry [m].
+        Translation of the match, projected onto the direction of the odometry displacement [m].
     stated_heading, stated_along : (n,)
-        Variances of the odometry between them, as the log or the front end states them [rad², m²].
+        Variances of the odometry between them, from the log or the front end [rad², m²].
     heading, along, side : (n,)
-        Odometry less match [rad, m, m].
+        Odometry minus match [rad, m, m]; ``side`` is a magnitude.
     """
 
     apart: Array
@@ -83,7 +83,7 @@ class ScanPairs:
     side: Array
 
     def take(self, keep: Array) -> ScanPairs:
-        """Some of them."""
+        """Subset of the pairs."""
         return ScanPairs(**{k: getattr(self, k)[keep] for k in self.__dataclass_fields__})
 
     def __len__(self) -> int:
@@ -91,7 +91,7 @@ class ScanPairs:
 
 
 def matched_pairs(steps: Steps, most: int) -> ScanPairs:
-    """Pairs of key scans spread over the log, at most ``most`` of each distance."""
+    """Matched pairs of key scans spread over the log, at most ``most`` for each index difference."""
     o = steps.odometry
     g = group_of(o.increments)
     d = np.linalg.norm(g.log(o.increments)[:, g.position], axis=1)
@@ -139,7 +139,7 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
             shift = e[g.position]
             along = float(shift @ start)
             side = float(np.linalg.norm(shift - along * start)) / math.sqrt(steps.dim - 1)
-            # the way that the match says: noise in the regressor would make the scale too large
+            # translation of the match, not of the odometry: noise in the regressor would bias the scale
             chord = float(np.asarray(found.T_target_source[: steps.dim]) @ direction)
             gone = [float(s[b] - s[a]) for s in sums]
             rows.append([apart, *gone, chord, float(e[g.heading]), along, side])
@@ -154,18 +154,18 @@ def matched_pairs(steps: Steps, most: int) -> ScanPairs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Regression:
-    """Errors as a linear function of constants, with noise that grows in several ways.
+    """Errors as a linear function of constants, with noise that has several growing parts.
 
     Parameters
     ----------
     value : (p,)
     covariance : (p, p)
     sigmas : (1 + s,)
-        Noise of a match, then of each way in which it grows.
+        σ of a match, then of each growing part.
     score : float
-        Negative log likelihood [nats].
+        Negative log-likelihood [nats].
     keep : (n,) bool
-        Not trimmed.
+        Errors that were not trimmed.
     """
 
     value: Array
@@ -176,16 +176,16 @@ class Regression:
 
 
 def regress_errors(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Regression:
-    """Greatest Student likelihood of errors ``(n,)`` with design ``(n, p)`` and variances ``c² + grows · s²``.
+    """Maximum Student likelihood of errors ``(n,)`` with design ``(n, p)`` and variances ``c² + grows · s²``.
 
     Parameters
     ----------
     e : (n,)
     A : (n, p)
     grows : (n, s)
-        What each further variance is multiplied by.
+        Factors of the variances s².
     trim : float
-        Errors of more σ are left out, and the rest fitted again; 0: none.
+        Residuals above this many σ are removed, and the rest is fitted again; 0: no trimming.
     """
     spread = max(1.4826 * float(np.median(np.abs(e - np.median(e)))), 1e-5)
     start = np.concatenate([[spread**2], spread**2 / np.maximum(2.0 * grows.mean(axis=0), 1e-9)])
@@ -220,7 +220,7 @@ def regress_errors(e: Array, A: Array, grows: Array, *, trim: float = 4.0) -> Re
             break
         keep = inside
     covariance = np.asarray(np.linalg.pinv(H) if A.shape[1] else np.zeros((0, 0)), dtype=np.float64)
-    # a Student variable of scale 1 varies by more than 1
+    # σ of a Student variable is its scale times √(ν / (ν - 2))
     return Regression(
         value=c, covariance=covariance, sigmas=np.exp(x) * math.sqrt(FREEDOM / (FREEDOM - 2.0)), score=score, keep=keep
     )
@@ -230,12 +230,12 @@ HEADING = ("yaw_bias", "turn_per_metre", "turn_scale")
 
 
 def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
-    """What the scans of a log say of its odometry.
+    """Estimate odometry noise and constants from scan matches.
 
     Parameters
     ----------
     steps : Steps
-        With the odometry as it was recorded.
+        Steps with the recorded odometry, not corrected by scan matching.
     """
     most = 200 if effort.windows is not None and effort.windows <= 20 else 1000
     most = max(int(most * effort.poses / 2000) if most == 200 else most, 40)
@@ -259,14 +259,14 @@ def calibrate_scans(steps: Steps, effort: CalibrationBudget) -> Calibration:
 def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Prediction:
     """Two-fold cross-validation: matches of one half of the log under the estimate of the other half.
 
-    Blocks of the log take turns: each is predicted from those of the other kind.
+    The halves are alternating blocks of :data:`BLOCK` matches.
 
     Parameters
     ----------
     found : Calibration
-        Whose applied constants are asked; each half estimates them anew.
+        Its applied constants are tested; each half estimates them again.
     widen : bool
-        The noise is at least what the log states.
+        The noise is at least that of the log.
     """
     applied = {e.name for e in found.estimates if e.applied}
     turning, along = (
@@ -296,7 +296,7 @@ def cross_validate(p: ScanPairs, found: Calibration, *, widen: bool) -> Predicti
 
 
 def student_likelihood(e: Array, variances: Array) -> float:
-    """Negative log likelihood of errors ``(n,)`` under Student's distribution with these variances [nats]."""
+    """Negative log-likelihood of errors ``(n,)`` under a Student distribution with these variances [nats]."""
     v = variances * (FREEDOM - 2.0) / FREEDOM
     constant = gammaln(0.5 * FREEDOM) - gammaln(0.5 * (FREEDOM + 1.0)) + 0.5 * math.log(FREEDOM * math.pi)
     terms = 0.5 * (FREEDOM + 1.0) * np.log1p(e**2 / (FREEDOM * v)) + 0.5 * np.log(v)
@@ -304,7 +304,7 @@ def student_likelihood(e: Array, variances: Array) -> float:
 
 
 def _match_noise(e: Array, stated: Array) -> float:
-    """σ of a match that makes errors likeliest whose other noise is as stated."""
+    """Maximum-likelihood σ of a match for given variances of the odometry."""
     found = minimize_scalar(
         lambda x: student_likelihood(e, math.exp(2.0 * x) + stated), bounds=_MATCHES, method="bounded"
     )
@@ -352,7 +352,7 @@ def _heading(p: ScanPairs) -> tuple[list[Estimate], list[Finding], dict[str, flo
 
 
 def _gated(name: str, full: Regression, parts: list[Regression], k: int, gain: float) -> Estimate:
-    """Near and far pairs must agree with each other; the estimate is that of all."""
+    """Estimate from all pairs; near and far pairs must agree with each other."""
     near, far = ((float(r.value[k]), math.sqrt(r.covariance[k, k])) for r in parts)
     value, sd = float(full.value[k]), math.sqrt(full.covariance[k, k])
     agree = abs(near[0] - far[0]) <= max(AGREE * math.hypot(near[1], far[1]), 0.15 * abs(value))
@@ -361,7 +361,7 @@ def _gated(name: str, full: Regression, parts: list[Regression], k: int, gain: f
 
 
 def _distance(p: ScanPairs) -> tuple[Estimate, dict[str, float]]:
-    """Scale of the distances, and the noise along and to the side."""
+    """Scale of the distances, and longitudinal and lateral noise."""
     grows = p.metres[:, None]
     A = p.chord[:, None]
     full = regress_errors(p.along, A, grows)
@@ -371,7 +371,7 @@ def _distance(p: ScanPairs) -> tuple[Estimate, dict[str, float]]:
         keep = full.keep
         gain = regress_errors(p.along[keep], A[keep][:, :0], grows[keep], trim=0).score - full.score
     raw = _gated("distance_scale", full, parts, 0, gain)
-    # odometry less match over match is the factor less 1
+    # (odometry - match) / match is the factor minus 1
     value = math.log1p(max(raw.value, -0.9))
     scale = Estimate(
         **{k: getattr(raw, k) for k in raw.__dataclass_fields__ if k not in ("value", "other")},

@@ -1,4 +1,4 @@
-"""Stretches in which wheels slip: distances that contradict the sightings for about a second."""
+"""Detection of wheel slip: intervals of about a second whose odometry distances contradict the observations."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from graphslam.core.findings import Finding
 
 Stretches = tuple[tuple[float, float], ...]
 LONG = 1.0
-"""Length of a stretch [s]."""
+"""Length of an interval [s]."""
 CHANCE = 0.005
-"""Probability that one is found in a log whose noise is Gaussian and known; the scale that is estimated of 150 of them
-makes it three times as large."""
+"""Probability of a false detection in a log with known Gaussian noise; about three times larger if the scale is
+estimated from 150 intervals."""
 ROUNDS = 4
-"""Fits at most: slip inflates the noise that it is compared with, and what was found is left out of the next."""
+"""Maximal number of fits: slip inflates the noise of the test, so the fit is repeated without the found intervals."""
 
 
 def find_slips(s: Smoothing) -> Stretches:
-    """Stretches ``(begin, end)`` whose distances contradict sightings [s], none overlapping another.
+    """Disjoint intervals ``(begin, end)`` whose distances contradict the observations [s].
 
-    The statistic is the χ² that goes if the distances of a stretch are left out. Its scale is that of its median over
-    all stretches, which few bursts do not move: fitted noise is inflated by them.
+    The statistic is the decrease of χ² without the distances of an interval. Its threshold is scaled by its median over
+    all intervals, because slip inflates the fitted noise, but changes the median little.
     """
     if not s.windows:
         return ()
@@ -48,7 +48,7 @@ def find_slips(s: Smoothing) -> Stretches:
 
 
 def with_untested(slips: Stretches, seen: SightingLog) -> Stretches:
-    """Wheels that slip may slip where no sighting tells: second by second before the first one and after the last."""
+    """If there are slips, add intervals before the first and after the last observation: slip there is unobservable."""
     if not slips:
         return ()
     out, s = list(slips), seen.sightings

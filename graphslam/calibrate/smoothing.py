@@ -1,7 +1,7 @@
-"""One smoothing of a log in windows, and the likelihood of its noise with poses and landmarks integrated out.
+"""Smoothing of a log in windows, and the marginal likelihood of its noise (poses and landmarks integrated out).
 
-Every window is a chain of poses with landmarks of its own; constants (biases, scales, angles) are shared by all. With
-Laplace's approximation the negative log likelihood of the standard deviations is
+Each window is a chain of poses with separate landmarks; all windows share the constants (biases, scales, angles). With
+Laplace's approximation the negative log-likelihood of the standard deviations is
 
     ½ χ² + ½ ln det H + Σ ln σ
 
@@ -30,9 +30,9 @@ CONSTANTS = (
     "range_offset",
     "sensor_yaw",
 )
-"""In the order of the kernels: rad/s, ln, rad/m, rad/rad, share, m, rad."""
+"""In the order of the kernels: rad/s, ln of the factor, rad/m, rad/rad, factor - 1, m, rad."""
 PRIOR = np.array([0.1, 0.2, 0.1, 0.2, 0.2, 0.5, 0.2])
-"""σ of each before the log was looked at."""
+"""Prior σ of each constant."""
 SIGMAS = (
     "along_metre",
     "along_second",
@@ -49,37 +49,37 @@ SIGMAS = (
 )
 """In the order of the kernels: m/√m, m/√s, m/√m, rad/√m, rad/√rad, rad/√s, m, rad, m, rad, m, rad."""
 CHI2_CLASS = dict(zip(SIGMAS, (0, 0, 1, 2, 2, 2, 3, 4, 3, 4, 0, 2)))
-"""Class of the residuals that each one weights, as the kernels count them."""
+"""Class of the residuals that each σ weights: index in ``Work.chi2``."""
 START = {
     **{"along_metre": 0.05, "along_second": 0.02, "lateral_metre": 0.03, "heading_metre": 0.01},
     **{"heading_radian": 0.02, "heading_second": 0.005, "range": 0.2, "bearing": 0.02},
     **{"visit_range": 0.1, "visit_bearing": 0.01, "floor_position": 1e-3, "floor_heading": 1e-4},
 }
 WIDTH = 2.0
-"""σ of the logarithm of a standard deviation before the log was looked at, about its start."""
+"""Prior σ of the logarithm of each standard deviation about :data:`START`."""
 
 
 @dataclass(slots=True)
 class SmoothingWindow:
-    """A stretch of the log with a frame and landmarks of its own.
+    """A part of the log with a separate frame and separate landmarks.
 
     Parameters
     ----------
     times : (n,)
         Stamps of the poses [s].
     steps : (n, 8)
-        dx, dy, turn, seconds in motion, metres, from the pose before; row 0 is zero. Then variances that stand in place
-        of the model's, where they are above 0.
+        dx, dy, turn, seconds in motion, metres, from the previous pose; row 0 is zero. Then variances that replace
+        those of the noise model if they are above 0.
     first : (n + 1,) int64
-        Sightings of pose k are rows ``first[k]:first[k + 1]``.
+        Observations of pose k are rows ``first[k]:first[k + 1]``.
     sightings : (q, 2)
-        Range and bearing; NaN where there is no bearing.
+        Range [m] and bearing [rad]; NaN where there is no bearing.
     slots : (q, 2) int64
-        Landmark, and visit or -1, as a row of ``nuisance``.
+        Landmark, and visit or -1, as row indices of ``nuisance``.
     kinds : (M,) int64
         0 a landmark, 1 a visit.
     rows : (q,) int64
-        Of the sightings in the stream.
+        Index of each observation in the stream.
     poses : (n, 3)
     nuisance : (M, 2)
     """
@@ -97,19 +97,19 @@ class SmoothingWindow:
 
 @dataclass(slots=True)
 class Smoothing:
-    """Windows, their states, and what is shared by all.
+    """Windows with their states, and the constants and σ that all windows share.
 
     Parameters
     ----------
     sensor : (3,)
-        Sensor in the base.
+        Pose of the sensor in the base frame.
     free : tuple of str
-        Constants that are estimated; the others are held.
+        Constants that are estimated; the others are fixed.
     constants : (7,)
     sigmas : mapping of str to float
         All of :data:`SIGMAS`.
     fitted : tuple of str
-        Those that are estimated.
+        Standard deviations that are estimated.
     """
 
     windows: list[SmoothingWindow]
@@ -122,7 +122,7 @@ class Smoothing:
     _memory: list[K.Work] = field(default_factory=list)
 
     def copy(self, **changes: object) -> Smoothing:
-        """The same state, to be changed on its own."""
+        """Copy with independent states."""
         windows = [replace(w, poses=w.poses.copy(), nuisance=w.nuisance.copy()) for w in self.windows]
         return replace(
             self,
@@ -158,14 +158,14 @@ class Smoothing:
         return logdet, volume, np.triu(S) + np.triu(S, 1).T, chi2
 
     def _with_prior(self, S: Array) -> tuple[Array, Array, float]:
-        """Information and right side of the free constants, and χ² with their prior."""
+        """Information matrix and right-hand side of the free constants, and χ² with their prior."""
         i = self._index
         W = 1.0 / PRIOR[i] ** 2
         H = S[np.ix_(i, i)] + np.diag(W)
         return H, S[i, K.RHS] - W * self.constants[i], float(S[K.RHS, K.RHS] + np.sum(W * self.constants[i] ** 2))
 
     def objective(self, sigmas: Mapping[str, float] | None = None) -> float:
-        """Negative log likelihood at the optimum of the problem linearised where the states are [nats]."""
+        """Negative log-likelihood at the optimum of the problem linearised at the current states [nats]."""
         if sigmas is not None:
             kept, self.sigmas = self.sigmas, {**self.sigmas, **sigmas}
             try:
@@ -183,13 +183,13 @@ class Smoothing:
         return value if np.isfinite(value) else 1e12
 
     def total(self) -> float:
-        """χ² of all residuals and priors where the states are."""
+        """χ² of all residuals and priors at the current states."""
         _, _, _, chi2 = self._eliminated(self._parameters())
         i = self._index
         return float(chi2.sum() + np.sum((self.constants[i] / PRIOR[i]) ** 2))
 
     def gain_without_distances(self, count: int, every: int = 1) -> list[Array]:
-        """χ²(count) if the noise is right: what goes if ``count`` distances, from each ``every`` steps on, are free."""
+        """Decrease of χ² without ``count`` distances from each ``every``-th step on; χ²(count) for the true noise."""
         p, out = self._parameters(), []
         for w, work in zip(self.windows, self._buffers()):
 
@@ -207,7 +207,7 @@ class Smoothing:
         return out
 
     def settle(self, iterations: int = 20, tolerance: float = 1e-3) -> float:
-        """Gauss-Newton with Levenberg's damping where a step fails; returns χ²."""
+        """Gauss-Newton, with Levenberg-Marquardt damping after a failed step; returns χ²."""
         p, damping = self._parameters(), 0.0
         i = self._index
         value = np.inf
@@ -243,10 +243,10 @@ class Smoothing:
         return value
 
     def fit(self, *, rounds: int = 4, budget: int = 400, tolerance: float = 0.05) -> float:
-        """Standard deviations of greatest likelihood, states and constants with them; returns the objective.
+        """Maximum-likelihood standard deviations, with states and constants; returns the objective.
 
-        The search is that of the problem linearised at the states, which then settle under what it found; a few
-        rounds of that do.
+        Each round minimises the objective of the problem linearised at the states, then updates the states with the
+        standard deviations found.
         """
         self.settle()
         names = list(self.fitted)
@@ -265,7 +265,7 @@ class Smoothing:
                 options={
                     "eps": 1e-3 * scale,
                     "ftol": tolerance / max(abs(value), 1.0),
-                    # in units of scale the Hessian is about 1: half the square of the gradient is what can be won
+                    # in units of scale the Hessian is about 1: half the squared gradient is the possible decrease
                     "gtol": np.sqrt(2.0 * tolerance / len(names)),
                     "maxfun": budget,
                     "maxls": 10,
@@ -281,7 +281,7 @@ class Smoothing:
         return value
 
     def _fisher_scale(self, names: list[str]) -> Array:
-        """Root of the Fisher information of the logarithm of each standard deviation, about 2 χ² of its residuals."""
+        """√ of the Fisher information of ln σ of each standard deviation: about 2 χ² of its residuals, plus prior."""
         chi2 = self._eliminated(self._parameters())[3]
         return np.array([np.sqrt(2.0 * chi2[CHI2_CLASS[s]] + WIDTH**-2) for s in names])
 
@@ -293,7 +293,7 @@ class Smoothing:
             self.covariance[np.ix_(i, i)] = np.linalg.inv(H)
 
     def residuals(self) -> list[Array]:
-        """Whitened residuals of sightings ``(q, 2)``, NaN without a bearing, by window."""
+        """Whitened residuals of the observations ``(q, 2)`` per window; NaN without a bearing."""
         g, s = self.constants, self.sigmas
         seen = []
         for w in self.windows:
@@ -311,7 +311,7 @@ class Smoothing:
 
 
 def most_open_nuisances(w: SmoothingWindow) -> int:
-    """The most nuisances of a window that were sighted already and will be sighted again."""
+    """Maximal number of nuisances of a window that are active at one pose (between first and last observation)."""
     k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))
     change = np.zeros(len(w.poses) + 1, dtype=np.int64)
     for j in range(len(w.nuisance)):
@@ -323,7 +323,7 @@ def most_open_nuisances(w: SmoothingWindow) -> int:
 
 
 def keep_sightings(smoothing: Smoothing, keep: Sequence[npt.NDArray[np.bool_]]) -> Smoothing:
-    """The smoothing without some of its sightings; what is seen less than twice then is no landmark."""
+    """The smoothing with a subset of its observations; windows with at most 3 observations are dropped."""
     windows = []
     for w, good in zip(smoothing.windows, keep):
         windows.append(rebuild_window(w, good))
@@ -331,7 +331,7 @@ def keep_sightings(smoothing: Smoothing, keep: Sequence[npt.NDArray[np.bool_]]) 
 
 
 def rebuild_window(w: SmoothingWindow, good: npt.NDArray[np.bool_]) -> SmoothingWindow:
-    """A window with some of its sightings, nuisances renumbered in the order in which they are seen first."""
+    """A window with a subset of its observations; drops landmarks with fewer than 2 (4 in range-only windows)."""
     good = good.copy()
     landmark = w.slots[:, 0]
     least = 2 if np.isfinite(w.sightings[:, 1]).any() else 4
@@ -353,7 +353,7 @@ def rebuild_window(w: SmoothingWindow, good: npt.NDArray[np.bool_]) -> Smoothing
 
 
 def renumber_slots(slots: Ints) -> tuple[Ints, Ints]:
-    """Slots ``(q, 2)`` numbered in the order of their first sighting, and the old number of each new one."""
+    """Slots ``(q, 2)`` renumbered in the order of their first observation, and the old number of each new one."""
     flat = slots.ravel()
     names, first, inverse = np.unique(flat, return_index=True, return_inverse=True)
     order = np.argsort(first)

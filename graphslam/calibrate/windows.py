@@ -1,4 +1,4 @@
-"""Windows of a log: its motion between the stamps of sightings, and tracks of landmarks that live in one window."""
+"""Windows of a log: motion between the stamps of observations, and landmark tracks within each window."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from graphslam.core.records import LandmarkObservations, Odometry, VelocityContr
 from graphslam_frontends.odometry.motion import Motion, MotionNoise, dead_reckoned_increments, motion_stream
 
 LONGEST = 1.0
-"""A pause of the motion records that is thrice the usual one, and longer than this, ends a window [s]."""
+"""A gap between motion records longer than this and than three times the median period ends a window [s]."""
 _HOLD = 0.5
 HELD, EVERY = 2.5, 20.0
-"""Of every twenty seconds the sightings of so many are withheld from an estimate, to be foretold by it [s]. That is
-shorter than what ends a visit."""
+"""Observations of the last HELD of every EVERY seconds are withheld for cross-validation [s]; this is shorter than the
+gap that ends a visit."""
 
 
 @dataclass(frozen=True, slots=True)
 class SightingLog:
-    """The motion and the sightings of a log, ready to be cut into windows.
+    """Motion and observations of a log, to be cut into windows.
 
     Parameters
     ----------
     name : str
-        Of the stream of sightings.
-    clock : Array
-        Stamps of the motion's records, and at them the seconds in motion and the metres since the first (3, r).
+        Name of the stream of observations.
+    clock : (3, r)
+        Stamps of the motion records [s], with accumulated seconds in motion and metres driven.
     withheld : (q,) bool, optional
-        Sightings that no window has; None: all are there.
+        Observations that are excluded from the windows; None: no observation is excluded.
     stated : MotionNoise, optional
-        Windows have the variances of the motion that the log states, with this noise of controls; None: no variances.
+        If given, windows have the motion variances of the log, computed with this noise for controls.
     slips : tuple of (float, float)
-        Stretches in which the wheels slipped, in the clock of the motion [s].
+        Intervals of wheel slip, in the clock of the motion [s].
     """
 
     log: SensorLog
@@ -52,29 +52,29 @@ class SightingLog:
 
     @classmethod
     def of(cls, log: SensorLog, name: str, sightings: LandmarkObservations) -> SightingLog:
-        """Of a log whose sightings are in the stream ``name``, or were detected in it."""
+        """From a log whose observations are in the stream ``name``, or were detected in it."""
         _, motion = motion_stream(log)
         return cls(log, name, sightings, cumulative_motion(motion))
 
     def mended(self, c: Corrections) -> SightingLog:
-        """The same with corrections applied, and what is withheld."""
+        """Copy with corrections applied; the same observations are withheld."""
         made = SightingLog.of(apply_corrections(self.log, c), self.name, corrected_sightings(self.sightings, c))
         return replace(made, withheld=self.withheld, stated=self.stated)
 
     def holding(self) -> SightingLog:
-        """The same without the sightings of some seconds now and then."""
+        """Copy with some observations withheld: the last :data:`HELD` of every :data:`EVERY` seconds."""
         s = self.sightings
         times = np.repeat(s.times, np.diff(s.offsets))
         return replace(self, withheld=np.mod(times - self.span[0], EVERY) > EVERY - HELD)
 
     @property
     def span(self) -> tuple[float, float]:
-        """Over which there is motion [s]."""
+        """First and last stamp of the motion [s]."""
         return float(self.clock[0, 0]), float(self.clock[0, -1])
 
     @property
     def period(self) -> float:
-        """Usual time between records of the motion [s]."""
+        """Median time between motion records [s]."""
         return float(np.median(np.diff(self.clock[0])))
 
     def steps(self, stamps: Array, shift: float = 0.0) -> Array:
@@ -83,9 +83,9 @@ class SightingLog:
         Parameters
         ----------
         stamps : (n,)
-            Of the sightings.
+            Stamps of the observations [s].
         shift : float
-            The motion's clock is ahead of that of the sightings by it [s].
+            Clock of the motion minus clock of the observations [s].
         """
         t = np.asarray(stamps) + shift
         odometry, _ = dead_reckoned_increments(self.log, t, self.stated or MotionNoise(), hold=_HOLD + abs(shift))
@@ -100,14 +100,14 @@ class SightingLog:
         return out
 
     def breaks(self) -> Array:
-        """Stamps after which the motion has a gap, and those at which it ends ``(k, 2)``."""
+        """Begin and end of the gaps in the motion ``(k, 2)`` [s]."""
         dt = np.diff(self.clock[0])
         k = np.flatnonzero(dt > max(3.0 * float(np.median(dt)), LONGEST))
         return np.column_stack([self.clock[0, k], self.clock[0, k + 1]])
 
 
 def cumulative_motion(motion: Motion) -> Array:
-    """Stamps of the motion's records, seconds in motion and metres driven until each ``(3, r)``."""
+    """Stamps of the motion records, with accumulated seconds in motion and metres driven ``(3, r)``."""
     t = motion.times
     dt = np.diff(t)
     if isinstance(motion, Odometry):
@@ -127,21 +127,21 @@ def cumulative_motion(motion: Motion) -> Array:
 def cut_windows(
     seen: SightingLog, seconds: float, count: int | None = None, *, visits: bool = False
 ) -> list[SmoothingWindow]:
-    """Windows of a length.
+    """Cut a log into windows of ``seconds``.
 
     Parameters
     ----------
     count : int, optional
-        At most so many, spread over the log; all by default.
+        Maximal number of windows, spread over the log; default: all.
     visits : bool
-        With a constant for each visit of a landmark.
+        Add a constant for each visit of a landmark.
     """
     made = (make_window(seen, scans, visits=visits) for scans in window_scans(seen, seconds, count))
     return [w for w in made if w is not None]
 
 
 def window_scans(seen: SightingLog, seconds: float, count: int | None = None) -> list[Ints]:
-    """Scans of each window that :func:`cut_windows` makes."""
+    """Indices of the scans in each window of :func:`cut_windows`."""
     s, (begin, end) = seen.sightings, seen.span
     used = np.flatnonzero((np.diff(s.offsets) > 0) & (s.times >= begin - _HOLD) & (s.times <= end + _HOLD))
     if len(used) < 5:
@@ -167,7 +167,7 @@ def window_scans(seen: SightingLog, seconds: float, count: int | None = None) ->
 
 
 def make_window(seen: SightingLog, scans: Ints, *, visits: bool) -> SmoothingWindow | None:
-    """Window of these scans, landmarks where the odometry puts them; None where nothing is seen twice."""
+    """Window of these scans with landmarks initialised by odometry; None with fewer than 4 usable observations."""
     s = seen.sightings
     steps = seen.steps(s.times[scans])
     poses = np.zeros((len(scans), 3))
@@ -209,16 +209,16 @@ def make_window(seen: SightingLog, scans: Ints, *, visits: bool) -> SmoothingWin
 
 
 def sighting_points(z: Array, sensor: Array) -> Array:
-    """Where sightings ``(q, 2)`` put their landmarks, from sensors ``(q, 3)``; NaN without a bearing."""
+    """Points ``(q, 2)`` of observations (range, bearing) from sensor poses ``(q, 3)``; NaN without a bearing."""
     local = np.column_stack([z[:, 0] * np.cos(z[:, 1]), z[:, 0] * np.sin(z[:, 1])])
     return np.asarray(se2_transform(sensor, local))
 
 
 def track_points(points: Array, k: Ints, *, gate: float = 1.0, ratio: float = 1.5, lost: int = 10) -> Ints:
-    """Tracks ``(q,)`` of points seen from poses ``k``: nearest, mutual, and clearly nearer than the second; -1: none.
+    """Track indices ``(q,)`` of points seen from poses ``k``, -1: none; mutual nearest neighbours with a ratio test.
 
-    A landmark stands where it was seen last by the odometry, so that a track does not need the odometry to be right for
-    longer than from one sighting to the next.
+    The position of a landmark is that of its last observation, so that only the odometry error between consecutive
+    observations matters.
     """
     track = np.full(len(points), -1, dtype=np.int64)
     place = np.zeros((0, 2))
