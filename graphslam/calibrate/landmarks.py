@@ -164,7 +164,7 @@ def _part(whole: SmoothingWindow, path: Array, places: dict[int, Array], rng: np
 
 
 def _anywhere(at: Array, r: Array, rng: np.random.Generator) -> Array:
-    """Beacon position from ranges: random choice of the best two of 24 solutions from the circle of the shortest one."""
+    """Beacon position from ranges: random choice of the best two of 24 solutions started on the shortest range."""
     i = int(np.argmin(r))
     angle = np.arange(24) * (2 * np.pi / 24)
     found = []

@@ -1,8 +1,8 @@
-"""A map as Autoware loads it: a cloud in tiles, the list of tiles, and where on the globe it lies.
+"""Writer of Autoware maps: a point cloud in tiles, the list of tiles, and the georeference.
 
-A folder with ``pointcloud_map.pcd/`` (binary PCD 0.7, one file a tile), ``pointcloud_map_metadata.yaml`` (the size of a
-tile, and the lower corner of each) and ``map_projector_info.yaml`` (``LocalCartesian`` about a datum of WGS 84: x east,
-y north, z up; or ``Local``: the frame of the map).
+A folder with ``pointcloud_map.pcd/`` (binary PCD 0.7, one file per tile), ``pointcloud_map_metadata.yaml`` (size of the
+tiles and lower corner of each), and ``map_projector_info.yaml`` (``LocalCartesian`` at a WGS 84 datum: x east, y north,
+z up; or ``Local``: the frame of the map).
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def write_autoware(
     Parameters
     ----------
     folder : path
-        Made; tiles of an earlier map in it are removed.
+        Created if missing; tiles of an earlier map in it are removed.
     points : (n, 3)
-        [m]; with a datum x east, y north, z up from it, otherwise in the frame of the map.
+        [m]; with a datum: east, north, up relative to it; otherwise in the frame of the map.
     datum : (latitude, longitude), optional
         [deg, WGS 84]; its height is 0.
     tile : float

@@ -1,4 +1,4 @@
-"""Files of bags: ROS 1, ROS 2 and MCAP, opened by the package ``rosbags`` and read message by message, without ROS."""
+"""Files of ROS 1, ROS 2 and MCAP bags, read message by message without ROS (packages ``rosbags`` and ``mcap``)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graphslam.io.source_probe import SourceProbe, plain_name
 
 @dataclass
 class BagTopic:
-    """A topic: its type, and how many messages were seen."""
+    """A topic with its message type and number of messages."""
 
     name: str
     type: str
@@ -29,16 +29,16 @@ class BagTopic:
 
 
 class McapFile(cut.RecordFile):
-    """A single MCAP file, whatever else is in it."""
+    """A single MCAP file."""
 
     def open(self) -> None:
-        """Find the topics: in the summary at the end, or else by all records."""
+        """Find the topics: from the summary at the end of the file, or else by reading all records."""
         from mcap.reader import make_reader
 
         try:
             with open(self._path, "rb") as stream:
                 summary = make_reader(stream).get_summary()
-        except Exception:  # cut off: its records may be there all the same
+        except Exception:  # a truncated file has no summary, but may have records
             summary = None
         if summary is not None and summary.statistics is not None and summary.channels:
             counts = summary.statistics.channel_message_counts
@@ -53,7 +53,7 @@ class McapFile(cut.RecordFile):
         name = str(schema.name) if schema is not None else "no schema"
         if channel.message_encoding not in ("cdr", "ros1"):
             name += f", {channel.message_encoding}"
-        elif name.count("/") == 1:  # as ROS 1 says it
+        elif name.count("/") == 1:  # type names of ROS 1
             name = name.replace("/", "/msg/")
         return cut.BagChannel(str(channel.topic), name, int(count), str(channel.message_encoding))
 
@@ -75,7 +75,7 @@ class McapFile(cut.RecordFile):
 
 
 class BagFiles:
-    """The files of a bag, opened: topics, and messages as ``(topic, bytes, bag's stamp, decode)``."""
+    """The open files of a bag: topics, and messages as ``(topic, bytes, receive time [s])``."""
 
     def __init__(self, path: Path, stack: ExitStack) -> None:
         for package in ("mcap", "rosbags"):
@@ -102,7 +102,7 @@ class BagFiles:
                 topic.count += int(c.msgcount)
 
     def _open(self, path: Path) -> None:
-        """The reader of a file: that of rosbags, or else record by record."""
+        """Open a file with the reader of rosbags or, if that fails, record by record."""
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
 
@@ -114,7 +114,7 @@ class BagFiles:
             if self.ros2 and (missing := cut.missing_pages(file)):
                 raise FormatError(missing)
             return self._add(Reader2(file) if self.ros2 else Reader1(file))
-        except Exception as error:  # MemoryError, too: a damaged length asks for more than any file holds
+        except Exception as error:  # includes MemoryError, from a damaged length field
             why = error_text(error)
         try:
             if kind == "MCAP":
@@ -138,7 +138,7 @@ class BagFiles:
         self.faults[id(reader)] = fault
 
     def messages(self, names: set[str], drops: DropCounter) -> Iterator[tuple[str, bytes, float]]:
-        """Messages of topics, in the order of the bag; a bag that ends too early ends there, which is counted."""
+        """Messages of topics, in the order of the bag, up to the end of a truncated bag, which is counted."""
         for r in self.readers:
             chosen = [c for c in r.connections if c.topic in names and c.msgtype == self.topics[c.topic].type]
             why, count, first, last = self.faults[id(r)], 0, 0, 0
@@ -158,7 +158,7 @@ class BagFiles:
                 )
 
     def decode(self, raw: bytes, kind: str) -> Any:
-        """A message; :class:`ValueError` where it cannot be decoded."""
+        """Decode a message; :class:`ValueError` if that fails."""
         try:
             if self.ros2:
                 return self.store.deserialize_cdr(raw, kind)
@@ -175,12 +175,12 @@ def error_text(error: Exception) -> str:
 def _quietly(close: Callable[[], None]) -> None:
     try:
         close()
-    except Exception:  # a reader that failed may be closed already
+    except Exception:  # a reader that failed may already be closed
         return
 
 
 def _files(path: Path) -> list[Path]:
-    """What rosbags opens: a folder with metadata.yaml, or files that are parts of one recording."""
+    """Files of one bag: a single file, the files of a folder with metadata.yaml, or the parts of one recording."""
     if path.is_file():
         return [path]
     if not path.is_dir():

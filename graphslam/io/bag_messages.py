@@ -1,4 +1,4 @@
-"""Messages of a bag by kind: which topics are read, their values, clouds on disk, and transforms between frames."""
+"""Messages of a bag by kind: choice of topics, message values, point clouds on disk, and transforms."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ WANTED = "messages of LaserScan, PointCloud2 or CustomMsg (and Odometry)"
 
 
 class FloatSpool:
-    """Rows of float32 that are written one after the other and read back as a map of memory."""
+    """Rows of float32 in a temporary file: appended, then read as a memory map."""
 
     def __init__(self, width: int) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as its map
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - must stay open for its memory map
         self._width, self.rows = width, 0
 
     def add(self, a: Array) -> None:
@@ -58,10 +58,10 @@ class FloatSpool:
 
 @dataclass
 class CloudSpool:
-    """Points of the clouds of a bag and their times, on disk while the bag is read.
+    """Points of the clouds of a bag and their times, written to disk while the bag is read.
 
-    Times are kept less the earliest of their scan, ``first`` (n,), which is NaN for scans without times; ``spans`` (n,)
-    are those between the earliest and the latest. Both in the unit of the field.
+    Times are stored relative to the earliest one of their scan, ``first`` (n,), NaN for scans without times; ``spans``
+    (n,) is latest minus earliest. All are in the unit of the message field.
     """
 
     points: FloatSpool = field(default_factory=lambda: FloatSpool(3))
@@ -78,18 +78,18 @@ class CloudSpool:
 
 
 class SpooledClouds:
-    """Clouds of a bag, in a file without a name that goes with the process; see ``CloudSource``.
+    """Clouds of a bag in temporary files that are deleted with the process; see ``CloudSource``.
 
     Parameters
     ----------
     counts : (n,) int64
-        Points of each scan.
+        Number of points of each scan.
     stamps : (n,)
-        Of the scans [s].
+        Stamps of the scans [s].
     clock : PointClock or None
-        Unit of the times of points; None: they are not used.
+        Unit and origin of the point times; None: they are not used.
     T_base_frame : (n, 7) or None
-        Pose of the frame of each cloud in the base, where that frame moves against it; None: it does not.
+        Pose of the frame of each cloud in the base, if that frame moves relative to the base; otherwise None.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class SpooledClouds:
         return self._clock.ages(times, float(self._stamps[k]))
 
     def packed(self) -> bytes:
-        """See :class:`~graphslam.core.point_clouds.CloudSource`: digests of the points."""
+        """See :class:`~graphslam.core.point_clouds.CloudSource`: a digest of points, times and poses."""
         d = hashlib.blake2b(self._bounds.tobytes(), digest_size=32)
         T = self._T_base_frame
         for a in (self._points, self._times, self._first, *(() if T is None else (T,))):
@@ -133,7 +133,7 @@ class SpooledClouds:
 def choose_topics(
     bag: BagFiles, asked: dict[str, str | None], notes: list[str], counter: DropCounter
 ) -> dict[str, BagTopic]:
-    """The topic of each kind."""
+    """The topic of each kind: the requested one, or else by :func:`_rank` and number of messages."""
     there: dict[str, list[BagTopic]] = {}
     for t in bag.topics.values():
         kind = KINDS.get(t.type)
@@ -151,7 +151,7 @@ def choose_topics(
             ranked = [(_rank(kind, t.name), -t.count, t.name, t) for t in there[kind]]
             chosen[kind] = min(ranked, key=lambda row: row[:3])[3]
     if asked["clouds"] is None and asked["laser"] is None and {"clouds", "laser"} <= chosen.keys():
-        # a depth camera beside a laser is no lidar; else the sensor that sees more is taken
+        # clouds that are probably no lidar (depth camera) give way to a laser; otherwise clouds are used
         cloud_topic: BagTopic = chosen["clouds"]
         del chosen["clouds" if _rank("clouds", cloud_topic.name) else "laser"]
     if asked["laser"] not in (None, "none") and asked["clouds"] is None:
@@ -174,7 +174,7 @@ def choose_topics(
 
 
 def _rank(kind: str, topic: str) -> int:
-    """0: the raw stream of a sensor; 1: probably something made of it."""
+    """0: the raw stream of a sensor; 1: probably derived data."""
     name = topic.lower()
     if kind == "clouds":
         return int(bool(_NO_LIDAR.search(name)))
@@ -184,7 +184,7 @@ def _rank(kind: str, topic: str) -> int:
 def collect_messages(
     bag: BagFiles, chosen: dict[str, BagTopic], counter: DropCounter
 ) -> tuple[FrameTree, dict[str, TopicRows], CloudSpool | None]:
-    """All messages of the chosen topics, points in a spool."""
+    """Read all messages of the chosen topics; points are written to a :class:`CloudSpool`."""
     kind_of = {t.name: k for k, t in chosen.items()}
     transforms = {t.name for t in bag.topics.values() if t.type in TRANSFORMS}
     frames, rows = FrameTree(), {k: TopicRows() for k in chosen}

@@ -1,15 +1,15 @@
 """Bags of ROS 1 and ROS 2 and MCAP files, read by the package ``rosbags``, without ROS.
 
-Read are ``LaserScan``, ``PointCloud2``, Livox ``CustomMsg``, ``Imu``, ``Odometry``, ``NavSatFix`` and the transforms of
-``tf_static`` (and those of ``tf`` that never change). Of several topics of one kind that with most messages is taken,
-which an option replaces; the log's notes say which, and what else there is. Other messages are counted by type.
+It reads ``LaserScan``, ``PointCloud2``, Livox ``CustomMsg``, ``Imu``, ``Odometry``, ``NavSatFix``, and the transforms
+of ``tf_static`` and ``tf``. If several topics have the same kind, raw data are preferred, then the topic with most
+messages; options select another one. The notes of the log list the choice. Other messages are counted by type.
 
-* Stamps are those of the headers; where a driver leaves them at zero, those of the bag.
-* Odometry comes from ``Odometry``, or else from the transform of an ``odom`` frame to the robot; in a log of a planar
-  laser it is planar. Its covariance is a part of the way driven (options): what messages state is seldom meant.
-* The base is the frame that odometry moves, or else that of the clouds. A sensor without a known place sits in the
-  base, which is said; an IMU without one is left out.
-* Fixes without status or with impossible places are dropped and counted; positions are east, north, up at the first.
+* Stamps are those of the headers, or receive times of the bag if the headers have none.
+* Odometry is from ``Odometry``, or else from the transform of an ``odom`` frame to the robot; with a planar laser it is
+  planar. Its covariance grows with distance and rotation (options); covariances of the messages are not used.
+* The base is the child frame of odometry, or else a usual base frame, or that of the scanner. A scanner without a known
+  mounting is assumed at the base, with a note; an IMU without one is not used.
+* GPS messages without a fix or with impossible positions are dropped and counted; positions are ENU at the first fix.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ from graphslam.io.planar_scans import unify_layout
 from graphslam.io.point_times import PointTimes, choose_point_times
 
 FIX_SIGMA = 5.0
-"""σ of a fix whose message says nothing of it [m]."""
+"""σ of a fix without a usable covariance [m]."""
 FAR = 1000.0
-"""No fix closer than this to the middle of all is left out as far from them [m]."""
+"""A fix closer than this to the median of all is never dropped as too far away [m]."""
 FEWEST_FIXES = 5
-"""Of fewer it is not decided which are far."""
-_MOST_FAR = 3600.0  # [s] between stamps of headers and of the bag, beyond which it is said
+"""With fewer fixes, none is dropped as too far away."""
+_MOST_FAR = 3600.0  # [s] a larger difference between stamps of headers and of the bag is noted
 
 
 @dataclass(frozen=True, slots=True)
 class BagTopics:
-    """Topics of a bag by kind; ``none`` leaves a kind out, None takes the one with most messages, raw ones first.
+    """Topics of a bag by kind; ``none``: do not read this kind; None: prefer raw data, then most messages.
 
-    Odometry may also be ``tf:FRAME``: the transform that moves in this frame.
+    Odometry may also be ``tf:FRAME``: the moving transform with this parent frame.
     """
 
     clouds: str | None = None
@@ -92,18 +92,18 @@ def read_bag(
     path : path
         A ``.bag``, ``.db3`` or ``.mcap`` file, or a folder with one bag.
     topics : BagTopics
-        Which are read.
+        Topics to read.
     base_frame : str, optional
         Frame of the robot.
     mount : (6,), optional
-        Place of the scanner in the base, instead of what transforms say: x, y, z [m], roll, pitch, yaw [rad].
+        Pose of the scanner in the base, replaces the transforms: x, y, z [m], roll, pitch, yaw [rad].
     point_times : bool
-        Use times of points, where clouds have them.
+        Use the times of points, if clouds have them.
     max_range : float, optional
-        Of a planar laser [m], instead of what its messages say.
+        Maximal range of a planar laser [m], replaces that of its messages.
     accelerometer_unit : {"m/s2", "g"}
     noise : OdometryNoise
-        Of the odometry.
+        Noise of the odometry.
     """
     if max_range is not None and not (np.isfinite(max_range) and max_range > 0):
         raise ConfigError(f"bag: max_range is {max_range}; wanted a positive number")
@@ -150,11 +150,11 @@ class _BagLog:
     Parameters
     ----------
     where : str
-        Path of the bag, for messages.
+        Path of the bag, for error messages.
     rows : dict of str to TopicRows
-        By kind.
+        Message values by kind.
     counter, notes
-        What was dropped and said so far; added to.
+        Dropped records and notes so far; both are extended.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class _BagLog:
         self._times: dict[str, Array] = {}
 
     def _stamps(self, kind: str) -> Array:
-        """Stamps of headers; of the bag where headers have none."""
+        """Stamps of the headers [s], or receive times of the bag if the headers have none."""
         if kind not in self._times:
             self._times[kind] = self._choose_stamps(kind)
         return self._times[kind]
@@ -183,7 +183,7 @@ class _BagLog:
         return t
 
     def moving(self, parent: str | None) -> TopicRows | None:
-        """Odometry from the transforms, or None."""
+        """Odometry from the moving transforms, or None."""
         key = self.frames.odometry({self.rows[k].frame for k in ("clouds", "laser") if k in self.rows}, parent)
         if key is None:
             if parent is not None:
@@ -226,7 +226,7 @@ class _BagLog:
         return found
 
     def _kept(self, kind: str, bad: dict[str, Any]) -> tuple[Array, Any]:
-        """Stamps, and which records are kept; ROS sends some twice and some late."""
+        """Stamps of the kept records, and their mask. Half may be dropped: ROS repeats and delays some messages."""
         times = self._stamps(kind)
         keep = usable_records(times, bad, stream=kind, where=f"{self.where}, {kind}", drops=self.counter, limit=0.5)
         return times[keep], keep
@@ -238,7 +238,7 @@ class _BagLog:
         stamps, frame = self._stamps("clouds"), self.rows["clouds"].frame
         fixed = mount is not None or self.frames.know(self.base, frame)
         T = None if fixed else self.frames.moving_place(self.base, frame, stamps)
-        if T is not None:  # the driver has already put the points together in that frame
+        if T is not None:  # the driver has already transformed all points to that frame
             self.moved.append("clouds")
             self.notes.append(f"clouds in {frame!r}, which moves: brought to {self.base!r} by the transforms")
         self.point_times = choose_point_times(spool.spans if timed and T is None else (), stamps)
@@ -267,7 +267,7 @@ class _BagLog:
                 odd[k] = True
                 scans.append((np.zeros(2, np.float32), np.array([0.0, 1.0])))
                 continue
-            if up < 0:  # hung upside down: what turns left for it turns right for the robot
+            if up < 0:  # upside-down mounting reverses the sense of rotation
                 start, step = -start, -step
             beams = known.setdefault((start, step, n), np.sort(start + step * np.arange(n)))
             seen = np.where(np.isfinite(ranges) & (ranges >= max(low, 0.0)) & (ranges > 0), ranges, np.nan)
@@ -365,14 +365,14 @@ class _BagLog:
 
 
 def far_fixes(llh: Array, usable: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Fixes ``(n,)`` that are far from all others: receivers report such places before they have a solution.
+    """Mask of fixes ``(n,)`` that are far from all others: receivers report such positions before they have a solution.
 
     Parameters
     ----------
     llh : (n, 3)
         Latitude, longitude [deg], height [m].
     usable : (n,)
-        Those that are compared.
+        Mask of the fixes that are compared.
     """
     far = np.zeros(len(llh), np.bool_)
     rows = np.flatnonzero(usable)

@@ -1,7 +1,7 @@
-"""Data-set cards: what a recorded data set is, where it comes from, its terms and the checksums of its files.
+"""Data set descriptions: content, origin, terms and file checksums of a recorded data set.
 
-A card is a TOML file in the folder ``datasets`` of the repository, which installs as ``graphslam/cards``. The format is
-described in ``datasets/README.md``. Data themselves never ship.
+A description is a TOML file in the folder ``datasets`` of the repository, which installs as ``graphslam/cards``; its
+format is in ``datasets/README.md``. The data are not part of the package.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ class CardFile:
     Parameters
     ----------
     path : str
-        Below the card's folder, with forward slashes.
+        Relative to the folder of the data set, with forward slashes.
     bytes, sha256 : int, str
-        Of the file as the card names it.
+        Size and checksum of the file ``path``.
     content_bytes, content_sha256 : int, str or None
-        Of what is inside, where the name ends in ``.gz``, ``.bz2`` or ``.xz``: the uncompressed file is as good.
+        Size and checksum of the uncompressed file, which is also accepted; for ``.gz``, ``.bz2`` and ``.xz`` only.
     url : str or None
-        Direct download of the file or, where there is a content, of the content.
+        Direct download of the file or, if there is a content checksum, of the uncompressed file.
     optional : bool
-        The set can be used without it.
+        The data set can be used without it.
     """
 
     path: str
@@ -54,13 +54,13 @@ class CardFile:
 
     @property
     def plain_path(self) -> str | None:
-        """Name of the uncompressed file, if the card knows its checksum."""
+        """Name of the uncompressed file, if its checksum is given."""
         return str(PurePosixPath(self.path).with_suffix("")) if self.content_sha256 else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CardArchive:
-    """A zip archive that holds files of the set (found by name, in any folder inside it)."""
+    """A zip archive with files of the data set (found by name, in any folder of the archive)."""
 
     url: str
     members: tuple[str, ...]
@@ -69,26 +69,26 @@ class CardArchive:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Card:
-    """What is known of a recorded data set.
+    """Description of a recorded data set.
 
     Parameters
     ----------
     kind : str
         One of :data:`KINDS`.
     folder : str
-        Below a data root.
+        Relative to a data root.
     records : str
-        What it holds, in words.
+        Content, as text.
     source, obtained_from : str
-        The original page, and where our copy came from.
+        The original page, and the source of our copy.
     caveats : tuple of str
-        Traps.
+        Known problems of the data.
     reader : str or None
         Name of a reader (:mod:`graphslam.io.readers`).
     plugin : str or None
-        Distribution that brings the reader, where graphslam itself has it not.
+        Python distribution with the reader, if it is not part of graphslam.
     options : mapping of str to float
-        What the reader must be told of this set, because its files do not say it.
+        Options of the reader that its files do not contain.
     """
 
     name: str
@@ -114,13 +114,13 @@ class Card:
         return sum(f.bytes for f in self.files)
 
     def archive_of(self, file: CardFile) -> CardArchive | None:
-        """The archive that holds a file, under its own or its uncompressed name."""
+        """The archive that contains a file, under its compressed or uncompressed name."""
         names = {PurePosixPath(p).name for p in (file.path, file.plain_path) if p}
         return next((a for a in self.archives if names & set(a.members)), None)
 
     @property
     def fetchable(self) -> bool:
-        """Can every needed file be downloaded directly?"""
+        """Can every required file be downloaded directly?"""
         return all(f.url or self.archive_of(f) for f in self.files if not f.optional)
 
     def _repr_html_(self) -> str:
@@ -136,7 +136,7 @@ class Card:
 
 
 def cards_folder() -> Path:
-    """Folder of the cards: inside the installed package, or ``datasets`` beside it in a checkout."""
+    """Folder of the descriptions: in the installed package, or ``datasets`` next to it in a checkout."""
     package = Path(graphslam.__file__).resolve().parent
     for folder in (package / "cards", package.parent / "datasets"):
         if any(folder.glob("*.toml")):
@@ -146,12 +146,12 @@ def cards_folder() -> Path:
 
 @cache
 def list_cards() -> tuple[Card, ...]:
-    """All cards, by name."""
+    """All data set descriptions, sorted by file name."""
     return tuple(read_card(p) for p in sorted(cards_folder().glob("*.toml")))
 
 
 def find_card(name: str) -> Card:
-    """The data set description of that name."""
+    """The data set description with this name."""
     known = {c.name: c for c in list_cards()}
     if name not in known:
         raise UnknownNameError("data set", name, known)
@@ -159,11 +159,11 @@ def find_card(name: str) -> Card:
 
 
 def read_card(path: Path) -> Card:
-    """Read and check one card."""
+    """Read and check one data set description."""
     where = str(path)
     try:
         content = tomllib.loads(read_text(path))
-    except (ValueError, RecursionError) as error:  # tomllib's own errors are ValueErrors
+    except (ValueError, RecursionError) as error:  # tomllib.TOMLDecodeError is a ValueError
         raise FormatError(f"not TOML ({error})", where=where) from None
     if content.pop("format", None) != CARD_FORMAT:
         raise FormatError("unknown format of a data set description", where=where, wanted=repr(CARD_FORMAT))
@@ -205,7 +205,7 @@ def _list(content: dict[str, Any], key: str, where: str) -> list[Any]:
 
 
 def _build(kind: Any, values: Mapping[str, Any], where: str) -> Any:
-    """A dataclass from a table whose keys and types must be its fields'."""
+    """A dataclass from a table; its keys and types must match the fields."""
     wanted = {f.name: str(f.type) for f in fields(kind)}
     for key, value in values.items():
         if key not in wanted:

@@ -1,8 +1,8 @@
-"""Recorded data by name: find it, check it, load it.
+"""Recorded data by name: find, check and load them.
 
-Files are looked for under the folders of the environment variable ``GRAPHSLAM_DATA``, then in the cache
-(``GRAPHSLAM_CACHE``, or the platform's cache folder for graphslam), where :func:`graphslam.io.fetch.fetch_dataset` puts
-them.
+Files are searched in the folders of the environment variable ``GRAPHSLAM_DATA``, then in the cache
+(``GRAPHSLAM_CACHE``, or the platform's cache folder for graphslam), to which
+:func:`graphslam.io.fetch.fetch_dataset` downloads.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ State = Literal["ok", "missing", "differs"]
 
 
 def cache_folder() -> Path:
-    """Where downloads go: ``GRAPHSLAM_CACHE``, or the platform's cache folder."""
+    """Folder of downloads: ``GRAPHSLAM_CACHE``, or the platform's cache folder."""
     value = os.environ.get(CACHE_VARIABLE)
     if value:
         return Path(value)
@@ -48,7 +48,7 @@ def find_file(folder: Path, file: CardFile) -> Path | None:
 
 
 def locate(data: Card | str) -> Path:
-    """Folder that holds the data set's needed files."""
+    """First folder that contains all required files of a data set; otherwise :class:`MissingDataError`."""
     c = find_card(data) if isinstance(data, str) else data
     needed = [f for f in c.files if not f.optional]
     roots = data_roots()
@@ -69,7 +69,7 @@ def locate(data: Card | str) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class FileCheck:
-    """What :func:`check_files` found of one file."""
+    """Result of :func:`check_file`."""
 
     file: CardFile
     state: State
@@ -83,7 +83,7 @@ def sha256_of(path: Path) -> str:
 
 
 def check_file(folder: Path, file: CardFile) -> FileCheck:
-    """Compare one file (or its uncompressed form) below ``folder`` with the card."""
+    """Compare one file (or its uncompressed form) below ``folder`` with its size and checksum."""
     path = find_file(folder, file)
     if path is None:
         return FileCheck(file, "missing", None)
@@ -94,7 +94,7 @@ def check_file(folder: Path, file: CardFile) -> FileCheck:
 
 
 def check_files(data: Card | str) -> list[FileCheck]:
-    """Compare every file with the card, in the first root that holds any of them."""
+    """Compare every file with its size and checksum, in the first root that contains any of them."""
     c = find_card(data) if isinstance(data, str) else data
     folders = [root / c.folder for root in data_roots()]
     folder = next((d for d in folders if any(find_file(d, f) for f in c.files)), folders[-1])
@@ -108,19 +108,19 @@ def load_recording(source: str | os.PathLike[str], *, reader: str | None = None,
     ----------
     source : str or path
         Name of a data set; ``name/file`` for one file of it (the ending may be left out, as ``posegraphs/intel``);
-        ``name/part`` where a set holds several logs (``mrclam-dataset7/robot1``); or an existing file or folder.
+        ``name/part`` if a data set has several logs (``mrclam-dataset7/robot1``); or an existing file or folder.
     reader : str, optional
         Name of the reader (:func:`graphslam.io.readers.list_readers`). Default: that of the data set, or the first one
         that recognises the content of the path.
     options
-        For the reader.
+        Options of the reader.
 
     Returns
     -------
     SensorLog, list of Submap, LandmarkObservations, TucLog, PoseNetwork or Path
-        By the reader. A pose network of g2o, TORO or iSAM gives the path of its file, for
-        :func:`graphslam.io.network_file.read_network`. ``meta["reader"]`` of a log says who read what, with which
-        options.
+        The type depends on the reader. For a pose network of g2o, TORO or iSAM, it is the path of its file, for
+        :func:`graphslam.io.network_file.read_network`. ``meta["reader"]`` of a log has the name and options of the
+        reader.
     """
     text = os.fspath(source)
     known = {c.name for c in list_cards()}
@@ -131,7 +131,7 @@ def load_recording(source: str | os.PathLike[str], *, reader: str | None = None,
         if c.reader is None and reader is None:
             raise DataError(f"there is no reader for data set {c.name!r}", where=str(locate(c)), got=c.kind)
         name = reader or str(c.reader)
-        find_reader(name)  # before its files are looked for
+        find_reader(name)  # an unknown reader is reported before missing files
         return _read(name, locate(c), f"data set {c.name}", {"name": c.name}, {**c.options, **options})
     name, slash, part = text.partition("/")
     if slash and name in known and not Path(text).exists():
@@ -155,7 +155,7 @@ def load_recording(source: str | os.PathLike[str], *, reader: str | None = None,
 def _read(
     name: str, path: Path, found: str, named: Mapping[str, Any], options: Mapping[str, Any], also: Sequence[str] = ()
 ) -> Any:
-    """What a reader gives; a log remembers who read it."""
+    """Result of a reader; for a log, with the reader in ``meta``."""
     r = find_reader(name)
     value = r(path, **(named if r.takes_name() else {}), **options)
     if not isinstance(value, SensorLog):
@@ -167,7 +167,7 @@ def _read(
 
 
 def _plain(value: Any) -> Any:
-    """As JSON has it."""
+    """Convert to types of JSON; other types become text."""
     if isinstance(value, str | bool | int | float) or value is None:
         return value
     return [_plain(v) for v in value] if isinstance(value, list | tuple) else str(value)

@@ -1,7 +1,7 @@
-"""Stamps as they come from files: which records to keep, and how many may be lost before a file is refused.
+"""Check of the stamps in a file: which records are kept, and how many may be dropped before the file is rejected.
 
-The rule for every reader: an isolated bad record is dropped and counted with its reason; when more than
-``MAX_DROPPED`` of a stream would go, the file is not what it should be and is refused.
+The rule for every reader: an isolated bad record is dropped and counted with its reason; if more than the fraction
+``MAX_DROPPED`` of a stream would be dropped, the file is rejected with an error.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from graphslam.core.log import DropCounter
 
 Mask = npt.NDArray[np.bool_]
 MAX_DROPPED = 0.05
-"""Share of a stream's records that may be dropped."""
+"""Maximal fraction of dropped records of a stream."""
 BLOCK = 20
-"""So many records in a row whose stamps are out of order are no jitter:"""
+"""At least this many consecutive records with stamps out of order are not jitter:"""
 CLOCK_SET_BACK = "stamp after the clock was set back"
 """… the clock was set back, or a second drive follows in the same recording."""
 STALE, STALE_TIMES = 20.0, 100.0
-"""A first record that all others follow after so long [s], and so many times what is usual between them, is an old one
-that was handed out when the recording began (a latched message)."""
+"""The first record is dropped as an old (latched) message if the gap to the second one is longer than STALE [s] and
+than STALE_TIMES the median time between the others."""
 
 
 def longest_increasing(times: Array) -> Mask:
     """Mask ``(n,)`` of a longest strictly increasing subsequence of finite ``times`` ``(n,)``.
 
-    One wild stamp then costs one record, whether it lies in the past or in the future. Of equal stamps the first is
-    kept. (Patience sorting, O(n log n).)
+    So one wrong stamp removes one record, whether it is too early or too late. Of equal stamps one is kept. (Patience
+    sorting, O(n log n).)
     """
     if np.all(np.diff(times) > 0):
         return np.ones(len(times), dtype=np.bool_)
@@ -59,18 +59,18 @@ def longest_increasing(times: Array) -> Mask:
 def usable_records(
     times: Array, bad: dict[str, Mask], *, stream: str, where: str, drops: DropCounter, limit: float = MAX_DROPPED
 ) -> Mask:
-    """Which records of a stream to keep; the others are counted in ``drops``.
+    """Mask of the records of a stream to keep; the others are counted in ``drops``.
 
     Parameters
     ----------
     times : (n,)
         Stamps as read.
     bad : dict of str to (n,) bool
-        Reason → records that are bad for it. A record is counted once, for its first reason.
+        Reason → mask of the records to drop. A record is counted once, for its first reason.
     stream, where : str
         Name of the stream in the counter, and file.
     limit : float
-        Greatest share of dropped records.
+        Maximal fraction of dropped records; above it, :class:`DataError`.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""Files of bags read record by record: without an index, cut off, packed, or left by a recorder that was stopped.
+"""Bag files read record by record: without an index, truncated, compressed, or with a leftover SQLite journal.
 
-ROS 1: records follow each other, and a chunk that is cut is unpacked as far as it goes. ROS 2 (sqlite3): SQLite finds
-rows by a tree whose pages may be missing, so all pages are gone through (https://sqlite.org/fileformat2.html).
+ROS 1: records are sequential, and a truncated chunk is decompressed up to its end. ROS 2 (sqlite3): SQLite finds rows
+by a tree whose pages may be missing, so all pages are scanned (https://sqlite.org/fileformat2.html).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from urllib.parse import quote
 from graphslam.core.reading import check_size, most_bytes
 from graphslam.io.recognise import SQLITE, ZSTD
 
-_MOST_MESSAGE = 1 << 28  # bytes that a packed message may say to hold
-_LEAF, _INTEGERS = 13, {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # SQLite: a page of rows; bytes of integers
+_MOST_MESSAGE = 1 << 28  # maximal declared size of a compressed message [bytes]
+_LEAF, _INTEGERS = 13, {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # SQLite: page type; bytes per serial type
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,18 +42,18 @@ Record = tuple[BagChannel, int, bytes]
 
 
 class RecordFile:
-    """A file that is read from its beginning; with the methods of the readers of rosbags that are used here."""
+    """A file that is read sequentially; with those methods of the rosbags readers that are used here."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.connections: list[BagChannel] = []
 
     def records(self) -> Iterator[Record]:
-        """All messages; an exception where the file ends too early."""
+        """All messages; an exception at the end of a truncated file."""
         raise NotImplementedError
 
     def open(self) -> None:
-        """Find the topics by all records."""
+        """Find the topics by reading all records."""
         seen: Counter[str] = Counter()
         known: dict[str, BagChannel] = {}
         try:
@@ -71,11 +71,11 @@ class RecordFile:
         return (r for r in self.records() if r[0].topic in topics)
 
     def close(self) -> None:
-        """Nothing is open between two calls."""
+        """Does nothing: no file stays open between calls."""
 
 
 class CutBag1(RecordFile):
-    """A ROS 1 bag whose index is missing or does not fit."""
+    """A ROS 1 bag with a missing or wrong index."""
 
     def records(self) -> Iterator[Record]:
         """See :class:`RecordFile`."""
@@ -115,12 +115,12 @@ def _unchunked(raw: bytes, compression: str) -> bytes:
 
 
 class CutDatabase(RecordFile):
-    """A ROS 2 bag (sqlite3) of which pages are missing."""
+    """A ROS 2 bag (sqlite3) with missing pages."""
 
     def records(self) -> Iterator[Record]:
         """See :class:`RecordFile`."""
         with closing(sqlite3.connect(f"file:{quote(str(self._path))}?immutable=1", uri=True)) as db:
-            db.execute("PRAGMA writable_schema = ON")  # else a file shorter than its header says is refused
+            db.execute("PRAGMA writable_schema = ON")  # otherwise SQLite rejects a truncated file
             rows = db.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         known = {int(k): BagChannel(str(name), str(kind), 0, str(form)) for k, name, kind, form in rows}
         lost = 0
@@ -142,16 +142,16 @@ class CutDatabase(RecordFile):
 
 
 def page_size(head: bytes) -> int:
-    """Bytes of a page of a database."""
+    """Page size of a database [bytes]."""
     return {0: 512, 1: 1 << 16}.get(size := int.from_bytes(head[16:18]), size)
 
 
 def _row(data: mmap.mmap, at: int, page: int) -> tuple[int, int, bytes] | None:
-    """Topic, stamp and message; None of a row of another table, IndexError if a page of it is missing."""
+    """Topic, stamp and message; None for a row of another table, IndexError if one of its pages is missing."""
     length, at = _varint(data, at)
     _, at = _varint(data, at)
     usable, local = page - data[20], length
-    if length > usable - 35:  # its end is on a chain of other pages
+    if length > usable - 35:  # the rest is on a chain of overflow pages
         least = (usable - 12) * 32 // 255 - 23
         local = least + (length - least) % (usable - 4)
         local = local if local <= usable - 35 else least
@@ -187,7 +187,7 @@ def _varint(data: mmap.mmap | bytes, at: int) -> tuple[int, int]:
 
 
 def missing_pages(path: Path) -> str:
-    """How much of a database is there, if not all; else empty."""
+    """Present and expected size of a truncated database as text; empty if it is complete."""
     with open(path, "rb") as stream:
         head = stream.read(100)
     known = head.startswith(SQLITE) and head[24:28] == head[92:96]
@@ -196,7 +196,7 @@ def missing_pages(path: Path) -> str:
 
 
 def local_copy(path: Path, stack: ExitStack) -> Path:
-    """The file itself; or a temporary copy, unpacked (zstd), or with what a journal of SQLite beside it says."""
+    """The file itself, or a temporary copy: decompressed (zstd), or with the SQLite journal next to it applied."""
     with open(path, "rb") as stream:
         head = stream.read(16)
     beside = [path.with_name(path.name + e) for e in ("-wal", "-journal")] if head == SQLITE else []
@@ -222,7 +222,7 @@ def local_copy(path: Path, stack: ExitStack) -> Path:
 
 
 def unpack_message(raw: bytes) -> bytes:
-    """A message as it was before a recorder packed it (zstd)."""
+    """Decompress a message that the recorder compressed (zstd)."""
     if raw.startswith(ZSTD):
         import zstandard
 
