@@ -1,18 +1,18 @@
-"""Logs of the CARMEN robot toolkit: planar laser scans with the odometry pose of each.
+"""Reader of logs of the CARMEN robot toolkit: planar laser scans with their odometry poses.
 
-Lines with scans, of one laser:
+Scans of one laser are read, from these lines:
 
-* ``FLASER n r_1 … r_n x y θ odom_x odom_y odom_θ ipc_stamp host logger_stamp`` (``RLASER``: the one that looks back).
+* ``FLASER n r_1 … r_n x y θ odom_x odom_y odom_θ ipc_stamp host logger_stamp`` (``RLASER``: the rear laser).
 * ``ROBOTLASER1 type start fov resolution max_range accuracy remission n r_1 … r_n k rem_1 … rem_k laser_x laser_y
   laser_θ robot_x robot_y robot_θ tv rv forward_safety side_safety turn_axis ipc_stamp host logger_stamp``
-* ``RAWLASER1``: the same up to the remissions, then the stamps: it brings no pose.
+* ``RAWLASER1``: the same up to the remissions, then the stamps, without a pose.
 
-The first two bring laser and odometry in one record, which no delay between two processes can part: lines ``ODOM`` are
-then counted and left alone. Poses of scans that bring none, or always the same, are put between those of ``ODOM``.
-Scans of another number of beams than most are put on the beams of most.
+The first two have laser and odometry in one record, so no delay between two processes separates them: lines ``ODOM``
+are then counted and not used. For scans without a pose, or with a constant one, poses are interpolated from ``ODOM``.
+Scans with an unusual beam layout are resampled to the most frequent one.
 
-Stamps of such logs may fall back where a computer was busy, while the order of the lines stays right. They are mended,
-not dropped: the nearest stamps that rise (isotonic regression), if none has to move far.
+Stamps of such logs may decrease if the computer was busy, while the order of the lines is right. They are not dropped,
+but corrected to the nearest increasing stamps (isotonic regression), if no stamp moves by more than ``most_mended``.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ from graphslam.io.recognise import CARMEN_SCANS
 from graphslam.io.source_probe import SourceProbe
 
 MAX_RANGE = 80.0
-"""Ranges at or above it are no return, where lines state none [m]."""
+"""Default maximal range, if the log has none [m]: ranges at or above it are "no return"."""
 
 _LASER_PARAM = re.compile(r"PARAM (?:robot|laser)_(front|rear)_?laser_(fov|max|max_range) (\d+\.?\d*)\b")
 USUAL_BEAMS = (180, 181, 360, 361)
-"""Beams of scanners of 180° with steps of 1° and of half a degree."""
-_SPACING = 1e-3  # least time between mended stamps [s]
+"""Numbers of beams of 180° scanners with steps of 1° and 0.5°."""
+_SPACING = 1e-3  # minimal time between corrected stamps [s]
 _POSED = {"FLASER": 9, "RLASER": 9, "ROBOTLASER": 14, "RAWLASER": 3}  # words after ranges (and remissions)
 
 
 def beam_bearings(n: int) -> Array:
-    """Directions ``(n,)`` of the beams of a scanner of 180°, from the right to the left [rad].
+    """Directions ``(n,)`` of the beams of a 180° scanner, from right to left [rad].
 
-    An odd number of beams has one at either end, an even number none at the left end.
+    With an odd number, beams are at both ends; with an even number, there is none at the left end.
     """
     return np.asarray(-0.5 * np.pi + np.pi / (n - 1 if n % 2 else n) * np.arange(n))
 
@@ -65,31 +65,31 @@ def read_carmen(
     noise: OdometryNoise = DEFAULT_NOISE,
     most_mended: float = 3.0,
 ) -> SensorLog:
-    """Read a CARMEN log, and the corrected one beside it.
+    """Read a CARMEN log, and the corrected log in the same folder.
 
     Parameters
     ----------
     path : path
-        A log, plain or compressed, or a folder that holds one, and perhaps one named ``*-corrected.log``: the poses
-        that another SLAM found, matched to the scans by their ranges.
+        A log, plain or compressed, or a folder with one log and optionally one named ``*-corrected.log``: poses from
+        another SLAM program, matched to the scans by their ranges.
     max_range : float, optional
-        Ranges at or above it are "no return" [m]. By default what the lines state, or 80 m: the usual scanner says
-        81.8 m and more.
+        Ranges at or above it are "no return" [m]. Default: the value in the log, or 80 m: the usual scanner writes
+        81.8 m and more for "no return".
     laser : str, optional
-        Lines that are read, for instance ``ROBOTLASER1``; by default those of the tag that occurs most.
+        Tag of the lines to read, for instance ``ROBOTLASER1``; default: the most frequent tag.
     fov : float, optional
-        Field of view of scans in lines FLASER and RLASER, which do not state it [deg]. By default that of a line
+        Field of view of scans in lines FLASER and RLASER, which do not contain it [deg]. Default: that of a line
         PARAM, or 180°.
     noise : OdometryNoise
-        Of the odometry; the logs state none.
+        Noise of the odometry; the logs contain none.
     most_mended : float
-        Farthest that a stamp may be moved [s].
+        Maximal correction of a stamp [s].
 
     Returns
     -------
     SensorLog
-        Streams ``laser``, ``odometry`` (one motion a scan; none if the log tells no pose) and, with a corrected log,
-        ``reference``: a Trajectory of the base. It is the output of another SLAM, not truth.
+        Streams ``laser``, ``odometry`` (one motion per scan; none if the log has no poses) and, with a corrected log,
+        ``reference``: a Trajectory of the base. It is the output of another SLAM program, not ground truth.
     """
     for what, value in (("max_range", max_range), ("most_mended", most_mended), ("fov", fov)):
         if value is not None and not (np.isfinite(value) and value > 0):
@@ -141,18 +141,18 @@ def read_carmen(
 
 
 def mend_stamps(stamps: Array, most: float, *, where: str) -> tuple[Array, int]:
-    """The nearest stamps that rise by a millisecond at least, in the order of the records, and how many had to move.
+    """Least-squares correction to stamps that increase by at least 1 ms, and the number of corrected stamps.
 
     Parameters
     ----------
     stamps : (n,)
         Finite [s].
     most : float
-        Farthest that any may move [s].
+        Maximal correction of a stamp [s]; above it, :class:`DataError`.
     """
     if np.all(np.diff(stamps) > 0):
         return stamps, 0
-    start = stamps[0]  # large numbers would cost digits
+    start = stamps[0]  # unix times would lose digits
     ramp = _SPACING * np.arange(len(stamps))
     times = start + isotonic_regression(stamps - start - ramp).x + ramp
     moved = np.abs(times - stamps)
@@ -188,7 +188,7 @@ def _files(path: Path) -> tuple[Path, Path | None]:
 
 @dataclass(frozen=True, slots=True)
 class _Scans:
-    """Scans ``(k, n)`` with stamps ``(k,)``; poses of laser and robot ``(k, 6)``, or None; lines ODOM."""
+    """Scans ``(k, n)`` with stamps ``(k,)``; poses of laser and robot ``(k, 6)`` or None; rows (t, x, y, θ) of ODOM."""
 
     ranges: npt.NDArray[np.float32]
     bearings: Array
@@ -201,7 +201,7 @@ class _Scans:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """One scan: directions as first, step and number; pose of laser and robot or None."""
+    """One scan: layout of beams (first angle, step, number); poses of laser and robot, or None."""
 
     layout: tuple[float, float, int]
     ranges: npt.NDArray[np.float32]
@@ -211,7 +211,7 @@ class _Line:
 
 
 def _parse(words: list[str]) -> _Line | str:
-    """A line with a scan, or why it is none."""
+    """A parsed scan line, or the reason for its rejection."""
     tag = words[0].rstrip("0123456789")
     at = 1 if tag in ("FLASER", "RLASER") else 8
     try:
@@ -322,7 +322,7 @@ def _directions(layout: tuple[float, float, int], fov: float | None) -> Array:
 
 @dataclass
 class _Laser:
-    """What lines PARAM state of one laser: field of view [rad] and greatest range [m]."""
+    """Values of lines PARAM for one laser: field of view [rad] and maximal range [m]."""
 
     fov: float | None = None
     max_range: float | None = None
@@ -358,7 +358,7 @@ def _still(poses: Array) -> bool:
 def _between(
     odom: list[tuple[float, float, float, float]], times: Array, most_mended: float, where: str
 ) -> tuple[npt.NDArray[np.bool_], Array] | None:
-    """Which stamps lie inside the lines ODOM, and the robot at all of them; None without such lines."""
+    """Mask of the stamps within the time of the lines ODOM, and interpolated robot poses; None without such lines."""
     if len(odom) < 2:
         return None
     a = np.array(odom)
@@ -375,9 +375,9 @@ def _between(
 
 
 def _match(ranges: npt.NDArray[np.float32], corrected: Path, drops: DropCounter) -> tuple[npt.NDArray[np.intp], Array]:
-    """Scans ``(m,)`` that the corrected log holds, rising, and its poses of the laser ``(m, 3)``.
+    """Increasing indices ``(m,)`` of the scans in the corrected log, and its poses of the laser ``(m, 3)``.
 
-    A corrected log has lost digits of its stamps, but its ranges are those of the scans.
+    Stamps of corrected logs are rounded, but their ranges are identical, so scans are matched by ranges.
     """
     found = _scans(corrected, DropCounter())
     theirs, poses = found.ranges, found.poses
@@ -391,7 +391,7 @@ def _match(ranges: npt.NDArray[np.float32], corrected: Path, drops: DropCounter)
     for k, row in enumerate(ranges):
         known.setdefault(row.tobytes(), []).append(k)
     index, kept, last = [], [], -1
-    for k, row in enumerate(theirs):  # both are in order, so of equal scans the first after the last match is meant
+    for k, row in enumerate(theirs):  # both are in order: of equal scans, use the first after the last match
         later = next((j for j in known.get(row.tobytes(), []) if j > last), None)
         if later is None:
             continue

@@ -1,11 +1,11 @@
-"""EuRoC recordings of a flying robot without its cameras: an IMU, and positions of a prism by a tracking total station.
+"""Reader of EuRoC recordings of a flying robot, without cameras: IMU, and prism positions from a total station.
 
-* ``imu``: angular rates and specific forces. Noise densities and walks are those of the file beside the table, times
-  ``noise_scale``; what σ the biases have at the start the files do not say.
-* ``leica``: positions of the prism, whose place on the body is its lever. The station keeps another clock than the IMU;
-  ``late`` is taken off its stamps.
+* ``imu``: angular rates and specific forces. Noise densities, times ``noise_scale``, and random walks are from
+  ``sensor.yaml``, which does not contain the initial σ of the biases.
+* ``leica``: positions of the prism; its position on the body is the lever arm. The station has another clock than the
+  IMU; ``late`` is subtracted from its stamps.
 
-Stamps are seconds since the first reading of the IMU.
+Stamps are seconds since the first IMU reading.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from graphslam.io.source_probe import SourceProbe
 from graphslam.io.text_records import find_text_file, read_table
 
 GYRO_BIAS, FORCE_BIAS = 0.1, 0.3
-"""σ of the biases at the start [rad/s, m/s²]; the files state none."""
+"""Assumed initial σ of the biases [rad/s, m/s²]."""
 _DENSITIES = {
     "gyro": "gyroscope_noise_density",
     "gyro_walk": "gyroscope_random_walk",
@@ -52,15 +52,15 @@ def read_euroc(
     Parameters
     ----------
     folder : path
-        Holds ``imu0/data.csv`` and ``imu0/sensor.yaml`` (or ``imu0_data.csv`` and ``imu0_sensor.yaml``), perhaps the
-        same of ``leica0``, and a table of poses (``state_groundtruth_estimate0``, ``vicon0``); tables plain or
-        compressed, in folders of any depth.
+        Contains ``imu0/data.csv`` and ``imu0/sensor.yaml`` (or ``imu0_data.csv`` and ``imu0_sensor.yaml``), optionally
+        the same for ``leica0``, and a table of poses (``state_groundtruth_estimate0``, ``vicon0``); tables may be
+        compressed and in subfolders.
     sigma : float
-        Of a coordinate of a position [m]; the recording states none.
+        Assumed σ of each coordinate of a position [m].
     late : float
-        Taken off the stamps of the positions [s].
+        Subtracted from the stamps of the positions [s].
     noise_scale : float
-        Factor on the noise densities of the data sheet.
+        Factor on the noise densities of ``sensor.yaml``; not on random walks.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -119,12 +119,12 @@ def _there(root: Path, name: str) -> Path | None:
 
 
 def _sheet(table: Path) -> Path:
-    """The data sheet beside a table: ``imu0_data.csv`` and ``imu0_sensor.yaml``, or ``imu0/data.csv`` and its own."""
+    """The ``sensor.yaml`` of a table: ``imu0_sensor.yaml`` for ``imu0_data.csv``, or in the same folder."""
     return table.with_name(table.name.partition("data.csv")[0] + "sensor.yaml")
 
 
 def _reference(path: Path, counter: DropCounter) -> tuple[Array, int]:
-    """Rows of stamp, position and quaternion (w first), and how many there were."""
+    """Usable rows of stamp, position and quaternion (w first), and the number of all rows."""
     lines = [s for s in read_text(path).splitlines() if s.strip() and not s.startswith("#")]
     rows = [parse_numbers(s) or [] for s in lines]
     table = np.array([r[:8] if len(r) >= 8 else [np.nan] * 8 for r in rows]).reshape(-1, 8)
@@ -138,7 +138,7 @@ def _reference(path: Path, counter: DropCounter) -> tuple[Array, int]:
 
 
 def _table(path: Path, columns: int, stream: str, counter: DropCounter) -> tuple[Array, int]:
-    """Rows that can be used, and how many there were."""
+    """Usable rows, and the number of all rows."""
     table, _ = read_table(path, columns, separator=",")
     bad = {"a number is not finite": np.asarray(~finite_mask(table[:, 1:]).all(axis=1))}
     keep = usable_records(table[:, 0], bad, stream=stream, where=str(path), drops=counter)
@@ -153,7 +153,7 @@ def _number(text: str, word: str, path: Path) -> float:
 
 
 def _matrix(path: Path) -> Array:
-    """``T_BS``, sixteen numbers in brackets."""
+    """``T_BS`` ``(4, 4)`` of a ``sensor.yaml``."""
     found = re.search(r"data:\s*\[([^\]]{1,2000})\]", read_text(path))
     numbers = re.findall(_NUMBER, found[1]) if found else []
     T = np.array([float(x) for x in numbers])

@@ -1,4 +1,4 @@
-"""Download of data sets into the cache, every file checked against its card before it gets its name."""
+"""Download of data sets into the cache; the size and checksum of every file are checked."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from graphslam.io.catalog import cache_folder, check_file, data_roots
 
 log = logging.getLogger(__name__)
 TIMEOUT = 60.0
-"""Seconds without an answer before a download fails."""
+"""Time without an answer after which a download fails [s]."""
 SCHEMES = ("https",)
-"""Of addresses that are asked, those of redirects included."""
+"""Allowed schemes of addresses and of redirects."""
 MOST_REDIRECTS = 5
 
 
 def fetch_dataset(data: Card | str, *, progress: bool = False) -> Path:
-    """Have all files of a data set on this machine; download what is missing or differs.
+    """Make all files of a data set available locally; download files that are missing or differ.
 
     Parameters
     ----------
     progress : bool
-        Show a bar for every download.
+        Show a progress bar for every download.
 
     Returns
     -------
     Path
-        Folder that holds the files: the cache, or where they already were.
+        Folder with the files: the cache, or the data root that already had them.
     """
     c = find_card(data) if isinstance(data, str) else data
     log.info("%s: %s", c.name, c.title)
@@ -76,7 +76,7 @@ def fetch_dataset(data: Card | str, *, progress: bool = False) -> Path:
 
 
 def _fetch_file(c: Card, f: CardFile, target: Path, progress: bool) -> None:
-    """Download a file, or its content where that is what the link gives."""
+    """Download a file, or its uncompressed content if that has a checksum."""
     assert f.url is not None
     name, digest, size = f.path, f.sha256, f.bytes
     if f.plain_path and f.content_bytes is not None:
@@ -84,7 +84,7 @@ def _fetch_file(c: Card, f: CardFile, target: Path, progress: bool) -> None:
     folder = target / PurePosixPath(name).parent
     folder.mkdir(parents=True, exist_ok=True)
     if f.plain_path:
-        (target / f.path).unlink(missing_ok=True)  # a spoilt packed file would hide the good plain one
+        (target / f.path).unlink(missing_ok=True)  # a damaged compressed file would hide the plain one
     _download(c, f.url, folder, PurePosixPath(name).name, digest, size, progress)
 
 
@@ -93,9 +93,9 @@ def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, mo
     import requests
 
     log.info("%s: downloading %s", c.name, url)
-    # quiet: pooch advises to paste an unknown hash into the code; here the members of an archive are checked instead
+    # quiet: pooch recommends to add an unknown hash to the code; here the members of an archive are checked instead
     pooch.get_logger().setLevel("WARNING")
-    (folder / name).unlink(missing_ok=True)  # pooch keeps a file whose hash it was not told
+    (folder / name).unlink(missing_ok=True)  # without a known hash pooch would keep an old file
     try:
         return Path(
             pooch.retrieve(
@@ -121,7 +121,7 @@ def _download(c: Card, url: str, folder: Path, name: str, digest: str | None, mo
 
 
 def _stream(url: str, file: str, most: int, progress: bool) -> None:
-    """Write what an address gives, no more than ``most`` bytes of it; every redirect must be to an allowed scheme."""
+    """Download an address to a file, at most ``most`` bytes; every redirect must have an allowed scheme."""
     import requests
 
     from graphslam.core.progress import Bar
@@ -154,7 +154,7 @@ def _stream(url: str, file: str, most: int, progress: bool) -> None:
 
 
 def _unpack(packed: Path, wanted: list[CardFile], target: Path) -> None:
-    """Take the wanted files out of a zip archive, by their last name; nothing else is written, and nowhere else."""
+    """Extract the wanted files of a zip archive by their base names to their paths below ``target``; no other files."""
     where = packed.name.removeprefix(".")
     try:
         with zipfile.ZipFile(packed) as archive:
@@ -175,7 +175,7 @@ def _unpack(packed: Path, wanted: list[CardFile], target: Path) -> None:
                         continue
                     raise MissingDataError(f"archive does not hold {PurePosixPath(name).name}", where=where)
                 with archive.open(member) as stream:
-                    content = stream.read(size + 1)  # never more than the card says: a bomb stays folded
+                    content = stream.read(size + 1)  # limits the size: protects against zip bombs
                 if len(content) != size or hashlib.sha256(content).hexdigest() != digest:
                     raise DataError(
                         f"{member.filename} differs from the description of the data set",
@@ -186,6 +186,6 @@ def _unpack(packed: Path, wanted: list[CardFile], target: Path) -> None:
                 with atomic_open(target / name) as out:
                     out.write(content)
                 if name != f.path:
-                    (target / f.path).unlink(missing_ok=True)  # a spoilt packed file would hide it
+                    (target / f.path).unlink(missing_ok=True)  # a damaged compressed file would hide it
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise FormatError(f"archive is truncated or corrupt ({error})", where=where) from None

@@ -1,7 +1,7 @@
-"""Times of the points of a scan: their unit, and whether they count from the scan or are stamps on its clock.
+"""Times of the points of a scan: their unit, and whether they are offsets from the scan or stamps on its clock.
 
-Files and messages have a field of times, but do not state its unit. The unit is decided once for the whole log, from
-how long its scans last in it: a scan lasts about as long as scans are apart, and never much longer.
+Files and messages have a field of times, but not its unit. The unit is chosen once for the whole log, such that the
+duration of a scan is close to the time between scans, and never much longer.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from graphslam.core.geometry import Array
 
 UNITS = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "ns": 1e-9}
 TICKS = {"ticks of 100 µs": 1e-4, "ticks of 10 µs": 1e-5, "ticks of 100 ns": 1e-7}
-"""Units [s] that some drivers use; taken only if a scan then lasts as long as scans are apart."""
+"""Units [s] of some drivers; used only if the duration of a scan then equals the time between scans (FULL)."""
 SWEEP = (0.005, 2.0)
-"""A scan lasts so long [s]."""
+"""Plausible durations of a scan [s]."""
 FULL = (0.8, 1.05)
-"""A scan that lasts such a share of the time between scans fills it."""
+"""Duration of a scan divided by the time between scans, if scans are contiguous."""
 LONGEST = 1.25
-"""No scan lasts longer than such a share of the time between scans."""
+"""Maximal duration of a scan divided by the time between scans."""
 SAME_CLOCK = 5.0
-"""Times of points this close to the stamp of their scan are stamps on its clock [s]."""
+"""If the median time of points is this close to the stamp of the scan, the times are stamps on its clock [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +33,9 @@ class PointClock:
     Parameters
     ----------
     unit : float
-        Seconds in a unit of the field.
+        Unit of the field [s].
     name : str
-        The unit in words.
+        Name of the unit.
     lasts : float
         Median duration of a scan [s].
     """
@@ -45,9 +45,9 @@ class PointClock:
     lasts: float
 
     def ages(self, times: Array | None, stamp: float) -> Array | None:
-        """Time from each point to the stamp of its scan ``(m,)`` [s]; None without times, or one time for all.
+        """Stamp of the scan minus time of each point ``(m,)`` [s]; None without times, or if all are equal.
 
-        Times within 5 s of the stamp are stamps on its clock, others are offsets from it.
+        Times with a median within 5 s of the stamp are stamps on its clock, others are offsets from it.
         """
         if times is None or len(times) < 2 or np.ptp(times) == 0.0:
             return None
@@ -60,17 +60,17 @@ class PointClock:
 
 @dataclass(frozen=True, slots=True)
 class PointTimes:
-    """What a reader does with the times of points of a log.
+    """Use of the point times of a log.
 
     Parameters
     ----------
     state : {"used", "none", "constant", "unclear"}
     note : str
-        The same in words.
+        The state as text.
     clock : PointClock or None
-        Their unit; None: they are not used.
+        Unit of the times; None: they are not used.
     doubtful : bool
-        The unit is unusual, or none fits: the note is a line of the verdict.
+        The unit is unusual, or none fits: the note becomes a line of the verdict.
     """
 
     state: str
@@ -79,19 +79,19 @@ class PointTimes:
     doubtful: bool = False
 
     def assumed(self) -> list[tuple[str, str]]:
-        """Level and text of a line of the verdict, where there is one."""
+        """Level and text of a line of the verdict, if doubtful."""
         return [("look", f"{self.note}. Write them in s, ms, µs or ns.")] if self.doubtful else []
 
 
 def choose_point_times(spans: Iterable[float], stamps: Array | None) -> PointTimes:
-    """Unit of the times of points of a log.
+    """Choose the unit of the point times of a log.
 
     Parameters
     ----------
     spans : iterable of float
-        Latest less earliest time of each scan that has times, in the unit of the field.
+        Latest minus earliest time of each scan with times, in the unit of the field.
     stamps : (n,) or None
-        Of the scans [s]; None where the log states none.
+        Stamps of the scans [s]; None if the log has none.
     """
     found = np.array([s for s in spans if np.isfinite(s)])
     if not len(found):

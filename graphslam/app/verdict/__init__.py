@@ -1,1 +1,1 @@
-"""The verdict of a run, from its figures and from what the run itself saw; :mod:`checks` has the table."""
+"""The verdict of a run, from its stored metrics and from findings during the run; :mod:`checks` has the table."""

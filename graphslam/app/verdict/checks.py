@@ -1,9 +1,9 @@
 """The verdict of a run: is it solved, is it consistent, is it complete, and was all requested data used.
 
-"Reported" means: a line here, of the form ``subject: value [bounds] — meaning`` and, where something is to be done,
-one imperative sentence. The command line prints the lines, ``--json`` and ``run.json`` hold them, the report
-shows them. What follows from the stored figures is worked out anew wherever it is shown (:data:`CHECKS`); what only the
-run itself saw (:mod:`graphslam.app.verdict.observed`) is read from ``run.json``.
+Each line has the form ``subject: value [bounds] — meaning``, with one imperative sentence if the user should do
+something. The command line prints the lines, ``--json`` and ``run.json`` contain them, and the report shows them. Lines
+from stored metrics are computed again wherever they are shown (:data:`CHECKS`); findings during the run
+(:mod:`graphslam.app.verdict.observed`) are read from ``run.json``.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from graphslam.core.findings import Finding, findings_of_json
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One check of the stored figures of a run.
+    """One check of the stored metrics of a run.
 
     Parameters
     ----------
     find : callable
-        Gives the lines of the verdict.
+        Returns the lines of the verdict.
     codes : tuple of str
-        Of all lines that it can give: lines with these codes are worked out anew wherever a verdict is shown.
+        Codes of all its lines: stored lines with these codes are replaced whenever a verdict is shown.
     """
 
     find: Callable[[RunMetrics], list[Finding]]
@@ -51,12 +51,12 @@ CHECKS = [
 
 
 def findings_from_metrics(figures: RunMetrics) -> list[Finding]:
-    """Lines that follow from the stored figures."""
+    """Lines of the verdict from the stored metrics."""
     return [line for check in CHECKS for line in check.find(figures)]
 
 
 def run_findings(figures: RunMetrics) -> list[Finding]:
-    """All lines of a finished run, with those of ``report["verdict"]`` that the run itself saw."""
+    """All lines of a finished run: from metrics, and those of ``report["verdict"]`` that no check computes."""
     known, found = {code for check in CHECKS for code in check.codes}, findings_from_metrics(figures)
     stored = findings_of_json(figures.report.get("verdict"))
     return found + [f for f in stored if f.code not in known and f not in found]

@@ -1,4 +1,4 @@
-"""Tests of a ratio that is 1 where covariances are consistent: χ² of the graph, NEES against the truth."""
+"""Tests of a ratio that is 1 for consistent covariances: χ²/dof of the graph, NEES/dof with ground truth."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ RESIDUALS_IN_WORDS = {
     "overconfident": "residuals are larger than the noise model explains",
     "conservative": "residuals are smaller than the noise model expects",
 }
-"""Of fitted residuals; the line on the covariances is about the errors of the map."""
+"""For the χ² of residuals; :data:`IN_WORDS` is for the NEES."""
 EXACT = 1e-12
-"""χ²/dof below which all measurements are met to the last digit, as in a chain that never closes."""
+"""χ²/dof below this is numerically zero: no redundant measurement, as in a chain without loop closures."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChiSquareTest:
-    """A ratio that is 1 where covariances are consistent, and its bounds.
+    """A ratio that is 1 for consistent covariances, and its bounds.
 
     Parameters
     ----------
@@ -34,9 +34,9 @@ class ChiSquareTest:
     name : str
         ``χ²/dof``.
     about : str
-        Of what.
+        Subject of the test.
     tests : int
-        That share the significance level (Bonferroni).
+        Number of tests that share the significance level (Bonferroni).
     """
 
     code: str
@@ -47,7 +47,7 @@ class ChiSquareTest:
     tests: int = 1
 
     def bounds(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
-        """Two-sided bounds of the ratio; above those of residuals there is the tolerance of their tests."""
+        """Two-sided bounds of the ratio; for χ² the upper one is multiplied by :data:`TOLERANCE`."""
         low, high, _ = two_sided_bounds(self.ratio, self.dof, 1.0 - (1.0 - confidence) / self.tests)
         return low, high * (TOLERANCE if self.code == "chi2" else 1.0)
 
@@ -59,12 +59,12 @@ class ChiSquareTest:
 
     @property
     def power(self) -> float:
-        """Probability that the test detects covariances that are half as large as they should be."""
+        """Probability that the test detects covariances that are half as large as the true ones."""
         return detection_power(self.dof, self.bounds()[1] * self.dof)
 
     @property
     def level(self) -> Level:
-        """One consistent run in forty is outside on either side; bad is less likely than one in a thousand."""
+        """``good`` within the bounds; ``bad`` above those at confidence :data:`CERTAIN`; otherwise ``look``."""
         if self.word == "consistent":
             return "good"
         return "bad" if self.ratio > self.bounds(CERTAIN)[1] else "look"
@@ -78,7 +78,7 @@ class ChiSquareTest:
 
 
 def chi_square_test(figures: RunMetrics) -> ChiSquareTest | None:
-    """χ² of the whole graph; None where nothing is redundant that could contradict, or that is not known."""
+    """χ² of the whole graph; None without redundant measurements or if the degrees of freedom are unknown."""
     found = whole_chi2(figures)
     if found is None or found[0] < EXACT * found[1]:
         return None
@@ -86,12 +86,12 @@ def chi_square_test(figures: RunMetrics) -> ChiSquareTest | None:
 
 
 def of_the_start(figures: RunMetrics, chi2: ChiSquareTest) -> bool:
-    """Does it say of the start of a refined path only that its noise was stated too large?"""
+    """Is the run refined, and is the χ² of its initial graph conservative? Then it is not a fault of the result."""
     return bool(figures.part("refine")) and chi2.word == "conservative"
 
 
 def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
-    """NEES against the truth, where it is known: in each gauge in which it was taken, and of overconfident axes."""
+    """NEES with ground truth: in each gauge for which it was computed, and of single axes that are overconfident."""
     m = dict(figures.metrics)
     gauges = [("nees", "first base fixed"), ("nees_aligned_landmarks", "landmarks, after alignment")]
     bases = [f"{s.get('name')}_base_nees" for s in figures.sessions]

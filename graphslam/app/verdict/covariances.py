@@ -1,4 +1,4 @@
-"""Are the covariances consistent? Tests without ground truth, and against it."""
+"""Are the covariances consistent? Tests without and with ground truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
 
 
 def covariance_assessment(figures: RunMetrics) -> CovarianceAssessment | None:
-    """Are the covariances consistent, by the tests that need no ground truth? None in folders without their results."""
+    """Assessment of the covariances by tests without ground truth; None for run folders without their results."""
     if figures.report.get("evidence") is None:
         return None
     rows = consistency_tests_of_json(figures.report.get("evidence"))
@@ -52,7 +52,7 @@ def check_chi2(figures: RunMetrics) -> list[Finding]:
 
 
 def check_trust(figures: RunMetrics) -> list[Finding]:
-    """Are the covariances consistent? The line names the tests; none of them uses ground truth."""
+    """Are the covariances consistent? The line lists the tests; none of them uses ground truth."""
     found = covariance_assessment(figures)
     if found is None:
         return []
@@ -96,14 +96,14 @@ def _said(row: ConsistencyTest) -> str:
 
 
 def check_nees(figures: RunMetrics) -> list[Finding]:
-    """Do the errors match the covariances, where the truth is known?"""
+    """Do the errors relative to ground truth match the covariances?"""
     said = [(j, f"NEES ({j.about}): {j.text}. One run is one sample.") for j in nees_tests(figures)]
     none = "NEES: not tested — no ground truth for this result."
     return [Finding(j.level, "nees", text) for j, text in said] or [Finding("", "nees", none)]
 
 
 def check_classes(figures: RunMetrics) -> list[Finding]:
-    """Failed tests without ground truth; those that a run passes are in the metrics."""
+    """Failed tests without ground truth, by class of factors; passed tests are only in the metrics."""
     out: list[Finding] = []
 
     def check(what: str, value: Any, dof: Any, cause: str) -> None:
@@ -123,7 +123,7 @@ def check_classes(figures: RunMetrics) -> list[Finding]:
             else None
         )
         check(f"χ²/dof of factors “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
-        # a refined path holds fixes; the other factors of the graph were its start
+        # a refined path contains GPS factors; the other factors of the graph only gave its initial value
         if row.get("verdict") == LASTING and (row.get("class") == "gps" or not figures.part("refine")):
             out.append(_lasting(row))
     m = figures.metrics

@@ -1,4 +1,4 @@
-"""Is the map whole, and do its parts agree? Fused map, alternative graphs, two contradicting maps, sessions."""
+"""Is the map complete, and do its parts agree? Fused map, alternative graphs, two contradicting maps, sessions."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from graphslam.core.findings import Finding
 from graphslam.maps.contradictions import LOOK
 
 TWO_MAPS_DO = "check which of the two is right there, or add GPS there and run again"
-"""Of two maps that explain a log."""
+"""Advice if two maps explain a log."""
 DENIED = 0.1
-"""Share of occupied voxels contradicted by overlapping submaps from which a map is bad."""
+"""A map is bad if overlapping submaps contradict more than this fraction of its occupied voxels."""
 
 
 def check_map(figures: RunMetrics) -> list[Finding]:
-    """Is the fused map there, and do its overlapping parts agree?"""
+    """Was the fused map made, and do its overlapping parts agree?"""
     out: list[Finding] = []
     if figures.report.get("map_left_out"):
         out.append(Finding("look", "map-left-out", f"fused map: not made — {figures.report['map_left_out']}"))
@@ -91,7 +91,7 @@ def _listed(loops: Sequence[int]) -> str:
 
 
 def check_sessions(figures: RunMetrics) -> list[Finding]:
-    """Do the sessions of a merge show one place?"""
+    """Are the sessions of a merge from one place?"""
     out: list[Finding] = []
     for s in figures.sessions:
         common, rejected = s.get("common_landmarks"), s.get("rejected")

@@ -1,4 +1,4 @@
-"""What only the run itself saw: use of every stream, anomalies in it, findings of the front end, outliers."""
+"""Findings during a run: use of every stream, anomalies in it, findings of the front end, outliers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from graphslam.core.submap import Submap
 from graphslam.evaluate.stream_checks import StreamFinding
 
 QUARTER = 0.25
-"""Share of the records of a stream that was asked for and of which a part may be kept back; below, as for MOSTLY."""
+"""Lower limit of the used fraction of a requested stream, part of which may be withheld; below, a line is written."""
 ALIKE = 2
-"""Submaps whose equal findings are shown in full; of further ones only the keys are listed."""
+"""Number of submaps with the same finding that are shown in full; of further ones only the keys are listed."""
 MOSTLY = 0.95
-"""Share of the records of a stream below which the verdict asks to look at what became of the others."""
+"""Lower limit of the used fraction of an input stream; below, a line is written."""
 
 
 def findings_from_run(
@@ -31,11 +31,11 @@ def findings_from_run(
     Parameters
     ----------
     noticed : sequence of StreamFinding
-        Of the raw streams; what is bad in one that was not used is only worth a look.
+        Anomalies of the raw streams; ``bad`` becomes ``look`` if the stream was not used.
     submaps : sequence of Submap
-        Their reports may hold ``findings``: rows of :meth:`Finding.as_row`, of the run as a whole or of the submap.
+        Their reports may contain ``findings``: rows of :meth:`Finding.as_row`, for the run or for the submap.
     events : sequence of mapping
-        Of the graph; ``outlier``, ``beacon-not-placed`` and ``readings-dropped`` become lines.
+        Events of the graph; ``outlier``, ``gps-errors``, ``no-effect`` and ``beacon-not-placed`` become lines.
     """
     counts = "; ".join(s.text() for s in streams)
     out = [Finding("", "streams", f"records used: {counts}.")] if streams else []
@@ -82,7 +82,7 @@ def _shares(submaps: Sequence[Submap]) -> list[Finding]:
 
 
 def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
-    """Findings of front ends on submaps; of equal ones the first in full and the keys of the others."""
+    """Findings of front ends on submaps; of equal ones, the first two in full and the keys of the others."""
     said = [(s.key, f) for s in submaps for row in s.report.get("findings", ()) if (f := Finding.from_row(row))]
     told: dict[tuple[Level, str], list[int]] = {}
     out = []
@@ -101,7 +101,7 @@ def _of_submaps(submaps: Sequence[Submap]) -> list[Finding]:
 
 
 def _of_events(events: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Measurements that the graph left out."""
+    """Lines from events of the graph: outliers, GPS errors, options without effect, beacons without position."""
     out = []
     taken = Counter(str(e["group"]) for e in events if e.get("event") == "outlier")
     if taken:

@@ -9,9 +9,9 @@ from graphslam.core.findings import Finding
 from graphslam.evaluate.intervals import by_chance
 
 SMALL_GAP = 1e-6
-"""Of the objective: an objective above the optimum by less is at it."""
+"""Relative gap of the objective above the batch optimum that counts as zero."""
 FLAGGED = 0.05
-"""Share of the submaps of consistent runs that front ends may flag by chance."""
+"""Probability that the front end flags a submap of a consistent run."""
 
 
 def check_solved(figures: RunMetrics) -> list[Finding]:
@@ -45,7 +45,7 @@ def check_certificate(figures: RunMetrics) -> list[Finding]:
 
 
 def check_flagged(figures: RunMetrics) -> list[Finding]:
-    """Submaps that the front end flags; consistent ones are flagged now and then, by chance."""
+    """Does the front end flag more submaps than expected by chance?"""
     counts = figures.part("flagged_submaps")
     flagged, n = counts.get("any", 0), figures.metrics.get("submaps", 0.0)
     if not (is_finite_number(flagged) and flagged):
@@ -59,7 +59,7 @@ def check_flagged(figures: RunMetrics) -> list[Finding]:
 
 
 def check_imu_path(figures: RunMetrics) -> list[Finding]:
-    """Do the axes and the rates of the IMUs fit the path?"""
+    """Do the axes and angular rates of the IMUs agree with the path?"""
     out: list[Finding] = []
     for e in figures.events:
         if e.get("event") == "imu-axes" and e.get("verdict") == "wrong":
