@@ -1,4 +1,4 @@
-"""Layer 1: evidence grids, log-odds maps of occupied and free space with copy on write (SegSLAM, section 2)."""
+"""Layer 1: evidence grids, i.e. occupancy maps in log-odds with copy-on-write (SegSLAM, section 2)."""
 
 from graphslam.core.lazy_exports import lazy_exports
 

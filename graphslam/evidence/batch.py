@@ -1,7 +1,7 @@
-"""One scan into many grids, each at a pose of its own: the write path of a particle filter, and the only one there is.
+"""Insertion of one scan into many grids, each with its own pose, as a particle filter needs it.
 
-The same seed gives the same maps whatever the number of threads: each grid is written by one thread, and what it holds
-does not depend on the others.
+The result does not depend on the number of threads: each grid is written by one thread, and its values do not depend
+on the other grids.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from graphslam.evidence.tree_kernels import write_bricks
 from graphslam.evidence.update_kernels import PENDING, apply_grids, finalise_writes, release_sources, resolve_writes
 
 BATCH = 64
-"""Grids whose marks are kept at a time: bounds the scratch memory of filters with many particles."""
+"""Grids that are marked at a time; limits the scratch memory of filters with many particles."""
 SERIAL_BATCH = 4
-"""The same on one thread: so few marks are still in the cache when they are applied."""
+"""The same for one thread: the marks of so few grids are still in the cache when they are applied."""
 
 Scan = tuple[Array, Array, npt.NDArray[np.uint8], float]
 
@@ -56,13 +56,13 @@ def update_grids(
     Parameters
     ----------
     grids : sequence of EvidenceGrid
-        Of one pool, voxel size and beam model; none twice. Locked ones are left alone and counted.
+        With the same pool, voxel size and beam model; none twice. Locked grids are not changed, only counted.
     poses : (P, 7), (P, 4, 4), or (P, 3) in 2-D
-        ``T_grid_scan`` of each.
+        ``T_grid_scan`` for each grid.
     points, origin, max_range, returns
         As in `EvidenceGrid.insert_scan`.
     threads : int
-        Result and report are the same for any number.
+        Values and report are the same for any number.
 
     Returns
     -------
@@ -98,13 +98,13 @@ def update_grids(
 
 
 def update_report(tally: npt.NDArray[np.int64], locked: int = 0) -> UpdateReport:
-    """A kernel's tally in words."""
+    """Convert the tally of a kernel to a report."""
     t = tally.tolist()
     return UpdateReport(t[RAYS], t[CUT], t[NOT_FINITE], t[ZERO_LENGTH], t[OUTSIDE], locked, t[BRICKS])
 
 
 def insert_scan(grids: Sequence[GridTree], poses: Array, scan: Scan, threads: int) -> npt.NDArray[np.int64]:
-    """Write a checked scan; hold the pool's lock, and Ctrl-C back where there are several grids. ``poses (P, 12)``."""
+    """Insert a checked scan. Hold the pool's lock, and defer Ctrl-C if there are several grids. ``poses (P, 12)``."""
     pool = grids[0].pool
     tally = np.zeros(TALLY, np.int64)
     roots = make_unique(grids, pool)
@@ -118,7 +118,7 @@ def insert_scan(grids: Sequence[GridTree], poses: Array, scan: Scan, threads: in
     try:
         for begin in range(0, n, size):
             work(grids[0], roots[begin : begin + size], poses[begin : begin + size], scan, True, threads, tally)
-    finally:  # not before the end: what is shared must not depend on the size of a batch
+    finally:  # only at the end: sharing of bricks must not depend on the batch size
         release_sources(shared.left, pool.tree.brick_ref, pool.tree.brick_free, pool.tree.counters)
     return tally
 
@@ -132,15 +132,15 @@ def make_unique(grids: Sequence[GridTree], pool: GridPool) -> npt.NDArray[np.int
         for g, box in zip(grids, owned):
             g._box = box
         del boxes
-        pool.collect()  # roots nobody else holds: their bricks may be written in place
+        pool.collect()  # roots without another owner: their bricks may be written in place
     return np.array([box.root for box in owned], np.int64)
 
 
 def write_packed(grid: GridTree, keys: npt.NDArray[np.int64], values: npt.NDArray[np.int16]) -> None:
-    """Replace bricks by packed offset coordinates ``(n,)`` and values ``(n, 512)``, unchecked."""
+    """Replace bricks, given packed offset coordinates ``(n,)`` and values ``(n, 512)``; nothing is checked."""
     pool = grid.pool
     with pool.lock, defer_interrupts():
-        make_unique((grid,), pool)  # first: it may take a node itself
+        make_unique((grid,), pool)  # first, because it may allocate a node
         pool.reserve(len(keys) * (pool.levels - 1), len(keys))
         write_bricks(grid.root, keys, values, grid.model.threshold_step, pool.tree)
 
@@ -154,7 +154,7 @@ def _insert_serial(
     threads: int,
     tally: npt.NDArray[np.int64],
 ) -> None:
-    """As :func:`_insert_threads` in this thread; for a planar scan every microsecond spent here shows."""
+    """As :func:`_insert_threads`, in this thread only; its overhead matters for planar scans."""
     pool = grid.pool
     s = pool.scratch(0)
     n, levels = len(roots), pool.levels
@@ -193,7 +193,7 @@ def _insert_serial(
             t.counters,
         )  # fmt: skip
         finish()
-    except BaseException:  # Ctrl-C may fall between any two calls
+    except BaseException:  # Ctrl-C may occur between any two calls
         if pool.tree.counters[PENDING]:
             finish()
         elif not share:
@@ -213,7 +213,7 @@ def _insert_threads(
     threads: int,
     tally: npt.NDArray[np.int64],
 ) -> None:
-    """Mark in parallel, resolve in one thread (it allocates), apply in parallel; Ctrl-C waits outside."""
+    """Mark in parallel, resolve in one thread (it allocates), apply in parallel; the caller defers Ctrl-C."""
     pool = grid.pool
     threads = min(threads, len(roots))
     scale = 1.0 / grid.voxel_size
@@ -271,7 +271,7 @@ _threads: dict[int, ThreadPoolExecutor] = {}
 
 
 def _in_threads(work: Any, n: int) -> None:
-    """Call ``work(0) … work(n-1)``, the first of them here; wait for all; the first error is raised."""
+    """Run ``work(0)`` in this thread and ``work(1) … work(n-1)`` in others; wait for all; raise the first error."""
     if n not in _threads:
         _threads[n] = ThreadPoolExecutor(n - 1, thread_name_prefix="evidence")
     others = [_threads[n].submit(work, i) for i in range(1, n)]

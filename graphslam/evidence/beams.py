@@ -1,4 +1,4 @@
-"""What one beam says of a voxel: log-odds of a hit and of a pass, and where they saturate."""
+"""Beam model of an evidence grid: log-odds of a hit and of a miss, and the clamping bounds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def log_odds(probability: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class BeamModel:
-    """Update of an evidence grid by a beam, as probabilities. The defaults are OctoMap's.
+    """Inverse sensor model of a beam, in probabilities. The defaults are those of OctoMap.
 
     Parameters
     ----------
@@ -28,9 +28,9 @@ class BeamModel:
     miss : float
         The same, given that a beam passed through it; below 0.5.
     clamp : (low, high)
-        Bounds of a voxel's probability: they let a map change its mind, and keep memory small.
+        Bounds of the probability of a voxel, so that a map can adapt to changes.
     threshold : float
-        A known voxel of at least this probability is occupied.
+        A known voxel with at least this probability is occupied.
     """
 
     hit: float = 0.7
@@ -62,7 +62,7 @@ class BeamModel:
 
     @property
     def miss_step(self) -> int:
-        """Log-odds of a pass, in units of `layout.STEP`."""
+        """Log-odds of a miss, in units of `layout.STEP`."""
         return int(self.steps[0])
 
     @property
@@ -72,10 +72,10 @@ class BeamModel:
 
     @property
     def clamp_steps(self) -> tuple[int, int]:
-        """Bounds of a voxel's log-odds, in units of `layout.STEP`."""
+        """Bounds of the log-odds of a voxel, in units of `layout.STEP`."""
         return int(self.steps[2]), int(self.steps[3])
 
     @property
     def threshold_step(self) -> int:
-        """Least value of an occupied voxel, in units of `layout.STEP`."""
+        """Smallest value of an occupied voxel, in units of `layout.STEP`."""
         return int(self.steps[4])

@@ -1,13 +1,13 @@
 """Compiled ray casting: the first occupied voxel along each beam, in many grids.
 
-A ray is a merge of three rising sequences, the parameters at which it crosses the planes of each axis. Every parameter
-is computed from its plane, ``t = (k - o) / d``, never summed up, so that a walk by single voxels, one by bricks and a
-jump over a large empty cube see the same numbers and visit the same voxels, ties included (z before y before x).
+A ray crosses the voxel planes of each axis at increasing parameters t. Each parameter is computed from its plane,
+``t = (k - o) / d``, never by summation. So steps of one voxel, of one brick and over a large empty cube use the same
+numbers and visit the same voxels, also for equal parameters (order: z, then y, then x).
 
-Three gaits: subtrees whose bit in ``node_occupied`` is 0 are jumped over whole; inside a block of 4³ bricks the walk
-is by bricks and looks at one 64-bit mask only; voxels are read in bricks that hold an occupied one, and there only in
-lines of 32 that do (``brick_lines``). Arrays of the tree as in :mod:`~graphslam.evidence.tree_kernels`, read only;
-poses ``(12,)`` are R row by row, then t [m].
+There are three step sizes. Subtrees whose bit in ``node_occupied`` is 0 are skipped. Inside a block of 4³ bricks the
+ray steps by bricks and reads one 64-bit mask only. Voxels are read only in lines of 32 with an occupied one
+(``brick_lines``). Arrays of the tree as in :mod:`~graphslam.evidence.tree_kernels`, read only; poses ``(12,)`` are R
+row by row, then t [m].
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from graphslam.evidence.kernels import kernel
 
 MAX_RANGE, HIT, INSIDE, LEFT, UNUSABLE, UNKNOWN_SPACE = 0, 1, 2, 3, 4, 5
 
-# nearer to a plane than this [voxels], the plane's own crossing parameter decides the side; rounding in o + d t is
+# closer to a plane than this [voxels], its crossing parameter is compared with t instead; rounding in o + d t is
 # below 1e-10 in the largest addressable cube
 NEAR = 1e-9
-# a component this small never crosses a plane inside the cube; its inverse stands for infinity without making NaN of 0
+# a component below FLAT crosses no plane inside the cube; NEVER replaces its infinite inverse, as 0 · inf is NaN
 FLAT, NEVER = 1e-200, 1e300
 
 
 @kernel(error_model="numpy")
 def coordinate_after(o, d, inverse, first, t, tie):
-    """Voxel coordinate on one axis when all its planes crossed before ``t`` (or at ``t`` too: ``tie``) lie behind.
+    """Voxel coordinate on one axis after the ray crossed all planes before ``t`` (with ``tie`` also those at ``t``).
 
-    ``first`` is the coordinate of the ray's origin ``o``; a ray never lies behind it.
+    ``first`` is the voxel coordinate of the origin ``o``; the result is never behind it.
     """
     f = o + d * t
     p = math.floor(f + 0.5)
@@ -48,9 +48,9 @@ def coordinate_after(o, d, inverse, first, t, tie):
 
 @kernel(error_model="numpy")
 def crossed_lines(oy, dy, oz, dz, t, end):
-    """Bits of the lines of a brick (8 x 4 x 1 voxels each) that a ray may meet between parameters t and end.
+    """Bits of the lines of a brick (8 x 4 x 1 voxels each) that a ray may cross between parameters t and end.
 
-    No line that it meets is missing; coordinates count from the brick's corner.
+    The set may contain too many lines, never too few; coordinates are relative to the corner of the brick.
     """
     a, b = oz + dz * t, oz + dz * end
     low = int(max(min(a, b) - NEAR, 0.0))
@@ -66,10 +66,10 @@ def crossed_lines(oy, dy, oz, dz, t, end):
 
 @kernel(error_model="numpy")
 def unit_directions(directions, out):
-    """Directions ``(n, 3)`` of unit length; NaN where there is none."""
+    """Normalise directions ``(n, 3)``; NaN for zero and non-finite ones."""
     for b in range(directions.shape[0]):
         x, y, z = directions[b, 0], directions[b, 1], directions[b, 2]
-        # scaled first, so that squares neither vanish nor overflow
+        # scaled first, so that squares neither underflow nor overflow
         m = max(abs(x), abs(y), abs(z))
         if m > 0.0 and m < np.inf:
             x, y, z = x / m, y / m, z / m
@@ -112,14 +112,14 @@ def cast_rays(
     directions : (n, 3)
         Unit length, or NaN.
     reach : float
-        Longest range [m], may be infinite.
+        Maximum range [m], may be infinite.
     threshold : int
-        Least value of an occupied voxel.
+        Smallest value of an occupied voxel.
     ranges, status : (P, n) float64, int8
-        Written. A range is to the middle of the ray's chord in the voxel, no more than ``reach``; for a beam that ends
-        otherwise it is where it ended.
+        Output. For a hit, the range to the middle of the ray's chord in the voxel, at most ``reach``; for other beams
+        the range where they ended.
     voxels : (P, n, 3) int32 or (0, 0, 0)
-        Written where asked for: the voxel where the beam ended, signed; undefined for unusable beams.
+        Output if requested: signed coordinates of the voxel where the beam ended; undefined for unusable beams.
     """
     scale = 1.0 / voxel_size
     edge = 2.0 * half
@@ -159,17 +159,17 @@ def cast_rays(
                 iz = 1.0 / dz
             else:
                 dz = 0.0
-            # which face of a cell a ray leaves by: 1 the upper, 0 the lower
+            # face through which a ray leaves a cell: 1 upper, 0 lower
             ux, uy, uz = (1 if dx >= 0.0 else 0), (1 if dy >= 0.0 else 0), (1 if dz >= 0.0 else 0)
             x0, y0, z0 = int(ox), int(oy), int(oz)
             x, y, z = x0, y0, z0
             bx, by, bz = x0 >> 3, y0 >> 3, z0 >> 3
-            # parameters of the faces by which the brick is left
+            # parameters of the exit faces of the brick
             gx = (((bx + ux) << 3) - ox) * ix
             gy = (((by + uy) << 3) - oy) * iy
             gz = (((bz + uz) << 3) - oz) * iz
-            t, axis = 0.0, 3  # where and by which axis the present brick was entered; 3: the ray began in it
-            cx, cy, cz = -9, -9, -9  # present block of bricks; a ray that leaves the cube comes to -1
+            t, axis = 0.0, 3  # parameter and axis of entry into the current brick; axis 3: the ray starts in it
+            cx, cy, cz = -9, -9, -9  # current block of bricks; outside the cube it may be -1
             node, mask = 0, np.uint64(0)
             state, leave = MAX_RANGE, 0.0
             while t <= reach_voxels:
@@ -195,7 +195,7 @@ def cast_rays(
                     if state == UNKNOWN_SPACE:
                         break
                     if shift > 0:
-                        # nothing in a cube of 4^level bricks: go to its far face
+                        # nothing occupied in a cube of 4^level bricks per edge: go to its exit face
                         gx = ((((bx >> shift) + ux) << (shift + 3)) - ox) * ix
                         gy = ((((by >> shift) + uy) << (shift + 3)) - oy) * iy
                         gz = ((((bz >> shift) + uz) << (shift + 3)) - oz) * iz
@@ -275,7 +275,7 @@ def cast_rays(
                         t = enter
                         leave = min(tx, ty, tz)
                         break
-                # on to the next brick
+                # next brick
                 if gx < gy and gx < gz:
                     axis, t = 0, gx
                     bx += 2 * ux - 1

@@ -1,6 +1,6 @@
-"""Compaction of evidence grids, and what is in them as a short list of pieces: the way out to files, and back in.
+"""Compaction of evidence grids, and conversion of a grid to and from a list of bricks and uniform cubes (for files).
 
-Only a few per cent of the bricks of a map are of one value, so updates do not look for them; files and maps at rest do.
+Only a few per cent of the bricks of a map have a single value, so updates do not search for them.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from graphslam.evidence.tree_kernels import BRICKS_USED, NODES_USED
 Ints = npt.NDArray[np.int64]
 
 VALUES = 1 << 16
-"""Distinct values of a voxel, UNKNOWN among them; a value v has the row v + 32768 of tables."""
+"""Number of distinct voxel values, including UNKNOWN; value v has row v + 32768 in tables."""
 
 G = TypeVar("G", bound=GridTree)
 
 
 @dataclass(frozen=True, slots=True)
 class CompactReport:
-    """What a compaction gave back to the pool.
+    """Nodes and bricks that a compaction returned to the pool.
 
     Parameters
     ----------
     nodes, bricks : int
-        Freed.
+        Numbers freed.
     """
 
     nodes: int = 0
@@ -46,7 +46,7 @@ class CompactReport:
 def find_all_states(
     grids: Sequence[GridTree], *, classes: bool = False, threshold: int = 0, maxima: bool = False
 ) -> States:
-    """States of everything the grids (of one pool) hold; keep the pool's lock for as long as they are used."""
+    """States of all nodes and bricks of grids of one pool; hold the pool's lock while the states are used."""
     pool = grids[0].pool
     counters = pool.tree.counters
     b, n = int(counters[BRICKS_USED]), int(counters[NODES_USED])  # ids beyond were never used
@@ -63,10 +63,10 @@ def find_all_states(
 
 
 def compact_grids(grids: GridTree | Sequence[GridTree]) -> CompactReport:
-    """Let all cubes of one value in some grids share one brick or node for each size and value, without loss.
+    """Make all uniform cubes of some grids share one brick or node per size and value; lossless.
 
-    Bricks and nodes that are of one value are kept once for each value, those entirely unknown not at all. What the
-    grids share with others stays shared; no value changes, so locked grids may be compacted too.
+    Bricks and nodes with a single value are stored once per value; unknown ones are removed. Sharing with other grids
+    is kept. No value changes, so locked grids may be compacted too.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def compact_grids(grids: GridTree | Sequence[GridTree]) -> CompactReport:
     Returns
     -------
     CompactReport
-        What was saved.
+        Numbers of freed nodes and bricks.
     """
     several = list(grids) if isinstance(grids, Sequence) else [grids]
     if not several:
@@ -86,7 +86,7 @@ def compact_grids(grids: GridTree | Sequence[GridTree]) -> CompactReport:
     with pool.lock, defer_interrupts():
         nodes, bricks = pool.used_nodes, pool.used_bricks
         states = find_all_states(several)
-        # flags of occupied voxels depend on the threshold, so grids of different ones share nothing
+        # occupancy flags depend on the threshold, so grids with different thresholds cannot share cubes
         for threshold in sorted({g.model.threshold_step for g in several}):
             shared = np.zeros((pool.levels, VALUES), np.int32)
             seen = np.zeros(len(states.node), np.uint8)
@@ -98,7 +98,7 @@ def compact_grids(grids: GridTree | Sequence[GridTree]) -> CompactReport:
 
 @dataclass(frozen=True, slots=True)
 class GridPieces:
-    """A map as bricks, and as cubes of one value where it can be. Ascending in (z, y, x); unknown space is not listed.
+    """A map as a list of bricks and of uniform cubes, ascending in (z, y, x); unknown space is not listed.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class GridPieces:
 
 
 def grid_pieces(grid: GridTree) -> GridPieces:
-    """What a grid holds; equal maps give equal pieces, whatever happened to them before."""
+    """Pieces of a grid; equal maps give equal pieces, independent of their history."""
     pool = grid.pool
     half = pool.half // BRICK_EDGE
     with pool.lock:
@@ -136,7 +136,7 @@ def grid_pieces(grid: GridTree) -> GridPieces:
 
 
 def list_grid(grid: GridTree) -> tuple[Ints, Ints]:
-    """Mixed bricks ``(n, 2)`` and cubes ``(m, 3)`` as `cube_kernels.list_pieces` gives them; hold the pool's lock."""
+    """Mixed bricks ``(n, 2)`` and cubes ``(m, 3)`` from `cube_kernels.list_pieces`; hold the pool's lock."""
     pool = grid.pool
     states = find_all_states([grid])
     found = np.zeros(2, np.int64)
@@ -149,13 +149,13 @@ def list_grid(grid: GridTree) -> tuple[Ints, Ints]:
 
 
 def fill_grid(grid: G, pieces: GridPieces) -> G:
-    """Fill an empty grid. The pieces fit its cube and none overlaps another (:func:`find_overlap`)."""
+    """Fill an empty grid. Pieces must fit its addressable cube and must not overlap (:func:`find_overlap`)."""
     pool = grid.pool
     half = pool.half // BRICK_EDGE
     sizes = (pieces.log_edges - 3) // 2  # a cube is one child, or eight, of a node of this level
     values = len(np.unique(pieces.cube_values))
     nodes = 1 + values * int(sizes.max(initial=0))
-    for level in range(pool.levels - 1):  # nodes on the paths to what they hold
+    for level in range(pool.levels - 1):  # nodes on the paths to the pieces
         below = np.concatenate([pieces.bricks, pieces.cubes[sizes <= level]]) + half
         nodes += len(np.unique(_pack(below >> 2 * (level + 1))))
     cubes = np.column_stack([pieces.cubes + half, pieces.log_edges, pieces.cube_values])
@@ -170,7 +170,7 @@ def fill_grid(grid: G, pieces: GridPieces) -> G:
 
 
 def find_overlap(pieces: GridPieces) -> str | None:
-    """What is impossible about pieces of an unknown source, or None: order, alignment, overlaps."""
+    """Describe the first error in the order, alignment or overlap of pieces from a file, or return None."""
     for name, rows in (("bricks", pieces.bricks), ("cubes", pieces.cubes)):
         if np.any(np.diff(_pack(rows + (1 << 18))) <= 0):
             return f"{name} are not in ascending order"
@@ -186,7 +186,7 @@ def find_overlap(pieces: GridPieces) -> str | None:
 
 
 def tree_levels(reach: int) -> int | None:
-    """Fewest levels of a tree that holds voxels -reach … reach - 1; None if none does."""
+    """Smallest number of levels of a tree that covers voxels -reach … reach - 1; None if too many."""
     for levels in range(2, MAX_LEVELS + 1):
         if BRICK_EDGE * FAN**levels // 2 >= reach:
             return levels
@@ -194,7 +194,7 @@ def tree_levels(reach: int) -> int | None:
 
 
 def check_reach(reach: int, pool: GridPool, where: str) -> None:
-    """Refuse a map that reaches beyond a pool's addressable cube."""
+    """Raise `GridError` if a map extends beyond the addressable cube of a pool."""
     if reach > pool.half:
         needed = tree_levels(reach)
         raise GridError(

@@ -1,4 +1,4 @@
-"""Compiles every kernel of the package by using it on a map of one voxel: ``python -m graphslam.evidence.compile``."""
+"""Compile all kernels of the package by running them on a tiny map: ``python -m graphslam.evidence.compile``."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from graphslam.evidence.octomap import read_octomap, write_octomap
 
 
 def compile_kernels() -> None:
-    """Compile every kernel.
+    """Compile all kernels.
 
-    Compiling is the compiler's own Python, on one core: a second process takes one half, where there is one to take it.
+    The compiler runs on one core, so a second process compiles one half if there is more than one core.
     """
     other = start_compiling("half", subprocess.Popen) if (os.cpu_count() or 1) > 1 else None
     with without_garbage_collection():
@@ -36,7 +36,7 @@ def compile_kernels() -> None:
 
 
 def _first_half() -> list[Callable[[], object]]:
-    """Small pieces of work: what a filter does with its maps."""
+    """Small calls of the functions that a filter uses."""
     grid = EvidenceGrid(1.0)
     other = grid.copy()
     point = np.array([[3.0, 0.0, 0.0]])
@@ -52,7 +52,7 @@ def _first_half() -> list[Callable[[], object]]:
 
 
 def _second_half() -> list[Callable[[], object]]:
-    """Small pieces of work: what is done with whole maps. None of it inserts a scan, which is compiled elsewhere."""
+    """Small calls of functions on whole maps. They insert no scan, because the first half compiles that."""
     grid = EvidenceGrid(1.0)
     values = np.full((1, BRICK_VOXELS), UNKNOWN, np.int16)
     values[0, 0] = 100

@@ -1,4 +1,4 @@
-"""What an evidence grid holds as a whole: voxels in boxes, extent, clouds, entropy."""
+"""Statistics of a whole evidence grid: voxel counts, extent, point clouds, entropy."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class BoxCounts:
-    """Voxels in boxes, each ``(m,)`` int64.
+    """Numbers of voxels in boxes, each ``(m,)`` int64.
 
     Parameters
     ----------
     occupied, known : (m,)
-        Occupied ones; those that were observed.
+        Occupied voxels; observed voxels.
     voxels : (m,)
-        All, of the addressable cube.
+        All voxels inside the addressable cube.
     """
 
     occupied: Ints
@@ -40,7 +40,7 @@ class BoxCounts:
 
 @dataclass(frozen=True, slots=True)
 class VoxelCounts:
-    """Voxels of a whole grid: known = occupied + free."""
+    """Numbers of voxels of a whole grid: known = occupied + free."""
 
     occupied: int
     free: int
@@ -53,7 +53,7 @@ class VoxelCounts:
 
 @dataclass(frozen=True, slots=True)
 class BinnedCloud:
-    """Occupied voxels gathered in larger cells, ascending in (z, y, x) of the cells.
+    """Occupied voxels grouped in larger cells, ascending in (z, y, x) of the cells.
 
     Parameters
     ----------
@@ -68,13 +68,13 @@ class BinnedCloud:
 
 
 def box_query(grid: GridTree, lower: Any, upper: Any) -> BoxCounts:
-    """Occupied, known and all voxels that boxes overlap.
+    """Numbers of occupied, known and all voxels that overlap boxes.
 
     Parameters
     ----------
     lower, upper : (m, dim)
-        Corners in the grid's frame [m]; may be infinite. A voxel that a box only touches is not of it; a box of no
-        extent along an axis overlaps the voxels it lies in. Voxels outside the addressable cube are not there.
+        Corners in the grid frame [m]; may be infinite. A voxel that a box only touches is not counted; a box without
+        extent along an axis overlaps the voxels that contain it. Voxels outside the addressable cube are not counted.
     """
     a = point_rows(lower, grid.dim, grid.voxel_size, "lower corners")
     b = point_rows(upper, grid.dim, grid.voxel_size, "upper corners")
@@ -99,7 +99,7 @@ def box_query(grid: GridTree, lower: Any, upper: Any) -> BoxCounts:
 
 
 def bounding_box(grid: GridTree) -> tuple[Array, Array] | None:
-    """Corners ``(dim,)``, ``(dim,)`` of the smallest box that holds all known voxels [m]; None of an empty map."""
+    """Corners ``(dim,)``, ``(dim,)`` of the smallest box that contains all known voxels [m]; None if empty."""
     pool = grid.pool
     bounds = np.empty(6, np.int64)
     with pool.lock:
@@ -114,7 +114,7 @@ def bounding_box(grid: GridTree) -> tuple[Array, Array] | None:
 def occupied_voxels(grid: GridTree) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int16]]:
     """Signed coordinates ``(n, 3)`` and values ``(n,)`` [`layout.STEP`] of the occupied voxels.
 
-    They come brick by brick, ascending in (z, y, x) of the bricks, and so inside each brick.
+    Order: brick by brick, ascending in (z, y, x) of the bricks and, inside each brick, of the voxels.
     """
     pool = grid.pool
     with pool.lock:
@@ -134,12 +134,12 @@ def occupied_cloud(grid: GridTree, *, with_log_odds: bool = False) -> Any:
     Parameters
     ----------
     with_log_odds : bool
-        Give their log-odds too.
+        Also return their log-odds.
 
     Returns
     -------
     (n, dim) float64, or that and (n,) float32
-        In the grid's frame [m], in the order of :func:`occupied_voxels`.
+        In the grid frame [m], in the order of :func:`occupied_voxels`.
     """
     voxels, values = occupied_voxels(grid)
     points = (voxels[:, : grid.dim] + 0.5) * grid.voxel_size
@@ -147,14 +147,14 @@ def occupied_cloud(grid: GridTree, *, with_log_odds: bool = False) -> Any:
 
 
 def binned_cloud(grid: GridTree, level: int, *, minimum: int = 1) -> BinnedCloud:
-    """Occupied voxels gathered in cells of ``2**level`` voxels a side: the thinned cloud that submaps are matched with.
+    """Occupied voxels grouped in cells with an edge of ``2**level`` voxels: a thinned cloud to match submaps with.
 
     Parameters
     ----------
     level : int
-        0 gives every voxel by itself. Cells are those of the octree: the lattice of cells contains the origin.
+        0: each voxel is a cell. Cells are those of the octree: the lattice of cells contains the origin.
     minimum : int
-        Cells with fewer occupied voxels are left out.
+        Cells with fewer occupied voxels are omitted.
     """
     height = int(grid.pool.half).bit_length()
     if not (isinstance(level, (int, np.integer)) and 0 <= level <= height):
@@ -163,7 +163,7 @@ def binned_cloud(grid: GridTree, level: int, *, minimum: int = 1) -> BinnedCloud
     cells = (voxels.astype(np.int64) >> int(level)) + grid.pool.half
     keys = (cells[:, 2] << 40) | (cells[:, 1] << 20) | cells[:, 0]
     _, first, inverse, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    # offsets from the cell's corner are small whole numbers, so their sums are exact in any order
+    # offsets from the cell corner are small integers, so their sums are exact in any order
     offsets = voxels - ((voxels >> int(level)) << int(level))
     sums = np.stack([np.bincount(inverse, offsets[:, i], len(counts)) for i in range(grid.dim)], axis=1)
     corner = ((voxels[first, : grid.dim] >> int(level)) << int(level)).astype(np.float64)
@@ -173,9 +173,9 @@ def binned_cloud(grid: GridTree, level: int, *, minimum: int = 1) -> BinnedCloud
 
 
 def value_counts(grid: GridTree) -> Ints:
-    """Number of voxels of each value, ``(65536,)``, row v + 32768; row 0, of the unknown, is set to 0.
+    """Number of voxels of each value, ``(65536,)``, row v + 32768; row 0 (unknown) is set to 0.
 
-    A brick that stands in many places of a compacted map is looked at once.
+    A brick that occurs in many places of a compacted map is read once.
     """
     pool = grid.pool
     counts = np.zeros(65536, np.int64)
@@ -202,15 +202,15 @@ def voxel_counts(grid: GridTree) -> VoxelCounts:
 
 
 def known_volume(grid: GridTree) -> float:
-    """Volume of the voxels that were observed [m³], in 2-D their area [m²]."""
+    """Volume of the observed voxels [m³], in 2-D their area [m²]."""
     return float(value_counts(grid).sum()) * grid.voxel_size**grid.dim
 
 
 def entropy(grid: GridTree) -> float:
-    """Entropy of the map (SegSLAM eq. 20–22): observed voxels only, times the volume of a voxel [nat m³; 2-D: nat m²].
+    """Entropy of the observed voxels times the voxel volume (SegSLAM eq. 20–22) [nat m³; in 2-D nat m²].
 
-    ``H = Σ γ (-ρ log ρ - (1 - ρ) log(1 - ρ))``. Voxels are counted by value first, so that the sum is the same whatever
-    the order of the bricks.
+    ``H = Σ γ (-ρ log ρ - (1 - ρ) log(1 - ρ))``. Voxels are counted by value first, so that the sum does not
+    depend on the order of the bricks.
     """
     return entropy_of_counts(value_counts(grid)) * grid.voxel_size**grid.dim
 
@@ -222,6 +222,6 @@ def entropy_of_counts(counts: Ints) -> float:
 
 @lru_cache(maxsize=1)
 def _entropies() -> Array:
-    """Entropy of a voxel of each value [nat] (eq. 21); even in the log-odds, so by the smaller probability."""
+    """Entropy of a voxel for each value [nat] (eq. 21), computed from the smaller of ρ and 1 - ρ."""
     q = 1.0 / (1.0 + np.exp(np.abs(np.arange(-32768, 32768)) * STEP))
     return -q * np.log(q) - (1.0 - q) * np.log1p(-q)

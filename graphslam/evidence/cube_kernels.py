@@ -1,7 +1,7 @@
-"""Compiled work on cubes of equal voxels: find them, share them, list them, fill them.
+"""Compiled functions for cubes of equal voxels: find, share, list and fill them.
 
-The *state* of a brick or node is the value all its voxels have, or MIXED. Where only classes matter, the values are
-reduced to FREE_STATE and OCCUPIED_STATE first. The *size* s of a cube: 0 a brick, s a node of level s - 1; its edge is
+The *state* of a brick or node is the common value of all its voxels, or MIXED. With ``classes``, known values are
+replaced by FREE_STATE or OCCUPIED_STATE first. The *size* s of a cube: 0 a brick, s a node of level s - 1; its edge is
 ``8·4**s`` voxels.
 """
 
@@ -22,19 +22,19 @@ from graphslam.evidence.tree_kernels import (
     take_node,
 )
 
-MIXED, UNSEEN = 1 << 20, 1 << 21  # no value of a voxel
+MIXED, UNSEEN = 1 << 20, 1 << 21  # outside the range of voxel values
 FREE_STATE, OCCUPIED_STATE = -1, 1
 
 
 class States(NamedTuple):
-    """What is of one value below some roots, by ids: a part that is shared many times is looked at once.
+    """States of bricks and nodes below some roots, by id, so that shared parts are examined once.
 
     Parameters
     ----------
     brick, node : (B,), (N,) int32
-        States, UNSEEN to begin with.
+        States, initially UNSEEN.
     brick_max, node_max : (B,), (N,) int16
-        Largest known value, -32768 where there is none; both (0,) where not wanted.
+        Largest known value, -32768 if all is unknown; both (0,) if not requested.
     """
 
     brick: npt.NDArray[np.int32]
@@ -54,7 +54,7 @@ def voxel_state(value, classes, threshold):
 
 @kernel()
 def voxels_state(row, classes, threshold):
-    """State of the voxels of a brick ``(512,)``."""
+    """State of a brick, given its voxels ``(512,)``."""
     if classes:
         s = voxel_state(row[0], classes, threshold)
         for j in range(1, 512):
@@ -65,7 +65,7 @@ def voxels_state(row, classes, threshold):
     for line in range(16):
         other = np.int16(0)
         for j in range(32 * line, 32 * line + 32):
-            other |= np.int16(row[j] ^ first)  # int16 after each operation, or it is not vectorised
+            other |= np.int16(row[j] ^ first)  # int16 after each operation, else the loop is not vectorised
         if other != 0:
             return 1 << 20
     return int(first)
@@ -73,7 +73,7 @@ def voxels_state(row, classes, threshold):
 
 @kernel()
 def child_state(child, level, states):
-    """State and largest known value of a child of a node of some level."""
+    """State and largest known value of a child of a node of level ``level``."""
     want_max = states.brick_max.shape[0] > 0
     if child == 0:
         return np.int64(-32768), np.int64(-32768)
@@ -84,7 +84,7 @@ def child_state(child, level, states):
 
 @kernel()
 def find_states(root, classes, threshold, tree, states):
-    """States of everything below a root, and the root's own."""
+    """Compute the states of a root and of everything below it."""
     levels, children = tree.levels, tree.children
     want_max = states.brick_max.shape[0] > 0
     node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)
@@ -124,11 +124,11 @@ def find_states(root, classes, threshold, tree, states):
 
 @kernel()
 def share_cubes(root, states, seen, shared, tree):
-    """Point every parent of a cube of one value at one brick or node, and at nothing where nothing is known.
+    """Replace every uniform cube by one shared brick or node per size and value; unknown cubes are removed.
 
-    The contents of no grid change, so nodes that have several parents are written as well: all of them gain.
-    ``seen (N,) uint8`` marks nodes that were done; ``shared (levels, 65536) int32`` holds the brick or node of each
-    size and value, 0 where none is known yet.
+    No value changes, so nodes with several parents are changed in place, for all grids that share them.
+    ``seen (N,) uint8`` marks nodes that were visited; ``shared (levels, 65536) int32`` has the brick or node of each
+    size and value, 0 if there is none yet.
     """
     one = np.empty(1, np.int64)
     stack = np.empty((64 * 8, 2), np.int64)
@@ -171,10 +171,10 @@ def share_cubes(root, states, seen, shared, tree):
 
 @kernel()
 def list_pieces(root, levels, children, states, mixed, cubes, found):
-    """List what is known: mixed bricks as [packed offset coordinates, id] in ``mixed (n, 2)``, the largest cubes of one
-    value as [packed offset coordinates of their first brick, size, value] in ``cubes (m, 3)``.
+    """List known space: mixed bricks as [packed offset coordinates, id] in ``mixed (n, 2)``, the largest uniform cubes
+    as [packed offset coordinates of their first brick, size, value] in ``cubes (m, 3)``.
 
-    ``found (2,)`` gets the numbers of both, also where the arrays are too short. The root is never one cube.
+    ``found (2,)`` gets the numbers of both, even if the arrays are too short. The root is never listed as one cube.
     """
     stack = np.empty((64 * 8, 5), np.int64)
     stack[0, 0], stack[0, 1] = root, levels - 1
@@ -209,12 +209,12 @@ def list_pieces(root, levels, children, states, mixed, cubes, found):
                 n += 1
 
 
-# --- building a tree that nobody else holds: room reserved, root owned, no shared node on any path ---------------
+# --- building a tree without other owners: capacity reserved, root owned, no shared node on any path --------------
 
 
 @kernel()
 def make_path(root, bx, by, bz, size, tree):
-    """Node whose children are cubes of a size, over a brick, and its child the brick is in; missing nodes are made."""
+    """Node above a brick whose children are cubes of size ``size``, and the child index; missing nodes are created."""
     node = root
     for level in range(tree.levels - 1, size, -1):
         c = child_index(bx, by, bz, level)
@@ -228,9 +228,9 @@ def make_path(root, bx, by, bz, size, tree):
 
 @kernel()
 def uniform_cube(size, value, threshold, uniform, tree):
-    """Brick or node all of whose voxels have a value, made where ``uniform (levels, 65536) int32`` has none yet.
+    """Brick or node whose voxels all have one value; created if ``uniform (levels, 65536) int32`` has none yet.
 
-    Its count of parents is the caller's to raise.
+    The caller must increase its parent count.
     """
     k = value + 32768
     occupied = value >= threshold
@@ -260,7 +260,7 @@ def uniform_cube(size, value, threshold, uniform, tree):
 
 @kernel()
 def finalise_occupied(root, threshold, tree):
-    """Write the flags of occupied voxels of a tree just built; parts with several parents have theirs already."""
+    """Set the occupancy flags of a new tree; parts with several parents have theirs already."""
     node, cursor = np.empty(9, np.int64), np.empty(9, np.int64)
     for k in range(9):  # np.zeros would take longer to compile
         cursor[k] = 0
@@ -294,11 +294,11 @@ def finalise_occupied(root, threshold, tree):
 @kernel()
 def build_tree(root, corners, values, cubes, threshold, uniform, tree):
     """Fill an empty grid with bricks (offset coordinates ``corners (n, 3) int64``, ``values (n, 512) int16``) and cubes
-    ``(m, 5) int64`` [offset coordinates of the first brick, log2 of the edge ≥ 8 in voxels, value]; none overlaps
-    another. A cube whose log2 is even is eight children of a node, one whose log2 is odd is one child.
+    ``(m, 5) int64`` [offset coordinates of the first brick, log2 of the edge ≥ 8 in voxels, value] without overlaps. A
+    cube with an even log2 is eight children of a node, a cube with an odd log2 is one child.
     """
     for k in range(corners.shape[0]):
-        lowest = tree.levels - tree.levels  # 0, but no literal, for which make_path would be compiled once more
+        lowest = tree.levels - tree.levels  # 0, but not a literal, for which make_path would be compiled again
         node, c = make_path(root, corners[k, 0], corners[k, 1], corners[k, 2], lowest, tree)
         b = take_brick(tree.brick_ref, tree.brick_free, tree.counters)
         tree.children[node, c] = b

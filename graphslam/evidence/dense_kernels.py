@@ -1,4 +1,4 @@
-"""Compiled copies from a tree to a dense array, in the order of the array."""
+"""Compiled copies from a tree to a dense array, and the bounding box of the known voxels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from graphslam.evidence.tree_kernels import find_node
 
 @kernel()
 def row_of_bricks(root, bx, by, bz, levels, children, ids):
-    """Bricks bx, bx + 1, … at one height and depth, 0 (all unknown) where there is none or no room for one."""
+    """Ids of bricks bx, bx + 1, … at given by and bz; 0 (the unknown brick) if absent or outside the cube."""
     edge = 1 << (2 * levels)
     parent, column = 0, -1
     inside = root != 0 and 0 <= by < edge and 0 <= bz < edge
@@ -29,10 +29,9 @@ def row_of_bricks(root, bx, by, bz, levels, children, ids):
 @kernel()
 def known_box(root, levels, children, bricks, box):
     """First known voxel and the one after the last per axis, ``box (6,) int64`` [offset coordinates]; first > last
-    where none is.
+    for an empty map.
 
-    What lies inside the box found so far is passed over, whole subtrees at a time, so that little of a map is read,
-    however large the cubes in it are.
+    Subtrees inside the box found so far are skipped, so that only a small part of a map is read.
     """
     for a in range(3):
         box[a], box[a + 3] = 1 << 40, 0
@@ -80,8 +79,8 @@ def dense_values(root, first, levels, children, bricks, out):
     bx = x0 >> 3
     ids = np.empty(((x0 + nx - 1) >> 3) - bx + 1, np.int64)
     last = ids.shape[0] - 1
-    begin = x0 - 8 * bx  # voxels of the first brick that are not wanted
-    # unsigned: a signed index is looked at for being negative
+    begin = x0 - 8 * bx  # voxels of the first brick before the box
+    # unsigned, because numba checks signed indices for negative values
     u1, u2, u3, u4 = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
     u5, u6, u7, u8 = np.uint64(5), np.uint64(6), np.uint64(7), np.uint64(8)
     for bz in range(z0 >> 3, ((z0 + nz - 1) >> 3) + 1):
@@ -96,7 +95,7 @@ def dense_values(root, first, levels, children, bricks, out):
                     t = np.uint64(row + 8 - begin)
                     for k in range(1, last):
                         s = np.uint64(512 * ids[k] + j)
-                        # all is read before any is written, or it does not become one load and one store
+                        # read all, then write all; otherwise the compiler does not make one load and one store
                         v0, v1, v2, v3 = source[s], source[s + u1], source[s + u2], source[s + u3]
                         v4, v5, v6, v7 = source[s + u4], source[s + u5], source[s + u6], source[s + u7]
                         target[t], target[t + u1], target[t + u2], target[t + u3] = v0, v1, v2, v3

@@ -1,4 +1,4 @@
-"""Evidence grids as dense arrays and as files, both without loss."""
+"""Lossless conversion of evidence grids to dense arrays, and reading of npz files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from graphslam.evidence.layout import (
 from graphslam.evidence.pool import GridPool
 
 DENSE_LIMIT = 1 << 34
-"""Largest dense array that is made [bytes]; a wish beyond it is a mistake in the bounds."""
+"""Largest dense array that is allocated [bytes]; a larger request is probably an error in the bounds."""
 
 Ints = npt.NDArray[np.int64]
 
@@ -42,7 +42,7 @@ class DenseGrid:
     Parameters
     ----------
     values : (nx, ny, nz), in 2-D (nx, ny)
-        int16 in units of `layout.STEP` with `layout.UNKNOWN`, or float32 log-odds with NaN for unknown. As made by
+        int16 in units of `layout.STEP` with `layout.UNKNOWN`, or float32 log-odds with NaN for unknown. From
         :func:`to_dense`, x is the fastest axis in memory.
     first_voxel : (dim,) int64
         Signed coordinates of the first voxel: it covers ``[i v, (i + 1) v) × …``.
@@ -61,7 +61,7 @@ class DenseGrid:
 
 
 def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
-    """First known voxel and the one after the last, on each axis ``(3,)``; both 0 where nothing is known."""
+    """First known voxel and the one after the last, on each axis ``(3,)``; both 0 for an empty map."""
     pool = grid.pool
     box = np.empty(6, np.int64)
     with pool.lock:
@@ -72,13 +72,13 @@ def known_bounds(grid: EvidenceGrid) -> tuple[Ints, Ints]:
 
 
 def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: Any = np.int16) -> DenseGrid:
-    """A map, or a box of it, as an array, to the last bit.
+    """Convert a map, or a box of it, to an array, without loss.
 
     Parameters
     ----------
     bounds : (2, dim) int, optional
-        First voxel and the one after the last; may reach beyond the map and its addressable cube. Default: the box of
-        the known voxels.
+        First voxel and the one after the last; may extend beyond the map and its addressable cube. Default: the
+        bounding box of the known voxels.
     dtype : int16 or float32
         Units of `layout.STEP`, or log-odds.
     """
@@ -100,7 +100,7 @@ def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: 
         values = np.empty(shape[::-1], kind)
         if kind == np.int16:
             dense_values(grid.root, first, pool.levels, pool.tree.children, pool.tree.bricks, values)
-        else:  # a few layers at a time, which the cache holds
+        else:  # a few layers at a time, which fit in the cache
             layers = np.empty((BRICK_EDGE, *values.shape[1:]), np.int16)
             for z in range(0, len(values), BRICK_EDGE):
                 part = layers[: len(values) - z]
@@ -118,7 +118,7 @@ def _checked_bounds(bounds: npt.ArrayLike, dim: int) -> tuple[Ints, Ints]:
             got=np.array2string(box, threshold=8),
             wanted=f"(2, {dim}) integers, [first voxel, the one after the last]",
         )
-    # far beyond every tree there is nothing, and sums there may overflow
+    # bounds far outside every tree: clipped, because sums may overflow
     far = 1 << 40
     box = (
         np.clip(box.astype(np.float64), -far, far).astype(np.int64) if np.any(np.abs(box.astype(float)) > far) else box
@@ -133,13 +133,13 @@ def _checked_bounds(bounds: npt.ArrayLike, dim: int) -> tuple[Ints, Ints]:
 
 
 def load_npz(path: str | os.PathLike[str], *, pool: GridPool | None = None) -> EvidenceGrid:
-    """Read what `EvidenceGrid.save` wrote.
+    """Read a file that was written by `EvidenceGrid.save`.
 
     Parameters
     ----------
     pool : GridPool, optional
-        Storage to read into, whatever its number of levels, so long as the map fits; default a new one of as many
-        levels as the map was made with.
+        Pool to read into; the map must fit in its addressable cube. Default: a new pool with the number of levels
+        stored in the file.
     """
     where = str(path)
     arrays = read_npz(path, fmt=FORMAT)
@@ -162,7 +162,7 @@ def load_npz(path: str | os.PathLike[str], *, pool: GridPool | None = None) -> E
 
 
 def _field(arrays: dict[str, npt.NDArray[Any]], name: str, dtype: Any, shape: tuple[int, ...], where: str) -> Any:
-    """An array of a file, checked; -1 in a shape stands for any number."""
+    """Array of a file, checked for type and shape; -1 in a shape means any number."""
     if name not in arrays:
         raise FormatError(f"array {name!r} is missing", where=where)
     a = arrays[name]

@@ -1,8 +1,8 @@
 """EvidenceGrid: a log-odds map of occupied and free space that copies in constant time.
 
-The deferred-reference-count octree of SegSLAM (section 2): a grid is a value-like handle on a tree in a shared pool.
-Copying shares the tree; writing copies only what it changes. So every particle of a filter owns a map, resampled
-particles share their history, and a submap that is entered again starts as a copy of what it was.
+This is the octree of SegSLAM (section 2) with deferred reference counting. A grid is a handle on a tree in a shared
+pool. A copy shares the tree; a write copies only the nodes and bricks that it changes. So every particle of a filter
+has its own map, resampled particles share unchanged parts, and a re-entered submap starts as a copy of its last map.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ FORMAT = "graphslam.evidence/1"
 class EvidenceGrid(GridTree):
     """A log-odds occupancy map, 3-D or 2-D, with O(1) copies.
 
-    Voxel (i, j, k) covers ``[i v, (i + 1) v) × …`` of the grid's frame, v the voxel size. A 2-D grid is the layer
-    k = 0 of the same thing.
+    Voxel (i, j, k) covers ``[i v, (i + 1) v) × …`` in the grid frame, with voxel size v. A 2-D grid is the layer
+    k = 0 of such a grid.
 
     Parameters
     ----------
     voxel_size : float
         Edge of a voxel [m].
     pool : GridPool, optional
-        Storage shared with other grids; default a pool of its own.
+        Storage shared with other grids; default: a new pool.
     dim : {3, 2}
 
     Examples
@@ -68,24 +68,24 @@ class EvidenceGrid(GridTree):
         max_range: float | None = None,
         returns: Any = None,
     ) -> UpdateReport:
-        """Insert beams by the beam model: free along the way, occupied at the end, each voxel once a scan.
+        """Insert beams with the beam model; each voxel is updated at most once per scan.
 
-        All voxels from that of the origin up to, not including, that of the end are passed; that of the end is hit. A
-        voxel some beam hit counts as hit, whatever passed through it. Beams that cannot be used are dropped and
-        counted.
+        Voxels from the origin up to, but not including, the end voxel get the miss update; the end voxel gets the hit
+        update. If some beams end in a voxel and others cross it, it gets the hit update. Unusable beams are dropped
+        and counted.
 
         Parameters
         ----------
         points : (n, 3) or (n, 2)
-            Ends of the beams in the frame of the scan [m].
+            End points of the beams in the scan frame [m].
         origin : (3,) or (n, 3), (2,) or (n, 2)
-            Where the beams start, in the same frame; one for each beam if the sensor moved. Default 0.
+            Start points of the beams in the scan frame [m]; one per beam if the sensor moved. Default 0.
         pose : (7,), (4, 4), or (3,) in 2-D
             ``T_grid_scan``; default identity.
         max_range : float, optional
-            Longer beams are cut there and give free space only [m].
+            Longer beams are cut at this range and mark free space only [m].
         returns : (n,) bool, optional
-            False where a beam met nothing: it is free up to its point. Default all True.
+            False for a beam without a return: it marks free space up to its point. Default all True.
         """
         self.check_writable()
         scan = scan_rows(points, origin, returns, max_range, self.dim, self.voxel_size)
@@ -94,14 +94,14 @@ class EvidenceGrid(GridTree):
             return update_report(insert_scan((self,), T, scan, 1))
 
     def write_bricks(self, coordinates: Any, values: Any) -> None:
-        """Replace whole bricks: the bulk way in for readers.
+        """Replace whole bricks, e.g. when a file is read.
 
         Parameters
         ----------
         coordinates : (n, 3) int
-            Signed; brick b holds voxels 8b … 8b + 7. None twice.
+            Signed; brick b holds voxels 8b … 8b + 7. No brick twice.
         values : (n, 512) int16
-            In units of `layout.STEP`, x fastest; `layout.UNKNOWN` where nothing is known.
+            In units of `layout.STEP`, x fastest; `layout.UNKNOWN` for unknown voxels.
         """
         self.check_writable()
         c = np.ascontiguousarray(coordinates, dtype=np.int64)
@@ -129,7 +129,7 @@ class EvidenceGrid(GridTree):
         write_packed(self, keys, v)
 
     def merge(self, other: EvidenceGrid, pose: Any = None) -> int:
-        """Add the log-odds of another map under ``T_self_other``; see `merge.merge`."""
+        """Add the log-odds of another map under ``T_self_other``; see `merge.merge_grids`."""
         return merge_grids(self, other, pose)
 
     # --- reading ---------------------------------------------------------------------------------------------
@@ -143,7 +143,7 @@ class EvidenceGrid(GridTree):
         return out
 
     def brick_blocks(self, size: int = 4096) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[np.int16]]]:
-        """Coordinates ``(m, 3)`` and values ``(m, 512)`` of the bricks, so many at a time, in their order."""
+        """Coordinates ``(m, 3)`` and values ``(m, 512)`` of the bricks, in order, ``size`` bricks at a time."""
         pool = self.pool
         coordinates = self.brick_coordinates()
         with pool.lock:
@@ -163,13 +163,13 @@ class EvidenceGrid(GridTree):
         ignore_unknown: bool = True,
         voxels: bool = False,
     ) -> queries.CastResult:
-        """Expected ranges of beams: `queries.cast`; for many grids at once, `queries.cast_grids`."""
+        """Expected ranges of beams (`queries.cast_beams`); for many grids at once, `queries.cast_grids`."""
         return queries.cast_beams(
             self, origins, directions, max_range, pose=pose, ignore_unknown=ignore_unknown, voxels=voxels
         )
 
     def log_odds_at(self, points: Any) -> npt.NDArray[np.float32]:
-        """Log-odds ``(n,)`` of the voxels that points ``(n, dim)`` [m] lie in, NaN where unknown."""
+        """Log-odds ``(n,)`` of the voxels that contain points ``(n, dim)`` [m], NaN where unknown."""
         return queries.log_odds_at(self, points)
 
     def occupied_at(self, points: Any) -> npt.NDArray[np.bool_]:
@@ -181,19 +181,19 @@ class EvidenceGrid(GridTree):
         return queries.known_at(self, points)
 
     def box_query(self, lower: Any, upper: Any) -> contents.BoxCounts:
-        """Occupied, known and all voxels in boxes between corners ``(m, dim)`` [m]: `contents.box_query`."""
+        """Numbers of occupied, known and all voxels in boxes with corners ``(m, dim)`` [m]: `contents.box_query`."""
         return contents.box_query(self, lower, upper)
 
     def bounding_box(self) -> tuple[Array, Array] | None:
-        """Corners ``(dim,)`` of the smallest box that holds all known voxels [m]; None of an empty map."""
+        """Corners ``(dim,)`` of the smallest box that contains all known voxels [m]; None for an empty map."""
         return contents.bounding_box(self)
 
     def occupied_cloud(self, *, with_log_odds: bool = False) -> Any:
-        """Centres of the occupied voxels ``(n, dim)`` [m]; with their log-odds ``(n,)`` if asked for."""
+        """Centres of the occupied voxels ``(n, dim)`` [m]; with ``with_log_odds`` also their log-odds ``(n,)``."""
         return contents.occupied_cloud(self, with_log_odds=with_log_odds)
 
     def binned_cloud(self, level: int, *, minimum: int = 1) -> contents.BinnedCloud:
-        """Occupied voxels gathered in cells of ``2**level`` voxels: `contents.binned_cloud`."""
+        """Occupied voxels grouped in cells with an edge of ``2**level`` voxels: `contents.binned_cloud`."""
         return contents.binned_cloud(self, level, minimum=minimum)
 
     def voxel_counts(self) -> contents.VoxelCounts:
@@ -209,16 +209,15 @@ class EvidenceGrid(GridTree):
         return contents.entropy(self)
 
     def memory(self) -> MemoryUse:
-        """Memory of this grid, and what of it no other grid shares; for sets of grids, `memory.memory`."""
+        """Memory of this grid, private and shared; for sets of grids, `memory.measure_memory`."""
         return measure_memory(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an npz archive that `formats.load_npz` reads: whole or not at all, the same map always as the same
-        bytes.
+        """Write an npz archive for `formats.load_npz`, atomically; equal maps give equal bytes.
 
-        The archive holds no unknown brick, and a cube of one value as its corner, size and value only (format
+        Unknown bricks are not stored. A cube with one value is stored as corner, size and value. Format
         ``graphslam.evidence/1``: arrays ``voxel_size``, ``dim``, ``levels``, ``model`` (hit, miss, clamp low, clamp
-        high, threshold), and those of `compact.Pieces`).
+        high, threshold), and those of `compact.GridPieces`.
         """
         pieces, m = grid_pieces(self), self.model
         write_npz(

@@ -1,4 +1,4 @@
-"""The handle on a tree of an evidence grid: what its maps, queries and files are built on."""
+"""Base class of evidence grids: a handle on a tree in a shared pool, with copying, locking and reading of values."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from graphslam.evidence.scan import point_rows
 from graphslam.evidence.tree_kernels import list_bricks, read_values
 
 _DEFAULT_MODEL = BeamModel()
-_new = object.__new__  # a name of the module: copying is counted in tenths of microseconds
+_new = object.__new__  # a module name is faster to look up; a copy takes tenths of microseconds
 
 
 class GridTree:
-    """A tree in a shared pool under a handle that copies in constant time (SegSLAM, section 2).
+    """Handle on a tree in a shared pool; a copy takes constant time (SegSLAM, section 2).
 
-    Base of :class:`~graphslam.evidence.grid.EvidenceGrid`, which has the parameters.
+    Base of :class:`~graphslam.evidence.grid.EvidenceGrid`; its parameters are documented there.
     """
 
     __slots__ = ("__weakref__", "_box", "dim", "locked", "model", "pool", "voxel_size")
     _plain: ClassVar[Any]
-    """Class of copies and of empty grids: that of grids in memory, also of one that is spilled."""
+    """Class of copies and of empty grids; copies of a spilled grid are of this in-memory class too."""
 
     def __init_subclass__(cls) -> None:
         if GridTree in cls.__bases__:
@@ -48,7 +48,7 @@ class GridTree:
         self._box = RootBox(0, self.pool.dead)
 
     def copy(self) -> Self:
-        """The same map under a second handle, in constant time; whichever is written first pays for what it changes.
+        """Copy the map in constant time; nodes and bricks are copied later, when one of the two is written to.
 
         The copy of a locked grid is not locked.
         """
@@ -69,18 +69,18 @@ class GridTree:
         return self.copy()
 
     def empty(self, pool: GridPool | None = None) -> Self:
-        """An empty grid of the same kind, in the same pool or another."""
+        """An empty grid with the same voxel size, beam model and dimension, in the same or another pool."""
         pool = self.pool if pool is None else pool
         made: Self = self._plain(self.voxel_size, model=self.model, pool=pool, dim=self.dim)
         return made
 
     def release(self) -> None:
-        """Forget the map now; the handle is an empty grid afterwards. Happens by itself when the last handle dies."""
+        """Free the map now and make this an empty grid. It is also freed when its last handle is deleted."""
         self._box = RootBox(0, self.pool.dead)
         self.pool.collect()
 
     def lock(self) -> None:
-        """Localise only: from here on, updating raises `GridLockedError` (SegSLAM A12)."""
+        """For localisation only: from now on, updates raise `GridLockedError` (SegSLAM A12)."""
         self.locked = True
 
     def unlock(self) -> None:
@@ -89,16 +89,16 @@ class GridTree:
 
     @property
     def root(self) -> int:
-        """Root node in the pool, 0 of an empty grid; valid until the next write."""
+        """Root node in the pool, 0 for an empty grid; valid until the next write."""
         return self._box.root
 
     def replace_contents(self, other: GridTree) -> None:
-        """Become what ``other``, a grid of the same kind, is now: how a long change is made whole or not at all."""
+        """Share the tree of ``other``, a grid of the same kind; makes a long change atomic."""
         other._box.shared = True
         self.pool, self._box = other.pool, other._box
 
     def same_as(self, other: GridTree) -> bool:
-        """Whether two handles hold the very same tree (a copy that neither side has written to)."""
+        """Whether two handles share one tree (a copy, and neither was written to since), or both are empty."""
         return self._box is other._box or (self.root == 0 == other.root)
 
     def check_writable(self) -> None:
@@ -124,8 +124,8 @@ class GridTree:
         return np.stack([keys & 0xFFFFF, (keys >> 20) & 0xFFFFF, keys >> 40], axis=1) - half
 
     def values_at(self, points: Any) -> npt.NDArray[np.int16]:
-        """Values of the voxels points lie in ``(n,)``, in units of `layout.STEP`; `layout.UNKNOWN` where nothing is
-        known, outside the addressable cube, and for points that are not finite."""
+        """Values ``(n,)`` of the voxels that contain points, in units of `layout.STEP`; `layout.UNKNOWN` for unknown
+        voxels, outside the addressable cube, and for points that are not finite."""
         p = point_rows(points, self.dim, self.voxel_size)
         out = np.empty(len(p), np.int16)
         pool = self.pool

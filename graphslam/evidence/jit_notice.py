@@ -1,7 +1,7 @@
-"""Says that kernels are being compiled, the one time they are.
+"""Progress message while the kernels are compiled, on the first use on a machine.
 
-Compiled code is kept on disk (:func:`graphslam.core.jit.compiled_folder`), so only the first use on a machine
-waits; a first use that waits in silence looks like a hang.
+Compiled code is cached on disk (:func:`graphslam.core.jit.compiled_folder`). Without a message, the first use would
+look like a hang.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _state = {"checked": False}
 
 
 def is_compiled(kernel: Any) -> bool:
-    """Whether compiled code of a kernel lies on disk; true also where nothing is compiled, or none can be kept."""
+    """Whether compiled code of a kernel is on disk; also True if compilation or its disk cache is disabled."""
     if not hasattr(kernel, "stats") or kernel.stats.cache_path is None:  # NUMBA_DISABLE_JIT; see graphslam.core.jit
         return True
     source = Path(inspect.getsourcefile(kernel.py_func) or "")
@@ -29,10 +29,10 @@ def is_compiled(kernel: Any) -> bool:
 
 
 def announce_compilation() -> None:
-    """If this machine has not compiled the kernels yet, have them compiled, with a line of progress on stderr.
+    """Compile the kernels if they are not on disk yet, with a progress line on stderr.
 
-    Other processes do it, and this one then loads their work from disk; where none can be started, kernels are compiled
-    at their use.
+    Other processes compile, and this process loads the result from disk. If no process can be started, each kernel is
+    compiled at its first call.
     """
     if _state["checked"]:
         return
@@ -43,7 +43,7 @@ def announce_compilation() -> None:
 
 
 def start_compiling(part: str, start: Any) -> Any:
-    """Start ``graphslam.evidence.compile`` for ``"all"`` or ``"half"`` of the kernels; None where that cannot be."""
+    """Start ``graphslam.evidence.compile`` for ``"all"`` or ``"half"`` of the kernels; None if that fails."""
     if not sys.executable:
         return None
     here = str(Path(__file__).resolve().parents[2])

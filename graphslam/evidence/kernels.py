@@ -1,4 +1,4 @@
-"""How every compiled function of the package is compiled."""
+"""Decorator with the numba options of all kernels of the package."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from graphslam.core.jit import njit
 
 
 def kernel(*, error_model: str = "python") -> Callable[[Any], Any]:
-    """Compiled on first use, kept on disk, runs beside other threads.
+    """Compiled at the first call and cached on disk; releases the GIL.
 
-    Nobody calls a kernel from C, and a wrapper for that would be a fifteenth of the time it takes to compile.
+    The wrapper for calls from C is not needed; it would add a fifteenth to the compile time.
     """
     return njit(nogil=True, no_cfunc_wrapper=True, error_model=error_model)  # type: ignore[no-any-return]

@@ -1,11 +1,10 @@
-"""How well a scan fits an evidence grid: the weights of particles.
+"""Likelihood of a scan given an evidence grid: the weights of particles.
 
-Two likelihoods. By *end points*: how occupied the map is where beams ended; flat, cheap, forgiving. By *casting*:
-whether each beam is as long as the map expects; sharp, and so it needs far stronger tempering. Beams of one scan are
-not independent (neighbours meet the same wall, with the same error of the map), so the sum of their logarithms must be
-scaled down by an exponent, and there is no default for it: what matters is the *effective* number of beams, exponent
-times beams, that a step adds before resampling; some tens for end points and a few for casting keep half of the
-particles effective.
+There are two likelihoods. *End points*: the occupancy of the map where beams ended; it is broad and fast. *Casting*:
+the measured range against the expected range; it is much sharper and needs stronger tempering. Beams of one scan are
+not independent (neighbouring beams hit the same wall, with the same map error), so the sum of log-likelihoods is
+scaled by an exponent. The exponent has no default; choose it by the *effective* number of beams per resampling step,
+exponent × beams: some tens for end points and a few for casting keep about half of the particles effective.
 """
 
 from __future__ import annotations
@@ -29,19 +28,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class EndpointLikelihood:
-    """Log-likelihood ``log(floor + (1 - floor) p)`` of a beam that ended where the map is occupied with probability p.
+    """Log-likelihood ``log(floor + (1 - floor) p)`` of a beam whose end point has occupancy probability p in the map.
 
-    Beams that met nothing within the maximum range say nothing here.
+    Beams without a return within the maximum range are not used.
 
     Parameters
     ----------
     exponent : float
         Scale of the sum over beams; exponent × beams is the effective number of beams.
     floor : float
-        Probability that a beam has nothing to do with the map.
+        Probability that a beam is an outlier, independent of the map.
     interpolation : {"trilinear", "nearest"}
     unknown : float
-        Probability of occupancy where the map knows nothing.
+        Occupancy probability of unknown voxels.
     """
 
     exponent: float
@@ -59,7 +58,7 @@ class EndpointLikelihood:
             raise ConfigError(f"interpolation {self.interpolation!r}; wanted 'nearest' or 'trilinear'")
 
     def beams(self, probability: Any) -> Array:
-        """Log-likelihood of each beam; NaN, of points that are not finite, gives 0."""
+        """Log-likelihood of each beam; 0 for NaN (points that are not finite)."""
         p = np.asarray(probability, dtype=np.float64)
         return np.nan_to_num(np.log(self.floor + (1.0 - self.floor) * p), nan=0.0)
 
@@ -68,23 +67,23 @@ class EndpointLikelihood:
 class CastLikelihood:
     """Log-likelihood ``-½ min(z², clip²)``, ``z = (measured - expected range) / sigma``, of each beam.
 
-    The constant of the Gaussian is the same for all particles and left out, so 0 is perfect agreement. Where the map
-    expects nothing within the maximum range and the beam met nothing, they agree; where only one of them met
-    something, the other stands at the maximum range.
+    The Gaussian constant is the same for all particles and is omitted, so 0 means perfect agreement. A beam without a
+    return is measured at the maximum range; a beam that hits nothing in the map within the maximum range is expected
+    there.
 
     Parameters
     ----------
     exponent : float
         Scale of the sum over beams; exponent × beams is the effective number of beams.
     sigma : float
-        Standard deviation of measured from expected ranges [m]: of sensor, voxels, pose and map together.
+        Standard deviation of measured minus expected range [m]: sensor, voxel size, pose and map together.
     clip : float
-        Standard deviations beyond which a beam is no worse: things move, and maps have holes.
+        Upper bound of abs(z), because of moving objects and holes in the map.
     ignore_unknown : bool
-        Look through voxels never observed; else a beam that comes to one before anything occupied tells nothing and
-        counts as ``unknown`` standard deviations off, unless it was measured to end nearer than that.
+        True: unknown voxels are treated as free. False: a beam that reaches an unknown voxel before an occupied one
+        gets abs(z) = ``unknown``, or more if it was measured shorter than the range of that voxel.
     unknown : float, optional
-        See there; default ``clip``, so that a map is not rewarded for knowing nothing.
+        See ``ignore_unknown``; default ``clip``, so that maps with much unknown space are not preferred.
     """
 
     exponent: float
@@ -105,9 +104,9 @@ class CastLikelihood:
         Parameters
         ----------
         expected, status : (..., n)
-            Of a `Cast`.
+            Of a `CastResult` [m].
         measured : (n,)
-            Ranges [m]; `max_range` or more where a beam met nothing, NaN for beams to leave out, which give 0.
+            Ranges [m]; `max_range` or more for beams without a return, NaN for beams to ignore, which give 0.
         """
         status = np.asarray(status)
         m = np.minimum(np.asarray(measured, dtype=np.float64), max_range)
@@ -115,7 +114,7 @@ class CastLikelihood:
         r = np.where(met, np.asarray(expected, dtype=np.float64), max_range)
         z = np.minimum(np.abs(m - r) / self.sigma, self.clip)
         if not self.ignore_unknown:
-            # known free space as far as the unknown: a beam that ended in it contradicts the map, others do not
+            # space before the unknown voxel is known to be free: only a beam that ended there contradicts the map
             short = np.minimum(np.maximum(np.asarray(expected) - m, 0.0) / self.sigma, self.clip)
             z = np.where(status == UNKNOWN_SPACE, np.maximum(short, self._unknown), z)
         z = np.where(status == UNUSABLE, self.clip, z)
@@ -137,20 +136,20 @@ def log_weights(
     returns: Any = None,
     threads: int = 1,
 ) -> Array:
-    """Logarithms of the likelihood of one scan in many grids, each at a pose of its own.
+    """Log-likelihoods of one scan in many grids, each with its own pose.
 
     Parameters
     ----------
     grids, poses, threads
         As in `cast_grids`.
     points, origin, max_range, returns
-        The scan, as in `update_grids`. Beams that are not finite, and of no length, tell nothing. Casting needs the
-        maximum range.
+        The scan, as in `update_grids`. Beams that are not finite or have length 0 are ignored. Casting needs
+        the maximum range.
 
     Returns
     -------
     (P,) float64
-        Sums over the beams, times the exponent; the same for any number of threads.
+        Sums over the beams, times the exponent; independent of the number of threads.
     """
     if not len(grids):
         return np.zeros(0)

@@ -1,4 +1,4 @@
-"""A 2-D evidence grid as the pair of files ROS map servers read: an image (PGM) and what it means (YAML)."""
+"""Write a 2-D evidence grid as the two files of the ROS map server: image (PGM) and metadata (YAML)."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from graphslam.evidence.grid import EvidenceGrid
 from graphslam.evidence.layout import UNKNOWN
 
 OCCUPIED, FREE, NOT_KNOWN = 0, 254, 205
-"""Greys of map_saver: they mean probabilities 1, 0.004 and 0.196."""
+"""Grey values of map_saver; they mean occupancy probabilities 1, 0.004 and 0.196."""
 OCCUPIED_ABOVE, FREE_BELOW = 0.65, 0.196
 
 
 def save_map_server(grid: EvidenceGrid, path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """Write a 2-D grid as ``path`` (``.yaml``) and the image beside it (``.pgm``, binary).
+    """Write a 2-D grid as ``path`` (``.yaml``) and an image in the same folder (``.pgm``, binary).
 
-    Voxels are occupied or free by the model's threshold, as in trinary mode; the image is the box of the known voxels,
-    its lower left corner the ``origin`` of the YAML.
+    Voxels are occupied or free by the threshold of the model (mode ``trinary``). The image covers the bounding box of
+    the known voxels; its lower left corner is the ``origin`` in the YAML file.
 
     Parameters
     ----------
     grid : EvidenceGrid
-        Of dimension 2.
+        2-D.
     path : path
-        Ending in ``.yaml``.
+        With the suffix ``.yaml``.
     """
     target = Path(path)
     if target.suffix != ".yaml":
@@ -58,11 +58,11 @@ def save_map_server(grid: EvidenceGrid, path: str | os.PathLike[str]) -> tuple[P
 
 
 def _quoted(name: str) -> str:
-    """A string of YAML in which nothing is special."""
+    """Single-quoted YAML string."""
     return "'" + name.replace("'", "''") + "'"
 
 
 def _number(value: float) -> str:
-    """A float that YAML 1.1 takes for one: an exponent needs a point before it."""
+    """Float in YAML 1.1 notation: with an exponent, a decimal point is required."""
     text = repr(value)
     return text.replace("e", ".0e") if "e" in text and "." not in text else text

@@ -1,14 +1,14 @@
-"""First phase of inserting a scan, compiled: *mark* the voxels that beams cross; no map is needed for it.
+"""First phase of inserting a scan, compiled: *mark* the voxels that beams cross; the map is not read.
 
-A byte a voxel is written into scratch bricks that a small table around the sensor finds (64³ entries by the low bits of
-a brick's coordinates; bricks that fall on the same entry are chained, so that a scan may be of any extent).
+One byte per voxel is written into scratch bricks. They are found in a hash table, the window: 64³ entries, indexed by
+the low bits of the brick coordinates. Bricks with the same entry are chained, so a scan may have any extent.
 
-Sixteen beams are stepped side by side, without a branch: which axis comes next is as good as random along one beam,
-and mispredicted branches were most of the time. So that a step is the same few operations on every lane, a voxel is one
-integer in which the bits of each coordinate lie apart (low 9 bits: voxel in the brick; next 18: entry of the window;
-then the rest), and the parameters of the next crossings are fixed-point integers.
+Sixteen beams (lanes) are stepped in parallel without branches: the next axis along a beam is unpredictable, and branch
+misprediction took most of the time. For equal operations on every lane, a voxel is one integer with separate bit fields
+for each coordinate (low 9 bits: voxel in the brick; next 18: entry of the window; then the rest), and the parameters of
+the next plane crossings are fixed-point integers.
 
-Scratch arrays: ``window (64³, 2) int64`` [key, 512 × slot] of the last brick on an entry or -1, ``slot_key (S,) int64``
+Scratch arrays: ``window (64³, 2) int64`` [key, 512 × slot] of the last brick of an entry or -1, ``slot_key (S,) int64``
 brick coordinates, ``slot_next (S,) int32`` next slot of the entry or -1, ``marks (S, 512) uint8`` (``marks64 (S, 64)
 uint64`` is the same memory), ``work (S, 5) int32``; between scans the window is all -1 and the marks are all 0. Scans
 are ``points (n, 3)``, ``origins (n, 3) or (1, 3)``, ``returns (n,) or (0,) uint8``; poses ``(P, 12)`` are R row by row,
@@ -23,21 +23,21 @@ import numpy as np
 
 from graphslam.evidence.kernels import kernel
 
-# what a tally counts, per call
+# counters of a tally, per call
 RAYS, NOT_FINITE, ZERO_LENGTH, OUTSIDE, CUT, BRICKS, NEED_SLOTS = 0, 1, 2, 3, 4, 5, 6
 TALLY = 7
 
-# bits of the three coordinates in the integer of a voxel; those of a brick lie 9 lower
+# bits of the three coordinates in the code of a voxel; the code of a brick is shifted right by 9
 MASK_X = 0b111 | (0x3F << 9) | (0x1FF << 27)
 MASK_Y = (0b111 << 3) | (0x3F << 15) | (0x1FF << 36)
 MASK_Z = (0b111 << 6) | (0x3F << 21) | (0x1FF << 45)
-ONE = 2.0**58  # parameter of a beam's end in fixed point
+ONE = 2.0**58  # parameter of the end of a beam in fixed point
 NEVER = 2**61
 
 
 @kernel()
 def voxel_code(x, y, z):
-    """Integer of a voxel: the bits of its offset coordinates, each field apart."""
+    """Code of a voxel: integer with separate bit fields of its offset coordinates."""
     return (
         (x & 7)
         | (((x >> 3) & 0x3F) << 9)
@@ -53,7 +53,7 @@ def voxel_code(x, y, z):
 
 @kernel()
 def brick_key(code):
-    """Packed brick coordinates (20 bits each) of a brick's code."""
+    """Packed brick coordinates (20 bits each) from the code of a brick."""
     bx = (code & 0x3F) | (((code >> 18) & 0x1FF) << 6)
     by = ((code >> 6) & 0x3F) | (((code >> 27) & 0x1FF) << 6)
     bz = ((code >> 12) & 0x3F) | (((code >> 36) & 0x1FF) << 6)
@@ -62,7 +62,7 @@ def brick_key(code):
 
 @kernel()
 def find_slot(code, n, window, slot_key, slot_next):
-    """Slot of a brick that is not the last one on its entry; n where it was made there, -1 where there is no room."""
+    """Slot of a brick that is not the last one of its entry; n if it is new, -1 if all slots are in use."""
     w = code & 0x3FFFF
     s = window[w, 1] >> 9
     while s >= 0 and slot_key[s] != code:
@@ -80,7 +80,7 @@ def find_slot(code, n, window, slot_key, slot_next):
 
 @kernel(error_model="numpy")
 def fixed_point(parameter):
-    """Parameter along a beam in fixed point, far beyond its end where it is no number we can hold."""
+    """Parameter along a beam in fixed point; `NEVER` if it is too large or NaN."""
     f = parameter * ONE
     return np.int64(f) if f < 2.0**61 else np.int64(NEVER)
 
@@ -103,10 +103,10 @@ def mark_grids(
     marks,
     tally,
 ):
-    """Mark what a scan crosses in grids ``begin … end-1``, whose slots follow each other from 0 on.
+    """Mark the voxels crossed by a scan in grids ``begin … end-1``; their slots are consecutive, from 0 on.
 
-    ``ends (P,)`` becomes the end of each grid's slots. Returns whether the slots sufficed; if not, ``tally`` says how
-    many to have, and the scratch must be made anew.
+    Writes the end of the slots of each grid to ``ends (P,)``. Returns whether there were enough slots; if not,
+    ``tally[NEED_SLOTS]`` is the number to allocate before the next attempt.
 
     Amanatides & Woo's traversal in voxel coordinates (``scale`` = 1 / voxel size), from the voxel of the origin up to
     but not including the voxel of the end, which is marked as hit if the beam returned and was not cut.
@@ -118,13 +118,13 @@ def mark_grids(
     edge = 2 * half
     flat = marks.reshape(marks.size)
     hits = np.empty(total, np.int64)
-    left = np.empty(16, np.int64)  # steps a lane has to go
-    # rows of 16 lanes: next crossings in x, y, z (0, 16, 32), from one to the next (48, 64, 80), coordinates (96, 112,
-    # 128), bits filled in before a step so that it carries over the gaps (144, 160, 176), steps (192, 208, 224), how
-    # many are to go (240, 256, 272). One flat array with constant offsets: only so can the compiler see that the rows
-    # do not overlap.
+    left = np.empty(16, np.int64)  # remaining steps of a lane
+    # rows of 16 lanes: parameters of the next crossings in x, y, z (0, 16, 32), their increments (48, 64, 80),
+    # coordinates (96, 112, 128), bits set before a step so that the carry crosses the gaps (144, 160, 176), steps (192,
+    # 208, 224), remaining steps (240, 256, 272). It is one flat array with constant offsets, so that the compiler sees
+    # that the rows do not overlap.
     room = np.empty(296, np.int64)
-    shift = (-room.ctypes.data & 63) >> 3  # rows that lie across lines of the cache cost a third more
+    shift = (-room.ctypes.data & 63) >> 3  # aligned, because rows across cache lines take a third more time
     L = room[shift : shift + 288]
     for l in range(288):  # np.zeros would take longer to compile
         L[l] = 0
@@ -132,14 +132,14 @@ def mark_grids(
     for g in range(begin, end):
         first, active, b, n_hits = n, 0, 0, 0
         while True:
-            while active < 16 and b < total:  # fill the lanes that are free
+            while active < 16 and b < total:  # fill free lanes
                 o = 0 if single else b
                 lx, ly, lz = origins[o, 0], origins[o, 1], origins[o, 2]
                 dx, dy, dz = points[b, 0] - lx, points[b, 1] - ly, points[b, 2] - lz
                 hit = all_return or returns[b] != 0
                 b += 1
                 length = math.sqrt(dx * dx + dy * dy + dz * dz)
-                if not length < np.inf:  # neither of two infinities nor of a NaN
+                if not length < np.inf:  # also rejects NaN
                     tally[NOT_FINITE] += 1
                     continue
                 if length == 0.0:
@@ -218,7 +218,7 @@ def mark_grids(
                 run = min(run, left[l])
             for l in range(active):
                 left[l] -= run
-            for _ in range(run):  # no lane ends before the last of these
+            for _ in range(run):  # no active lane ends before these steps
                 for l in range(active):
                     p = L[96 + l] | L[112 + l] | L[128 + l]
                     code = p >> 9
@@ -232,17 +232,17 @@ def mark_grids(
                         if slot == n:
                             n += 1
                         place = slot << 9
-                    # a plain store: reading first would make neighbours that meet in a voxel wait for each other
+                    # store without reading first, so that lanes in the same voxel do not wait for each other
                     flat[np.uint64(place | (p & 511))] = 1
                 if full:
                     break
                 for l in range(16):
                     tx, ty, tz = L[l], L[16 + l], L[32 + l]
-                    mx = -(np.int64(tx < ty) & np.int64(tx < tz))  # all bits of the axis that comes next
+                    mx = -(np.int64(tx < ty) & np.int64(tx < tz))  # all bits set for the axis of the next step
                     my = -np.int64(ty < tz) & ~mx
                     mz = ~(mx | my)
-                    # an axis that was stepped as often as the ends lie apart is not stepped again: whatever the
-                    # roundings, a beam through edges and corners ends where it should
+                    # an axis is not stepped more often than start and end differ on it, so that a beam through edges
+                    # or corners ends in the right voxel despite rounding
                     nx, ny, nz = L[240 + l] + mx, L[256 + l] + my, L[272 + l] + mz
                     L[240 + l], L[256 + l], L[272 + l] = nx, ny, nz
                     L[l] = (tx + (L[48 + l] & mx)) | (NEVER & -np.int64(nx == 0))
@@ -254,7 +254,7 @@ def mark_grids(
             if full:
                 break
             l = 0
-            while l < active:  # the last lane takes the place of one that ended
+            while l < active:  # move the last active lane to the place of a finished one
                 if left[l] > 0:
                     l += 1
                     continue
@@ -263,10 +263,10 @@ def mark_grids(
                 for k in range(0, 288, 16):
                     L[k + l] = L[k + active]
                 for k in range(48, 96, 16):
-                    L[k + active] = 0  # an idle lane stays where it is
+                    L[k + active] = 0  # an idle lane does not move
         for k in range(n_hits):
             flat[np.uint64(hits[k])] |= 2
-        for s in range(first, n):  # empty the entries of this grid's slots, and name the bricks as the tree does
+        for s in range(first, n):  # clear the window, and convert codes of bricks to packed coordinates
             w = slot_key[s] & 0x3FFFF
             window[w, 0] = -1
             window[w, 1] = -1

@@ -1,4 +1,4 @@
-"""How much memory evidence grids take, and how much of it they share with others."""
+"""Memory of evidence grids, private and shared with other grids."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from graphslam.evidence.tree_kernels import BRICKS_USED, NODES_USED
 
 @dataclass(frozen=True, slots=True)
 class MemoryUse:
-    """Memory of one grid or of a set of grids; what they share among themselves counts once.
+    """Memory of one grid or of a set of grids; parts shared within the set count once.
 
     Parameters
     ----------
     nodes, bricks : int
-        That the grids reach.
+        Total numbers reachable from the grids.
     private_nodes, private_bricks : int
-        Of these, what would be freed if exactly these grids were released; grids outside the set hold the rest too.
+        Numbers that would be freed if exactly these grids were released; grids outside the set share the rest.
     """
 
     nodes: int
@@ -35,22 +35,22 @@ class MemoryUse:
 
     @property
     def total(self) -> int:
-        """All the grids reach [bytes]."""
+        """Private and shared memory [bytes]."""
         return self.nodes * NODE_BYTES + self.bricks * BRICK_BYTES
 
     @property
     def private(self) -> int:
-        """What releasing exactly these grids would free [bytes]."""
+        """Memory that would be freed by releasing exactly these grids [bytes]."""
         return self.private_nodes * NODE_BYTES + self.private_bricks * BRICK_BYTES
 
     @property
     def shared(self) -> int:
-        """What others hold too [bytes]."""
+        """Memory that other grids use too [bytes]."""
         return self.total - self.private
 
 
 def measure_memory(grids: GridTree | Sequence[GridTree]) -> MemoryUse:
-    """Memory of a grid or of a set of grids of one pool, by one walk over what they reach.
+    """Memory of a grid or of a set of grids of one pool.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def measure_memory(grids: GridTree | Sequence[GridTree]) -> MemoryUse:
         free: dict[int, bool] = {}
         for g in distinct:
             if g.root:
-                # handles that were copied from each other hold one box: Python counts them, and the argument itself
+                # copies share one box, so its reference count is the number of handles, plus the argument itself
                 free[g.root] = sys.getrefcount(g._box) - 1 == mine[g.root]
         roots = np.array(list(free), np.int64)
         n, b = int(pool.tree.counters[NODES_USED]), int(pool.tree.counters[BRICKS_USED])  # ids beyond were never used

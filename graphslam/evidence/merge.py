@@ -1,4 +1,4 @@
-"""Merging maps by adding their log-odds under a transform (SegSLAM A12)."""
+"""Merge of two maps: sum of their log-odds under a rigid transform (SegSLAM A12)."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from graphslam.evidence.merge_kernels import sample_bricks
 from graphslam.evidence.scan import pose_row
 
 CHUNK = 2048
-"""Bricks worked on at a time: bounds the memory of a merge to some megabytes."""
+"""Bricks that are processed at a time; limits the memory of a merge to a few megabytes."""
 
 
 def merge_grids(grid: GridTree, other: GridTree, pose: Any = None) -> int:
-    """Add the log-odds of ``other`` to ``grid``; returns how many voxels got something.
+    """Add the log-odds of ``other`` to ``grid``; returns the number of voxels updated.
 
-    A voxel takes the value of the voxel of ``other`` that its centre lies in; unknown there adds nothing. Sums are
-    clamped to the bounds of ``grid``'s model. The two may be of different pools, and may share history.
+    The value added to a voxel is that of the voxel of ``other`` that contains its centre, or 0 if that is unknown. Sums
+    are clamped to the bounds of the model of ``grid``. The grids may be of different pools, and may share bricks.
 
     Parameters
     ----------
     grid, other : EvidenceGrid
-        Of one voxel size and dimension.
+        With the same voxel size and dimension.
     pose : (7,), (4, 4), or (3,) in 2-D
         ``T_grid_other``; default identity.
     """
@@ -39,17 +39,17 @@ def merge_grids(grid: GridTree, other: GridTree, pose: Any = None) -> int:
             got=f"{other.voxel_size} m, {other.dim}-D",
             wanted=f"{grid.voxel_size} m, {grid.dim}-D",
         )
-    source = other.copy()  # stays what it is, also where it shares bricks with the grid that is written to
+    source = other.copy()  # unaffected by the write, even if it shares bricks with the written grid
     T = pose_row(pose, grid.dim)
     R, t = T[:9].reshape(3, 3), T[9:]
     if grid.dim == 2 and abs(R[2, 2] - 1) + abs(t[2]) > 1e-9:
         raise GridError("a 2-D grid was to be merged out of its plane", got=T.tolist(), wanted="rotation about z")
     T_inverse = np.concatenate([R.T.ravel(), -R.T @ t])
     keys = _touched(grid, source.brick_coordinates(), R, t)
-    work = grid.copy()  # the grid itself changes when all is done, or not at all
+    work = grid.copy()  # the grid itself is replaced at the end, so that the merge is atomic
     pool = grid.pool
     with pool.lock:
-        bricks = grid.packed_bricks()  # stay what they are while the work goes on: the grid is not written
+        bricks = grid.packed_bricks()  # unchanged during the merge, because only the copy is written
     found = 0
     for begin in range(0, len(keys), CHUNK):
         part = keys[begin : begin + CHUNK]
@@ -70,7 +70,7 @@ def merge_grids(grid: GridTree, other: GridTree, pose: Any = None) -> int:
 
 
 def _ids(bricks: npt.NDArray[np.int64], keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Bricks of packed coordinates, 0 (which is all unknown) where there is none; ``bricks (n, 2)`` ascending."""
+    """Ids of bricks at packed coordinates, 0 (the unknown brick) if absent; ``bricks (n, 2)`` is ascending."""
     if len(bricks) == 0:
         return np.zeros(len(keys), np.int64)
     at = np.minimum(np.searchsorted(bricks[:, 0], keys), len(bricks) - 1)
@@ -78,21 +78,21 @@ def _ids(bricks: npt.NDArray[np.int64], keys: npt.NDArray[np.int64]) -> npt.NDAr
 
 
 def _sum(old: npt.NDArray[np.int16], add: npt.NDArray[np.int16], low: int, high: int) -> npt.NDArray[np.int16]:
-    """Sum of log-odds, clamped; what is unknown adds nothing, and unknown voxels start at 0."""
+    """Clamped sum of log-odds; unknown values of ``add`` add nothing, unknown voxels of ``old`` start at 0."""
     known = add != UNKNOWN
     new = np.where(old == UNKNOWN, 0, old).astype(np.int32) + add
     return np.where(known, np.clip(new, low, high), old).astype(np.int16)
 
 
 def _touched(grid: GridTree, coordinates: npt.NDArray[np.int64], R: Array, t: Array) -> npt.NDArray[np.int64]:
-    """Packed coordinates of the target bricks that the boxes around the moved source bricks meet, ascending."""
+    """Packed coordinates of the target bricks that the bounding boxes of moved source bricks overlap, ascending."""
     edge = BRICK_EDGE * grid.voxel_size
     half = grid.pool.half // BRICK_EDGE
     if len(coordinates) == 0:
         return np.zeros(0, np.int64)
     centre = (coordinates + 0.5) * edge @ R.T + t
-    reach = 0.5 * edge * np.abs(R).sum(axis=1)  # of the box around a turned cube
-    # a millionth of a voxel keeps bricks that only touch out of a merge on the same lattice
+    reach = 0.5 * edge * np.abs(R).sum(axis=1)  # half extent of the box around a rotated cube
+    # slack: bricks that only touch are not merged if both lattices coincide
     slack = 1e-6 * grid.voxel_size
     first = np.floor((centre - reach + slack) / edge).astype(np.int64)
     last = np.floor((centre + reach - slack) / edge).astype(np.int64)

@@ -1,7 +1,7 @@
-"""Compiled addition of one map's log-odds to another's under a rigid transform.
+"""Compiled sampling of the log-odds of one map at the voxel centres of another, under a rigid transform.
 
-Every voxel of the target asks which voxel of the source its centre lies in: no voxel is met twice and none is left out,
-as scattering the source's voxels over a turned lattice would.
+For each target voxel the source voxel that contains its centre is read. So each target voxel gets one value; mapping
+source voxels to a rotated target lattice would skip some target voxels and hit others twice.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from graphslam.evidence.tree_kernels import find_node
 
 @kernel()
 def sample_bricks(keys, T, voxel, half, root, source, values):
-    """Source values ``(n, 512)`` at the voxel centres of target bricks ``keys (n,)``; returns how many are known.
+    """Source values ``(n, 512)`` at the voxel centres of target bricks ``keys (n,)``; returns the number known.
 
-    ``T (12,)`` takes target coordinates to the source's [m]; ``half`` is of the target's cube, ``source`` the other's
-    tree.
+    ``T (12,)`` transforms target to source coordinates [m]; ``half`` is that of the target, ``source`` the Tree of the
+    source.
     """
     children, bricks, levels, source_half = source.children, source.bricks, source.levels, source.half
     scale, edge = 1.0 / voxel, 2 * source_half

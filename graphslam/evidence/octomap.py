@@ -1,7 +1,7 @@
-"""Evidence grids from and to OctoMap's files: ``.ot`` (log-odds) and ``.bt`` (occupied or free).
+"""Reading and writing of OctoMap files: ``.ot`` (log-odds) and ``.bt`` (occupied or free).
 
-What is written is what OctoMap itself would write of the same map: pruned, inner nodes of a ``.ot`` holding the largest
-value below them. The lattice is OctoMap's own, so voxels are the same ones.
+Files have the same contents as OctoMap would write for this map: pruned, and inner nodes of a ``.ot`` have the largest
+value of their children. The lattice is that of OctoMap, so voxels are identical.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ log = logging.getLogger(__name__)
 
 BINARY_MAGIC, FULL_MAGIC = b"# Octomap OcTree binary file", b"# Octomap OcTree file"
 HEADER_LIMIT = 1 << 16
-"""Bytes a header may take; its comments are free."""
+"""Maximum size of a header [bytes]; it may contain any comments."""
 OCTOMAP_HALF = 1 << 15
-"""Voxels from the centre of OctoMap's cube to its faces."""
+"""Voxels from the centre of the OctoMap cube to its faces."""
 GUESS = {True: 74, False: 400}
-"""Records a brick takes: no more than this in a ``.bt``, nodes above the bricks apart, seldom more in a ``.ot``."""
+"""Records per brick without the nodes above it: an upper bound for a ``.bt``, rarely exceeded in a ``.ot``."""
 ORDER = sum(
     (np.arange(BRICK_VOXELS) >> 3 * level & 1 << axis) << 2 * axis + level for level in range(3) for axis in range(3)
 )
-"""Voxels of a brick in the order of the octree: bits 0, 1, 2 are x, y, z in a cube of 2³, the next of it in 4³."""
+"""Voxels of a brick in octree order: bits 0, 1, 2 are x, y, z in a cube of 2³, the next three those of it in 4³."""
 FULL_RECORD = np.dtype([("value", "<f4"), ("code", "u1")])
 
 Ints = npt.NDArray[np.int64]
@@ -62,30 +62,30 @@ class _Header:
     binary: bool
     nodes: int
     resolution: float
-    start: int  # byte the records begin at
+    start: int  # offset of the first record [bytes]
 
     @property
     def width(self) -> int:
-        """Bytes of a record."""
+        """Size of a record [bytes]."""
         return 2 if self.binary else FULL_RECORD.itemsize
 
 
 def read_octomap(
     path: str | os.PathLike[str], *, model: BeamModel | None = None, pool: GridPool | None = None
 ) -> EvidenceGrid:
-    """Read a ``.bt`` or ``.ot`` file of an OctoMap ``OcTree``; which of them, the file says.
+    """Read a ``.bt`` or ``.ot`` file of an OctoMap ``OcTree``; the format is detected from the header.
 
     Parameters
     ----------
     model : BeamModel, optional
-        The files name none. Leaves of a ``.bt`` get its clamping values, as in OctoMap.
+        The files contain no model. Leaves of a ``.bt`` get its clamping values, as in OctoMap.
     pool : GridPool, optional
-        Default a new one, of as many levels as the map needs but no less than usual.
+        Default: a new pool with as many levels as the map needs, at least `layout.DEFAULT_LEVELS`.
 
     Returns
     -------
     EvidenceGrid
-        Log-odds of a ``.ot`` are rounded to the nearest multiple of `layout.STEP` and cut at ±16.
+        Log-odds of a ``.ot`` are rounded to the nearest multiple of `layout.STEP` and clipped at ±16.
     """
     where = str(path)
     data = read_bytes(path)
@@ -96,7 +96,7 @@ def read_octomap(
     model = BeamModel() if model is None else model
     pieces, reach = _pieces_of(records, head, model, where)
     levels = tree_levels(reach)
-    assert levels is not None  # OctoMap's cube is smaller than the largest of ours
+    assert levels is not None  # the OctoMap cube is smaller than our largest cube
     pool = GridPool(max(levels, DEFAULT_LEVELS)) if pool is None else pool
     check_reach(reach, pool, where)
     return fill_grid(EvidenceGrid(head.resolution, model=model, pool=pool), pieces)
@@ -133,7 +133,7 @@ def _read_header(data: bytes, where: str) -> _Header:
         if name not in fields:
             raise FormatError(f"header has no {name!r}", where=f"{where}, byte {start}")
     kind, at = fields["id"]
-    if kind not in ("OcTree", "1"):  # 1: what the first versions called it
+    if kind not in ("OcTree", "1"):  # 1: the name in early versions of OctoMap
         raise FormatError("another type of OctoMap tree", where=f"{where}, byte {at}", got=kind, wanted="OcTree")
     size, at = fields["size"]
     if not (size.isascii() and size.isdigit()):
@@ -154,7 +154,7 @@ def _read_header(data: bytes, where: str) -> _Header:
 
 
 def _read_records(data: bytes, head: _Header, where: str) -> TreeRecords:
-    """The bytes after the header as arrays; their structure is not looked at yet."""
+    """The bytes after the header as arrays; the tree structure is not checked here."""
     width, tally = head.width, np.zeros(6, np.int64)
     number, rest = divmod(len(data) - head.start, width)
     if rest:
@@ -182,7 +182,7 @@ def _read_records(data: bytes, head: _Header, where: str) -> TreeRecords:
 
 
 def _pieces_of(records: TreeRecords, head: _Header, model: BeamModel, where: str) -> tuple[GridPieces, int]:
-    """What the records say, and how far it reaches [voxels]; their structure is checked before room is made."""
+    """Pieces in the records, and their extent [voxels]; the tree structure is checked before memory is allocated."""
     tally = records.tally
     bricks, cubes = np.zeros((0, 3), np.int64), np.zeros((0, 5), np.int64)
     values = np.zeros((0, BRICK_VOXELS), np.int16)
@@ -214,15 +214,15 @@ def _check_tree(records: TreeRecords, head: _Header, where: str) -> None:
 
 
 def write_octomap(grid: EvidenceGrid, path: str | os.PathLike[str]) -> None:
-    """Write a grid as an OctoMap ``OcTree``, whole or not at all.
+    """Write a grid as an OctoMap ``OcTree``; the file is written atomically.
 
     Parameters
     ----------
     grid : EvidenceGrid
-        A 2-D grid is written as the layer of voxels it is.
+        A 2-D grid is written as one layer of voxels.
     path : path
-        Ending in ``.ot``: log-odds, exact. Ending in ``.bt``: known voxels are occupied or free by the model's
-        threshold (maximum likelihood), and nothing more is kept of them.
+        Suffix ``.ot``: exact log-odds. Suffix ``.bt``: known voxels are written as occupied or free by the threshold
+        of the model (maximum likelihood); their log-odds are not stored.
     """
     suffix = Path(path).suffix
     if suffix not in (".bt", ".ot"):
@@ -255,7 +255,7 @@ def _records_of(
         if pool.half > OCTOMAP_HALF:
             _check_middle(grid, states.node, where)
         tally[RECORD] = GUESS[binary] * np.count_nonzero(states.brick != UNSEEN)
-        while tally[RECORD] > len(codes):  # once, or twice where the guess was short
+        while tally[RECORD] > len(codes):  # once, or twice if the guess was too small
             codes = np.empty(int(tally[RECORD]), np.uint16)
             values = np.empty(0 if binary else len(codes), np.int16)
             write_tree(grid.root, binary, threshold, states, ORDER, pool.tree, TreeRecords(codes, values, tally))
@@ -263,7 +263,7 @@ def _records_of(
 
 
 def _check_middle(grid: EvidenceGrid, states: npt.NDArray[np.int32], where: str) -> None:
-    """Refuse a grid of 7 levels that holds anything outside the middle eight of its root's children."""
+    """Raise `GridError` if a grid with 7 levels has known voxels outside the central eight children of its root."""
     children = grid.pool.tree.children[grid.root]
     inner = np.zeros((4, 4, 4), bool)
     inner[1:3, 1:3, 1:3] = True

@@ -1,11 +1,11 @@
-"""Compiled reading and writing of OctoMap's trees (Hornung et al. 2013; octomap/OcTreeBaseImpl.hxx).
+"""Compiled reading and writing of OctoMap trees (Hornung et al. 2013; octomap/OcTreeBaseImpl.hxx).
 
-An OctoMap tree has 16 levels over a cube of 2¹⁶ voxels a side, the key of a voxel being its signed coordinate + 2¹⁵.
-Child i of a node lies at the upper side of x, y, z where bits 0, 1, 2 of i are set; nodes are written depth first, a
-node before its children. Here m = 16 - depth is the level of a node above the voxels: its edge is 2^m voxels.
+An OctoMap tree has 16 levels and covers a cube of 2¹⁶ voxels per edge; the key of a voxel is its signed coordinate +
+2¹⁵. Bits 0, 1, 2 of the child index i select the upper half in x, y, z. Nodes are written depth first, a node before
+its children. Here m = 16 - depth is the level of a node above the voxels: its edge is 2^m voxels.
 
-A *record* is what the file holds of a node: in a ``.bt`` two bits for each child of a node that has children, in a
-``.ot`` the log-odds of any node and one bit for each child.
+A *record* is the data of a node in the file: in a ``.bt`` two bits per child, for nodes with children only; in a
+``.ot`` the log-odds of any node and one bit per child.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from graphslam.evidence.cube_kernels import child_state, voxel_state
 from graphslam.evidence.kernels import kernel
 
-# what reading found, and where it stands in a tally
+# error codes, and indices in a tally
 TRUNCATED, TOO_DEEP, CHILDLESS = 1, 2, 3
 ERROR, RECORD, NODES, REACH, BRICKS, CUBES = 0, 1, 2, 3, 4, 5
 
@@ -31,10 +31,10 @@ class TreeRecords(NamedTuple):
     codes : (r,) uint16
         Bits of the children.
     values : (r,) int16 or (0,)
-        Log-odds of a ``.ot``, none of a ``.bt``.
+        Log-odds of a ``.ot``, in units of `layout.STEP`; empty for a ``.bt``.
     tally : (6,) int64
-        Error, records, nodes, voxels from the centre to the farthest face, bricks, cubes; the numbers of what is
-        written also where the arrays for it are too short.
+        Error, records, nodes, voxels from the centre to the farthest face, bricks, cubes. The counts are complete even
+        if the output arrays are too short.
     """
 
     codes: npt.NDArray[np.uint16]
@@ -44,7 +44,7 @@ class TreeRecords(NamedTuple):
 
 @kernel()
 def read_tree(records, low, high, bricks, brick_values, cubes):
-    """Go through a file's records; list its bricks and its leaves of at least a brick's size.
+    """Parse the records of a file; list its bricks, and its leaves with an edge of 8 voxels or more.
 
     low, high : values of the free and occupied leaves of a ``.bt``.
     bricks : (b, 3) int64 out, signed coordinates; brick_values : (b, 512) int16 out, all unknown before.
@@ -54,7 +54,7 @@ def read_tree(records, low, high, bricks, brick_values, cubes):
     stack = np.empty((8 * 17, 5), np.int64)
     binary = values.shape[0] == 0
     record, nodes, reach, found, large = 0, 0, 0, 0, 0
-    # level, corner, and what the parent said: 1 free, 2 occupied, 3 see the next record
+    # level, corner, kind from the parent: 1 free leaf, 2 occupied leaf, 3 node with a record
     stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3], stack[0, 4] = 16, 0, 0, 0, 3
     n = 1
     while n > 0:
@@ -91,7 +91,7 @@ def read_tree(records, low, high, bricks, brick_values, cubes):
                 found += 1
             half = edge >> 1
             for k in range(8):
-                i = 7 - k  # the first comes off the stack first
+                i = 7 - k  # reversed, because the stack is last in, first out
                 what = (code >> (2 * i)) & 3 if binary else 3 * ((code >> i) & 1)
                 if what != 0:
                     stack[n, 0] = m - 1
@@ -120,9 +120,9 @@ def read_tree(records, low, high, bricks, brick_values, cubes):
 
 # --- writing -----------------------------------------------------------------------------------------------------
 #
-# A node of the octree is (m, id, part) in our tree. Ours has four children a side, so a node of even m ≥ 4 is an octant
-# of one of ours, one of odd m ≥ 5 all of it, m = 3 a brick. Above the root's octants (m = top =
-# 2·levels + 2) there are nodes with one octant of the root each, since ours are centred on a corner of OctoMap's.
+# A node of the octree is (m, id, part) in our tree. Our nodes have 4³ children, so an octree node of even m ≥ 4 is an
+# octant of one of our nodes, one of odd m ≥ 5 is a whole node, and m = 3 is a brick. Octree nodes above the octants of
+# our root (m = top = 2·levels + 2) contain one such octant each, because our root is centred on a corner of theirs.
 
 
 @kernel()
@@ -134,7 +134,7 @@ def child_of(m, node, part, i, levels, children):
         if m == 16:
             return node, i
         return (node, part) if i == 7 - part else (0, 0)
-    if m == 16:  # of 7 levels: OctoMap's cube is the middle of ours
+    if m == 16:  # 7 levels: the OctoMap cube is the centre of ours
         return np.int64(children[node, ((1 + iz) << 4) | ((1 + iy) << 2) | (1 + ix)]), 0
     if m & 1:
         return node, i
@@ -144,7 +144,7 @@ def child_of(m, node, part, i, levels, children):
 
 @kernel()
 def tree_node_state(m, node, part, levels, children, states):
-    """State of a node of the octree, and its largest known value where it is wanted."""
+    """State of a node of the octree, and its largest known value if ``states`` has maxima."""
     if node == 0 or m == 3 or m == 16 or (m & 1 == 1 and m < 2 * levels + 2):
         return child_state(node, m - 3, states)
     state, largest = 1 << 21, -32768
@@ -155,16 +155,16 @@ def tree_node_state(m, node, part, levels, children, states):
         largest = max(largest, v)
         state = s if state == 1 << 21 or state == s else 1 << 20
     if m > level and state != -32768:
-        state = 1 << 20  # seven eighths of it lie outside our cube
+        state = 1 << 20  # seven of its eight octants lie outside our cube
     return state, largest
 
 
 @kernel()
 def write_brick(row, order, classes, threshold, record, records):
-    """Records of a brick ``row (512,)`` that is not of one value, from ``record`` on; returns the end of them.
+    """Write the records of a mixed brick ``row (512,)``, from index ``record`` on; returns the index after the last.
 
-    order : (512,) int64, the brick's voxels as the octree has them, so that eight in a row are a cube of 2³ and 64 one
-    of 4³.
+    order : (512,) int64, voxels of the brick in octree order: each 8 in sequence are a cube of 2³, each 64 a cube of
+    4³.
     """
     codes, values, tally = records
     states, maxima = np.empty(73, np.int64), np.empty(73, np.int64)  # cubes of 2³, cubes of 4³, the brick
@@ -219,19 +219,19 @@ def write_brick(row, order, classes, threshold, record, records):
 
 @kernel()
 def write_tree(root, classes, threshold, states, order, tree, records):
-    """Records of a grid's tree with all that is of one value (``classes``: of one class, a ``.bt``) pruned.
+    """Write the records of a grid; nodes with one value (``classes``, for a ``.bt``: one class) are pruned.
 
     order : see :func:`write_brick`.
     """
     codes, values, tally = records
     stack = np.empty((8 * 17, 5), np.int64)
-    # by way of the stack: for literals tree_node_state would be compiled once more
+    # read from the stack: for literals tree_node_state would be compiled again
     stack[0, 0], stack[0, 1], stack[0, 2] = 16, root, 0
     m, node, part = stack[0, 0], stack[0, 1], stack[0, 2]
     state, largest = tree_node_state(m, node, part, tree.levels, tree.children, states)
     room = codes.shape[0]
     tally[RECORD], tally[NODES] = 0, 0
-    record = tally[RECORD]  # no literal either
+    record = tally[RECORD]  # not a literal either
     n = 0
     if state != -32768:
         stack[0, 3], stack[0, 4] = state, largest
@@ -244,7 +244,7 @@ def write_tree(root, classes, threshold, states, order, tree, records):
             continue
         tally[NODES] += 1
         leaf = state != 1 << 20
-        if classes and leaf:  # a .bt has no record of a leaf; the root is none, our own being larger or elsewhere
+        if classes and leaf:  # a .bt has no records of leaves
             continue
         code = 0
         if not leaf:

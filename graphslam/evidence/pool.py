@@ -1,8 +1,8 @@
-"""The pool of nodes and bricks that any number of evidence grids share.
+"""Pool of nodes and bricks that is shared by any number of evidence grids.
 
-Deferred reference counting (SegSLAM's DRCO): copying a grid touches nothing here; the copy is paid for by whichever
-side writes first, and only for what it writes. Maps that died are given back at the next use of the pool, in one call,
-because a finaliser may run at any moment, also while a kernel works on these arrays.
+Deferred reference counting (SegSLAM's DRCO): copying a grid changes nothing here. The grid that writes first copies
+the nodes and bricks that it changes. Trees of deleted grids are freed at the next use of the pool, because a finaliser
+may run at any moment, even while a kernel works on these arrays.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ OF_BRICKS = ("bricks", "brick_ref", "brick_lines", "brick_free")
 
 
 class RootBox:
-    """Owner of one tree; grids that were copied from each other hold the same box until one of them writes."""
+    """Owner of one tree; copies of a grid refer to the same box until one of them is written to."""
 
     __slots__ = ("dead", "root", "shared")
 
@@ -44,8 +44,8 @@ class RootBox:
         self.dead = dead
 
     def __del__(self) -> None:
-        if getattr(self, "root", 0):  # none yet, if Ctrl-C fell into __init__
-            self.dead.append(self.root)  # atomic; the pool takes it from there
+        if getattr(self, "root", 0):  # no attribute yet if Ctrl-C interrupted __init__
+            self.dead.append(self.root)  # atomic; freed by GridPool.collect
 
 
 class GridPool:
@@ -54,8 +54,8 @@ class GridPool:
     Parameters
     ----------
     levels : int
-        Levels of nodes over the bricks, 2 … 7: the addressable cube has ``8·4**levels`` voxels a side (8,192 at the
-        default of 5, which is 819 m of 0.1 m voxels).
+        Levels of nodes above the bricks, 2 … 7. The edge of the addressable cube is ``8·4**levels`` voxels: 8,192 for
+        the default of 5, or 819 m with 0.1 m voxels.
     """
 
     def __init__(self, levels: int = DEFAULT_LEVELS) -> None:
@@ -65,7 +65,7 @@ class GridPool:
         self.levels = levels
         self.half = half_edge(levels)
         self.lock = threading.RLock()
-        """Hold it while `tree` is used."""
+        """Must be held while `tree` is used."""
         self.tree = Tree(
             children=aligned_zeros((64, CHILDREN), np.int32),
             node_ref=np.zeros(64, np.int32),
@@ -75,7 +75,7 @@ class GridPool:
             brick_ref=np.zeros(64, np.int32),
             brick_lines=np.zeros(64, np.uint16),
             brick_free=np.zeros(64, np.int32),
-            counters=np.array([1, 0, 1, 0, 0], np.int64),  # node 0 and brick 0 are "absent"
+            counters=np.array([1, 0, 1, 0, 0], np.int64),  # node 0 and brick 0 mean "absent"
             levels=levels,
             half=self.half,
         )
@@ -83,23 +83,23 @@ class GridPool:
         self.dead: deque[int] = deque()
         self._scratches: list[Scratch] = []
         self.kept: RootBox | None = None
-        """A tree that lives as long as the pool (:mod:`graphslam.evidence.spilled_grid`)."""
+        """A tree that is never freed before the pool (:mod:`graphslam.evidence.spilled_grid`)."""
 
     def scratch(self, thread: int) -> Scratch:
-        """Scratch memory of a thread of an update."""
+        """Scratch memory of one thread of an update."""
         while len(self._scratches) <= thread:
             self._scratches.append(Scratch())
         return self._scratches[thread]
 
     def release_scratch(self) -> None:
-        """Let go of the scratch memory of updates, some 20 MB; it is made again where a grid is written to."""
+        """Free the scratch memory of updates (about 20 MB per thread); the next update allocates it again."""
         with self.lock:
             self._scratches.clear()
 
     # --- room ------------------------------------------------------------------------------------------------
 
     def reserve(self, nodes: int, bricks: int) -> None:
-        """Make room for so many new nodes and bricks. All of it or, if memory is short, nothing."""
+        """Ensure capacity for this number of new nodes and bricks; raises MemoryError if there is none."""
         c = self.tree.counters
         more_nodes = nodes - (len(self.tree.node_ref) - c[NODES_USED] + c[NODES_FREE])
         more_bricks = bricks - (len(self.tree.brick_ref) - c[BRICKS_USED] + c[BRICKS_FREE])
@@ -109,7 +109,7 @@ class GridPool:
             self.tree = _grown(self.tree, OF_BRICKS, int(more_bricks), c[BRICKS_USED])
 
     def fit(self) -> None:
-        """Give back the room for what may come: for a pool that nobody will write to."""
+        """Free the unused capacity of a pool whose grids will not be written to any more."""
         with self.lock:
             for names, used in ((OF_NODES, NODES_USED), (OF_BRICKS, BRICKS_USED)):
                 n = int(self.tree.counters[used])
@@ -117,32 +117,32 @@ class GridPool:
 
     @property
     def used_nodes(self) -> int:
-        """Nodes of living grids."""
+        """Nodes used by existing grids."""
         with self.lock:
             self.collect()
             return int(self.tree.counters[NODES_USED] - 1 - self.tree.counters[NODES_FREE])
 
     @property
     def used_bricks(self) -> int:
-        """Bricks of living grids."""
+        """Bricks used by existing grids."""
         with self.lock:
             self.collect()
             return int(self.tree.counters[BRICKS_USED] - 1 - self.tree.counters[BRICKS_FREE])
 
     @property
     def used_bytes(self) -> int:
-        """Memory of living grids, shared parts once [bytes]."""
+        """Memory of existing grids; shared parts count once [bytes]."""
         return self.used_nodes * NODE_BYTES + self.used_bricks * BRICK_BYTES
 
     @property
     def nbytes(self) -> int:
-        """Memory set aside [bytes]; what was never used of it is not in the machine's memory yet."""
+        """Allocated memory [bytes]; pages never written do not occupy physical memory yet."""
         return sum(a.nbytes for a in self.tree if isinstance(a, np.ndarray))
 
     # --- ownership -------------------------------------------------------------------------------------------
 
     def collect(self) -> None:
-        """Give back the maps that died since."""
+        """Free the trees of grids deleted since the last call."""
         if not self.dead:
             return
         with self.lock:
@@ -156,10 +156,10 @@ class GridPool:
             )  # fmt: skip
 
     def own(self, boxes: list[RootBox]) -> list[RootBox]:
-        """Boxes that may be written to, one for each: the same, or a new one with a copied root. Hold `lock`.
+        """Return a writable box for each box: the same one, or a new one with a copied root. Hold `lock`.
 
-        The callers' old boxes must be dropped before :meth:`collect` is called, which makes the children of roots that
-        nobody else holds writable again.
+        The caller must drop its old boxes before it calls :meth:`collect`. Then the children of roots without another
+        owner become writable in place.
         """
         foreign = [k for k, box in enumerate(boxes) if box.shared or not box.root]
         if not foreign:
@@ -179,7 +179,7 @@ class GridPool:
                 roots, self.levels, t.children, t.node_ref, t.node_occupied, t.brick_ref, t.node_free, t.counters
             )
             hand_over()
-        except BaseException:  # Ctrl-C, after the roots were taken and before somebody owned them
+        except BaseException:  # Ctrl-C after the roots were copied and before a box owns them
             hand_over()
             raise
         owned = list(boxes)
@@ -195,10 +195,10 @@ class GridPool:
 
 
 def _grown(tree: Tree, names: tuple[str, ...], more: int, used: int) -> Tree:
-    """A tree whose arrays of these names have room for ``more`` rows at least; far more where the machine has it.
+    """A tree in which the named arrays have at least ``more`` additional rows, or many more if memory allows.
 
-    What is set aside costs nothing before it is used, while every growth is a copy into memory that was never touched,
-    which can be dearer than all that is done in it.
+    Unused rows take no physical memory, while each growth copies the arrays into fresh memory, which can take longer
+    than the update itself.
     """
     size = len(getattr(tree, names[0]))
     try:
@@ -208,7 +208,7 @@ def _grown(tree: Tree, names: tuple[str, ...], more: int, used: int) -> Tree:
 
 
 def _resized(tree: Tree, names: tuple[str, ...], n: int, used: int) -> Tree:
-    """Arrays of n rows in place of some. Rows that were never used are not touched, so they take no memory yet."""
+    """Copy the named arrays to arrays with n rows. Only used rows are written, so others take no physical memory."""
     arrays: dict[str, Any] = {}
     for name in names:
         a = getattr(tree, name)

@@ -1,7 +1,7 @@
-"""Asking the processor for memory before it is needed, in compiled code.
+"""Software prefetch in compiled code.
 
-Maps of many particles do not fit into the cache, and which bricks a scan touches the processor cannot guess; we know
-it some bricks ahead.
+Maps of many particles do not fit in the cache, and the processor cannot predict which bricks a scan changes; the
+kernels know it some bricks ahead.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numba.extending import intrinsic, overload
 
 
 def prefetch(array: Any, row: int, column: int) -> None:
-    """Say that an element of a 2-D array will be written soon. It need not exist: nothing is read or written.
+    """Prefetch an element of a 2-D array for writing. It need not exist: nothing is read or written.
 
-    Does nothing where nothing is compiled.
+    Has no effect if numba is disabled.
     """
 
 
@@ -39,5 +39,5 @@ def _prefetch(_: Any, array: Any, row: Any, column: Any) -> Any:
 
 
 @overload(prefetch)
-def _compiled(array, row, column):  # type: ignore[no-untyped-def]  # as the lambda's, or numba refuses it
+def _compiled(array, row, column):  # type: ignore[no-untyped-def]  # arguments as those of the lambda, as numba requires
     return lambda array, row, column: _prefetch(array, row, column)  # type: ignore[call-arg]

@@ -1,6 +1,6 @@
-"""What a sensor would see in evidence grids: expected ranges, and the voxels that end points fall in.
+"""Queries on evidence grids: expected ranges of beams (ray casting), and values of voxels at points.
 
-Both work on many grids in one call, each at a pose of its own, since that is what weighting particles is.
+`cast_grids` and `endpoint_probability` work on many grids in one call, each with its own pose, to weight particles.
 """
 
 from __future__ import annotations
@@ -53,22 +53,22 @@ _NO_VOXELS = np.empty((0, 0, 0), np.int32)
 
 @dataclass(frozen=True, slots=True)
 class CastResult:
-    """Expected ranges of beams, for one grid ``(n,)`` or for P of them ``(P, n)``.
+    """Expected ranges of beams, for one grid ``(n,)`` or for P grids ``(P, n)``.
 
     Parameters
     ----------
     ranges : (..., n)
-        For a hit, from the origin to the middle of the beam's chord in the first occupied voxel, but no more than the
-        maximum range [m]. A beam that measured this voxel ended anywhere on that chord, so its middle is the range
-        without bias; the entry would be short by half a chord. For other beams, where they ended; NaN for unusable
-        ones.
+        For a hit, distance from the origin to the middle of the beam's chord in the first occupied voxel, at most the
+        maximum range [m]. A beam measured in this voxel may end anywhere on the chord, so its middle is unbiased,
+        while the entry point would be too short by half a chord. For other beams, the range where they ended; NaN for
+        unusable beams.
     status : (..., n) int8
-        `MAX_RANGE` 0: went to the maximum range; `HIT` 1; `INSIDE` 2: began in an occupied voxel, range 0; `LEFT` 3:
-        left the addressable cube; `UNUSABLE` 4: direction zero or not finite, or origin not finite or outside the
-        cube; `UNKNOWN_SPACE` 5: came to an unknown voxel, if it was to stop there.
+        `MAX_RANGE` 0: no hit up to the maximum range; `HIT` 1; `INSIDE` 2: starts in an occupied voxel, range 0;
+        `LEFT` 3: left the addressable cube; `UNUSABLE` 4: direction zero or not finite, or origin not finite or
+        outside the cube; `UNKNOWN_SPACE` 5: reached an unknown voxel (only if ``ignore_unknown`` is False).
     voxels : (..., n, 3) int32 or None
-        Signed coordinates of the voxel a beam ended in, if asked for; for hits it is the occupied one, for the others
-        that of the end point to rounding. Undefined for unusable beams.
+        Signed coordinates of the voxel where a beam ended, if requested. For hits it is the occupied voxel, for other
+        beams that of the end point, up to rounding. Undefined for unusable beams.
     """
 
     ranges: Array
@@ -77,7 +77,7 @@ class CastResult:
 
     @property
     def hit(self) -> npt.NDArray[np.bool_]:
-        """Beams that met an occupied voxel, the one they began in included."""
+        """Beams that ended in an occupied voxel, including those that started in one."""
         return (self.status == HIT) | (self.status == INSIDE)
 
 
@@ -96,17 +96,17 @@ def cast_beams(
     Parameters
     ----------
     origins : (3,) or (n, 3), (2,) or (n, 2) in 2-D, or None for 0
-        In the frame of the scan [m].
+        In the scan frame [m].
     directions : (n, 3) or (n, 2)
-        In the frame of the scan, of any length.
+        In the scan frame, of any length.
     max_range : float
-        A voxel entered beyond it is not met [m]; infinite: to the faces of the addressable cube.
+        Voxels entered beyond this range are ignored [m]; infinite: up to the faces of the addressable cube.
     pose : (7,), (4, 4), or (3,) in 2-D
         ``T_grid_scan``; default identity.
     ignore_unknown : bool
-        Look through voxels that were never observed, as OctoMap's ``castRay`` may; else stop there.
+        True: unknown voxels are treated as free (an option of OctoMap's ``castRay``). False: beams stop there.
     voxels : bool
-        Give the voxels too.
+        Also return the end voxels.
 
     Returns
     -------
@@ -129,14 +129,14 @@ def cast_grids(
     voxels: bool = False,
     threads: int = 1,
 ) -> CastResult:
-    """As :func:`cast_beams` for one scan in many grids, each at a pose of its own.
+    """As :func:`cast_beams` for one scan in many grids, each with its own pose.
 
     Parameters
     ----------
     grids : sequence of EvidenceGrid
-        P of them, of one pool, voxel size and threshold; one may stand there several times.
+        P grids with the same pool, voxel size and threshold; a grid may occur several times.
     poses : (P, 7), (P, 4, 4), or (P, 3) in 2-D
-        ``T_grid_scan`` of each.
+        ``T_grid_scan`` for each grid.
     threads : int
         The result is the same for any number.
 
@@ -169,7 +169,7 @@ def _cast(
     limit = float(max_range)
     if not limit > 0.0:
         raise GridError("impossible maximum range", got=max_range, wanted="> 0 m")
-    # a direction has no height: only the origin lies half-way up the layer of a 2-D grid
+    # z of a 2-D direction is 0; only the origin is at half the height of the layer
     d = point_rows(directions, first.dim, 0.0, "beam directions")
     o = np.zeros(first.dim) if origins is None else np.asarray(origins, dtype=np.float64)
     o = point_rows(o[None] if o.ndim == 1 else o, first.dim, first.voxel_size, "beam origins")
@@ -204,17 +204,17 @@ def endpoint_probability(
     unknown: float = 0.5,
     threads: int = 1,
 ) -> npt.NDArray[np.float32]:
-    """Probabilities of occupancy where the points of one scan fall, in many grids.
+    """Occupancy probabilities at the points of one scan, in many grids.
 
     Parameters
     ----------
     grids, poses, points
-        P grids; ``T_grid_scan`` ``(P, 7)``, ``(P, 4, 4)`` or ``(P, 3)``; ``(n, 3 | 2)`` in the frame of the scan [m].
+        P grids; ``T_grid_scan`` ``(P, 7)``, ``(P, 4, 4)`` or ``(P, 3)``; ``(n, 3 | 2)`` in the scan frame [m].
     interpolation : {"nearest", "trilinear"}
-        The voxel a point lies in, or between the centres of the eight around it (of the four in 2-D), which is smooth
-        in the pose.
+        Value of the voxel that contains the point, or interpolation between the centres of the eight voxels around it
+        (four in 2-D), which is continuous in the pose.
     unknown : float
-        Probability of voxels that were never observed or lie outside the cube.
+        Probability used for unknown voxels and outside the cube.
 
     Returns
     -------
@@ -230,18 +230,18 @@ def endpoint_probability(
 
 
 def log_odds_at(grid: GridTree, points: Any) -> npt.NDArray[np.float32]:
-    """Log-odds ``(n,)`` of the voxels that points ``(n, dim)`` [m] of the grid's frame lie in; NaN where unknown."""
+    """Log-odds ``(n,)`` of the voxels that contain points ``(n, dim)`` [m] in the grid frame; NaN where unknown."""
     rows = pose_row(None, grid.dim)[None]
     return _look_up([grid], rows, points, _log_odds_table(), False, 1)[0]
 
 
 def occupied_at(grid: GridTree, points: Any) -> npt.NDArray[np.bool_]:
-    """Whether points ``(n, dim)`` [m] of the grid's frame lie in occupied voxels: known, at the threshold or above."""
+    """Whether points ``(n, dim)`` [m] in the grid frame lie in occupied voxels: known, value ≥ threshold."""
     return grid.values_at(points) >= grid.model.threshold_step
 
 
 def known_at(grid: GridTree, points: Any) -> npt.NDArray[np.bool_]:
-    """Whether points ``(n, dim)`` [m] of the grid's frame lie in voxels that were observed."""
+    """Whether points ``(n, dim)`` [m] in the grid frame lie in observed voxels."""
     return ~np.isnan(log_odds_at(grid, points))
 
 
@@ -278,7 +278,7 @@ def _look_up(
 
 
 def check_together(grids: Sequence[GridTree], *, same_threshold: bool = False) -> GridTree:
-    """Refuse grids that cannot be read in one call; returns the first."""
+    """Raise `GridError` for grids that cannot be read in one call; returns the first grid."""
     first = grids[0]
     for k, g in enumerate(grids):
         if g.pool is not first.pool or g.voxel_size != first.voxel_size or g.dim != first.dim:
@@ -293,7 +293,7 @@ def check_together(grids: Sequence[GridTree], *, same_threshold: bool = False) -
 
 
 def _share(run: Callable[[int, int], None], n: int, threads: int) -> None:
-    """``run(begin, end)`` over n grids by threads."""
+    """Call ``run(begin, end)`` on blocks of n grids, one block per thread."""
     if threads < 1:
         raise ConfigError(f"{threads} threads; wanted at least 1")
     threads = min(threads, n)
@@ -306,7 +306,7 @@ def _share(run: Callable[[int, int], None], n: int, threads: int) -> None:
 
 @lru_cache(maxsize=1)
 def _log_odds_table() -> npt.NDArray[np.float32]:
-    """Log-odds of each value, row v + 32768; NaN of the unknown."""
+    """Log-odds of each value, row v + 32768; NaN for unknown."""
     table = (np.arange(-32768, 32768) * STEP).astype(np.float32)  # exact: STEP is a power of two
     table[0] = math.nan
     return table

@@ -1,4 +1,4 @@
-"""Compiled queries: voxels at points, counts in boxes, occupied voxels, and what grids share.
+"""Compiled queries: values at points, counts in boxes, occupied voxels, shared nodes and bricks.
 
 Arrays of the :class:`~graphslam.evidence.tree_kernels.Tree` are read only; poses ``(12,)`` are R row by row, then t
 [m]. Lists of bricks are ``rows (n, 2) int64`` [packed offset coordinates, brick], as ``list_bricks`` gives them.
@@ -15,10 +15,10 @@ from graphslam.evidence.kernels import kernel
 
 @kernel()
 def find_brick(root, x, y, z, levels, children, last):
-    """Brick that holds voxel (x, y, z) [offset coordinates], or 0.
+    """Brick that contains voxel (x, y, z) [offset coordinates], or 0.
 
-    ``last (4,)`` remembers the node of the present block of 4³ bricks [x, y, z of the block, node]: neighbouring points
-    descend once. Start it at -1.
+    ``last (4,)`` caches the node of the last block of 4³ bricks [x, y, z of the block, node], so that neighbouring
+    points need one descent. Initialise it with -1.
     """
     bx, by, bz = x >> 3, y >> 3, z >> 3
     if (bx >> 2) != last[0] or (by >> 2) != last[1] or (bz >> 2) != last[2]:
@@ -31,24 +31,24 @@ def find_brick(root, x, y, z, levels, children, last):
             if node == 0:
                 break
         last[3] = node
-    # node 0 has no children, so that an absent block has absent bricks
+    # all children of node 0 are 0, so this is right for an absent block too
     return np.int64(children[np.uint64(last[3]), np.uint64(((bz & 3) << 4) | ((by & 3) << 2) | (bx & 3))])
 
 
 @kernel(error_model="numpy")
 def look_up_values(begin, end, roots, poses, points, scale, half, levels, trilinear, table, children, bricks, out):
-    """Figures of ``table (65536,)``, one for each value a voxel may hold, at points seen from grids ``begin … end-1``.
+    """Entries of ``table (65536,)`` for the voxel values at points, in grids ``begin … end-1``.
 
     Parameters
     ----------
     points : (n, 3)
         In the scan frame [m].
     trilinear : bool
-        Interpolate between the centres of the eight voxels around a point, instead of the voxel it lies in.
+        Interpolate between the centres of the eight voxels around a point, else use the voxel that contains it.
     table : (65536,) float32
-        Row v + 32768 for a value v; row 0 is the figure of the unknown, and of what lies outside the cube.
+        Row v + 32768 for a value v; row 0 is for unknown voxels and outside the cube.
     out : (P, n) float32
-        Written; NaN for points that are not finite.
+        Output; NaN for points that are not finite.
     """
     edge = 2.0 * half
     last = np.empty(4, np.int64)
@@ -92,14 +92,14 @@ def look_up_values(begin, end, roots, poses, points, scale, half, levels, trilin
 
 @kernel()
 def count_boxes(root, lower, upper, levels, threshold, children, bricks, out):
-    """Occupied and known voxels in boxes.
+    """Numbers of occupied and known voxels in boxes.
 
     Parameters
     ----------
     lower, upper : (m, 3) int64
         Offset coordinates of the first voxel and of the one after the last, inside the cube.
     out : (m, 2) int64
-        Written: occupied, known.
+        Output: occupied, known.
     """
     stack = np.empty((64 * 8, 5), np.int64)  # node, level, voxel coordinates of its corner
     for q in range(lower.shape[0]):
@@ -140,9 +140,9 @@ def count_boxes(root, lower, upper, levels, threshold, children, bricks, out):
 
 @kernel()
 def list_occupied(rows, half, threshold, bricks, brick_lines, voxels, values):
-    """Number of occupied voxels; fills ``voxels (n, 3) int32`` (signed) and ``values (n,) int16`` where they have rows.
+    """Number of occupied voxels; fills the rows of ``voxels (n, 3) int32`` (signed) and ``values (n,) int16``.
 
-    Voxels come brick by brick in the order of the rows, inside a brick x fastest.
+    Order: brick by brick in the order of ``rows``, inside a brick x fastest.
     """
     n = 0
     for r in range(rows.shape[0]):
@@ -167,25 +167,25 @@ def list_occupied(rows, half, threshold, bricks, brick_lines, voxels, values):
 
 @kernel()
 def walk_once(roots, levels, children, node_times, brick_times, nodes, links, begins):
-    """Visit every node and brick below some roots once, level by level, however many parents share it.
+    """Visit every node and brick below some roots exactly once, level by level, even if it has several parents.
 
     Parameters
     ----------
     roots : (R,) int64
         Distinct, none 0.
     node_times, brick_times : (N,), (B,) int64
-        All 0; written: in how many places of the trees a node or brick stands.
+        All 0 on input; output: number of places where a node or brick occurs in the trees.
     nodes : (N,) int64
-        Written: nodes in the order of the visit, levels from the roots down.
+        Output: nodes in the order of the visit, from the roots down.
     links : (B,) int64
-        Written: bricks likewise.
+        Output: bricks in the order of the visit.
     begins : (levels + 1,) int64
-        Written: where each level begins in ``nodes`` (roots first), and the end.
+        Output: start of each level in ``nodes`` (roots first), and the end.
 
     Returns
     -------
     int
-        Bricks found.
+        Number of bricks.
     """
     n = 0
     for r in range(roots.shape[0]):
@@ -231,10 +231,10 @@ def count_voxel_values(ids, times, bricks, counts):
 
 @kernel()
 def count_private(nodes, begins, free_roots, node_left, brick_left, tree):
-    """Nodes and bricks that would be freed with some roots, as (nodes, bricks).
+    """Numbers of nodes and bricks that would be freed with some roots.
 
-    ``nodes, begins`` are from :func:`walk_once`; ``free_roots (R,)`` says which of the roots nobody else holds.
-    ``node_left (N,)``, ``brick_left (B,)`` int32 are all 0; written: parents that would go.
+    ``nodes, begins`` are from :func:`walk_once`; ``free_roots (R,)`` is True for roots without another owner.
+    ``node_left (N,)``, ``brick_left (B,)`` int32 are all 0 on input; output: numbers of parents that would be freed.
     """
     freed_nodes, freed_bricks = 0, 0
     for step in range(tree.levels):

@@ -1,4 +1,4 @@
-"""Scans and poses as the kernels want them, and the report of what became of a scan's beams."""
+"""Conversion of scans and poses to the input arrays of the kernels, and the report of an update."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _IDENTITY = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0])
 
 @dataclass(frozen=True, slots=True)
 class UpdateReport:
-    """What became of the beams of an update, summed over the grids it went to.
+    """Counts of inserted and dropped beams of an update, summed over its grids.
 
     Parameters
     ----------
     rays : int
         Beams that were inserted.
     cut : int
-        Of these, beams cut at the maximum range: they give free space only.
+        Of these, beams cut at the maximum range: they mark free space only.
     not_finite, zero_length, outside : int
-        Beams that were dropped: NaN or infinite, of no length, or reaching out of the addressable cube.
+        Dropped beams: NaN or infinite, of length 0, or not inside the addressable cube.
     locked : int
-        Grids that were left alone because they are locked.
+        Grids that were not updated because they are locked.
     bricks : int
         Bricks that were written.
     """
@@ -54,7 +54,7 @@ class UpdateReport:
 
 
 def pose_row(pose: Any, dim: int) -> Array:
-    """``T_grid_scan`` as the kernels want it, ``(12,)``: rotation row by row, then translation.
+    """``T_grid_scan`` for the kernels, ``(12,)``: rotation matrix row by row, then translation [m].
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def pose_row(pose: Any, dim: int) -> Array:
     T = np.asarray(pose, dtype=np.float64)
     if T.shape != (7,):
         return pose_rows(T[None], dim)[0]
-    # one pose at a time is the path of a single map, where twenty array operations would cost as much as the scan
+    # fast path for a single map: twenty array operations would take as long as the scan itself
     px, py, pz, x, y, z, w = T.tolist()
     n = x * x + y * y + z * z + w * w
     if not (0.25 <= n <= 4.0 and math.isfinite(px + py + pz)):
@@ -82,16 +82,16 @@ def pose_row(pose: Any, dim: int) -> Array:
 
 
 def pose_rows(poses: Any, dim: int) -> Array:
-    """As :func:`pose_row` for many, ``(n, 7)``, ``(n, 3)`` or ``(n, 4, 4)`` to ``(n, 12)``."""
+    """As :func:`pose_row` for many poses, ``(n, 7)``, ``(n, 3)`` or ``(n, 4, 4)`` to ``(n, 12)``."""
     T = np.asarray(poses, dtype=np.float64)
-    finite = math.isfinite(T.sum())  # quick, and right unless figures are near the largest there are
+    finite = math.isfinite(T.sum())  # fast; the sum of finite numbers may overflow, hence the second test
     if not finite and not np.all(np.isfinite(T)):
         k = int(np.argwhere(~np.isfinite(T))[0][0])
         raise GeometryError(f"pose {k} is not finite", got=T[k], wanted="finite numbers")
     out = np.empty((len(T), 12))
     if T.ndim == 3 and T.shape[1:] == (4, 4):
         R = T[:, :3, :3]
-        # figures of text files are rounded; what is left of a rotation then moves no point of a scan by a voxel
+        # tolerance for matrices from text files, whose entries are rounded
         wrong = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-4
         wrong |= np.linalg.det(R) < 0
         if wrong.any():
@@ -129,12 +129,12 @@ def pose_rows(poses: Any, dim: int) -> Array:
 
 
 def point_rows(points: Any, dim: int, voxel_size: float, what: str = "points") -> Array:
-    """Points ``(n, 3)`` in 3-D, ``(n, 2)`` in 2-D, as ``(n, 3)``; 2-D points get the height of the layer's middle."""
+    """Points ``(n, 3)`` or ``(n, 2)`` as ``(n, 3)`` [m]; 2-D points get the height of the centre of the layer k = 0."""
     p = np.ascontiguousarray(points, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] != dim:
         raise GridError(f"{what} have the wrong shape", got=p.shape, wanted=f"(n, {dim})")
     if dim == 3:
-        # to the compiler a read-only array is another type: every kernel would be compiled once more
+        # numba treats a read-only array as another type and would compile every kernel again
         return p if p.flags.writeable else p.copy()
     flat = np.empty((len(p), 3))
     flat[:, :2] = p
@@ -145,7 +145,7 @@ def point_rows(points: Any, dim: int, voxel_size: float, what: str = "points") -
 def scan_rows(
     points: Any, origin: Any, returns: Any, max_range: float | None, dim: int, voxel_size: float
 ) -> tuple[Array, Array, npt.NDArray[np.uint8], float]:
-    """A scan as the kernels want it: points ``(n, 3)``, origins ``(n, 3)`` or ``(1, 3)``, returns, maximum range."""
+    """Scan for the kernels: points ``(n, 3)``, origins ``(n, 3)`` or ``(1, 3)``, returns, maximum range [m]."""
     p = point_rows(points, dim, voxel_size)
     if origin is None:
         o = _ZERO if dim == 3 else np.array([[0.0, 0.0, 0.5 * voxel_size]])
@@ -169,6 +169,6 @@ def scan_rows(
 
 
 def check_number(what: str, got: Sequence[Any] | Array, wanted: int) -> None:
-    """Refuse lists that do not belong together."""
+    """Raise `GridError` if a list has not one entry per grid."""
     if len(got) != wanted:
         raise GridError(f"{what} differ in number from the grids", got=len(got), wanted=wanted)

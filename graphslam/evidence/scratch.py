@@ -1,4 +1,4 @@
-"""Scratch memory of one thread's marks (:mod:`update_kernels`)."""
+"""Scratch memory of one thread for marking and applying scans (:mod:`mark_kernels`, :mod:`update_kernels`)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from graphslam.evidence.layout import BRICK_VOXELS
 
 WINDOW = 64**3
 MADE = 32768
-"""New bricks of one update that later grids can share; beyond them bricks are not looked for, only made."""
+"""Maximum number of new bricks of one update that later grids can share; further bricks are not shared."""
 
 
 class Scratch:
     """Window, slots and marks; between scans the window is all -1 and the marks are all 0.
 
-    What no scan has touched yet is not in the machine's memory.
+    Parts that no scan has written to take no physical memory.
     """
 
     def __init__(self, slots: int = 16384) -> None:
@@ -30,8 +30,8 @@ class Scratch:
         self.resize(slots)
 
     def resize(self, slots: int) -> None:
-        """Room for so many bricks touched by a scan."""
-        marks = aligned_zeros((slots, BRICK_VOXELS), np.uint8)  # first: it alone can fail for want of memory
+        """Allocate for this number of bricks per scan."""
+        marks = aligned_zeros((slots, BRICK_VOXELS), np.uint8)  # first: the largest, may raise MemoryError
         self.slot_key = np.zeros(slots, np.int64)
         self.slot_next = np.zeros(slots, np.int32)
         self.work = np.zeros((slots, 5), np.int32)
@@ -39,19 +39,19 @@ class Scratch:
         self.marks64 = marks.view(np.uint64)
 
     def reserve_left(self, more: int) -> None:
-        """Room to note so many more sources."""
+        """Ensure capacity for this number of further sources."""
         if self.left[0] + 1 + more > len(self.left):
             longer = np.zeros(2 * (int(self.left[0]) + 1 + more), np.int64)
             longer[: len(self.left)] = self.left
             self.left = longer
 
     def forget_made(self) -> None:
-        """Another update begins: what it makes of a brick is not what the last one made."""
+        """Clear the list of new bricks at the start of an update; they are shared within one update only."""
         self.table[self.made[1 : self.made[0, 0], 3]] = -1
         self.made[0, 0] = 1
 
     def reset(self) -> None:
-        """Forget marks that will not be applied."""
+        """Clear marks that will not be applied."""
         self.window[:] = -1
         self.marks[:] = 0
 
@@ -63,12 +63,12 @@ LINE = 64  # bytes
 
 
 def aligned_zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """Zeros; what was never touched takes no memory yet."""
+    """Zeros, aligned to cache lines; pages never written take no physical memory."""
     return _aligned(np.zeros, shape, np.dtype(dtype))
 
 
 def aligned_empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """Values of no meaning; what was never touched takes no memory yet."""
+    """Uninitialised array, aligned to cache lines; pages never written take no physical memory."""
     return _aligned(np.empty, shape, np.dtype(dtype))
 
 

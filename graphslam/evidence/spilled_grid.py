@@ -1,7 +1,7 @@
-"""Evidence grids that are finished: in memory while they are used, else in the file of a shelf.
+"""Evidence grids that are kept in a spill cache: in memory while they are used, else in a file.
 
-A run holds the grid of every submap to its end, and uses a few at a time. :func:`spill_grid` makes a grid that is the
-same to everybody who asks it something; whoever writes to it has it in memory from then on.
+A run keeps the grid of every submap, but uses only a few at a time. A grid from :func:`spill_grid` has the same
+interface as any other grid; it moves back into memory for good when it is written to.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _Kind: TypeAlias = tuple[float, BeamModel, int]
 
 
 class SpilledGrid(EvidenceGrid):
-    """A grid whose tree is in a pool of its own, which a shelf holds.
+    """A grid whose tree is in a separate pool, which is stored in a spill cache.
 
-    Both are asked for when they are needed. They stay the same for as long as somebody holds the pool, so that whoever
-    takes the pool first and its root later has both of one tree.
+    Pool and root are loaded on access. They do not change while a reference to the pool exists, so code that reads
+    first the pool and then the root gets both from one tree.
     """
 
     __slots__ = ("_own", "_slot")
@@ -39,17 +39,17 @@ class SpilledGrid(EvidenceGrid):
         self._own: tuple[GridPool, RootBox] | None = None
 
     def empty(self, pool: GridPool | None = None) -> EvidenceGrid:  # type: ignore[override]
-        """A grid like this one, that is empty and lies on no shelf."""
+        """An empty grid like this one, in memory."""
         return EvidenceGrid(self.voxel_size, model=self.model, pool=self.pool if pool is None else pool, dim=self.dim)
 
     @property
     def on_shelf(self) -> bool:
-        """Has nobody written to it?"""
+        """Whether the grid is in the spill cache, i.e. it was never written to."""
         return self._slot is not None
 
     @property
     def pool(self) -> GridPool:  # type: ignore[override]
-        """Where the tree is now."""
+        """Pool of the tree; loaded from the spill file if necessary."""
         if self._slot is not None:
             return self._slot.get()
         assert self._own is not None
@@ -72,12 +72,12 @@ class SpilledGrid(EvidenceGrid):
 
 
 def spill_grid(grid: EvidenceGrid, shelf: SpillCache | None = None) -> EvidenceGrid:
-    """The same map on a shelf, in a pool of its own; the memory of ``grid`` goes with its last owner.
+    """The same map in the spill cache, with its own pool; ``grid`` itself is not freed.
 
     Parameters
     ----------
     shelf : SpillCache, optional
-        By default that of the process.
+        Default: the cache of the process.
     """
     if isinstance(grid, SpilledGrid) and grid.on_shelf:
         return grid
@@ -87,7 +87,7 @@ def spill_grid(grid: EvidenceGrid, shelf: SpillCache | None = None) -> EvidenceG
 
 
 def load_spilled(path: str | os.PathLike[str]) -> EvidenceGrid:
-    """Read what `EvidenceGrid.save` wrote, onto the shelf of the process; errors are those of `formats.load_npz`."""
+    """Read a file of `EvidenceGrid.save` into the spill cache of the process; errors as in `formats.load_npz`."""
     grid = load_npz(path)
     return _put(grid, _with(grid.pool, grid._box), SPILL_CACHE)
 
@@ -104,14 +104,14 @@ def _kind(grid: EvidenceGrid, levels: int) -> EvidenceGrid:
 
 
 def _pool_of(kind: EvidenceGrid, pieces: GridPieces) -> GridPool:
-    """The pool of an empty grid, with a tree of some pieces."""
+    """Fill an empty grid with pieces and return its pool."""
     fill_grid(kind, pieces)
     return _with(kind.pool, kind._box)
 
 
 def _with(pool: GridPool, box: RootBox) -> GridPool:
-    """A pool that keeps its only tree, and has no more room than that takes."""
-    box.shared = True  # whoever writes to it has a root of his own
+    """Make a pool keep its only tree, and free its unused capacity."""
+    box.shared = True  # a write then copies the root
     pool.kept = box
     pool.fit()
     return pool
@@ -123,7 +123,7 @@ def _tree_of(pool: GridPool) -> RootBox:
 
 
 def _packed(kind: _Kind, pool: GridPool) -> Arrays:
-    """What a pool's tree holds: bricks as the values that are known, and where."""
+    """Arrays of the tree of a pool; of bricks only the known values and their positions."""
     voxel_size, model, dim = kind
     grid = EvidenceGrid(voxel_size, model=model, pool=pool, dim=dim)
     grid._box = _tree_of(pool)
@@ -140,13 +140,13 @@ def _unpacked(kind: _Kind, levels: int, arrays: Arrays) -> GridPool:
 
 
 def packed_values(values: npt.NDArray[np.int16]) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int16]]:
-    """Which voxels of bricks ``(n, 512)`` are known, a bit each ``(n, 64)``, and their values in a row."""
+    """Bit mask ``(n, 64)`` of the known voxels of bricks ``(n, 512)``, and their values in one array."""
     known = values != UNKNOWN
     return np.packbits(known, axis=1), values[known]
 
 
 def unpacked_values(where: npt.NDArray[np.uint8], known: npt.NDArray[np.int16]) -> npt.NDArray[np.int16]:
-    """Bricks ``(n, 512)`` of what :func:`packed_values` made."""
+    """Inverse of :func:`packed_values`: bricks ``(n, 512)``."""
     values = np.full((len(where), BRICK_VOXELS), UNKNOWN, np.int16)
     values[np.unpackbits(where, axis=1).view(np.bool_)] = known
     return values

@@ -1,7 +1,7 @@
-"""Compiled bookkeeping of the shared node pool: allocate, own, descend, release.
+"""Compiled operations on the trees of a pool: allocate, copy on write, descend, read, write, release.
 
-Nothing here checks capacity: callers reserve first, so that a tree is never left half-changed. Node 0 and brick 0 stand
-for "absent"; brick 0 is all unknown, so that reading it as a source is right.
+Capacity is not checked here: callers reserve it first, so that no tree is left half-changed. Node 0 and brick 0 mean
+"absent"; brick 0 is all unknown, so it may be read as a source.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ NODES_USED, NODES_FREE, BRICKS_USED, BRICKS_FREE = 0, 1, 2, 3
 class Tree(NamedTuple):
     """Arrays of the nodes and bricks of all grids of a pool (:mod:`layout`).
 
-    Kernels that are called for every scan take single arrays: with tuples a planar scan takes a twelfth longer.
+    Kernels that are called for every scan take single arrays: tuples make the insertion of a planar scan 8 % slower.
 
     Parameters
     ----------
     children : (N, 64) int32
-        Nodes, in a node of level 0 bricks.
+        Ids of the children: nodes, or bricks for a node of level 0.
     node_ref, brick_ref : (N,), (B,) int32
         Numbers of parents.
     node_occupied : (N,) uint64
-        Bits of the children that hold an occupied voxel.
+        Bits of the children that contain an occupied voxel.
     bricks : (B, 512) int16
     brick_lines : (B,) uint16
-        Bits of the lines of 32 voxels that hold an occupied one.
+        Bits of the lines of 32 voxels that contain an occupied one.
     node_free, brick_free : (N,), (B,) int32
-        Stacks of what is free.
+        Stacks of free ids.
     counters : (5,) int64
-        First node never used, free nodes on the stack, first brick never used, free bricks on the stack, whether an
+        First node never used, free nodes on the stack, first brick never used, free bricks on the stack, 1 while an
         update is between its phases.
     levels, half : int
         Levels of nodes; voxels from the centre of the addressable cube to its faces.
@@ -56,14 +56,14 @@ class Tree(NamedTuple):
 
 @kernel()
 def child_index(bx, by, bz, level):
-    """Which child of a node of a level a brick is in."""
+    """Index of the child that contains a brick, in a node of level ``level``."""
     s = 2 * level
     return (((bz >> s) & 3) << 4) | (((by >> s) & 3) << 2) | ((bx >> s) & 3)
 
 
 @kernel()
 def take_node(children, node_ref, node_occupied, node_free, counters):
-    """An empty node with one parent."""
+    """Allocate an empty node with one parent."""
     if counters[NODES_FREE] > 0:
         counters[NODES_FREE] -= 1
         n = int(node_free[counters[NODES_FREE]])
@@ -79,7 +79,7 @@ def take_node(children, node_ref, node_occupied, node_free, counters):
 
 @kernel()
 def take_brick(brick_ref, brick_free, counters):
-    """A brick with one parent; its voxels are whatever they were."""
+    """Allocate a brick with one parent; its voxels are not initialised."""
     if counters[BRICKS_FREE] > 0:
         counters[BRICKS_FREE] -= 1
         b = int(brick_free[counters[BRICKS_FREE]])
@@ -92,7 +92,7 @@ def take_brick(brick_ref, brick_free, counters):
 
 @kernel()
 def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node_free, counters):
-    """A copy with one parent; the source has one parent less, the children one more."""
+    """Copy a node. The copy has one parent, the source one parent less, the children one more."""
     n = take_node(children, node_ref, node_occupied, node_free, counters)
     for c in range(64):
         child = children[source, c]
@@ -109,9 +109,9 @@ def clone_node(source, level, children, node_ref, node_occupied, brick_ref, node
 
 @kernel()
 def own_child(node, c, level, tree):
-    """Child of a node that is the caller's own, and so is the child then: made if missing, copied if shared.
+    """Child of an unshared node, made unshared too: created if missing, copied if shared.
 
-    ``level`` of the child.
+    ``level`` is that of the child.
     """
     children, node_ref, node_occupied, node_free = tree.children, tree.node_ref, tree.node_occupied, tree.node_free
     child = np.int64(children[node, c])
@@ -129,7 +129,7 @@ def own_child(node, c, level, tree):
 
 @kernel()
 def find_node(root, bx, by, bz, levels, children):
-    """Node of level 0 over a brick, or 0."""
+    """Node of level 0 that contains a brick, or 0."""
     node = root
     for level in range(levels - 1, 0, -1):
         shift = 2 * level
@@ -142,7 +142,7 @@ def find_node(root, bx, by, bz, levels, children):
 
 @kernel()
 def set_occupied(root, bx, by, bz, levels, occupied, children, node_occupied):
-    """Write on the path from the root whether a brick holds an occupied voxel. The path is the caller's own."""
+    """Set whether a brick contains an occupied voxel, in all nodes on its path, which must be unshared."""
     path = np.empty(8, np.int64)
     path[levels - 1] = root
     for level in range(levels - 1, 0, -1):
@@ -170,7 +170,7 @@ def set_occupied(root, bx, by, bz, levels, occupied, children, node_occupied):
 def unique_roots(roots, levels, children, node_ref, node_occupied, brick_ref, node_free, counters):
     """Replace the roots ``(n,)`` by copies, and those that are 0 (empty maps) by empty nodes.
 
-    The old root keeps its parent count: other handles still hold it.
+    The old root keeps its parent count, because other handles still use it.
     """
     for k in range(roots.shape[0]):
         old = roots[k]
@@ -183,7 +183,7 @@ def unique_roots(roots, levels, children, node_ref, node_occupied, brick_ref, no
 
 @kernel()
 def drop_brick(brick, brick_ref, brick_free, counters):
-    """One parent less; the last one frees it."""
+    """Decrease the parent count of a brick; free it at 0."""
     brick_ref[brick] -= 1
     if brick_ref[brick] == 0:
         brick_free[counters[BRICKS_FREE]] = brick
@@ -192,8 +192,8 @@ def drop_brick(brick, brick_ref, brick_free, counters):
 
 @kernel()
 def release_roots(roots, levels, children, node_ref, brick_ref, node_free, brick_free, counters):
-    """Give back trees; what other trees share stays."""
-    # at most 63 siblings wait on each level, besides the node itself
+    """Free trees; parts shared with other trees stay."""
+    # stack size: at most 63 siblings per level, and the node itself
     stack = np.empty(64 * 8, np.int64)
     depth = np.empty(64 * 8, np.int64)
     for k in range(roots.shape[0]):
@@ -220,7 +220,7 @@ def release_roots(roots, levels, children, node_ref, brick_ref, node_free, brick
 
 @kernel()
 def list_bricks(root, levels, children, out):
-    """Number of bricks below a root; fills ``out (n, 2)`` [packed offset coordinates, brick] where it has rows."""
+    """Number of bricks below a root; fills the rows of ``out (n, 2)`` [packed offset coordinates, brick]."""
     stack = np.empty((64 * 8, 5), np.int64)  # node, level, coordinates of its corner in bricks
     stack[0, 0], stack[0, 1] = root, levels - 1
     stack[0, 2], stack[0, 3], stack[0, 4] = 0, 0, 0
@@ -251,13 +251,13 @@ def list_bricks(root, levels, children, out):
 def gather_bricks(ids, bricks, out):
     """Copy bricks to rows of ``out (n, 512)``."""
     for k in range(ids.shape[0]):
-        for j in range(512):  # by rows it would compile for a second
+        for j in range(512):  # a copy of whole rows would take 1 s to compile
             out[k, j] = bricks[ids[k], j]
 
 
 @kernel()
 def read_values(root, points, scale, half, levels, children, bricks, out):
-    """Values of the voxels that points ``(n, 3)`` lie in."""
+    """Values of the voxels that contain points ``(n, 3)`` [m]; -32768 outside the cube."""
     edge = 2.0 * half
     for k in range(points.shape[0]):
         x, y, z = points[k, 0] * scale + half, points[k, 1] * scale + half, points[k, 2] * scale + half
@@ -274,7 +274,7 @@ def read_values(root, points, scale, half, levels, children, bricks, out):
 
 @kernel()
 def occupied_lines(brick, threshold, bricks):
-    """Bits of the lines of a brick that hold an occupied voxel."""
+    """Bits of the lines of a brick that contain an occupied voxel."""
     lines = 0
     for line in range(16):
         for j in range(32):
@@ -287,7 +287,7 @@ def occupied_lines(brick, threshold, bricks):
 
 @kernel()
 def write_bricks(root, keys, values, threshold, tree):
-    """Replace bricks (packed offset coordinates ``keys (n,)``) by ``values (n, 512)``. Root owned, room reserved."""
+    """Replace bricks at packed offset coordinates ``keys (n,)`` by ``values (n, 512)``; the root must be unshared."""
     for k in range(keys.shape[0]):
         bx, by, bz = keys[k] & 0xFFFFF, (keys[k] >> 20) & 0xFFFFF, keys[k] >> 40
         parent = root
@@ -301,7 +301,7 @@ def write_bricks(root, keys, values, threshold, tree):
                 tree.brick_ref[b] -= 1
             b = take_brick(tree.brick_ref, tree.brick_free, tree.counters)
             tree.children[parent, c] = b
-        for j in range(512):  # by rows it would compile for two seconds
+        for j in range(512):  # a copy of whole rows would take 2 s to compile
             tree.bricks[b, j] = values[k, j]
         lines = occupied_lines(b, threshold, tree.bricks)
         tree.brick_lines[b] = lines

@@ -1,7 +1,7 @@
 """Second phase of inserting a scan, compiled: *apply* the marks of :mod:`mark_kernels` to the maps.
 
-The path to each touched brick is resolved once (copy-on-write), then whole lines of voxels are worked on. A scan that
-is half marked has changed no map, and applying cannot fail, since room was reserved before. Scratch arrays as in
+The path to each marked brick is resolved once (copy-on-write), then whole lines of voxels are updated. Marking changes
+no map, and applying cannot run out of memory, because capacity was reserved before. Scratch arrays as in
 :mod:`mark_kernels`, tree arrays as in :mod:`tree_kernels`.
 """
 
@@ -14,25 +14,25 @@ from graphslam.evidence.prefetch_kernels import prefetch
 from graphslam.evidence.tree_kernels import clone_node, drop_brick, set_occupied, take_brick, take_node
 
 AHEAD = 4
-"""Bricks that memory is asked for before the one that is worked on."""
+"""Prefetch distance [bricks]."""
 PENDING = 4
-"""Place in the pool's counters: an update is between its phases, and its trees are no maps."""
+"""Index in the counters of a pool: 1 while an update is between its phases and its trees are not valid."""
 
 
 @kernel()
 def find_identical_write(s, source, marks64, table, made, made_marks):
-    """Place in ``made`` of the brick made of this source and these marks, and the last one is the new brick's own if
-    there was none; -1 where there is no room for it.
+    """Row in ``made`` of the brick with this source and these marks; a new last row if there is none, -1 if ``made``
+    is full.
 
-    ``made (M, 4) int64``: [source, target, hash, place in the table], row 0 the number of rows in use;
-    ``made_marks (M + 1, 16) uint64``: two bits a voxel; ``table (T,) int32``: rows, or -1; T a power of two, at least
-    2 M. Compared in full; the hash only finds what to compare.
+    ``made (M, 4) int64``: [source, target, hash, index in the table], row 0 the number of rows in use;
+    ``made_marks (M + 1, 16) uint64``: two bits per voxel; ``table (T,) int32``: rows, or -1; T a power of two, at least
+    2 M. Source and marks are compared in full; the hash only selects candidates.
     """
     n = made[0, 0]
-    for k in range(16):  # packed where it stays if it is new
+    for k in range(16):  # written to its final row if it is new
         a, b, c, d = marks64[s, k], marks64[s, 16 + k], marks64[s, 32 + k], marks64[s, 48 + k]
         made_marks[n, k] = a | (b << np.uint64(2)) | (c << np.uint64(4)) | (d << np.uint64(6))
-    # Four chains, so that none waits for another. No product: where nothing is compiled its overflow is a warning.
+    # four independent chains for speed; no product, because without numba its overflow raises a warning
     h, h1, h2, h3 = np.uint64(source), np.uint64(0), np.uint64(0), np.uint64(0)
     left, right = np.uint64(13), np.uint64(7)
     for k in range(4):
@@ -87,17 +87,17 @@ def resolve_writes(
     brick_free,
     counters,
 ):
-    """Own the paths to the bricks of the slots of grids ``begin … end-1``, and a brick at the end of each.
+    """Make the paths to the marked bricks of grids ``begin … end-1`` unshared, and assign a target brick to each slot.
 
-    ``work (S, 5)`` becomes [parent node, child, source, target, state]. Source equals target where the brick is nobody
-    else's. Bricks with the same source and the same marks will be equal, so several grids get one target: particles
-    that came from one parent see most of their surroundings alike for some scans, and what they see alike stays one
-    brick. State is 0, or ~source where another slot writes the target. Sources keep all their parents until
-    :func:`release_sources`, at the end of the update: what is shared must not depend on who came first. From here to
-    :func:`finalise_writes` ``counters[PENDING]`` is set: the trees are no maps. Room was reserved.
+    ``work (S, 5)`` becomes [parent node, child, source, target, state]. Source equals target if the brick has no other
+    parent. Bricks with the same source and the same marks will be equal, so several grids get one target: particles
+    from one parent have equal marks in most bricks for some scans, and these bricks stay shared. State is 0, or ~source
+    if another slot writes the target. Sources keep all their parents until :func:`release_sources` at the end of the
+    update, so that sharing does not depend on the order of the grids. From here to :func:`finalise_writes`,
+    ``counters[PENDING]`` is 1 and the trees are not valid. Capacity must be reserved.
 
-    ``share``: look for such bricks, among those of this update, with ``table, made, made_marks`` of the scratch. The
-    loops are inside: handing a dozen arrays to a function for every brick would cost more than the work.
+    ``share``: find equal bricks within this update, with ``table, made, made_marks`` of the scratch. The loop over
+    bricks is inside, because a call with a dozen arrays per brick would take longer than the work.
     """
     path = np.empty(8, np.int64)
     s = 0
@@ -108,7 +108,7 @@ def resolve_writes(
         while s < ends[g]:
             key = slot_key[s]
             bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40
-            # climb to the lowest node that this brick shares with the last one
+            # go up to the lowest common node of this brick and the last one
             differ = ((bx ^ px) | (by ^ py) | (bz ^ pz)) >> 2
             level = known
             if level == 0:
@@ -155,7 +155,7 @@ def resolve_writes(
 
 @kernel()
 def _fetch(s, marks64, work, bricks):
-    """Ask for the lines of a slot's bricks that will be read or written."""
+    """Prefetch the lines of a slot's bricks that will be read or written."""
     source, target = np.int64(work[s, 2]), np.int64(work[s, 3])
     if work[s, 4] < 0:
         return
@@ -170,7 +170,7 @@ def _fetch(s, marks64, work, bricks):
 
 @kernel()
 def carry_flag(s, root, lines, levels, slot_key, work, children, node_occupied):
-    """Carry a slot's flag "something is occupied" up its grid's tree where it changed."""
+    """If the occupancy flag of a slot's brick changed, update the flags on its path in the tree."""
     bit = (node_occupied[work[s, 0]] >> np.uint64(work[s, 1])) & np.uint64(1)
     if (bit != np.uint64(0)) != (lines != 0):
         key = slot_key[s]
@@ -195,13 +195,13 @@ def apply_grids(
     bricks,
     brick_lines,
 ):
-    """Write the bricks of grids ``begin … end-1``: each target is its source updated by its marks, which are cleared.
+    """Write the bricks of grids ``begin … end-1``: target = source updated by its marks; then the marks are cleared.
 
-    Brick 0 as a source is a brick nobody has seen. Lines without marks are copied, or not touched at all: a planar
-    scanner marks few lines of the bricks it crosses, and with many particles the bricks are not in the cache.
-    Arithmetic stays in int16 after each operation, or it is not vectorised; so does having one loop that reads and
-    writes one brick and another that copies. Values are bounded before the step is added and not after: those of a
-    file may lie anywhere, and would overflow. Applying twice is applying once.
+    Brick 0 as a source is an unobserved brick. Lines without marks are copied, or skipped if source and target are the
+    same brick, because a planar scanner marks few lines of a brick and with many particles the bricks are not in the
+    cache. For vectorisation, all arithmetic is in int16, and there are separate loops for update in place and for copy.
+    Values are clamped before the step is added, not after, because values of a file may be anywhere and could
+    overflow. Calling it again after an interruption gives the same result.
     """
     miss, hit, low, high, threshold = steps[0], steps[1], steps[2], steps[3], steps[4]
     s = 0
@@ -271,8 +271,8 @@ def apply_grids(
 def finalise_writes(
     begin, end, roots, ends, levels, slot_key, work, children, node_occupied, brick_lines, left, counters
 ):  # fmt: skip
-    """Once every brick is written, whatever thread did it: flags of those another slot wrote, and the sources that
-    were copied are added to ``left (n,) int64``, the first of which is their number. Doing it twice is doing it once.
+    """After all threads wrote their bricks: set the flags of bricks that another slot wrote, and add the copied sources
+    to ``left (n,) int64`` (element 0 is their number). Calling it again gives the same result.
     """
     s = 0
     for g in range(begin, end):
@@ -292,7 +292,7 @@ def finalise_writes(
 
 @kernel()
 def release_sources(left, brick_ref, brick_free, counters):
-    """Take one parent from each of the bricks that were left for a copy."""
+    """Decrease the parent count of each source brick that was replaced by a copy."""
     for k in range(left[0]):
         drop_brick(left[k + 1], brick_ref, brick_free, counters)
     left[0] = 0

@@ -1,4 +1,4 @@
-"""The dense maps of submaps behind one view: of a grid, and of a cloud, whose beams make a grid when it is needed."""
+"""Common view of the dense maps of submaps: of a grid, or of a cloud (whose grid is built when needed)."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class GridView:
         return self._grid.dim
 
     def points(self, level: int = 0) -> Array:
-        """Middles of the occupied voxels; from level 1 on their means in cells of the octree."""
+        """Centres of the occupied voxels; for level ≥ 1 their means in cells of the octree."""
         return np.asarray(self._grid.binned_cloud(level).points if level else self._grid.occupied_cloud())
 
     def known_at(self, points: Any) -> npt.NDArray[np.bool_]:
-        """See `MapView`."""
+        """See `DenseMapView`."""
         return self._grid.known_at(points)
 
     def log_odds_at(self, points: Any) -> npt.NDArray[np.float32]:
-        """See `MapView`."""
+        """See `DenseMapView`."""
         return self._grid.log_odds_at(points)
 
     def evidence(self) -> EvidenceGrid:
@@ -50,13 +50,13 @@ class GridView:
 
 
 class CloudView:
-    """A `graphslam.core.dense.DenseMapView` of a cloud: points as measured, space from the grid beside it or its own
-    beams.
+    """A `graphslam.core.dense.DenseMapView` of a cloud: points as measured, free space from the grid of the submap or
+    from the beams of the cloud.
 
     Parameters
     ----------
     grid : EvidenceGrid, optional
-        Of the same submap, where the front end made one.
+        Of the same submap, if the front end built one.
     """
 
     def __init__(self, cloud: CloudMap, grid: EvidenceGrid | None = None) -> None:
@@ -70,25 +70,25 @@ class CloudView:
 
     @property
     def knows_space(self) -> bool:
-        """With a grid, or with the places from which the points were seen."""
+        """Whether free space is known: there is a grid, or the cloud has the sensor origins of its points."""
         return self._given is not None or self._cloud.origins is not None
 
     def points(self, level: int = 0) -> Array:
-        """Means of the points in cells."""
+        """Means of the points in cells with an edge of ``cell · 2**level`` [m]."""
         return voxel_downsample(self._cloud.points, self._cloud.cell * 2**level)
 
     def known_at(self, points: Any) -> npt.NDArray[np.bool_]:
-        """See `MapView`. Where no space is known, that is in a column through one of its points."""
+        """See `DenseMapView`. Without known space: whether a point of the cloud is in the same 1 m column."""
         if self.knows_space:
             return self._space.known_at(points)
         return np.isin(_columns(np.asarray(points)), _columns(self._cloud.points))
 
     def log_odds_at(self, points: Any) -> npt.NDArray[np.float32]:
-        """See `MapView`."""
+        """See `DenseMapView`."""
         return self._space.log_odds_at(points)
 
     def evidence(self) -> EvidenceGrid:
-        """The grid beside the cloud; else one of its beams, or without these of the voxels in which points lie."""
+        """The given grid; else a grid from the beams of the cloud, or without origins from its points only."""
         return self._space
 
     @cached_property
@@ -127,13 +127,13 @@ def has_dense_view(submap: Submap) -> bool:
 
 
 def _columns(points: Array, edge: float = 1.0) -> npt.NDArray[np.int64]:
-    """Numbers of the columns ``(m,)`` of so many metres a side that points lie in."""
+    """Indices ``(m,)`` of the vertical columns with this edge [m] that contain points."""
     cells = np.floor(points[:, :2] / edge).astype(np.int64)
     return np.asarray((cells[:, 0] << 32) + cells[:, 1])
 
 
 def _mark(grid: EvidenceGrid, points: Array) -> None:
-    """Write the voxels in which points lie as hit once for each point, up to the clamp; the rest stays unknown."""
+    """Write one hit per point to the voxels that contain points, up to the clamp; other voxels stay unknown."""
     voxels = np.zeros((len(points), 3), np.int64)
     voxels[:, : grid.dim] = np.floor(points / grid.voxel_size)
     cells, count = np.unique(voxels, axis=0, return_counts=True)

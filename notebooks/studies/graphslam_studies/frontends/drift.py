@@ -1,7 +1,7 @@
-"""How far off dead reckoning is after a path of some length: a small model that only knows the length.
+"""Covariance of dead reckoning as a function of path length only.
 
-Segments of a particle filter need it: particles that descend from a common ancestor share its errors, so their spread
-says little about how far off they all are.
+Segments of a particle filter need it: particles with a common ancestor share its errors, so their spread
+underestimates the error.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from graphslam.core.geometry import Array
 class DriftModel:
     """Covariance at the end of a path of length L: each variance is ``start² + walk² L + (scale L)²``.
 
-    The defaults are those of what a particle filter leaves of dead reckoning: pieces of 5 to 80 m of the paths of 20
-    particles in simulated garages.
+    The defaults are for the paths of a particle filter, i.e. dead reckoning corrected by scans: sections of 5 to 80 m
+    of the paths of 20 particles in simulated garages.
     """
 
     dim: int = 3
     position_start: float = 0.028
-    """σ along x and y at no length [m]."""
+    """σ along x and y at length 0 [m]."""
     position_walk: float = 0.0
     """[m/√m]"""
     position_scale: float = 0.0093
@@ -43,10 +43,10 @@ class DriftModel:
     heading_scale: float = 0.0
     """[rad/m]"""
     tilt: float = 0.006
-    """σ of roll and pitch, whatever the length [rad]."""
+    """σ of roll and pitch at any length [rad]."""
     bend: float = 0.22
-    """How much of the error of the heading moves the end sideways: 1 on a straight path without any correction, 0 where
-    scans hold the position. With it the error of the heading and that to the side are correlated."""
+    """Share of the heading error that moves the end point sideways: 1 on a straight path without correction, 0 if scans
+    fix the position. If it is > 0, heading error and lateral error are correlated."""
 
     def __post_init__(self) -> None:
         if self.dim not in (2, 3):
@@ -95,10 +95,10 @@ def _variance(L: npt.ArrayLike, start: float, walk: float, scale: float) -> Arra
 
 
 def _sideways(L: npt.ArrayLike, walk: npt.ArrayLike, scale: npt.ArrayLike) -> tuple[Array, Array]:
-    """Variance to the side, and covariance with the heading, of a straight path whose heading walks and bends.
+    """Lateral variance, and covariance with the heading, at the end of a straight path with heading errors.
 
-    A walk of variance w L of the heading gives ∫∫ w min(a, b) = w L³/3 to the side and w L²/2 with the heading; a
-    heading that is off by s l at l gives s² L⁴/4 and s² L³/2.
+    A random walk of the heading with variance w L gives the lateral variance ∫∫ w min(a, b) = w L³/3 and the covariance
+    w L²/2; a heading error proportional to length, with variance s L², gives s L⁴/4 and s L³/2.
     """
     l, w, s = (np.asarray(a, dtype=np.float64) for a in (L, walk, scale))
     return w * l**3 / 3.0 + s * l**4 / 4.0, w * l**2 / 2.0 + s * l**3 / 2.0

@@ -1,4 +1,4 @@
-"""The front end ``ekf-slam``: a single EKF map over the whole log, and snapshots of it."""
+"""The front end ``ekf-slam``: a single EKF map of the whole log, and snapshots of its estimate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OnScan = Callable[[int], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EkfSlamConfig(EkfFilterConfig):
-    """EKF-SLAM with a single map over the whole log."""
+    """Settings of EKF-SLAM with a single map of the whole log."""
 
     @property
     def smoothing_noise(self) -> None:
@@ -39,12 +39,12 @@ def _prepare(log: SensorLog, config: EkfSlamConfig | EkfConfig, drops: DropCount
 
 @dataclass(frozen=True, slots=True)
 class EkfSlam(FrontEnd):
-    """The front end ``ekf-slam``: one EKF map over the whole log, handed over as a single submap.
+    """The front end ``ekf-slam``: one EKF map of the whole log, output as a single submap.
 
     Parameters
     ----------
     on_scan : callable, optional
-        Called with the number of scans taken in, after each: to watch progress or to take the time. It has no part in
+        Called after each scan with the number of scans processed, e.g. for progress or timing. It does not affect
         the result.
     """
 
@@ -62,7 +62,7 @@ class EkfSlam(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`graphslam_frontends.base.FrontEnd`; there is nothing after the one submap."""
+        """See :class:`graphslam_frontends.base.FrontEnd`; there is only one submap."""
         if after is not None:
             return
         data = _prepare(log, self.config, drops)
@@ -84,21 +84,21 @@ def ekf_snapshots(
     drops: DropCounter | None = None,
     on_scan: OnScan | None = None,
 ) -> Iterator[Snapshot]:
-    """Run EKF-SLAM with a single map and tell what it believes after given numbers of scans.
+    """Run EKF-SLAM with a single map and yield its estimate after given numbers of scans.
 
     Parameters
     ----------
     config : EkfSlamConfig or EkfConfig
-        Of the latter, what concerns local maps alone is not read.
+        Of an `EkfConfig`, settings for local maps are ignored.
     seed : SeedTree, optional
-        Not used: the filter draws nothing. Here so that every filter is called alike.
+        Not used, because the filter is deterministic; for the same signature as other filters.
     cuts : sequence of int
-        Numbers of scans, strictly increasing, from 1 to the number of scans that can be used. The filter stops after
-        the last of them.
+        Numbers of scans, strictly increasing, from 1 to the number of usable scans. The filter stops after the last
+        one.
     joint : {"last", "all", "never"}
-        Which snapshots carry the joint Gaussian.
+        Which snapshots have the joint Gaussian.
     drops : DropCounter, optional
-        Where records that are not used are counted.
+        Counts records that are not used.
     on_scan : callable, optional
         As in :class:`EkfSlam`.
     """

@@ -1,9 +1,8 @@
-"""A particle set for one map over a whole log: histories are shared by ancestry, resampling copies only what dies.
+"""Particle set with one map of a whole log; paths and associations are stored with an ancestry tree.
 
-A submap lives for a minute, so its particles may each carry their own path and association. Over a whole log that
-would copy megabytes at every resampling. Here the poses and associations of a scan are written once, and which particle
-descends from which is remembered instead; a survivor keeps its own row, so a resampling copies one map for every
-particle that dies and nothing else.
+In a submap of about a minute, each particle can store its own path and associations. Over a whole log, this would copy
+megabytes at every resampling. Here the poses and associations of a scan are stored once, together with the parent of
+each particle. A survivor keeps its row, so a resampling copies one map per particle that is replaced, and nothing else.
 """
 
 from __future__ import annotations
@@ -42,15 +41,15 @@ class SingleMapParticles(ParticleSet):
         n = config.particles
         self.path = np.zeros((n, 0, 3))  # see :meth:`paths`
         self._by_identity = config.association == "known"
-        self._poses = np.zeros((64, n, 3))  # by scan: the particles as they stood then
-        self._slots = np.full((256, n), IGNORED, dtype=np.int32)  # by observation, likewise
+        self._poses = np.zeros((64, n, 3))  # scan × particle: poses at that scan
+        self._slots = np.full((256, n), IGNORED, dtype=np.int32)  # observation × particle: slots at that scan
         self._scan_of = np.zeros(256, dtype=np.int32)
-        self._parents: list[tuple[int, Ints]] = []  # (scans taken in, row that each row goes on from)
+        self._parents: list[tuple[int, Ints]] = []  # (number of scans, parent row of each row)
 
     def _grow_history(self, n_obs: int) -> None:
         if n_obs > self.assoc.shape[1]:
             self.assoc = np.full((len(self.assoc), 2 * n_obs), IGNORED, dtype=np.int32)
-        self.assoc[:] = IGNORED  # holds this scan alone
+        self.assoc[:] = IGNORED  # for the current scan only
         if self.scans >= len(self._poses):
             self._poses = np.concatenate([self._poses, np.zeros_like(self._poses)])
         if self._by_identity:
@@ -70,7 +69,7 @@ class SingleMapParticles(ParticleSet):
             self._scan_of[rows] = self.scans
 
     def _note_past(self, start: BeaconInitialisation) -> None:
-        pass  # with known identities no history of associations is kept, and without them no range waits
+        pass  # known identities: no association history is stored; otherwise no range waits for initialisation
 
     def _resample(self, survivors: Ints) -> None:
         copies = np.bincount(survivors, minlength=len(self.pose))
@@ -92,7 +91,7 @@ class SingleMapParticles(ParticleSet):
         self.resamplings += 1
 
     def _stretches(self) -> list[tuple[int, int, Ints]]:
-        """Between resamplings: first scan, scan after the last, and the row that today's particles had then."""
+        """Intervals between resamplings: first scan, scan after the last, rows of the ancestors of present particles."""
         row, end, out = np.arange(len(self.pose)), self.scans, []
         for scan, source in reversed(self._parents):
             out.append((scan, end, row))
@@ -101,16 +100,16 @@ class SingleMapParticles(ParticleSet):
         return out[::-1]
 
     def paths(self) -> Array:
-        """Poses of every particle's own past ``(scans, n, 3)``."""
+        """Path of every particle ``(scans, n, 3)``."""
         out = np.empty((self.scans, len(self.pose), 3))
         for a, b, row in self._stretches():
             out[a:b] = self._poses[a:b, row]
         return out
 
     def associations(self) -> Ints:
-        """Slot of every observation in every particle's own past ``(observations, n)``; -1 where it was not used.
+        """Slot of every observation in the history of every particle ``(observations, n)``; -1 if it was not used.
 
-        What was seen of a provisional feature that went counts as not used, also where its slot was taken again.
+        Observations of a provisional feature that was deleted count as not used, even if its slot was reused.
         """
         q = self.observations
         scan_of = self._scan_of[:q]
@@ -145,7 +144,7 @@ class SingleMapParticles(ParticleSet):
             kept = np.flatnonzero(np.all(self.hits[:, chosen] > 0, axis=1))
             return kept, np.broadcast_to(chosen, (len(kept), len(chosen)))
         table = self.associations()
-        rank = np.full(self.hits.shape[1] + 1, -1, dtype=np.int64)  # its last entry serves slot -1
+        rank = np.full(self.hits.shape[1] + 1, -1, dtype=np.int64)  # the last entry is for slot -1
         rank[chosen] = np.arange(len(chosen))
         feature = rank[table[:, best]]
         used = feature >= 0

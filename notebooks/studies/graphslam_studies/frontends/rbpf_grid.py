@@ -1,9 +1,9 @@
-"""RBPF SLAM on evidence grids: one filter over the whole log, full 6-D (or 2-D), the baseline of the SegSLAM paper.
+"""RBPF SLAM on evidence grids: one filter over the whole log, in 6 DoF (or 2-D); the baseline of the SegSLAM paper.
 
-Each particle carries a pose and a map. Nothing is segmented and nothing matched: a loop closes if one of the particles
-has come back to where its own map has the place. Forty particles seldom do after a long way, and their spread says
-nothing of it, since resampling leaves them a recent common ancestor; so what is handed over is their spread *and* the
-covariance of dead reckoning over the path.
+Each particle has a pose and a map. There is no segmentation and no matching: a loop closes if a particle returns to the
+right place in its own map. Forty particles rarely do so after a long path, and their spread does not show it, because
+after resampling they have a recent common ancestor. So the output covariance is their spread *plus* the covariance of
+dead reckoning along the path.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ from graphslam_frontends.stepwise import StepwiseFrontEnd
 from graphslam_studies.frontends.drift import DriftModel
 
 KNOTS = 33
-"""Places along the path at which errors that are passed on are worked out; between them they are interpolated."""
+"""Number of poses on the path where the passed-on covariance is computed; it is interpolated between them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RbpfResult:
-    """What a filter over all steps came to.
+    """Result of a filter over all steps.
 
     Parameters
     ----------
     times : (n,)
         Of the steps [s].
     path_length : (n,)
-        Metres driven until each step, by the odometry.
+        Odometry path length up to each step [m].
     effective : (n,)
-        N_eff after each step's scan, before resampling.
+        N_eff after the scan of each step, before resampling.
     resampled : (n,) bool
     particles : GridParticles
-        At the end, with the grids of the survivors.
+        At the end, with their grids.
     best : int
-        The particle whose map and path are handed over.
+        Index of the particle whose map and path are output.
     tally : FilterCounts
-        Wall time by part, and what happened to beams.
+        Wall time by part, and counts of beams.
     used_bytes : int
-        Memory of all maps at the end, shared parts once.
+        Memory of all maps at the end; shared parts count once.
     uses : frozenset of str
-        Streams that are inside.
+        Streams that were used.
     """
 
     name: str
@@ -103,9 +103,9 @@ class RbpfResult:
         Parameters
         ----------
         drift : callable, optional
-            Path length [m] → covariance ``(d, d)`` of dead reckoning. With it the path has covariances: second moment
-            of the particles' paths about this one, plus that. Without, none: the particles' alone would be far too
-            small.
+            Path length [m] → covariance ``(d, d)`` of dead reckoning. If given, the path has covariances: second moment
+            of all particles' paths about this one, plus this drift. Otherwise it has none, because the second moment
+            alone would be far too small.
         """
         path = self.ancestry.path(self.best)
         if drift is None:
@@ -119,7 +119,7 @@ class RbpfResult:
         return Trajectory(self.times, path, cov)
 
     def report(self) -> dict[str, Any]:
-        """The run in figures; JSON-serialisable."""
+        """Metrics of the run; JSON-serialisable."""
         n = len(self.particles)
         quantiles = np.quantile(self.effective / n, [0.05, 0.5])
         last = self.ancestry.coalescence()
@@ -151,9 +151,9 @@ def run_rbpf(
     Parameters
     ----------
     seed : SeedTree
-        The same seed gives the same bytes, with any number of threads.
+        The same seed gives identical results for any number of threads.
     prune_every : int
-        Steps between two looks for lineages that died out; 0 keeps them all, for pictures of the whole tree.
+        Steps between prunings of extinct lineages; 0: no pruning, for plots of the whole tree.
     progress : bool
         Show a progress bar.
 
@@ -196,19 +196,19 @@ def rbpf_submap(
     steps: Steps | None = None,
     passed: ErrorPassThrough | None = None,
 ) -> Submap:
-    """The whole run as one submap: the best particle's map and path, and an honest covariance of where it ends.
+    """The whole run as one submap: map and path of the best particle, and a consistent covariance of its end pose.
 
     Parameters
     ----------
     drift : callable
         Path length [m] → covariance ``(d, d)`` of dead reckoning, right tangent.
     drift_scale : float
-        Factor on the drift model's covariance.
+        Factor on the covariance of the drift model.
     steps : Steps, optional
-        With them, dead reckoning's own covariance is added where no scan corrects it
-        (:mod:`graphslam_frontends.odometry.scan_use`), and elsewhere the share of it that the filter passes on.
+        If given, the covariance of dead reckoning is added where no scan corrects it
+        (:mod:`graphslam_frontends.odometry.scan_use`).
     passed : ErrorPassThrough, optional
-        That share; default none.
+        Share of the dead-reckoning covariance that the filter passes on elsewhere; needs ``steps``. Default: none.
     """
     times = result.times
     if len(times) < 2:
@@ -224,7 +224,7 @@ def rbpf_submap(
     }
     path = result.trajectory(lambda s: drift_scale * np.asarray(drift(s)))
     added = np.zeros_like(exit.total)
-    alone = len(result.particles) == 1  # nobody to choose from: the path is dead reckoning, whatever scans there are
+    alone = len(result.particles) == 1  # a single particle: the path is dead reckoning, because scans cannot correct it
     if steps is not None and (stretches := [(1, len(path) - 1)] if alone else unobserved_stretches(steps)):
         assert path.covariances is not None
         more = [unobserved_covariance(steps, stretches, path.poses[: k + 1], 0, k) for k in range(len(path))]
@@ -249,7 +249,7 @@ def rbpf_submap(
 
 
 def covariance_along_path(steps: Steps, poses: Array, passed: ErrorPassThrough, particles: int) -> Array:
-    """Covariances ``(n, d, d)``, along a filter's path, of the errors of dead reckoning that it passes on."""
+    """Covariances ``(n, d, d)`` along the path of a filter: the dead-reckoning errors that it passes on."""
     n = len(poses)
     knots = np.unique(np.linspace(0, n - 1, min(n, KNOTS)).round().astype(np.int64))
     tilt = None if steps.tilt is None else steps.tilt_sigma
@@ -268,19 +268,19 @@ class RbpfGridConfig:
     """The front end ``rbpf-grid``."""
 
     steps: StepConfig = field(default_factory=StepConfig)
-    """How the log becomes steps."""
+    """Conversion of the log to steps."""
     filter: GridFilterConfig = field(default_factory=GridFilterConfig)
     """Particles, motion, weights."""
     drift_scale: float = 1.0
-    """Factor on the covariances of the errors that all particles share: of the drift model, and of what a filter passes
-    on of the errors of dead reckoning."""
+    """Factor on the covariances of errors common to all particles: the drift model, and the dead-reckoning errors that
+    the filter passes on."""
 
 
 @dataclass(frozen=True, slots=True)
 class RbpfGrid(StepwiseFrontEnd):
     """The front end ``rbpf-grid``: the whole log as one submap with an evidence grid.
 
-    Needs a stream of beams (a spinning scanner, point clouds, planar scans) and one of motion.
+    Needs a stream of range data (spinning scanner, point clouds, planar scans) and a stream of motion.
     """
 
     config: RbpfGridConfig = field(default_factory=RbpfGridConfig)
@@ -295,7 +295,7 @@ class RbpfGrid(StepwiseFrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`graphslam_frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        """See :class:`graphslam_frontends.base.FrontEnd`. There is only one submap."""
         if after is None:
             steps = self.steps(log, drops=drops)
             result = run_rbpf(steps, self.config.filter, seed.child(0))

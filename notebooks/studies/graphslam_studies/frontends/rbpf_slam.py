@@ -1,7 +1,7 @@
-"""RBPF-SLAM with a single map over the whole log: the baseline that Combined SLAM compares submaps with.
+"""RBPF-SLAM with a single map of the whole log: the baseline of Combined SLAM.
 
-One FastSLAM filter, moment-matched (B3) wherever it is asked what it believes. Forty particles cannot hold the
-uncertainty of a long path, so this map is overconfident by orders of magnitude; it is here to be measured.
+One FastSLAM filter; its output is moment-matched (B3). Forty particles cannot represent the uncertainty of a long path,
+so this map is overconfident by orders of magnitude; it serves for comparison only.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Joint = Literal["never", "last", "all"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RbpfSlamConfig(FilterConfig):
-    """One particle filter with one map over the whole log."""
+    """Settings of one particle filter with one map of the whole log."""
 
     @property
     def smoothing_noise(self) -> None:
@@ -43,7 +43,7 @@ class RbpfSlamConfig(FilterConfig):
 
 
 class SingleMapFilter:
-    """The filter of one log, scan by scan."""
+    """Particle filter over one log, advanced scan by scan."""
 
     def __init__(self, data: PreparedLog, config: RbpfSlamConfig, rng: np.random.Generator) -> None:
         obs = data.observations
@@ -51,10 +51,10 @@ class SingleMapFilter:
         miss_range = 0.9 * min(config.max_range, obs.max_range)
         self.particles = SingleMapParticles(config, obs.T_base_sensor, obs.field_of_view, miss_range, rng)
         self.slot_of: dict[int, int] = {}
-        """Slot of every identity, where they are known."""
+        """Identity → slot, if identities are known."""
 
     def advance(self) -> None:
-        """Take in the next scan."""
+        """Process the next scan."""
         k, obs = self.particles.scans, self.data.observations
         rows = obs.scan(k)
         if self.config.association == "known":
@@ -65,12 +65,12 @@ class SingleMapFilter:
         self.particles.step(odometry.increments[k], odometry.covariances[k], self.data.rows[rows], known)
 
     def ids(self, slots: Ints) -> Ints:
-        """Identities of the landmarks in ``slots`` of the standard particle; -1 where the filter found them itself."""
+        """Identities of the landmarks in ``slots`` of the standard particle; -1 for unknown identities."""
         by_slot = {s: i for i, s in self.slot_of.items()}
         return np.array([by_slot.get(int(s), -1) for s in slots], dtype=np.int64)
 
     def snapshot(self, *, joint: bool) -> tuple[Snapshot, int, Ints]:
-        """What the particles believe, the number of those left out of it (B4), and the standard particle's slots."""
+        """Snapshot, number of particles not used for it (B4), and the landmark slots of the standard particle."""
         p = self.particles
         kept, slots = p.features(self.config.min_hits)
         m = Moments.of(p, kept, slots)
@@ -97,14 +97,14 @@ def rbpf_snapshots(
     joint: Joint = "last",
     drops: DropCounter | None = None,
 ) -> Iterator[Snapshot]:
-    """Run one filter over the log and say what it believes at each cut.
+    """Run one filter over the log and yield its estimate at each cut.
 
     Parameters
     ----------
     cuts : sequence of int
         Numbers of scans after which a snapshot is taken, increasing; the filter stops at the last one.
     joint : {"last", "all", "never"}
-        Which snapshots carry the joint Gaussian; the others hold the marginals of pose and landmarks.
+        Which snapshots have the joint Gaussian; the others have marginals of pose and landmarks only.
 
     Yields
     ------
@@ -144,13 +144,13 @@ class RbpfSlam(FrontEnd):
         drops: DropCounter | None = None,
         watch: Watch | None = None,
     ) -> Iterator[Submap]:
-        """See :class:`graphslam_frontends.base.FrontEnd`. There is one submap, so nothing comes after it."""
+        """See :class:`graphslam_frontends.base.FrontEnd`. There is only one submap."""
         if after is None:
             data = prepare_log(log, self.config, drops if drops is not None else DropCounter())
             yield self._build(data, seed.child(0))
 
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations]:
-        """Name of the stream worked on, and the landmark observations in it (detected, where it holds raw scans)."""
+        """Name of the stream used, and its landmark observations (detected, if it has raw scans)."""
         return landmark_stream(log, self.config.detector)
 
     def _build(self, data: PreparedLog, seed: SeedTree) -> Submap:
@@ -199,11 +199,11 @@ class RbpfSlam(FrontEnd):
         )
 
     def _associated(self, filter: SingleMapFilter, slots: Ints) -> tuple[Ints, Ints]:
-        """Observations of the landmarks handed over, as the standard particle has them, and the landmark of each."""
+        """Observations of the output landmarks in the standard particle, and the landmark index of each."""
         p = filter.particles
-        rank = np.full(p.hits.shape[1] + 1, -1, dtype=np.int64)  # its last entry serves slot -1
+        rank = np.full(p.hits.shape[1] + 1, -1, dtype=np.int64)  # the last entry is for slot -1
         rank[slots] = np.arange(len(slots))
-        if self.config.association == "known":  # one association for all particles, which they do not record
+        if self.config.association == "known":  # one association for all particles, not recorded
             ids = filter.data.observations.ids
             assert ids is not None
             seen = np.array([filter.slot_of.get(int(i), -1) for i in ids], dtype=np.int64)
@@ -215,7 +215,7 @@ class RbpfSlam(FrontEnd):
 
 
 def _trajectory(filter: SingleMapFilter) -> Trajectory:
-    """Mean path of the particles that are left, with their scatter; the base stands first, exactly known."""
+    """Mean path of the final particles with their covariance; the first pose, the base, is exactly known."""
     p, times, t_start = filter.particles, filter.data.observations.times, filter.data.t_start
     paths, w = p.paths(), p.weights
     mean = np.einsum("k,tkc->tc", w, paths)

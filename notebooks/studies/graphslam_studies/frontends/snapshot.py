@@ -1,4 +1,4 @@
-"""What a single-map filter believes at one moment: the value that a study of whole runs judges."""
+"""Estimate of a single-map filter at one moment, for studies of whole runs."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ class Snapshot:
     Parameters
     ----------
     scan : int
-        Number of scans the filter has taken in.
+        Number of scans processed.
     time : float
-        Stamp of the last of them [s].
+        Time stamp of the last of them [s].
     pose : (3,)
         x, y, θ [m, m, rad].
     pose_covariance : (3, 3)
-        Of the plain vector x, y, θ (as in :attr:`graphslam.core.submap.LandmarkMap.mean`), not of the tangent.
+        Of the vector x, y, θ (as in :attr:`graphslam.core.submap.LandmarkMap.mean`), not of the tangent.
     landmark_ids : (L,) int64
-        Identity of each landmark; -1 where the filter found it by itself.
+        Identity of each landmark; -1 if it is unknown.
     landmarks : (L, 2)
         Positions [m].
     landmark_covariances : (L, 2, 2)
         Marginal of each landmark [m²].
     gaussian : Gaussian or None
-        The joint over ``[pose, landmark_1, …]`` in the order above, where it was asked for.
+        Joint Gaussian of ``[pose, landmark_1, …]`` in the order above, if requested.
     """
 
     scan: int
