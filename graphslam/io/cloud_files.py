@@ -1,7 +1,7 @@
-"""One cloud from one file: BIN (KITTI), PLY, PCD, LAS, LAZ. Points, and their times where the file tells them.
+"""Reader of one cloud from one file: BIN (KITTI), PLY, PCD, LAS, LAZ; points, and their times if present.
 
-Headers are read strictly and sizes are checked against the file before anything is allocated. Points that are not
-finite are left out, and so are those at the origin, which drivers write for a missing return.
+Headers are parsed strictly, and sizes are compared with the file before memory is allocated. Points that are not finite
+are dropped, and so are points at the origin, which drivers write for a missing return.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from graphslam.core.reading import check_size, finite_mask, read_bytes
 from graphslam.io.source_probe import file_ending, plain_name
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestampoffset", "time_offset", "gps_time")
-"""Names of fields with times of points, in small letters and without ``scalar_`` before them."""
+"""Names of fields with point times, in lower case and without the prefix ``scalar_``."""
 _PLY_TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
@@ -33,9 +33,9 @@ _HEADER = 1 << 16
 _PCD = rb"(#.*\n)*\s*VERSION\s"
 _KNOWN = "BIN, PLY, PCD, LAS or LAZ"
 BIN_COLUMNS = 4
-"""Columns of BIN files where neither a user nor the content says it: x, y, z and intensity of KITTI …"""
+"""Default number of columns of BIN files: x, y, z and intensity of KITTI."""
 USUAL_COLUMNS = (3, 4, 5, 6)
-"""… and numbers of columns that are looked for."""
+"""Numbers of columns that are tested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +47,11 @@ class CloudData:
     points : (m, 3)
         Finite [m].
     times : (m,) or None
-        As the file has them, in its own unit.
+        Times in the unit of the file.
     field : str
-        Name of the field they are of.
+        Name of the field with the times.
     not_finite, at_origin : int
-        Points that were left out.
+        Numbers of dropped points.
     """
 
     points: Array
@@ -62,7 +62,7 @@ class CloudData:
 
 
 def clean_cloud(points: Array, times: Array | None = None, field: str = "") -> CloudData:
-    """A cloud of what is usable of ``points`` ``(m, 3)``."""
+    """A cloud from the usable ones of ``points`` ``(m, 3)``."""
     finite = np.asarray(finite_mask(points).all(axis=1))
     if times is not None:
         finite &= np.asarray(finite_mask(times))
@@ -79,12 +79,12 @@ def clean_cloud(points: Array, times: Array | None = None, field: str = "") -> C
 
 
 def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> CloudData:
-    """Read one cloud; the format is told by the first bytes, that of BIN by its ending.
+    """Read one cloud; the format is detected from the first bytes, BIN from the file name extension.
 
     Parameters
     ----------
     columns : int
-        Of float32 in a BIN file, x, y and z first: 4 in KITTI, 5 in nuScenes.
+        Number of float32 columns of a BIN file, x, y and z first: 4 in KITTI, 5 in nuScenes.
     """
     p = Path(path)
     raw = read_bytes(p)
@@ -100,19 +100,19 @@ def read_cloud(path: str | os.PathLike[str], *, columns: int = 4) -> CloudData:
 
 
 def bin_columns(paths: list[Path], *, most: int = 1 << 20) -> int:
-    """Number of float32 columns of BIN files, told by their content.
+    """Number of float32 columns of BIN files, estimated from their content.
 
-    Columns hold different things: heights are not widths, intensities are not metres. Read with a number of columns
-    that is not theirs, all columns are mixtures of the true ones, and no mixture is as far from the average as its
-    parts are, on average. So the distance of columns from the pool of all (Kolmogorov–Smirnov), averaged over columns,
-    is largest for the true number and its multiples; of those that are as large but for chance the smallest is taken.
+    The columns (x, y, z, intensity) have different distributions. With a wrong number of columns, each column is a
+    mixture of the true ones, and mixtures are closer to the pooled distribution than their parts on average. So the
+    Kolmogorov–Smirnov distance of the columns from the pool, averaged over columns, is largest for the true number and
+    its multiples; the smallest number within the statistical error of the largest distance is returned.
 
     Parameters
     ----------
     paths : list of Path
-        Of one kind; others than BIN, compressed ones and those that cannot be read say nothing.
+        BIN files with equal columns; files that cannot be read are skipped.
     most : int
-        Bytes that are read of a file.
+        Maximal number of bytes that are read per file.
     """
     raws: list[bytes] = []
     whole = dict.fromkeys(USUAL_COLUMNS, 0)
@@ -132,14 +132,14 @@ def bin_columns(paths: list[Path], *, most: int = 1 << 20) -> int:
         return BIN_COLUMNS
     apart = {c: _columns_apart([v[: len(v) // c * c].reshape(-1, c) for v in values]) for c in fits}
     best = max(apart.values())
-    chance = {c: 2.0 * np.sqrt(c / total) for c in apart}  # of c distances of n / c values each
+    chance = {c: 2.0 * np.sqrt(c / total) for c in apart}  # error of c distances from n / c values each
     if best <= max(chance.values()):
         return BIN_COLUMNS
     return min(c for c in apart if apart[c] > best - chance[c])
 
 
 def _columns_apart(tables: list[npt.NDArray[np.float32]]) -> float:
-    """Mean distance of the distribution of a column from that of all columns."""
+    """Mean Kolmogorov–Smirnov distance of the distribution of a column from that of all columns."""
     columns = np.nan_to_num(np.concatenate(tables), nan=3e38, posinf=3e38, neginf=-3e38)
     pool = np.sort(columns, axis=None)
     at = np.unique(pool)
@@ -149,7 +149,7 @@ def _columns_apart(tables: list[npt.NDArray[np.float32]]) -> float:
 
 
 def count_points(path: str | os.PathLike[str], *, columns: int = 4) -> int:
-    """Points that a file holds by its header, and has the bytes for: without decoding it, but for compressed files.
+    """Number of points by the header, if the file is long enough; only compressed files are decoded.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def count_points(path: str | os.PathLike[str], *, columns: int = 4) -> int:
         As for :func:`read_cloud`.
     """
     p = Path(path)
-    if plain_name(p) != p.name.lower():  # compressed: its size is known when it is unpacked
+    if plain_name(p) != p.name.lower():  # compressed: the size is known only after decompression
         return len(read_cloud(p, columns=columns).points)
     try:
         size = p.stat().st_size
@@ -205,7 +205,7 @@ def _bin(raw: bytes, where: str, columns: int) -> CloudData:
 
 
 def columns_cloud(fields: dict[str, npt.NDArray[Any]], where: str) -> CloudData:
-    """A cloud of columns by name."""
+    """A cloud from named columns."""
     lower = {k.lower().removeprefix("scalar_"): k for k in fields}
     if not {"x", "y", "z"} <= lower.keys():
         raise FormatError("points have no x, y, z", where=where, got=", ".join(fields)[:200], wanted="x, y, z")
@@ -217,9 +217,9 @@ def columns_cloud(fields: dict[str, npt.NDArray[Any]], where: str) -> CloudData:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """What the header of a file says: where its points begin, how many, and how they are written.
+    """Layout from the header of a file: first byte of the points, their number, and their encoding.
 
-    ``dtype`` is None for text, of whose lines ``skip`` come before the points; ``packed``: columns of compressed PCD.
+    ``dtype`` is None for text, of which ``skip`` lines precede the points; ``packed``: columns of a compressed PCD.
     """
 
     begin: int
@@ -230,7 +230,7 @@ class _Layout:
     packed: list[tuple[str, str, int]] | None = None
 
     def least_bytes(self) -> int:
-        """Bytes that a file with so many points has at least."""
+        """Minimal size of the file [bytes]."""
         if self.packed is not None:
             return self.begin + 8
         size = 2 * len(self.labels) if self.dtype is None else self.dtype.itemsize
@@ -336,7 +336,7 @@ def _pcd_layout(head: bytes, where: str) -> _Layout:
         raise FormatError(
             "PCD header is damaged", where=where, got={k: said.get(k) for k in ("FIELDS", "SIZE", "TYPE", "COUNT")}
         )
-    columns = [  # fields named "_" are padding and stand several times
+    columns = [  # fields named "_" are padding and may be repeated
         (f"{f}#{i}" if f == "_" else f, f"<{codes[k]}{s}", c)
         for i, (f, k, s, c) in enumerate(zip(fields, kinds, sizes, counts))
     ]
@@ -365,7 +365,7 @@ def _pcd(raw: bytes, where: str) -> CloudData:
         raise FormatError("file is truncated", where=where, got=f"{len(body) - 8} bytes", wanted=f"{packed} packed")
     data = unpack_lzf(body[8 : 8 + packed], plain, where)
     out, at = {}, 0
-    for f, d, c in said.packed:  # field after field, not point after point
+    for f, d, c in said.packed:  # stored by field, not by point
         size = np.dtype(d).itemsize * c * n
         if c == 1:
             out[f] = np.frombuffer(data, d, count=n, offset=at)
@@ -374,19 +374,19 @@ def _pcd(raw: bytes, where: str) -> CloudData:
 
 
 def unpack_lzf(data: bytes, size: int, where: str) -> bytes:
-    """Unpack LZF (as liblzf of PCL packs) to ``size`` bytes."""
+    """Decompress LZF (format of liblzf in PCL) to ``size`` bytes."""
     out = bytearray()
     at, end = 0, len(data)
     try:
         while at < end:
             control = data[at]
             at += 1
-            if control < 32:  # so many bytes as they are
+            if control < 32:  # literal bytes
                 if at + control + 1 > end:
                     raise IndexError
                 out += data[at : at + control + 1]
                 at += control + 1
-            else:  # a copy of what is there already
+            else:  # back reference
                 length = control >> 5
                 if length == 7:
                     length += data[at]
@@ -421,7 +421,7 @@ def _las(raw: bytes, where: str) -> CloudData:
         times = np.asarray(las.gps_time, np.float64) if "gps_time" in set(las.point_format.dimension_names) else None
     except (MemoryError, KeyboardInterrupt):
         raise
-    except BaseException as error:  # laspy and lazrs raise kinds of their own, panics of Rust among them
+    except BaseException as error:  # laspy and lazrs raise other types, also panics of Rust
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise FormatError(f"LAS is damaged ({type(error).__name__}: {error})", where=where) from None
@@ -440,7 +440,7 @@ def _las_count(head: bytes, length: int, where: str) -> int:
     extra = int(np.frombuffer(head[100:104], "<u4")[0])
     if head[25] >= 4 and len(head) >= 247:
         extra += int(np.frombuffer(head[243:247], "<u4")[0])
-    if extra * 54 > length:  # laspy reads as many as are claimed, for hours
+    if extra * 54 > length:  # laspy would try to read all of them, for hours
         raise FormatError("LAS header claims too many records", where=where, got=extra, wanted=f"in {length} bytes")
     check_size(n * 24, where)
     if head[104] & 0x80 and n > 40 * length:
@@ -449,10 +449,10 @@ def _las_count(head: bytes, length: int, where: str) -> int:
 
 
 def _check_chunks(raw: bytes, where: str) -> None:
-    """The table of chunks of LAZ: the decoder allocates what it claims, and the process ends where that is too much."""
+    """Check the chunk table of a LAZ file: the decoder allocates its size and aborts the process if it is too large."""
     first = int(np.frombuffer(raw[96:100], "<u4")[0])
     at = int(np.frombuffer(raw[first : first + 8].ljust(8, b"\0"), "<i8")[0])
-    if at == -1:  # written in one go: it stands in the last bytes
+    if at == -1:  # written as a stream: the offset is in the last 8 bytes
         at = int(np.frombuffer(raw[-8:], "<i8")[0])
     if not first <= at <= len(raw) - 8:
         raise FormatError("LAZ is truncated: its table of chunks is not there", where=where, got=f"{len(raw)} bytes")

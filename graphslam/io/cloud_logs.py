@@ -1,10 +1,10 @@
-"""Logs of 3-D lidar scans, one file each: folders of clouds with or without poses.
+"""Reader of folders of 3-D lidar scans, one file per scan, with or without poses.
 
-The log has the stream ``clouds``, and ``odometry`` where there are poses (they are then also ``reference``). Without
-stamps scans are ``period`` apart. Clouds are decoded when they are asked for.
+The log has the stream ``clouds`` and, if there are poses, ``odometry`` and ``reference``. Without stamps, scans are
+``period`` apart. Clouds are decoded on access.
 
-Times of points (fields ``t``, ``time``, ``timestamp``, ``offset_time``, ``gps_time``) have the unit that makes a scan
-last as long as scans are apart (:mod:`graphslam.io.point_times`).
+The unit of point times (fields ``t``, ``time``, ``timestamp``, ``offset_time``, ``gps_time``) is chosen such that the
+duration of a scan fits the time between scans (:mod:`graphslam.io.point_times`).
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ from graphslam.io.text_records import read_table
 
 Index = npt.NDArray[np.intp]
 PERIOD = 0.1
-"""Seconds from scan to scan where nothing says it: lidars turn ten times a second."""
+"""Default time between scans [s]: most lidars rotate at 10 Hz."""
 NO_STAMPS = "no stamps"
 ODOMETRY_SIGMAS = (0.03, 0.005)
-"""Stated σ of one motion between scans, per axis: metres, radians. Tables of poses state none."""
+"""Assumed σ of one motion between scans, per axis [m, rad]; tables of poses contain none."""
 IMU_NOISE = ImuNoise(
     gyro=2e-3, gyro_bias=0.02, gyro_walk=1e-4, accelerometer=2e-2, accelerometer_bias=0.2, accelerometer_walk=1e-3
 )
-"""Of an IMU whose log states no noise: a MEMS unit of middle price."""
+"""Default noise of an IMU without noise in its log: a mid-range MEMS unit."""
 MOST_DECODED = 100
-"""Clouds that are decoded when a folder is opened, evenly over it."""
+"""Maximal number of clouds that are decoded when a folder is opened, evenly spaced."""
 LEAST_COLUMNS = 7
-"""A table beside clouds with so many columns may hold a path or a sensor."""
+"""A table next to the clouds with at least this many columns may contain a path or sensor data."""
 CUT_SCAN = "scan is cut: less than a quarter of the usual points, at an end of the log"
 CUT = 0.25
-"""Scans at the begin and the end of a log with less than this share of the usual points are cut."""
+"""Scans at the begin and the end of a log with less than this fraction of the median number of points are cut."""
 COMPRESSED = (".laz", ".pcd")
-"""Their sizes do not tell how many points they hold."""
+"""Formats whose file size does not determine the number of points."""
 LOOKED_AT = 5
-"""BIN files, evenly over a folder, by whose content the number of their columns is told."""
-_KEPT = 8  # decoded clouds that are kept
+"""Number of evenly spaced files from which the number of BIN columns and the unit of point times are estimated."""
+_KEPT = 8  # decoded clouds in the cache
 
 
 class FileClouds:
@@ -75,13 +75,11 @@ class FileClouds:
     Parameters
     ----------
     columns : int
-        Of BIN files.
-    scale : float
-        Factor on coordinates.
+        Number of columns of BIN files.
     stamps : (n,)
-        Of the scans [s], for points that have stamps on the same clock.
+        Stamps of the scans [s], for points with stamps on the same clock.
     clock : PointClock or None
-        Unit of the times of points; None: they are not used.
+        Unit of the point times; None: they are not used.
     """
 
     def __init__(self, paths: list[Path], columns: int, stamps: Array, clock: PointClock | None) -> None:
@@ -89,7 +87,7 @@ class FileClouds:
         self._cache: OrderedDict[int, tuple[Array, Array | None]] = OrderedDict()
         self._lock = threading.Lock()
         self.counts = np.array([max(p.stat().st_size // 12, 0) for p in paths], dtype=np.int64)
-        """Points of every scan ``(n,)``, at most: known from the size of a file, without decoding it."""
+        """Upper limit of the number of points of each scan ``(n,)``, from the file size."""
 
     def _get(self, k: int) -> tuple[Array, Array | None]:
         with self._lock:
@@ -123,22 +121,22 @@ def read_clouds(
     point_times: bool = True,
     odometry_sigmas: tuple[float, float] = ODOMETRY_SIGMAS,
 ) -> SensorLog:
-    """Read a folder of clouds, one file a scan, in the order of the numbers in their names.
+    """Read a folder of clouds, one file per scan, in the order of stamps or numbers in the file names.
 
     Parameters
     ----------
     period : float, optional
-        Seconds from scan to scan; by default stamps come from ``times.txt``, from the poses, from names that are
-        stamps, or else scans are 0.1 s apart.
+        Time between scans [s]; default: stamps from ``times.txt``, from the poses, or from the file names; otherwise
+        0.1 s.
     columns : int, optional
-        Of float32 in BIN files; by default told by their content.
+        Number of float32 columns of BIN files; default: estimated from their content.
     poses : str, optional
-        Name of the table of poses (TUM or KITTI rows) in the folder, ``none`` for none; by default the one that is
-        there.
+        Name of the table of poses (TUM or KITTI rows) in the folder, ``none``: no poses; default: the table that is
+        found.
     point_times : bool
-        Use times of points, where files have them.
+        Use the times of points, if files have them.
     odometry_sigmas : (float, float)
-        σ of one motion from scan to scan, per axis: metres, radians.
+        σ of one motion from scan to scan, per axis [m, rad].
     """
     root = Path(path)
     if not root.is_dir():
@@ -169,14 +167,14 @@ def read_clouds(
 
 @dataclass(frozen=True, slots=True)
 class PoseTable:
-    """A table of poses beside clouds: one pose a cloud (KITTI), or a trajectory (TUM).
+    """A table of poses for clouds: one pose per cloud (KITTI), or a trajectory with stamps (TUM).
 
     Parameters
     ----------
     matrices : (n, 3, 4) or None
     path : Trajectory or None
     T_camera_lidar : (7,) or None
-        Where the poses are those of a camera.
+        Pose of the lidar in the camera frame, if the poses are those of a camera.
     """
 
     file: Path
@@ -195,7 +193,7 @@ class PoseTable:
         return cls(file, None, _tum(file, counter))
 
     def missing(self, n: int) -> dict[str, npt.NDArray[np.bool_]]:
-        """Which of ``n`` clouds have no pose, by reason."""
+        """Masks of the ``n`` clouds without a pose, by reason."""
         if self.matrices is None:
             return {}
         if len(self.matrices) != n:
@@ -206,7 +204,7 @@ class PoseTable:
         return {"pose is not finite": ~np.asarray(finite_mask(self.matrices).all(axis=(1, 2)))}
 
     def within(self, stamps: Array, keep: Index, counter: DropCounter) -> Index:
-        """Those of the clouds ``keep`` in the time of the poses."""
+        """Those of the clouds ``keep`` within the time span of the poses."""
         if self.path is None:
             return keep
         t = self.path.times
@@ -235,7 +233,7 @@ class PoseTable:
 
 @dataclass(frozen=True, slots=True)
 class CloudFolder:
-    """Files of clouds in the order of the numbers in their names, and how they are read."""
+    """Ordered files of clouds with their reading options."""
 
     look: SourceProbe
     files: list[Path]
@@ -257,7 +255,7 @@ class CloudFolder:
         extra: dict[str, Stream],
         counter: DropCounter,
     ) -> SensorLog:
-        """The log of the clouds, with stamps ``(n,)`` and where they are from, and with streams beside them."""
+        """The log of the clouds; ``stamped``: stamps ``(n,)`` [s] and their origin; ``extra``: further streams."""
         noise = constant_noise(sigmas)
         root, n, (stamps, by) = self.look.path, len(self.files), stamped
         by_log = not by.startswith(NO_STAMPS)
@@ -289,7 +287,7 @@ class CloudFolder:
         return SensorLog(name=root.name, streams=streams, read=read, dropped=dict(counter.counts), meta=meta)
 
     def _not_read(self, poses: PoseTable | None) -> list[tuple[str, str]]:
-        """Tables beside the clouds that look like a path or a sensor and are not read."""
+        """Notes on tables next to the clouds that may be a path or sensor data and are not read."""
         folders = {self.look.path, self.files[0].parent, self.files[0].parent.parent}
         known = ("times.txt", "timestamps.txt", "calib.txt")
         out = []
@@ -303,7 +301,7 @@ class CloudFolder:
         return out
 
     def _point_times(self, files: list[Path], stamps: Array | None) -> PointTimes:
-        """Unit of the times of points, by some clouds evenly over the log; see :func:`choose_point_times`."""
+        """Unit of the point times, from some evenly spaced clouds; see :func:`choose_point_times`."""
         if not self.point_times:
             return PointTimes("none", "times of points are not used (option point_times)")
         some = np.unique(np.linspace(0, len(files) - 1, LOOKED_AT).round().astype(int))
@@ -312,7 +310,7 @@ class CloudFolder:
 
 
 def scan_stamps(folder: CloudFolder, poses: PoseTable | None, period: float | None = None) -> tuple[Array, str]:
-    """Stamps of the scans ``(n,)`` [s], and where they are from."""
+    """Stamps of the scans ``(n,)`` [s], and their origin as text."""
     if period is not None and not (np.isfinite(period) and period > 0):
         raise ConfigError(f"clouds: period is {period}; wanted a positive number")
     n, path = len(folder.files), None if poses is None else poses.path
@@ -335,7 +333,7 @@ def scan_stamps(folder: CloudFolder, poses: PoseTable | None, period: float | No
 
 
 def embed_poses(poses: Array) -> Array:
-    """Poses ``(n, 3)`` as ``(n, 7)``; those that are it already, as they are."""
+    """Poses ``(n, 3)`` as ``(n, 7)``; poses ``(n, 7)`` are returned unchanged."""
     if poses.shape[1] == 7:
         return poses
     out = np.zeros((len(poses), 7))
@@ -344,22 +342,22 @@ def embed_poses(poses: Array) -> Array:
 
 
 def number_in_name(path: Path) -> tuple[list[tuple[int, int, str]], str]:
-    """Numbers count as numbers: cloud_10 is after cloud_9."""
+    """Sort key with numeric order: cloud_10 is after cloud_9."""
     words = re.split(r"(\d+)", path.name)
     return [(1, int(w), "") if w.isdigit() else (0, 0, w) for w in words], str(path)
 
 
 def in_order(files: list[Path]) -> list[Path]:
-    """Files by the stamps in their names, or else by the numbers in them."""
+    """Files sorted by the stamps in their names, or else by the numbers in them."""
     files = sorted(files, key=number_in_name)
     t = _stamps_in_names(files)
     return files if t is None else [files[k] for k in np.argsort(t, kind="stable")]
 
 
 def _stamps_in_names(files: list[Path]) -> Array | None:
-    """Stamps in names, one each: seconds with a fraction, or so many digits that they are unix time in ms, µs or ns.
+    """Stamps [s] in file names: seconds with a fraction, or unix time in ms, µs or ns (13, 16 or 19 digits); or None.
 
-    A name without a point among names with one is a whole second: programs leave out ``.0``.
+    A name without a decimal point among names with one is a whole second: some programs omit ``.0``.
     """
     found = [re.findall(r"\d+\.\d+|\d+", p.name[: -len(file_ending(p))]) for p in files]
     if any(not f for f in found):
@@ -384,7 +382,7 @@ def _assumed_noise(table: str, sigmas: tuple[float, float]) -> tuple[str, str]:
 
 
 def cut_scans(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Which scans ``(n,)`` at the begin and the end of a log are cut: a recording begins and ends within a sweep."""
+    """Mask ``(n,)`` of incomplete scans at the begin and the end of a log: recordings start and stop within a sweep."""
     few = counts < CUT * float(np.median(counts))
     inner = np.flatnonzero(~few)
     return few & ((np.arange(len(counts)) < inner[0]) | (np.arange(len(counts)) > inner[-1])) if len(inner) else few
@@ -414,12 +412,12 @@ def stamps_of_file(path: Path, n: int) -> Array | None:
 
 
 def _seconds(stamps: Array) -> Array:
-    """Stamps in seconds, or in nanoseconds of unix time, as seconds."""
+    """Stamps in seconds, from seconds or from unix time in nanoseconds."""
     return stamps * 1e-9 if len(stamps) and np.nanmedian(np.abs(stamps)) > 1e17 else stamps
 
 
 def _tum(path: Path, counter: DropCounter) -> Trajectory:
-    """A TUM table, also with commas; rows that are not usable are dropped and counted."""
+    """A TUM table, also with commas; unusable rows are dropped and counted."""
     rows = []
     for line in read_text(path).splitlines():
         v = parse_numbers(line) if line.strip() and not line.lstrip().startswith(("#", "%")) else None
@@ -457,10 +455,10 @@ def _stamped_matrices(path: Path, counter: DropCounter) -> Trajectory:
 def _good_files(
     files: list[Path], columns: int, counter: DropCounter
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Which files can be read, and which hold no point; points that were left out are counted.
+    """Masks of readable files and of empty ones; dropped points are counted.
 
-    All headers are read; decoded are all files of a small folder, and some of a large one: a drive is looked at in
-    seconds, and clouds are decoded when they are asked for.
+    All headers are read, but at most :data:`MOST_DECODED` files are decoded, so that a long drive is checked in
+    seconds.
     """
     good, empty = np.ones(len(files), np.bool_), np.zeros(len(files), np.bool_)
     decoded = {int(k) for k in np.linspace(0, len(files) - 1, min(len(files), MOST_DECODED)).round()}

@@ -1,4 +1,4 @@
-"""Coordinate frames of a bag: transforms that are fixed, and the ones that move."""
+"""Coordinate frames of a bag: static and moving transforms."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from graphslam.io import ros_messages as ros
 ODOMETRY_FRAMES = ("odom", "odom_combined", "odometry", "world_odom")
 BASE_FRAMES = ("base_link", "base_footprint", "base")
 MAP_FRAMES = ("map", "world", "earth", "utm")
-"""Frames above the odometry: what moves against them is already a result of SLAM or of GPS."""
+"""Frames above the odometry frame: motion relative to them is already a result of SLAM or GPS."""
 LEAST_WAY = 1.0
-"""A moving transform of an unknown name is odometry only if it covers more than this in some direction [m]: joints do
-not."""
+"""A moving transform with an unknown name is odometry only if its range along x, y or z is at least this [m]; that of
+joints is smaller."""
 
 
 @dataclass
 class TopicRows:
-    """What was read of one topic."""
+    """Values of the messages of one topic, with stamps and frames."""
 
     stamps: list[float] = field(default_factory=list)
     bag_stamps: list[float] = field(default_factory=list)
@@ -63,14 +63,14 @@ class FrameTree:
                 rows.values.append(pose)
 
     def settle(self) -> None:
-        """Transforms of ``tf`` that never changed are fixed ones."""
+        """Treat transforms of ``tf`` that never changed as fixed, except from odometry frames."""
         for key, rows in list(self.moving.items()):
             if np.ptp(np.array(rows.values), axis=0).max() == 0.0 and leaf(key[0]) not in ODOMETRY_FRAMES:
                 self.fixed.setdefault(key, rows.values[0])
                 del self.moving[key]
 
     def know(self, a: str, b: str) -> bool:
-        """Is the place of one in the other known?"""
+        """Are the frames connected by fixed transforms?"""
         return self.between(a, b) is not None
 
     def between(self, a: str, b: str) -> Array | None:
@@ -78,7 +78,7 @@ class FrameTree:
         return self._reached(a).get(b)
 
     def _reached(self, a: str) -> dict[str, Array]:
-        """``T_a_b`` of all frames b that are fixed against a."""
+        """``T_a_b`` of all frames b that are connected to a by fixed transforms."""
         steps: dict[str, list[tuple[str, Array]]] = {}
         for (parent, child), pose in self.fixed.items():
             T = np.concatenate([pose[:3], se3.quat_normalize(np.array(pose[3:]))])
@@ -97,15 +97,15 @@ class FrameTree:
     def odometry(self, scanners: set[str], parent: str | None = None) -> tuple[str, str] | None:
         """Parent and child of the moving transform that is odometry, or None.
 
-        Its child carries the base or a scanner, its parent does not carry the base. Known names come first, frames of
-        maps last, and a transform of an unknown name has to cover some way.
+        Known names are preferred, and map frames come last. For an unknown name, the base or a scanner must be fixed to
+        the child, the base must not be fixed to the parent, and the motion must reach :data:`LEAST_WAY`.
 
         Parameters
         ----------
         scanners : set of str
             Frames of the scanners.
         parent : str, optional
-            Its parent, if it is known.
+            Parent frame, if it is given by the user.
         """
         found = []
         for key, rows in self.moving.items():
@@ -123,7 +123,7 @@ class FrameTree:
         return max(found)[3] if found else None
 
     def moving_place(self, base: str, frame: str, times: Array) -> Array | None:
-        """``T_base_frame`` ``(n, 7)`` at times, where one moving transform joins base and frame; or None."""
+        """``T_base_frame`` ``(n, 7)`` at times, if one moving transform connects base and frame; or None."""
         for (parent, child), rows in self.moving.items():
             for up, down, inverse in ((parent, child, True), (child, parent, False)):
                 near, far = self.between(base, down), self.between(up, frame)

@@ -1,16 +1,16 @@
-"""g2o pose graphs, read and written.
+"""Reader and writer of g2o pose graphs.
 
 ``VERTEX_SE2 id x y θ``, ``EDGE_SE2 i j x y θ`` + 6 information entries; ``VERTEX_SE3:QUAT id x y z qx qy qz qw``,
 ``EDGE_SE3:QUAT i j x y z qx qy qz qw`` + 21; ``FIX id …``; 2-D landmarks ``VERTEX_XY id x y``,
 ``EDGE_SE2_XY i l x y`` + 3, and GTSAM's ``BR i l bearing range σ_bearing σ_range``. Upper triangles row by row.
 Priors ``EDGE_PRIOR_SE2 id x y θ`` + 6 and ``EDGE_SE3_PRIOR id parameter x y z qx qy qz qw`` + 21, with or without the
-parameter, become edges from one more vertex, which is held at the origin. Priors of a position alone are left out,
-which is said: with the full logarithm an edge cannot hold them.
+parameter, become edges from an additional vertex, which is fixed at the origin. Position-only priors are not read, with
+a warning: an edge with the full logarithm cannot represent them.
 
-g2o orders a 3-D information matrix translation first; a :class:`PoseNetwork` holds rotation first. The entries
-themselves are kept as they are, as GTSAM does: g2o's own residual uses the vector part of the quaternion, half the
-rotation vector, so the two programs print different objectives for one file (:mod:`graphslam.solve.network.solve`
-offers both). Files end in blank lines and may be compressed.
+g2o orders a 3-D information matrix translation first, a :class:`PoseNetwork` rotation first. The entries are not
+rescaled, as in GTSAM: the residual of g2o uses the vector part of the quaternion, half the rotation vector, so the two
+programs print different objectives for the same file (:mod:`graphslam.solve.network.solve` has both). Files may be
+compressed.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ IGNORED = (
     *("PARAMS_SE2OFFSET", "PARAMS_SE3OFFSET", "VERTEX_TAG", "VERTEX_CAM", "DATA_TAG"),
     *("ROBOTLASER1", "FLASER", "RLASER", "ODOM", "TRUEPOS", "MARKER", "VERTEX_ELLIPSE"),
 )
-"""Records without a measurement between vertices: parameters, tags, and the sensor data that g2o keeps beside them."""
+"""Records without a measurement between vertices: parameters, tags, and sensor data."""
 ALIASES = {"EDGE_SE3_PRIOR": "EDGE_PRIOR_SE3:QUAT", "EDGE_PRIOR_SE3": "EDGE_PRIOR_SE3:QUAT"}
 POSITIONS = (
     *("EDGE_PRIOR_SE2_XY", "EDGE_SE2_XY_PRIOR", "EDGE_SE3_PRIOR_XY", "EDGE_SE3_PRIOR_XYZ", "EDGE_PRIOR_SE3_XYZ"),
     *("EDGE_PRIOR_XY", "EDGE_PRIOR_XYZ", "EDGE_POINTXYZ_PRIOR"),
 )
-"""Priors of a position alone, of GPS for example."""
+"""Position-only priors, for example from GPS."""
 _2D = ("VERTEX_SE2", "EDGE_SE2", "EDGE_PRIOR_SE2", "VERTEX_XY", "EDGE_SE2_XY", "BR")
 _3D = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "EDGE_PRIOR_SE3:QUAT")
-# g2o (translation, rotation) -> ours (rotation, translation); its own inverse
+# g2o (translation, rotation) -> graphslam (rotation, translation); the permutation is its own inverse
 SWAP = np.array([3, 4, 5, 0, 1, 2])
 
 
@@ -64,13 +64,13 @@ def read_g2o(path: str | os.PathLike[str], *, repair: bool = False, create_missi
     Parameters
     ----------
     path : path-like
-        Plain, or compressed with xz, gzip or bzip2 (told by content).
+        Plain, or compressed with xz, gzip or bzip2 (detected from the content).
     repair : bool
-        Project indefinite information matrices to positive definite ones instead of refusing them; counted in
+        Project indefinite information matrices to positive definite ones instead of raising an error; the number is in
         ``PoseNetwork.repaired``.
     create_missing : bool
-        Make vertices that only edges name, without an initial pose, instead of refusing them. A file of edges alone
-        is read in any case.
+        Create vertices that occur only in edges, without an initial pose, instead of raising an error. A file without
+        vertices is always read.
     """
     return parse_g2o(path, read_text(path), repair=repair, create_missing=create_missing)
 
@@ -79,7 +79,7 @@ def parse_g2o(
     path: str | os.PathLike[str], text: str, *, repair: bool = False, create_missing: bool = False
 ) -> PoseNetwork:
     """The same from the content of the file; ``path`` names it in errors."""
-    implied = {"EDGE_PRIOR_SE3:QUAT": (2, ["0"])}  # no parameter: no offset of the sensor
+    implied = {"EDGE_PRIOR_SE3:QUAT": (2, ["0"])}  # without the parameter: no sensor offset
     records = Records(path, text, LAYOUTS, ignored=(*IGNORED, *POSITIONS), aliases=ALIASES, implied=implied)
     rows = records.rows
     in_3d = [tag for tag in _3D if len(rows[tag])]
@@ -99,7 +99,7 @@ def parse_g2o(
     fixed, fixed_lines = rows["FIX"].whole[:, 0], rows["FIX"].lines
     pairs, values, at = edges.whole, edges.real, edges.lines
     if len(priors):
-        build.create_missing |= not len(ids)  # a file of edges alone
+        build.create_missing |= not len(ids)  # a file without vertices
         named = np.concatenate([ids, edges.whole.ravel(), priors.whole[:, 0], rows["VERTEX_XY"].whole[:, 0]])
         origin = int(np.setdiff1d(np.arange(len(named) + 1), named)[0])
         ids, poses = np.append(ids, origin), np.vstack([poses, np.eye(width)[-1] * (width == 7)])
@@ -142,7 +142,7 @@ def _read_landmarks(records: Records, build: NetworkBuilder) -> None:
 def write_g2o(path: str | os.PathLike[str], network: PoseNetwork) -> None:
     """Write a network as g2o with 17 significant digits; ``.xz``, ``.gz`` and ``.bz2`` compress.
 
-    Poses without an initial value are left out, as in a file of edges only.
+    Poses without an initial value are not written, as in a file of edges only.
     """
     vertex, edge = ("VERTEX_SE2", "EDGE_SE2") if network.dim == 2 else ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
     lines = [

@@ -1,6 +1,6 @@
-"""A map on the globe, as KML (Google Earth) and GeoJSON (GIS): path, landmarks with their ellipses, GPS fixes.
+"""Writer of georeferenced maps as KML (Google Earth) and GeoJSON (GIS): path, landmarks with ellipses, GPS fixes.
 
-Both formats want longitude before latitude, in degrees of WGS 84. KML: OGC 07-147r2 (2.2). GeoJSON: RFC 7946, rings
+Both formats have longitude before latitude, in degrees of WGS 84. KML: OGC 07-147r2 (2.2). GeoJSON: RFC 7946, rings
 counter-clockwise.
 """
 
@@ -21,12 +21,12 @@ from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
 
 KML_NAMESPACE = "http://www.opengis.net/kml/2.2"
-_DIGITS = 9  # of a degree: 0.1 mm
+_DIGITS = 9  # decimals of a degree: 0.1 mm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeographicMap:
-    """What is drawn on the globe; every position is latitude, longitude [deg].
+    """Content of a georeferenced map; every position is latitude, longitude [deg].
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ class GeographicMap:
     landmark_sigmas : (k,)
         Largest σ of each landmark's position [m].
     ellipses : (k, m, 2)
-        Rings of the landmarks' confidence ellipses, counter-clockwise seen from above, the first point repeated last.
+        Confidence ellipses of the landmarks as closed rings, counter-clockwise seen from above.
     confidence : float
-        Of the ellipses.
+        Confidence of the ellipses.
     gps : (g, 2)
-        Fixes; empty where there are none.
+        GPS fixes; may be empty.
     """
 
     name: str
@@ -67,7 +67,7 @@ class GeographicMap:
 
 
 def write_kml(path: str | os.PathLike[str], content: GeographicMap) -> None:
-    """Write a KML file with folders path, landmarks and (where there are fixes) GPS."""
+    """Write a KML file with the path and folders of landmarks and, if any, of GPS fixes."""
     ET.register_namespace("", KML_NAMESPACE)
     root = ET.Element(_tag("kml"))
     document = _child(root, "Document")

@@ -1,4 +1,4 @@
-"""A log that is being recorded: records are added as they come, and beams that were used are kept on disk alone."""
+"""A log during recording: records are added one by one, and used scans are freed from memory and kept on disk."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ from graphslam.core.records import LaserScans, Stream
 from graphslam.io.log_kinds import StreamKind, kind_name, stream_kinds
 
 BEAMS = (LaserScans, RangeScans, PointClouds)
-"""Streams whose records are let go of: all others are small, and figures are made of them at the end."""
+"""Streams whose records are freed from memory; others are small and needed for the metrics at the end."""
 ROWS = ("n", "q")
-"""Lengths that grow with the records."""
+"""Symbols of array lengths that grow with the records."""
 
 
 class GrowingLog(RecordSource):
-    """A log whose records come one by one, or in portions.
+    """A log to which records are added one by one, or in portions.
 
-    A portion is a stream of the usual kind with one record or more. What does not change from record to record
-    (mounting, limits, noise of the sensor) must be the same in all of them. Beams are written to disk as they come and
-    stay in memory until the front end has used them; once the log has ended they are read from there as they are asked
-    for. All other streams stay in memory.
+    A portion is a stream with one or more records. Constants of the sensor (mounting, limits, noise) must be the same
+    in all portions. Scans (:data:`BEAMS`) are written to disk at once and stay in memory until the front end has used
+    them; after the end of the log they are read from disk on access. All other streams stay in memory.
 
     Parameters
     ----------
     folder : path
-        For the beams; must stay as long as the log is used.
+        Folder for the scans; must exist as long as the log is used.
     meta : mapping, optional
         See :class:`~graphslam.core.log.SensorLog`.
     """
@@ -46,7 +45,7 @@ class GrowingLog(RecordSource):
         self._whole: SensorLog | None = None
 
     def add(self, stream: str, records: Stream) -> None:
-        """Take records that follow those of the stream so far."""
+        """Append records, later than those of the stream so far."""
         if self.ended:
             raise DataError("records after the end of the log", where=f"{self._name}/{stream}")
         if not len(records.times):
@@ -56,7 +55,7 @@ class GrowingLog(RecordSource):
         self._held[stream].add(records)
 
     def end(self) -> None:
-        """No more records will come."""
+        """End the log; no record can be added afterwards."""
         if self._whole is None:
             streams = {name: held.whole() for name, held in self._held.items()}
             self._whole = SensorLog(name=self._name, streams=streams, meta=self._meta)
@@ -99,13 +98,13 @@ class GrowingLog(RecordSource):
         return held.part(first, held.ends[-1] if last is None else min(last, held.ends[-1]))
 
     def discard_before(self, stream: str, before: int) -> None:
-        """See :class:`~graphslam.core.record_source.RecordSource`; records of beams leave the memory."""
+        """See :class:`~graphslam.core.record_source.RecordSource`; frees scans from memory."""
         if self._whole is None:
             self._of(stream).discard_before(before)
 
     @property
     def held_records(self) -> dict[str, int]:
-        """Records in memory, by stream."""
+        """Number of records in memory, by stream."""
         return {name: held.ends[-1] - held.ends[0] for name, held in self._held.items()}
 
     def _of(self, stream: str) -> _Held:
@@ -160,7 +159,7 @@ class _Held:
         if first < self.ends[0]:
             raise DataError("records that were already freed", where=self.where, got=first, wanted=f"≥ {self.ends[0]}")
         if first == self.ends[0] and last == self.ends[-1] and len(self.parts) > 1:
-            self.parts, self.ends = [join_portions(self.kind, self.parts)], [first, last]  # next time it is one portion
+            self.parts, self.ends = [join_portions(self.kind, self.parts)], [first, last]  # merged once for later calls
         a = int(np.searchsorted(self.ends, first, side="right")) - 1
         b = max(int(np.searchsorted(self.ends, last, side="left")), a + 1)
         here = self.parts[a] if b == a + 1 else join_portions(self.kind, self.parts[a:b])
@@ -181,7 +180,7 @@ class _Held:
 
 
 class _Spool:
-    """Arrays that grow, on disk: raw numbers, one file an array."""
+    """Growing arrays on disk: raw numbers, one file per array."""
 
     def __init__(self, kind: StreamKind, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -189,7 +188,7 @@ class _Spool:
         self.files: dict[str, BinaryIO] = {}
         self.like: dict[str, Any] = {}
         self.rows: dict[str, int] = {}
-        self.sizes: dict[str, list[int]] = {}  # of arrays "n+1": rows of every record
+        self.sizes: dict[str, list[int]] = {}  # for offsets (length "n+1"): rows of each record
 
     def append(self, arrays: Mapping[str, Any]) -> None:
         for name in self._growing() & set(arrays):
@@ -207,7 +206,7 @@ class _Spool:
             self.sizes.setdefault(name, []).extend(np.diff(arrays[name]).tolist())
 
     def arrays(self) -> dict[str, Any]:
-        """All of them, read as they are asked for."""
+        """All arrays as memory maps."""
         out: dict[str, Any] = {}
         for name, file in self.files.items():
             file.close()
@@ -225,7 +224,7 @@ class _Spool:
 
 
 def join_portions(kind: StreamKind, parts: list[Stream]) -> Any:
-    """Portions of one stream behind each other, as a stream."""
+    """Concatenate portions of one stream."""
     arrays = [kind.arrays(p) for p in parts]
     out = dict(arrays[0])
     for name, f in {**kind.fields, **kind.more}.items():
@@ -240,6 +239,6 @@ def join_portions(kind: StreamKind, parts: list[Stream]) -> Any:
 
 
 def _constants(kind: StreamKind, arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """What is the same for all records."""
+    """Arrays that are the same for all records."""
     shapes = {n: f.shape for n, f in {**kind.fields, **kind.more}.items()}
     return {n: a for n, a in arrays.items() if not (shapes.get(n) and shapes[n][0] in (*ROWS, "n+1"))}

@@ -1,22 +1,22 @@
-"""TORO and iSAM text graphs: ``VERTEX2``, ``EDGE2``, ``ODOMETRY``, ``LANDMARK``; in 3-D ``VERTEX3``, ``EDGE3``.
+"""Reader of TORO and iSAM text graphs: ``VERTEX2``, ``EDGE2``, ``ODOMETRY``, ``LANDMARK``; ``VERTEX3``, ``EDGE3``.
 
-The noise columns mean different things in different programs, and no file says which. In 2-D:
+The meaning of the noise columns depends on the program that wrote the file, which is not recorded in it. In 2-D:
 
 * TORO: information, in the order I_xx I_xy I_yy I_θθ I_xθ I_yθ;
 * iSAM: the upper triangle of a square root of the information, xx xy xθ yy yθ θθ;
 * GTSAM's ``load2D``: a *covariance*, xx xy xθ yy yθ θθ, for lines whose off-diagonals are zero.
 
-``noise="auto"`` reads a diagonal in TORO's places as TORO's information, and a diagonal in the other places as
-``load2D`` does; or as iSAM does, if the turns are known better so. ``PoseNetwork.noise`` says which; anything else has
-to be asked for by name. A line that ends before its noise has unit noise, as in iSAM.
+``noise="auto"`` reads matrices that are diagonal in TORO's order as TORO's information. Matrices that are diagonal in
+the other order are covariances as in ``load2D`` or iSAM's square roots, whichever gives the smaller σ of turns.
+``PoseNetwork.noise`` has the choice; other cases need the option. A line without noise has unit noise, as in iSAM.
 
-In 3-D, ``x y z roll pitch yaw`` (R = R_z R_y R_x) + 21 numbers in that order: information (TORO, ``auto``), or what is
-asked for. ``EQUIV i j`` tells TORO which edges to contract; the edges themselves are read, the line is not.
+In 3-D, ``x y z roll pitch yaw`` (R = R_z R_y R_x) + 21 numbers in that order: information (TORO, ``auto``), or as given
+by the option. ``EQUIV i j`` (edges that TORO contracts) is ignored; the edges themselves are read.
 
 Poses and landmarks share one index space: a node is a landmark if it is the second index of a ``LANDMARK`` line.
 ``LANDMARK pose landmark x y c_xx c_xy c_yy``: an isotropic covariance becomes bearing and range with
 σ_range = √c and σ_bearing = √(c/10), as ``load2D`` does (the noise at ten metres); any other stays Cartesian. If the
-noise is asked for as information or its square root, that is meant of landmarks too, and they stay Cartesian.
+option is information or its square root, it also applies to landmarks, and they stay Cartesian.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from graphslam.io.text_records import Records
 
 Noise = Literal["auto", "covariance", "information", "sqrt-information", "toro"]
 UNKNOWN_TURN = 0.25
-"""A measured turn of this variance says hardly anything [rad²]: the columns probably mean something else."""
+"""If the median variance of turns is larger [rad²], the columns are probably not covariances."""
 log = logging.getLogger(__name__)
 LAYOUTS: dict[str, tuple[int, int]] = {
     "VERTEX2": (1, 3),
@@ -75,9 +75,9 @@ def parse_isam_graph(
         Meaning of the noise columns of edges; "toro" is information in TORO's order, the others are in the order
         xx xy xθ yy yθ θθ.
     repair : bool
-        Project impossible matrices instead of refusing them.
+        Project indefinite matrices to positive definite ones instead of raising an error.
     create_missing : bool
-        Make vertices that only edges name, where others are given, instead of refusing them.
+        Create vertices that occur only in edges, instead of raising an error.
     """
     if noise not in get_args(Noise):
         raise ConfigError(f"unknown noise format {noise!r}; known: {', '.join(get_args(Noise))}")
@@ -135,7 +135,7 @@ def _guess(columns: Array, records: Records, lines: Ids) -> Noise:
         wanted = np.isin(np.arange(6), places)
         if (nonzero == wanted).all():
             if name == "covariance" and (turn := float(np.median(columns[:, 5]))) > UNKNOWN_TURN:
-                # as a covariance σ is √c, as a square-root information 1 / c
+                # σ is √c for a covariance, 1 / c for a square root of the information
                 name = "covariance" if turn <= 1.0 else "sqrt-information"
                 log.warning(
                     "%s: noise columns are read as %s, so that σ of a turn is %.2g rad; if they mean something else: "

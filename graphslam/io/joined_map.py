@@ -1,8 +1,8 @@
-"""A joined map on disk: ``joined.npz`` and ``nodes.tum``.
+"""Writer of a joined map: ``joined.npz`` and ``nodes.tum``.
 
-Format 2 holds the uncertainty of the whole map: its information matrix, sparse by columns, or the covariance of a
-filter that carries one. ``state`` says of what: ``vector`` are poses as (x, y, θ) and landmarks, ``tangent`` the right
-tangents of poses and, where bases are levelled, two turns of the direction up. The first base is not part of it.
+Format 2 contains the uncertainty of the whole map: its sparse information matrix (CSC), or the covariance of a filter.
+``state`` is its parametrisation: ``vector``: poses as (x, y, θ) and landmarks; ``tangent``: right tangent vectors of
+poses and, if bases are levelled, two rotations of the up direction. The first base is not part of the state.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def write_joined(
     Parameters
     ----------
     times : (m + 1,)
-        Of its poses [s].
+        Stamps of its poses [s].
     estimate : SubmapEstimate or GraphEstimate
-        With its uncertainty; a vector also says in which chart it is Gaussian (:mod:`graphslam.core.charts`), and in
-        the group chart the end pose that each landmark hangs on.
+        With its uncertainty; for ``vector`` also the parametrisation in which it is Gaussian
+        (:mod:`graphslam.core.charts`) and, if present, the ``anchors`` of the landmarks.
     state : {"vector", "tangent"}
         Coordinates of the uncertainty.
     """

@@ -1,4 +1,4 @@
-"""The layouts of KITTI: odometry sequences with poses, and raw drives with ``gps`` and ``imu``."""
+"""Reader of KITTI: odometry sequences with poses, and raw drives with GPS and IMU (``oxts``)."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def read_kitti(
     Parameters
     ----------
     path : path
-        Holds ``velodyne/*.bin``, perhaps ``times.txt``, ``calib.txt`` and ``poses.txt``; or
-        ``velodyne_points/data/*.bin`` and ``timestamps.txt``, perhaps ``oxts``.
+        Contains ``velodyne/*.bin``, optionally ``times.txt``, ``calib.txt`` and ``poses.txt``; or
+        ``velodyne_points/data/*.bin`` and ``timestamps.txt``, optionally ``oxts``.
     poses : str, optional
-        Table of poses, seen from the folder; ``none``: none. Poses of the camera are brought to the lidar by ``Tr`` of
-        ``calib.txt``.
+        Table of poses, relative to the folder; ``none``: no poses. Poses of the camera are transformed to the lidar
+        with ``Tr`` of ``calib.txt``.
     odometry_sigmas : (float, float)
-        σ of one motion from scan to scan, per axis: metres, radians.
+        σ of one motion from scan to scan, per axis [m, rad].
     """
     root = Path(path)
     if not root.is_dir():
@@ -86,9 +86,9 @@ def read_kitti(
 
 
 def _without_tr(matrices: Array) -> tuple[Array | None, str]:
-    """``T_camera_lidar`` ``(7,)`` or None, and why, from the direction of motion: a vehicle drives ahead.
+    """``T_camera_lidar`` ``(7,)`` or None, and a note, from the main direction of motion: z of a camera, x of a lidar.
 
-    Ahead is z of a camera, and x of a lidar.
+    None means that the poses are those of the lidar.
     """
     R, t = matrices[:-1, :, :3], matrices[:, :, 3]
     moved = np.abs(np.einsum("kji,kj->ki", R, np.diff(t, axis=0)))
@@ -115,7 +115,7 @@ def _calibration(look: SourceProbe) -> Array | None:
 
 
 def _oxts(root: Path, look: SourceProbe, counter: DropCounter) -> dict[str, Stream]:
-    """``gps`` and ``imu`` of the records of oxts: 30 numbers each, in files of their own."""
+    """Streams ``gps`` and ``imu`` from the files of oxts, one per record with 30 numbers."""
     files = [p for p in look.by_ending.get(".txt", []) if p.parent.name == "data" and p.parent.parent.name == "oxts"]
     files = sorted(files, key=number_in_name)
     if len(files) < 2:

@@ -1,11 +1,11 @@
-"""Odometry and sightings of landmarks as two tables with headers: ``odometry.csv`` and ``sightings.csv``.
+"""Reader of odometry and landmark observations in two tables with headers: ``odometry.csv`` and ``sightings.csv``.
 
-Columns are found by their names, in any order and case; units in brackets behind a name are minded.
+Columns are identified by their names, in any order and case; units in brackets after a name are converted.
 
-* odometry: ``t`` and either ``v``, ``w`` (speed along x of the robot, yaw rate; held until the next record) or ``x``,
-  ``y``, ``theta`` (pose in any frame that stays).
-* sightings: ``t``, ``range``, and ``bearing`` (positive to the left, zero ahead), ``id`` (a whole number), or one of
-  the two. Rows of one stamp are one scan.
+* odometry: ``t`` and either ``v``, ``w`` (forward speed and yaw rate, constant until the next record) or ``x``, ``y``,
+  ``theta`` (pose in any fixed frame).
+* observations: ``t``, ``range``, and ``bearing`` (0 ahead, positive to the left) or ``id`` (an integer) or both. Rows
+  with the same stamp are one scan.
 
 Values are separated by commas, semicolons, tabs or blanks; lines that begin with ``#`` or ``%`` are comments.
 """
@@ -53,9 +53,9 @@ _UNIT_OF["bearing"] = "angle"
 ODOMETRY_HEADER = "t, v, w or t, x, y, theta"
 SIGHTINGS_HEADER = "t, range, and bearing or id or both"
 RANGE_SIGMA, BEARING_SIGMA = 0.3, float(np.deg2rad(3.0))
-"""Stated σ of a range [m] and of a bearing [rad]; the tables state none."""
+"""Assumed σ of a range [m] and of a bearing [rad]; the tables contain none."""
 NOISE = OdometryNoise((0.01, 0.005), (0.05, 0.02), 0.05)
-"""Of motions between the poses of a table."""
+"""Assumed noise of motions between the poses of a table."""
 TABLE_ENDINGS = (".csv", ".txt", ".tsv", ".dat")
 Ints = npt.NDArray[np.int64]
 
@@ -67,13 +67,13 @@ class Header:
     Parameters
     ----------
     columns : dict of str to (int, float)
-        Column and factor to SI units, by our name.
+        Column index and factor to SI units, by the names in :data:`NAMES`.
     width : int
-        Columns in all.
+        Number of columns.
     line : int
-        Of the header, counted from 1.
+        Line number of the header, counted from 1.
     said : str
-        As it stands there.
+        Text of the header.
     """
 
     columns: dict[str, tuple[int, float]]
@@ -84,26 +84,26 @@ class Header:
 
     @property
     def odometry(self) -> str:
-        """``velocity``, ``pose`` or nothing."""
+        """``velocity``, ``pose`` or empty."""
         if {"t", "v", "w"} <= self.columns.keys():
             return "velocity"
         return "pose" if {"t", "x", "y", "theta"} <= self.columns.keys() else ""
 
     @property
     def sightings(self) -> bool:
-        """Are they those of sightings?"""
+        """Is it a header of landmark observations?"""
         return {"t", "range"} <= self.columns.keys() and bool({"bearing", "id"} & self.columns.keys())
 
 
 def separator_of(line: str) -> str | None:
-    """What separates words of a line; None: white space."""
+    """Separator of the values of a line; None: white space."""
     return next((s for s in (";", "\t", ",") if s in line), None)
 
 
 def header_of(line: str, number: int = 1) -> Header:
-    """Columns by their names; a unit that is not known counts as a name that is not known."""
+    """Columns identified by their names; columns with an unknown name or unit are ignored."""
     said = line.lstrip("#% ").rstrip()
-    bare = re.sub(r"\s*[\[(]", "[", re.sub(r"[\])]", "]", said))  # "v [m/s]" and "v (m/s)" are one word
+    bare = re.sub(r"\s*[\[(]", "[", re.sub(r"[\])]", "]", said))  # "v [m/s]" and "v (m/s)" become "v[m/s]"
     sep = separator_of(bare)
     words = [w.strip().strip('"').lower() for w in (bare.split(sep) if sep else bare.split())]
     columns: dict[str, tuple[int, float]] = {}
@@ -124,7 +124,7 @@ def header_of(line: str, number: int = 1) -> Header:
 
 
 def _header_in(lines: list[str]) -> Header | None:
-    """Header of a table: the first line that is one; a comment may be one, too."""
+    """Header of a table: the first known one, also in comments before the first row."""
     for number, line in enumerate(lines[:20], start=1):
         found = header_of(line, number)
         if found.odometry or found.sightings:
@@ -161,7 +161,7 @@ def claim_tables(look: SourceProbe) -> ReaderMatch | None:
 
 
 def _tables(look: SourceProbe) -> tuple[list[Path], list[Path]]:
-    """Tables of odometry, and of sightings; those whose name says it first."""
+    """Tables of odometry, and of observations; those with a matching file name first."""
     motion: list[Path] = []
     seen: list[Path] = []
     for e in TABLE_ENDINGS:
@@ -187,13 +187,13 @@ def read_landmark_tables(
     Parameters
     ----------
     path : path
-        The folder that holds them.
+        The folder with both tables.
     range_sigma, bearing_sigma : float
         σ of a range [m] and of a bearing [rad].
     max_range : float, optional
-        Of the sensor [m]; by default the longest range that there is.
+        Maximal range of the sensor [m]; default: the longest range in the table.
     noise : OdometryNoise
-        Of motions between poses. Velocities carry none, it is an option of the front end.
+        Noise of motions between poses. The noise of velocities is an option of the front end.
     """
     root = Path(path)
     if not root.exists():
@@ -230,7 +230,7 @@ def read_landmark_tables(
 
 
 def _read(path: Path, stream: str, counter: DropCounter) -> tuple[dict[str, Array], Header]:
-    """Columns by our names, in SI units; NaN where a value is missing."""
+    """Columns by the names in :data:`NAMES`, in SI units; NaN where a value is missing."""
     lines = read_text(path).splitlines()
     header = _header_in(lines)
     if header is None:
@@ -261,7 +261,7 @@ def _read(path: Path, stream: str, counter: DropCounter) -> tuple[dict[str, Arra
     for name, (k, factor) in header.columns.items():
         words = [r[k].strip('"') for r in rows]
         odd = [w for w in words if w and not is_number(w)]
-        if 2 * len(odd) > len(words) and name == "id":  # names, which are numbered
+        if 2 * len(odd) > len(words) and name == "id":  # text identities are numbered
             out[name] = np.unique(words, return_inverse=True)[1].astype(np.float64)
             continue
         if 2 * len(odd) > len(words):
@@ -284,7 +284,7 @@ def _number(word: str) -> float:
 
 
 def _in_order(a: dict[str, Array], stream: str, counter: DropCounter) -> dict[str, Array]:
-    """Rows in order of time, where a table is not sorted at all; a few stamps out of order are left to be dropped."""
+    """Sort the rows by time if more than 2 % of the stamps decrease; fewer are dropped later."""
     t = a["t"]
     back = int(np.sum(np.diff(t) < 0))
     if back <= 0.02 * len(t):
@@ -360,7 +360,7 @@ def _sightings(
         )
         return seen, n
     b = b[rows]
-    if np.abs(b).max() <= 2 * np.pi + 1e-6:  # beyond it they are probably degrees, and `data check` says so
+    if np.abs(b).max() <= 2 * np.pi + 1e-6:  # larger ones are probably degrees, which `data check` reports
         b = np.arctan2(np.sin(b), np.cos(b))
     return LandmarkObservations(
         times=stamps,

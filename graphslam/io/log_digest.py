@@ -1,4 +1,4 @@
-"""Digest of what a log holds, stream by stream: tells two logs of one name apart."""
+"""Digests of the content of a log, by stream: they distinguish logs with the same name."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from graphslam.core.point_clouds import PointClouds
 from graphslam.io.log_kinds import stream_kinds
 
 META = ("T_world_frame",)
-"""Of a log's ``meta``, what figures are computed with."""
+"""Entries of ``meta`` that affect metrics."""
 
 
 def log_digest(log: SensorLog) -> dict[str, str]:
-    """One line a stream: its records and a digest of all its arrays, mounting and noise included; and of the truth.
+    """For each stream and for ground truth: number of records and digest of all arrays, with mounting and noise.
 
-    Nothing is decoded: a lidar stream whose points are still packed is told by its packed bytes, so that the same scans
-    in memory have another digest. Counts of records and the rest of ``meta`` do not matter.
+    Clouds are not decoded: the digest is from their packed bytes, so the same scans in memory have another one.
+    ``log.read``, ``log.dropped`` and the rest of ``meta`` do not affect digests.
 
     Returns
     -------
     dict of str to str
-        ``{"controls": "7249 records, blake2b 0123…", …}``; ``truth`` and ``meta`` where there are any.
+        ``{"controls": "7249 records, blake2b 0123…", …}``; ``(truth)`` and ``(meta)`` if there are any.
     """
     out, held = {}, {name: _arrays(stream) for name, stream in log.streams.items()}
     for name, stream in log.streams.items():
@@ -54,7 +54,7 @@ def _arrays(stream: Any) -> dict[str, Any]:
     kind = next((k for k in stream_kinds().values() if type(stream) is k.cls), None)
     if kind is not None:
         return kind.arrays(stream)
-    return _fields("", stream)  # a stream of somebody's own
+    return _fields("", stream)  # a stream class of a plug-in
 
 
 def _fields(where: str, value: Any) -> dict[str, Any]:

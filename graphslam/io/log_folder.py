@@ -1,7 +1,7 @@
-"""A simulated log and the place it was recorded in, in one folder.
+"""Writer of a simulated log and the mesh of its environment, in one folder.
 
-The log is stored as :mod:`graphslam.io.log_store` stores it (one npz a stream, ``truth.npz``, ``log.json`` written
-last), the mesh beside it as ``mesh.ply``, in the frame of the truth; ``meta["mesh"]`` names it.
+The log is stored by :mod:`graphslam.io.log_store` (one npz per stream, ``truth.npz``, ``log.json`` written last), the
+mesh as ``mesh.ply`` in the frame of the ground truth; ``meta["mesh"]`` has its name.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _OURS = (".npz", ".ply", ".json", ".part", ".tmp")
 
 
 def check_log_folder(path: str | os.PathLike[str]) -> None:
-    """Refuse a folder for a log that holds other files: a run, or something that is not ours."""
+    """Raise :class:`DataError` if a folder for a log contains files that are not part of a log."""
     root = Path(path)
     if root.is_dir() and (others := sorted(p.name for p in root.iterdir() if p.suffix not in _OURS or p.is_dir())):
         raise DataError(
@@ -30,16 +30,16 @@ def check_log_folder(path: str | os.PathLike[str]) -> None:
 
 
 def write_log_folder(log: SensorLog, path: str | os.PathLike[str], *, mesh: tuple[Any, Any] | None = None) -> Path:
-    """Write a log, and the mesh it was recorded in; an older log in that folder is replaced.
+    """Write a log and the mesh of its environment; an older log in the folder is replaced.
 
-    The folder is a log only when all is written: a run that is killed leaves none.
+    ``log.json`` is written last, so an interrupted call leaves no valid log.
 
     Parameters
     ----------
     path : path
-        Folder; made if missing.
+        Folder; created if missing.
     mesh : (v, 3), (t, 3), optional
-        Vertices in the frame of the truth [m], and triangles.
+        Vertices in the frame of the ground truth [m], and triangles.
     """
     check_log_folder(path)
     root = Path(path)
@@ -48,7 +48,7 @@ def write_log_folder(log: SensorLog, path: str | os.PathLike[str], *, mesh: tupl
     meta = dict(log.meta)
     if mesh is None:
         (root / MESH_NAME).unlink(missing_ok=True)
-        if isinstance(meta.get("mesh"), dict):  # a folder read from elsewhere and written without its mesh
+        if isinstance(meta.get("mesh"), dict):  # the log came from another folder, without its mesh
             meta["mesh"] = {k: v for k, v in meta["mesh"].items() if k != "file"}
     else:
         write_mesh(root / MESH_NAME, *mesh)

@@ -1,4 +1,4 @@
-"""Kinds of streams that a log on disk can hold, and how each becomes arrays and a stream again."""
+"""Kinds of streams that can be stored on disk, and their conversion to arrays and back."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def _nothing(_: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class StreamKind:
-    """How streams of one class are stored.
+    """Conversion of streams of one class to arrays and back.
 
     Parameters
     ----------
     fields : mapping of str to Field
-        Arrays stored under the name of a field of the class.
+        Arrays that are fields of the class.
     pack : callable
-        Stream → further arrays.
+        Stream → additional arrays.
     unpack : callable
-        Arrays → further arguments of the class.
+        Arrays → additional arguments of the class.
     more : mapping of str to Field
-        The further arrays.
+        The additional arrays.
     """
 
     cls: type
@@ -60,7 +60,7 @@ class StreamKind:
         return {**{f: getattr(stream, f) for f in self.fields}, **self.pack(stream)}
 
     def stream(self, arrays: Arrays, where: str) -> Any:
-        """Inverse of :meth:`arrays`; what the class refuses is raised as it is."""
+        """Inverse of :meth:`arrays`; errors of the class are not converted."""
         arrays = check_arrays(arrays, {**self.fields, **self.more}, where)
         return self.cls(**{f: arrays[f] for f in self.fields}, **self.unpack(arrays))
 
@@ -103,7 +103,7 @@ def _unpack_imu(a: Arrays) -> dict[str, Any]:
 
 
 def _pack_clouds(s: PointClouds) -> dict[str, Any]:
-    """Decodes every scan of the stream, and no other of its source."""
+    """Decode all scans of the stream, but not other scans of its source."""
     clouds = [np.asarray(c, dtype=np.float64).reshape(-1, 3) for c in s]
     offsets = np.concatenate([[0], np.cumsum([len(c) for c in clouds])]).astype(np.int64)
     ages = [s.ages(k) for k in range(len(s))]
@@ -118,7 +118,7 @@ def _unpack_clouds(a: Arrays) -> dict[str, Any]:
 
 
 def _floats(*names: str) -> dict[str, Any]:
-    """Packing of fields that are single numbers."""
+    """``pack``, ``unpack`` and ``more`` for fields that are single numbers."""
     return {
         "pack": lambda s: {n: np.float64(getattr(s, n)) for n in names},
         "unpack": lambda a: {n: float(a[n]) for n in names},
@@ -220,11 +220,11 @@ KINDS: dict[str, StreamKind] = {
         {"covariances": floats("n", "d", "d", optional=True)},
     ),
 }
-"""By the name that ``log.json`` gives; with :data:`~graphslam.core.records.PLAIN` these are :func:`stream_kinds`."""
+"""By the name in ``log.json``; :func:`stream_kinds` adds those of :data:`~graphslam.core.records.PLAIN`."""
 
 
 def stream_kinds() -> dict[str, StreamKind]:
-    """All kinds of streams that are stored, those of plug-ins included."""
+    """All kinds of streams that can be stored, also those of plug-ins."""
     return KINDS | {
         kind: StreamKind(cls, {f.name: floats("n") for f in dataclasses.fields(cls)}) for kind, cls in PLAIN.items()
     }

@@ -1,8 +1,8 @@
 """A sensor log on disk: a folder with ``log.json`` and one npz per stream (format ``graphslam.log/1``).
 
-``log.json`` holds name, meta, counts and the list of streams (name, kind, file, records); ``truth.npz`` holds the
-truth where it is known. Every number comes back bit for bit. Nothing is pickled; ``log.json`` is written last, so a
-folder without it is an unfinished log. The kinds of streams are those of :mod:`graphslam.io.log_kinds`.
+``log.json`` contains name, meta, counts and the list of streams (name, kind, file, records); ``truth.npz`` contains
+ground truth, if known. All numbers are restored bit for bit. Pickle is not used; ``log.json`` is written last, so a
+folder without it is an unfinished log. The kinds of streams are in :mod:`graphslam.io.log_kinds`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 def save_log(log: SensorLog, folder: str | os.PathLike[str]) -> Path:
-    """Write ``log`` into ``folder`` (made if missing; an older log there is replaced)."""
+    """Write ``log`` into ``folder`` (created if missing; an older log there is replaced)."""
     root = Path(folder)
     root.mkdir(parents=True, exist_ok=True)
-    (root / INDEX_NAME).unlink(missing_ok=True)  # from here to the last line the folder is no log
+    (root / INDEX_NAME).unlink(missing_ok=True)  # an interrupted call leaves no valid log
     entries = []
     for name, stream in log.streams.items():
         where = f"{root}, stream {name!r}"
@@ -140,7 +140,7 @@ def _truth(arrays: Arrays, where: str) -> Truth:
 
 
 def _build(where: str, make: Callable[[], Any]) -> Any:
-    """Run a constructor on what a file held; what it refuses is the file's fault."""
+    """Call a constructor with data of a file; its :class:`DataError` becomes a :class:`FormatError` of the file."""
     try:
         return make()
     except DataError as error:

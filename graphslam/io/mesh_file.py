@@ -1,4 +1,4 @@
-"""Triangle meshes as PLY files."""
+"""Writer of triangle meshes as PLY files."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def _header(vertices: int, triangles: int) -> str:
 
 
 def write_mesh(path: str | os.PathLike[str], vertices: Any, triangles: Any) -> None:
-    """Write a mesh as a binary PLY file in double precision, whole or not at all.
+    """Write a mesh as a binary PLY file in double precision, atomically.
 
     Parameters
     ----------
     vertices : (v, 3)
         [m]
     triangles : (t, 3)
-        Rows of ``vertices``.
+        Row indices of ``vertices``.
     """
     v, t = check_mesh(vertices, triangles, where=str(path))
     faces = np.empty(len(t), _FACE)

@@ -1,4 +1,4 @@
-"""From records of a file to a :class:`~graphslam.core.network.PoseNetwork`."""
+"""Construction of a :class:`~graphslam.core.network.PoseNetwork` from the records of a file."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _no_ids(*shape: int) -> Ids:
 
 @dataclass
 class NetworkBuilder:
-    """Collects what a file says, as arrays; :meth:`build` orders it by vertex id and checks it.
+    """Collects the content of a file as arrays; :meth:`build` sorts vertices by id and checks the network.
 
     Parameters
     ----------
@@ -53,11 +53,11 @@ class NetworkBuilder:
     dim : int
         2 or 3.
     where : callable
-        A place in words from a line number.
+        Line number → location for error messages.
     repair : bool
-        Project impossible matrices instead of refusing them.
+        Project indefinite matrices instead of raising an error.
     create_missing : bool
-        Make vertices that only edges name, where others are given; they have no initial pose.
+        Create vertices that occur only in edges; they have no initial pose.
     """
 
     source: str
@@ -96,7 +96,7 @@ class NetworkBuilder:
         if self.dim == 2:
             return poses
         length = np.linalg.norm(poses[:, 3:], axis=1)
-        # a printed unit quaternion is off by its digits; one that is off by more than 5 % is something else
+        # rounding of printed quaternions is tolerated; more than 5 % is an error
         bad = np.flatnonzero(np.abs(length - 1.0) > 5e-2)
         if len(bad):
             raise FormatError(
@@ -107,7 +107,7 @@ class NetworkBuilder:
         return np.concatenate([poses[:, :3], quat_normalize(poses[:, 3:])], axis=1)
 
     def add_edges(self, pairs: Ids, measurements: Array, information: Array, lines: Ids) -> None:
-        """Edges ``(m, 2)`` between vertex ids; information in GTSAM's order."""
+        """Edges ``(m, 2)`` between vertex ids; information matrices in the order of GTSAM (3-D: rotation first)."""
         loops = np.flatnonzero(pairs[:, 0] == pairs[:, 1])
         if len(loops):
             raise FormatError(
@@ -119,12 +119,12 @@ class NetworkBuilder:
         self.edges, self.edge_lines = (pairs, self._unit(measurements, lines), information), lines
 
     def add_observations(self, pairs: Ids, values: Array, information: Array, lines: Ids) -> None:
-        """Landmark sightings ``(k, 2)`` = (vertex id, landmark id)."""
+        """Landmark observations; ``pairs`` ``(k, 2)`` = (vertex id, landmark id)."""
         information = self.sound(information, sighting_labels(pairs), "landmark information matrices")
         self.sightings, self.sighting_lines = (pairs, values, information), lines
 
     def sound(self, matrices: Array, labels: Labels, what: str) -> Array:
-        """Matrices as they are, repaired and counted, or an error that names the impossible ones."""
+        """Check matrices; with ``repair``, indefinite ones are projected and counted, otherwise an error is raised."""
         if self.repair:
             matrices, changed = repair_informations(matrices)
             if len(changed):
@@ -133,7 +133,7 @@ class NetworkBuilder:
         return check_informations(matrices, labels, what=what, where=self.source)
 
     def invert(self, covariances: Array, labels: Labels, what: str) -> Array:
-        """Information of covariances, or an error that names the singular ones."""
+        """Information matrices from covariances; :class:`CovarianceError` for singular ones."""
         covariances = self.sound(covariances, labels, what)
         if not all_positive_definite(covariances):
             w = np.linalg.eigvalsh(covariances)
@@ -148,7 +148,7 @@ class NetworkBuilder:
         return np.asarray(np.linalg.inv(covariances))
 
     def build(self) -> PoseNetwork:
-        """The network, vertices in order of their ids."""
+        """The network, with vertices sorted by id."""
         width, d = (3, 3) if self.dim == 2 else (7, 6)
         pairs, measurements, information = self.edges or (_no_ids(0, 2), _none(0, width), _none(0, d, d))
         seen, values, seen_information = self.sightings or (_no_ids(0, 2), _none(0, 2), _none(0, 2, 2))
@@ -196,7 +196,7 @@ class NetworkBuilder:
             raise FormatError(str(error)) from None
 
     def _check_named(self, pairs: Ids, seen: Ids) -> None:
-        """Every vertex that a measurement names must be given, unless none is or they are to be made."""
+        """Every vertex of a measurement must be given, unless no vertex is or ``create_missing`` is set."""
         if len(self.vertices[0]) == 0 or self.create_missing:
             return
         named = np.concatenate([pairs.ravel(), seen[:, 0]])
@@ -227,10 +227,10 @@ class NetworkBuilder:
 
 
 def edge_labels(pairs: Ids) -> Labels:
-    """Names of edges, made when an error needs them."""
+    """Names of edges for error messages, created on demand."""
     return Labels(lambda k: f"{pairs[k, 0]} -> {pairs[k, 1]}")
 
 
 def sighting_labels(pairs: Ids) -> Labels:
-    """Names of landmark observations, made when an error needs them."""
+    """Names of landmark observations for error messages, created on demand."""
     return Labels(lambda k: f"{pairs[k, 0]} sees {pairs[k, 1]}")

@@ -1,4 +1,4 @@
-"""One door for pose-network files: the format is told by the records inside, not by the name."""
+"""Reader of pose-network files; the format is detected from the records, not from the file name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphslam.io import g2o, isam_graph
 from graphslam.io.isam_graph import Noise
 from graphslam.io.text_records import tagged_lines
 
-# The first record of a known kind tells the format; it is looked for in so many lines.
+# The first record of a known kind determines the format; it must be within this number of lines.
 _LINES = 100_000
 
 
@@ -29,13 +29,13 @@ def read_network(
     Parameters
     ----------
     noise : str
-        Meaning of TORO/iSAM noise columns (:func:`graphslam.io.isam_graph.parse_isam_graph`); g2o says it itself.
+        Meaning of TORO/iSAM noise columns (:func:`graphslam.io.isam_graph.parse_isam_graph`); not used for g2o.
     repair : bool
-        Project indefinite matrices to positive definite ones instead of refusing them.
+        Project indefinite matrices to positive definite ones instead of raising an error.
     create_missing : bool
-        Make vertices that only edges name instead of refusing them.
+        Create vertices that occur only in edges instead of raising an error.
     max_size : int, optional
-        Bytes that are read at most, after decompression; default :data:`~graphslam.core.reading.MAX_SIZE`.
+        Maximal size after decompression [bytes]; default :data:`~graphslam.core.reading.MAX_SIZE`.
     """
     with size_limit(max_size):
         text = read_text(path)
@@ -57,5 +57,5 @@ def read_network(
 
 
 def network_path(path: str | os.PathLike[str]) -> Path:
-    """The file itself: networks are read by :func:`read_network`, with the options of its caller."""
+    """The path itself: callers read the network by :func:`read_network`, with their options."""
     return Path(path)

@@ -1,4 +1,4 @@
-"""Odometry of a log that has poses and states no covariance."""
+"""Odometry with an assumed noise model, from poses without covariances."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from graphslam.core.records import Odometry
 
 @dataclass(frozen=True, slots=True)
 class OdometryNoise:
-    """σ of one motion of the odometry.
+    """σ of one motion of the odometry: root sum of squares of its parts.
 
     Parameters
     ----------
     floor : (float, float)
-        At least [m], [rad].
+        Constant part of position [m] and rotation [rad].
     per_metre : (float, float)
-        Per metre driven: of the position [m/m] and of the heading [rad/m].
+        Part per metre driven: of position [m/m] and of rotation [rad/m].
     per_radian : float
-        Of the heading per radian turned.
+        Part of rotation per radian turned.
     """
 
     floor: tuple[float, float] = (0.01, 0.005)
@@ -40,7 +40,7 @@ class OdometryNoise:
             )
 
     def odometry(self, times: Array, poses: Array) -> Odometry:
-        """Motions from each of the poses ``(n, 3|7)`` to the next."""
+        """Motions between consecutive poses ``(n, 3|7)``, with covariances; the first motion is the identity."""
         group = group_of(poses)
         motion = np.tile(group.identity, (len(poses), 1))
         motion[1:] = group.between(poses[:-1], poses[1:])
@@ -53,9 +53,9 @@ class OdometryNoise:
 
 
 DEFAULT_NOISE = OdometryNoise()
-"""Of a wheeled robot. Motions of a metre differ from those of corrected CARMEN logs about as much (median)."""
+"""For a wheeled robot: about the median difference of 1 m motions between raw and corrected CARMEN logs."""
 
 
 def constant_noise(sigmas: tuple[float, float]) -> OdometryNoise:
-    """The same σ of every motion, per axis: metres, radians."""
+    """The same σ for every motion, per axis [m, rad]."""
     return OdometryNoise(sigmas, (0.0, 0.0), 0.0)

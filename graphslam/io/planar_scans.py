@@ -1,4 +1,4 @@
-"""Planar scans whose beams are not all the same, put on the beams of most of them."""
+"""Resampling of planar scans with different beam layouts to the most frequent layout."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Ranges = npt.NDArray[np.float32]
 
 
 def resample_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
-    """Ranges of a scan on other beams: each takes the nearest one within a step, NaN where there is none.
+    """Resample a scan to other beams: range of the nearest beam within one step, otherwise NaN.
 
     Parameters
     ----------
     ranges, own : (n,)
-        Of the scan, and its directions, rising [rad].
+        Ranges of the scan [m] and their increasing directions [rad]; ``beams``: new directions [rad].
     beams : (m,)
     """
     k = np.clip(np.searchsorted(own, beams), 1, len(own) - 1)
@@ -29,20 +29,20 @@ def resample_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
 
 
 def unify_layout(scans: Sequence[tuple[Ranges, Array]]) -> tuple[Ranges, Array, int]:
-    """Scans of any beams as one table.
+    """Scans with different beams as one table.
 
     Parameters
     ----------
     scans : sequence of (ranges, directions)
-        Directions rise [rad]; scans that share them should share the array.
+        Directions increase [rad].
 
     Returns
     -------
     ranges : (k, m)
     beams : (m,)
-        Of most scans.
+        The most frequent layout.
     moved : int
-        Scans that had others.
+        Number of resampled scans.
     """
     keys = [(len(b), float(b[0]), float(b[-1])) for _, b in scans]
     counts = Counter(keys)

@@ -1,4 +1,4 @@
-"""What a reader is: how a kind of source is recognised and read."""
+"""Interface of readers: how a kind of source is recognised and read."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ class Reader:
     Parameters
     ----------
     says : str
-        What it reads, in one line.
+        Description of its sources, in one line.
     target : str
         ``module:function``; the function takes the path, and options as keyword arguments with annotations. Imported
-        when used.
+        on use.
     recognise : callable
-        Takes a :class:`~graphslam.io.source_probe.SourceProbe` and gives a
-        :class:`~graphslam.io.source_probe.ReaderMatch`, or None where the source is not its. It goes by what files
-        hold, and must not raise.
+        Takes a :class:`~graphslam.io.source_probe.SourceProbe` and returns a
+        :class:`~graphslam.io.source_probe.ReaderMatch`, or None if the reader cannot read the source. It uses the
+        content of files, and must not raise.
     parts : mapping of str to mapping
-        Logs inside one data set, by the name that stands after the card's (``mrclam-dataset7/robot1``), and what the
-        function is told for each.
+        Logs in one data set, by the name after that of the data set (``mrclam-dataset7/robot1``), with the options of
+        the function for each.
     preset : str
-        Name of the preset that fits what it reads, where the log's own name has none.
+        Name of the default preset for its sources, if there is none for the name of the log.
     """
 
     says: str
@@ -46,12 +46,12 @@ class Reader:
     preset: str = ""
 
     def function(self) -> Callable[..., Any]:
-        """The function itself."""
+        """Import and return the function."""
         module, _, function = self.target.partition(":")
         return typing.cast(Callable[..., Any], getattr(importlib.import_module(module), function))
 
     def options(self) -> dict[str, inspect.Parameter]:
-        """Options by name, with their defaults and annotations: keyword arguments, of a dataclass its fields."""
+        """Options by name, with defaults and annotations: keyword-only arguments; for a dataclass, its fields."""
         function = self.function()
         hints, out = typing.get_type_hints(function), dict[str, inspect.Parameter]()
         for p in list(inspect.signature(function).parameters.values())[1:]:
@@ -70,7 +70,7 @@ class Reader:
         return "name" in inspect.signature(self.function()).parameters
 
     def __call__(self, path: Path, **given: Any) -> Any:
-        """Read."""
+        """Read a source with the given options; :class:`ConfigError` for an unknown option."""
         function = self.function()
         known, hints = self.options(), typing.get_type_hints(function)
         if unknown := sorted(set(given) - set(known) - ({"name"} if self.takes_name() else set())):

@@ -1,4 +1,4 @@
-"""The registry of readers: who can read a source, told by what the source holds.
+"""Registry of readers, and choice of the reader from the content of a source.
 
 A reader is registered under the entry point ``graphslam.readers``; its value is a :class:`~graphslam.io.reader.Reader`:
 
@@ -7,8 +7,8 @@ A reader is registered under the entry point ``graphslam.readers``; its value is
     [project.entry-points."graphslam.readers"]
     my-format = "my_package:READER"
 
-Those of this package stand in :data:`graphslam.io.recognise.BUILT_IN`. Options of a reader are the keyword arguments of
-its function, checked against their annotations.
+Those of this package are in :data:`graphslam.io.recognise.BUILT_IN`. Options of a reader are the keyword arguments of
+its function; they are converted by their annotations.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ GROUP = "graphslam.readers"
 
 @cache
 def list_readers() -> dict[str, Reader]:
-    """All readers by name: those of other packages first, then our own, in the order in which they are asked."""
+    """All readers by name, in the order in which they are tried: those of other packages first."""
     out: dict[str, Reader] = {}
     for name in plugins(GROUP):
         found = load_plugin(GROUP, "reader", name)
@@ -39,7 +39,7 @@ def list_readers() -> dict[str, Reader]:
 
 
 def find_reader(name: str) -> Reader:
-    """The reader of that name."""
+    """The reader with this name."""
     try:
         return list_readers()[name]
     except KeyError:
@@ -48,14 +48,14 @@ def find_reader(name: str) -> Reader:
 
 @dataclass(frozen=True, slots=True)
 class RecognisedSource:
-    """Who reads a source.
+    """Reader of a source.
 
     Parameters
     ----------
     name, found : str
-        Of the reader, and what it sees in the source.
+        Name of the reader, and its description of the source.
     also : tuple of str
-        ``name: found`` of other readers that could read the source, too.
+        ``name: found`` for other readers that can also read the source.
     """
 
     name: str
@@ -64,7 +64,7 @@ class RecognisedSource:
 
 
 def recognise(path: Path) -> RecognisedSource:
-    """The first reader that can read a source."""
+    """The first reader that can read a source; :class:`MissingDataError` or :class:`FormatError` if there is none."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise MissingDataError("neither a file nor a folder", where=str(path), got="a pipe, socket or device")
     look = SourceProbe(path)

@@ -1,7 +1,6 @@
-"""What each reader of this package recognises, by content: first lines, magic bytes, headers, layouts of folders.
+"""Recognition of sources for each reader of this package: first lines, magic bytes, headers, layouts of folders.
 
-:data:`BUILT_IN` is in the order in which they are asked: what is told apart surely comes first, folders of loose files
-last. Nothing heavy is imported here.
+:data:`BUILT_IN` is in the order in which readers are tried: unambiguous formats first. Readers are imported on use.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ SQLITE, MCAP, BAG1, ZSTD = b"SQLite format 3\0", b"\x89MCAP0\r\n", b"#ROSBAG V",
 
 
 def parse_numbers(line: str) -> list[float] | None:
-    """Numbers of a line, separated by white space, commas or semicolons; None if it holds anything else."""
+    """Numbers of a line, separated by white space, commas or semicolons; None if it contains anything else."""
     words = [w for w in re.split(r"[\s,;]+", line.strip()) if w]
     try:
         return [float(w) for w in words]
@@ -32,7 +31,7 @@ def parse_numbers(line: str) -> list[float] | None:
 
 
 def first_rows(look: SourceProbe, path: Path, most: int = 20) -> list[list[float]]:
-    """Numbers of the first lines, comments and one line of names left out; empty if a line holds anything else."""
+    """Numbers of the first lines, without comments and one header line; empty if a line contains anything else."""
     lines = [s for s in look.lines(path, most) if not s.lstrip().startswith(("#", "%"))]
     found = [parse_numbers(s) for s in lines]
     if found and found[0] is None:
@@ -41,18 +40,18 @@ def first_rows(look: SourceProbe, path: Path, most: int = 20) -> list[list[float
 
 
 def is_tum(look: SourceProbe, path: Path) -> bool:
-    """Rows of stamp, position and a unit quaternion, perhaps with the number of a pose behind them (RTAB-Map)?"""
+    """Rows of stamp, position and unit quaternion, optionally with a pose number at the end (RTAB-Map)?"""
     rows = first_rows(look, path)
     return bool(rows) and all(len(r) in (8, 9) and abs(math.hypot(*r[4:8]) - 1.0) < 0.025 for r in rows)
 
 
 def is_kitti_poses(look: SourceProbe, path: Path) -> bool:
-    """Rows of a 3×4 matrix with a rotation in it?"""
+    """Rows of a 3×4 pose matrix?"""
     return _matrices(first_rows(look, path), 0)
 
 
 def is_stamped_matrices(look: SourceProbe, path: Path) -> bool:
-    """Rows of a stamp or the number of a scan, and a 3×4 matrix with a rotation in it (MulRan, KITTI-360)?"""
+    """Rows of a stamp or scan number, and a 3×4 pose matrix (MulRan, KITTI-360)?"""
     return _matrices(first_rows(look, path), 1)
 
 
@@ -74,7 +73,7 @@ def bag_kind(look: SourceProbe, path: Path) -> str:
     return "ROS 2 bag (sqlite3)" if head.startswith((SQLITE, ZSTD)) and file_ending(path) == ".db3" else ""
 
 
-# --- one function a reader ----------------------------------------------------------------------------------------
+# --- one function per reader --------------------------------------------------------------------------------------
 
 
 def _json_format(look: SourceProbe, names: tuple[str, ...], form: str) -> Path | None:
@@ -84,7 +83,7 @@ def _json_format(look: SourceProbe, names: tuple[str, ...], form: str) -> Path |
             try:
                 value = json.loads(path.read_bytes())
             except (ValueError, OSError, RecursionError):
-                return path  # its own reader says what is wrong
+                return path  # its reader reports the error
             if not isinstance(value, dict) or str(value.get("format", form)).startswith(form):
                 return path
     return None
@@ -100,7 +99,7 @@ def _submap_store(look: SourceProbe) -> ReaderMatch | None:
 
 
 def euroc_tables(look: SourceProbe) -> dict[str, Path]:
-    """Tables of a EuRoC recording by what their header says: ``imu``, ``leica``, ``vicon``, ``truth``."""
+    """Tables of a EuRoC recording by kind, from their headers: ``imu``, ``leica``, ``vicon``, ``truth``."""
     out: dict[str, Path] = {}
     marks = {"w_RS_S_x": "imu", "p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q": "truth", "p_RS_R_x": "leica"}
     for p in look.by_ending.get(".csv", []):
@@ -181,7 +180,7 @@ def _tables(look: SourceProbe) -> ReaderMatch | None:
 
 
 def cloud_folder(look: SourceProbe) -> tuple[list[Path], str]:
-    """The clouds of one ending in one folder, most of all there are, and the ending."""
+    """The largest group of clouds with the same folder and file name extension, and the extension."""
     groups: dict[tuple[Path, str], list[Path]] = {}
     for e in CLOUD_ENDINGS:
         for p in look.by_ending.get(e, []):
@@ -215,7 +214,7 @@ def _clouds(look: SourceProbe) -> ReaderMatch | None:
 
 
 def pose_file(look: SourceProbe) -> Path | None:
-    """A table of poses beside clouds: TUM, KITTI, or stamps with matrices."""
+    """A table of poses next to clouds: TUM, KITTI, or stamps with matrices; None if there is none."""
     some = [p for p in look.texts if file_ending(p) not in CLOUD_ENDINGS]
     clouds, _ = cloud_folder(look)
     beside = {look.path, *(c.parent for c in clouds[:1]), *(c.parent.parent for c in clouds[:1])}

@@ -1,7 +1,7 @@
-"""ROS messages that sensors send, as arrays; bytes that do not fit are a :class:`ValueError`.
+"""Conversion of ROS sensor messages to arrays; :class:`ValueError` if the size of the data is wrong.
 
-What is here takes messages as ``rosbags`` decodes them, except for clouds of Livox, which are decoded from their bytes:
-a message holds twenty thousand records.
+Messages are decoded by ``rosbags``, except for Livox clouds, which are decoded from bytes for speed: a message contains
+20,000 records.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 
 
 def stamp_of(message: Any) -> float:
-    """Seconds of a header; 0 where it was not filled in."""
+    """Stamp of a header [s]; 0 if the driver did not set it."""
     t = message.header.stamp
     return float(t.sec) + 1e-9 * float(t.nanosec)
 
@@ -53,7 +53,7 @@ def point_cloud(m: Any) -> CloudData:
         names.append(str(f.name))
         formats.append(order + kind)
         offsets.append(int(f.offset))
-    if row != width * step:  # rows with padding behind them
+    if row != width * step:  # rows end with padding
         padded = np.zeros(height * row, np.uint8)
         padded[: min(len(data), height * row)] = data[: height * row]
         data = np.ascontiguousarray(padded.reshape(height, row)[:, : width * step]).reshape(-1)
@@ -64,7 +64,7 @@ def point_cloud(m: Any) -> CloudData:
 
 @dataclass(frozen=True, slots=True)
 class LivoxCloud:
-    """A ``CustomMsg``: stamp of its header [s], frame, points and their times after the first [ns]."""
+    """A ``CustomMsg``: stamp of its header [s], frame, and points with their field ``offset_time`` [ns]."""
 
     stamp: float
     frame: str
@@ -95,7 +95,7 @@ def livox_cloud(raw: bytes, *, ros2: bool) -> LivoxCloud:
             at, step = at + 4, 19
     except (struct.error, IndexError) as error:
         raise ValueError(f"message is truncated ({error})") from None
-    data = body[at:].ljust(len(body) - at + step, b"\0")  # the last point has no padding behind it
+    data = body[at:].ljust(len(body) - at + step, b"\0")  # the last point has no padding
     if n * step > len(data) or (n and (n - 1) * step + 19 > len(body) - at):
         raise ValueError(f"{len(body) - at} bytes for {n} points")
     names = ["offset_time", "x", "y", "z"]

@@ -1,7 +1,7 @@
-"""What a source looks like from outside: the names in a folder, and the beginnings of some of its files.
+"""Overview of a source: file names of a folder, and the first bytes of some files.
 
-Readers tell by it whether a source is theirs. Nothing is decoded, and of each file no more than its beginning is read,
-so that a folder with thousands of clouds is looked at in a moment.
+Readers use it to recognise their sources. Only the first bytes of a file are read, so that a folder with thousands of
+clouds is checked quickly.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ MOST_FILES, DEEPEST, HEAD, SAMPLE = 200_000, 5, 1 << 16, 6
 
 @dataclass(frozen=True, slots=True)
 class ReaderMatch:
-    """What a reader says of a source.
+    """Result of a reader's check of a source.
 
     Parameters
     ----------
     found : str
-        What it sees in it, with figures: ``"CARMEN log intel.clf: FLASER"``.
+        Description of the source: ``"CARMEN log intel.clf: FLASER"``.
     missing : str
-        Empty where it can read the source; else what is missing for that, and what would do.
+        Empty if the reader can read the source; otherwise what is missing.
     """
 
     found: str
@@ -38,26 +38,26 @@ class ReaderMatch:
 
 @dataclass
 class SourceProbe:
-    """A file or folder."""
+    """A file or folder, with cached access to its names and first bytes."""
 
     path: Path
     _heads: dict[Path, bytes] = field(default_factory=dict, repr=False)
 
     @cached_property
     def files(self) -> list[Path]:
-        """The file itself; or those of the folder and of folders in it, sorted, hidden ones left out."""
+        """The file itself; or the files of the folder and of its subfolders, sorted, without hidden ones."""
         return [self.path] if self.path.is_file() else sorted(_walk(self.path))
 
     @cached_property
     def by_ending(self) -> dict[str, list[Path]]:
-        """Files by their ending in small letters, that of a compression left out."""
+        """Files by their extension in lower case, without that of a compression."""
         out: dict[str, list[Path]] = {}
         for p in self.files:
             out.setdefault(file_ending(p), []).append(p)
         return out
 
     def head(self, path: Path) -> bytes:
-        """The first 64 kB of a file, decompressed; empty where it cannot be read."""
+        """The first 64 kB of a file, decompressed; empty if it cannot be read."""
         if path not in self._heads:
             try:
                 self._heads[path] = read_bytes(path, first=HEAD)[:HEAD]
@@ -66,18 +66,18 @@ class SourceProbe:
         return self._heads[path]
 
     def lines(self, path: Path, most: int = 200) -> list[str]:
-        """The first whole lines of a text file that are not blank; none of a file that is no text."""
+        """The first complete lines of a text file, without blank ones; empty if it is no text file."""
         raw = self.head(path)
         if b"\0" in raw[:4096]:
             return []
         rows = raw.decode("utf-8-sig", errors="replace").splitlines()
         if len(raw) == HEAD and len(rows) > 1:
-            rows.pop()  # cut off
+            rows.pop()  # incomplete
         return [r for r in rows if r.strip()][:most]
 
     @cached_property
     def texts(self) -> list[Path]:
-        """Some files that are text: at most six of each ending in each folder."""
+        """Text files among the first six of each extension in each folder; at most 100."""
         seen: Counter[tuple[Path, str]] = Counter()
         out: list[Path] = []
         for p in self.files:
@@ -88,12 +88,12 @@ class SourceProbe:
         return out
 
     def named(self, *names: str) -> Path | None:
-        """The first file of one of these names (small letters, compression left out), nearest to the top."""
+        """The first file with one of these names (lower case, without compression extension), nearest to the top."""
         found = [p for p in self.files if plain_name(p) in names]
         return min(found, key=lambda p: (len(p.parts), names.index(plain_name(p)), p), default=None)
 
     def relative(self, path: Path) -> str:
-        """Name of a file as seen from the source."""
+        """Path of a file relative to the source."""
         return path.name if self.path.is_file() else path.relative_to(self.path).as_posix()
 
     def __str__(self) -> str:
@@ -121,11 +121,11 @@ def _walk(root: Path) -> Iterator[Path]:
 
 
 def plain_name(path: Path) -> str:
-    """Name in small letters, the ending of a compression left out."""
+    """Name in lower case, without the extension of a compression."""
     name = path.name.lower()
     return next((name[: -len(c)] for c in COMPRESSIONS if name.endswith(c)), name)
 
 
 def file_ending(path: Path) -> str:
-    """Ending in small letters, with its dot, that of a compression left out."""
+    """Extension in lower case, with its dot, without that of a compression."""
     return Path(plain_name(path)).suffix

@@ -1,4 +1,4 @@
-"""One submap as the arrays of its npz file, and back (``graphslam.submap/2``). No pickles; extra arrays are ignored."""
+"""Conversion of a submap to the arrays of its npz file and back (``graphslam.submap/2``); no pickles are used."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def submap_arrays(submap: Submap) -> dict[str, Any]:
-    """Everything of a submap but its grid, as the arrays of its file."""
+    """The arrays of a submap's file: everything except its grid."""
     d = submap.dim
     arrays: dict[str, Any] = {
         "format": SUBMAP_FORMAT,
@@ -43,7 +43,7 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
     }
     landmarks = submap.landmarks
     arrays["chart"] = "cartesian" if landmarks is None else landmarks.chart
-    if landmarks is None:  # what measures the exit alone is still a joint Gaussian over [exit pose]
+    if landmarks is None:  # the joint Gaussian is that of the exit (end pose) only
         P = submap.exit_covariance
         arrays["covariance"] = tangent_to_vector_covariance(submap.exit_pose, P) if d == 2 else P
         arrays["landmark_ids"], arrays["landmarks"] = np.zeros(0, dtype=np.int64), np.zeros((0, d))
@@ -90,7 +90,7 @@ def _plain(value: Any) -> Any:
 
 
 def submap_from_arrays(arrays: Arrays, *, where: str) -> Submap:
-    """The submap that :func:`submap_arrays` wrote down; optional arrays may be missing."""
+    """Inverse of :func:`submap_arrays`; optional arrays may be missing."""
 
     a = check_arrays(arrays, _FIELDS, where)
     try:

@@ -1,9 +1,9 @@
-"""Submaps on disk: one npz each and an index, whole at every moment, the same bytes for the same submaps.
+"""Submaps on disk: one npz per submap and an index, consistent after an interruption; same submaps, same bytes.
 
-``submaps/000000.npz`` … hold the submaps (``graphslam.submap/2``), ``submaps/index.json`` lists them
-(``graphslam.submaps/1``), ``truth.npz`` beside the folder holds the truth where it is known. A submap's file is written
-before the index names it, each under a temporary name that is then renamed: after a kill the store holds every submap
-the index names, and perhaps one file more, which is written again.
+``submaps/000000.npz`` … contain the submaps (``graphslam.submap/2``), ``submaps/index.json`` lists them
+(``graphslam.submaps/1``), ``truth.npz`` next to the folder contains ground truth, if known. The file of a submap is
+written before the index, each under a temporary name that is then renamed. So after an interruption every submap in the
+index has its file; there may be one more file, which is overwritten later.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class SubmapStore:
     Parameters
     ----------
     path : path
-        The folder ``submaps/``, or its parent. It is made by the first :meth:`append`.
+        The folder ``submaps/``, or its parent. It is created by the first :meth:`append`.
     load_grid : callable, optional
-        Reads ``<name>.grid.npz``; without it submaps come back without their grid.
+        Reads ``<name>.grid.npz``; without it, submaps are read without their grids.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, load_grid: GridLoader | None = None) -> None:
@@ -57,7 +57,7 @@ class SubmapStore:
 
     @property
     def entries(self) -> list[dict[str, Any]]:
-        """The index: key, file, interval and number of landmarks of every submap. Empty where there is none yet."""
+        """The index: key, file, interval and number of landmarks of each submap; empty if there is no index."""
         if self._entries is None:
             file = resolve_inside(self.path, INDEX, str(self.path))
             self._entries = _read_index(file) if file.exists() else []
@@ -67,7 +67,7 @@ class SubmapStore:
         return len(self.entries)
 
     def __getitem__(self, k: int) -> Submap:
-        """Submap k of the index (not: of key k)."""
+        """Submap at position k of the index (not with key k)."""
         entry = self.entries[k]
         file = resolve_inside(self.path, entry["file"], str(self.path / INDEX))
         submap = submap_from_arrays(read_npz(file, fmt=SUBMAP_FORMAT), where=str(file))
@@ -87,7 +87,7 @@ class SubmapStore:
         return list(self)
 
     def append(self, submap: Submap) -> None:
-        """Write one submap, then the index that names it."""
+        """Write one submap, then the extended index; keys must increase."""
         entries = self.entries
         if entries and submap.key <= entries[-1]["key"]:
             raise DataError(
@@ -107,9 +107,9 @@ class SubmapStore:
         self._write_index([*entries, entry], submap.dim)
 
     def complete_prefix(self) -> list[Submap]:
-        """The submaps from the first up to the last before anything is missing, damaged, or not what the index says.
+        """All submaps before the first one that is missing, damaged, or different from the index.
 
-        What a resumed run can trust: half-written temporary files and files the index does not name are ignored.
+        A resumed run can use them; temporary files and files that are not in the index are ignored.
         """
         whole: list[Submap] = []
         for k in range(len(self)):
@@ -121,9 +121,9 @@ class SubmapStore:
         return whole
 
     def truncate(self, count: int) -> None:
-        """Forget all but the first ``count`` submaps, and remove what else lies in the folder from a killed run.
+        """Delete all but the first ``count`` submaps, and files of an interrupted run that are not in the index.
 
-        The index goes first: after a kill it names submaps that are all there.
+        The index is written first, so that after an interruption every submap in it has its file.
         """
         kept = self.entries[:count]
         if not self.path.is_dir():
@@ -200,7 +200,7 @@ def read_submaps(path: str | os.PathLike[str], *, load_grid: GridLoader | None =
 
 
 def write_submaps(path: str | os.PathLike[str], submaps: list[Submap], *, truth: MapTruth | None = None) -> None:
-    """Write ``path/submaps/`` anew, and ``path/truth.npz`` where the truth is known."""
+    """Replace ``path/submaps/``, and write ``path/truth.npz`` if ground truth is given."""
     store = SubmapStore(Path(path) / "submaps")
     store.truncate(0)
     for submap in submaps:
@@ -210,13 +210,13 @@ def write_submaps(path: str | os.PathLike[str], submaps: list[Submap], *, truth:
 
 
 def write_truth(path: str | os.PathLike[str], truth: MapTruth) -> None:
-    """Write ``path/truth.npz``, beside the folder ``submaps/``."""
+    """Write ``path/truth.npz``, next to the folder ``submaps/``."""
     names = ("keys", "exit_poses", "landmark_ids", "landmarks")
     write_npz(Path(path) / TRUTH, {n: getattr(truth, n) for n in names})
 
 
 def read_truth(path: str | os.PathLike[str]) -> MapTruth | None:
-    """The truth beside a store, or None where it is not known.
+    """Ground truth of a store, or None if there is no file.
 
     Parameters
     ----------
@@ -226,13 +226,13 @@ def read_truth(path: str | os.PathLike[str]) -> MapTruth | None:
     root = Path(path)
     candidates = [root] if root.suffix == ".npz" else [root / TRUTH, root.parent / TRUTH]
     if root.suffix != ".npz" and not (root / INDEX).is_file():
-        candidates = candidates[:1]  # a run folder: what lies beside it is somebody else's
+        candidates = candidates[:1]  # a run folder: files next to it do not belong to it
     file = next((c for c in candidates if c.is_file()), None)
     if file is None:
         return None
     arrays = read_npz(file, fmt="none")
     if "landmarks" in arrays and arrays["landmarks"].size == 0:
-        arrays["landmarks"] = arrays["landmarks"].reshape(0, 2)  # of no landmarks the dimension need not be told
+        arrays["landmarks"] = arrays["landmarks"].reshape(0, 2)  # no landmarks: any dimension
     try:
         return MapTruth(**check_arrays(arrays, _TRUTH, str(file)))
     except GeometryError as error:

@@ -1,7 +1,6 @@
-"""Line-by-line text files, plain or compressed: tagged records (g2o, TORO, iSAM) and plain tables of numbers.
+"""Text files, plain or compressed: tagged records (g2o, TORO, iSAM) and tables of numbers.
 
-The compression is told by the first bytes, not by the name, and every number that cannot be read is reported with
-its file and line.
+Compression is detected from the first bytes when a file is read; errors contain file and line of an unreadable number.
 """
 
 from __future__ import annotations
@@ -41,22 +40,22 @@ def find_text_file(folder: str | os.PathLike[str], name: str) -> Path:
 def read_table(
     path: str | os.PathLike[str], columns: int, *, separator: str | None = None, skip: int = 0
 ) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Rows of ``columns`` numbers, one a line; blank lines and lines that begin with ``#`` are skipped.
+    """Rows of ``columns`` numbers, one per line; blank lines and lines that begin with ``#`` are skipped.
 
     Parameters
     ----------
     separator : str, optional
-        What stands between numbers, and perhaps after the last one; white space by default.
+        Separator of the numbers, also allowed after the last one; default: white space.
     skip : int
-        So many lines at the beginning are no rows.
+        Number of header lines.
 
     Returns
     -------
     values : (n, columns)
-        Numbers may be NaN or infinite (also what is larger than :data:`~graphslam.core.reading.LARGEST`): the caller
+        Numbers may be NaN or infinite; values above :data:`~graphslam.core.reading.LARGEST` become infinite. The caller
         decides what to drop.
     lines : (n,) int64
-        Line of every row, counted from 1, for messages.
+        Line number of each row, counted from 1, for error messages.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -78,12 +77,12 @@ def read_table(
     except ValueError:
         k, word = next((k, w) for k, words in enumerate(rows) for w in words if not is_number(w))
         raise FormatError("not a number", where=f"{path}, line {lines[k]}", got=repr(word[:40])) from None
-    values[np.abs(values) > LARGEST] = np.inf  # as useless, and dropped or refused as such
+    values[np.abs(values) > LARGEST] = np.inf  # rejected or dropped by the caller like infinite values
     return values, np.array(lines, dtype=np.int64)
 
 
 def is_number(word: str) -> bool:
-    """Whether Python reads it as a number."""
+    """Is the word a number for ``float``?"""
     try:
         float(word)
     except ValueError:
@@ -92,7 +91,7 @@ def is_number(word: str) -> bool:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a file, compressed if its name ends in .xz, .gz or .bz2; a reader never sees half of it."""
+    """Write a file atomically, compressed if its name ends in .xz, .gz or .bz2."""
     p = Path(path)
     data = text.encode("utf-8")
     if p.suffix in _WRITERS:
@@ -109,7 +108,7 @@ class Rows:
     Parameters
     ----------
     lines : (n,) int64
-        Line of every record, counted from 1.
+        Line number of each record, counted from 1.
     whole : (n, integers) int64
     real : (n, floats) float64
     """
@@ -129,22 +128,22 @@ class Records:
     ----------
     path : path-like
     text : str
-        What the file holds.
+        Content of the file.
     layouts : dict of str to tuple of int
-        Tag → (leading integers, following floats). A line of a known tag must have exactly that many numbers;
-        -1 integers means one or more and no floats: each is then a row of its own.
+        Tag → (leading integers, following floats). A line with a known tag must have exactly this many numbers;
+        -1 integers: one or more and no floats, each of which becomes a separate row.
     ignored : tuple of str
         Tags that are skipped.
     aliases : dict of str to str
-        Other tags of the same records.
+        Alternative tag → tag in ``layouts``.
     implied : dict of str to tuple
-        Tag → (place, words): what a line that is shorter by so many words means there.
+        Tag → (index, words): inserted at the index into a line that is shorter by the number of words.
 
     Attributes
     ----------
     rows : dict of str to Rows
     not_read : Counter of str
-        Lines of the ignored tags.
+        Number of lines of the ignored tags.
     """
 
     def __init__(
@@ -236,7 +235,7 @@ class Records:
 
 
 def tagged_lines(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Number, counted from 1, and words before a ``#`` of every line that has some."""
+    """Line number, counted from 1, and words before a ``#``, for each line with words."""
     for number, line in enumerate(text.splitlines(), start=1):
         tokens = line.partition("#")[0].split()
         if tokens:

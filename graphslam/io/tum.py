@@ -1,4 +1,4 @@
-"""Trajectories as TUM text: one line ``t x y z qx qy qz qw`` per pose, seconds and metres.
+"""Reader and writer of TUM trajectories: one line ``t x y z qx qy qz qw`` per pose [s, m]; writer of KITTI poses.
 
 2-D poses are embedded in the plane z = 0 (the rotation about z is the heading).
 """
@@ -25,11 +25,11 @@ from graphslam.io.source_probe import SourceProbe
 
 log = logging.getLogger(__name__)
 _NORM_TOLERANCE = 5e-2
-"""Quaternions of files are normalised; some print three digits."""
+"""Maximal deviation of the norm of a quaternion from 1, before it is normalised; some programs print three digits."""
 
 
 def embed_plane(poses: Array) -> Array:
-    """Poses ``(n, 3)`` of the plane as ``(n, 7)``: z = 0, rotation about z."""
+    """Planar poses ``(n, 3)`` as ``(n, 7)``: z = 0, rotation about z."""
     half = poses[:, 2] / 2.0
     out = np.zeros((len(poses), 7))
     out[:, :2] = poses[:, :2]
@@ -38,7 +38,7 @@ def embed_plane(poses: Array) -> Array:
 
 
 def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write a trajectory, atomically; 17 digits, so stamps and positions come back bit for bit."""
+    """Write a trajectory atomically; with 17 digits, stamps and positions are restored bit for bit."""
     poses = embed_plane(trajectory.poses) if trajectory.dim == 2 else trajectory.poses
     rows = np.column_stack([trajectory.times, poses])
     with atomic_open(path, "w") as stream:
@@ -47,7 +47,7 @@ def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
 
 
 def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write the poses of a trajectory as KITTI odometry does: the upper three rows of ``T`` a line, no stamps."""
+    """Write the poses of a trajectory in KITTI odometry format: upper three rows of ``T`` per line, no stamps."""
     poses = embed_plane(trajectory.poses) if trajectory.dim == 2 else trajectory.poses
     T = np.concatenate([se3.quat_to_matrix(poses[:, 3:]), poses[:, :3, None]], axis=2)
     with atomic_open(path, "w") as stream:
@@ -73,7 +73,7 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
         if not fields or fields[0].startswith("#"):
             continue
         if len(fields) == 9 and fields[8].isdigit():
-            fields.pop()  # RTAB-Map: the number of the pose
+            fields.pop()  # RTAB-Map: pose number
         if len(fields) != 8:
             raise FormatError(
                 "wrong number of columns",
@@ -108,7 +108,7 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
 
 
 def _without_repeats(data: Array, lines: list[int], where: str) -> tuple[Array, list[int]]:
-    """Rows without those that repeat the stamp before them, if these are few; the first one is kept."""
+    """Remove rows with the stamp of the previous row, if these are at most :data:`MAX_DROPPED` of all rows."""
     again = np.r_[False, np.diff(data[:, 0]) == 0][: len(data)]
     if not again.any() or again.mean() > MAX_DROPPED:
         return data, lines
@@ -128,14 +128,14 @@ def read_tum_log(
     *,
     odometry_sigmas: tuple[float, float] = (0.03, 0.005),
 ) -> SensorLog:
-    """A trajectory as a log with one stream, ``odometry``.
+    """Read a trajectory as a log with one stream, ``odometry``.
 
     Parameters
     ----------
     path : path
-        The table, or a folder that holds one.
+        The table, or a folder with one.
     odometry_sigmas : (float, float)
-        σ of one motion, per axis: metres, radians; the table states none.
+        Assumed σ of one motion, per axis [m, rad].
     """
     file = Path(path)
     if file.is_dir():
