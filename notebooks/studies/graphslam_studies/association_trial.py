@@ -1,7 +1,7 @@
-"""One run of the study of association ambiguity: nobody tells who is who, and every algorithm gets the same log.
+"""One run of the study of association ambiguity: unknown data association, the same log for every algorithm.
 
-The same noise figures, gates, confirmation rules and cuts for all; only ``known`` is told the identities. Local maps
-are then joined by one rule (joint compatibility) and polished, so that a difference is the front end's.
+All algorithms have the same noise model, confirmation rule and cuts; only ``known`` gets the identities. Local maps are
+joined by the same rule (joint compatibility) and polished, so that differences are due to the front end.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ Ints = npt.NDArray[np.int64]
 Options = Mapping[str, Any]
 
 FIVE_SIGMA_3DOF = 32.0
-"""D² of a pose (3 degrees of freedom) that an honest estimate exceeds as rarely as a number its 5 σ: 5.2e-7."""
+"""D² of a pose (3 degrees of freedom) that a consistent estimate exceeds with probability 5.2e-7, as for 5 σ."""
 MIN_HITS = 3
-"""Sightings that make a landmark worth handing over; all algorithms alike."""
+"""Observations required for a landmark to be output; the same for all algorithms."""
 
-# name -> (front end, options beside the common ones); one that joins by the true identities is `known`
+# name -> (front end, options besides the common ones); `known` joins by the true identities
 LOCAL: dict[str, tuple[str, Options]] = {
     "known": ("rbpf-ekf", {"association": "known", "particles": 40}),
     "ekf-nn": ("ekf", {"association": "nearest", "handover": "filter"}),
@@ -58,20 +58,20 @@ SINGLE: dict[str, Options] = {"ekf-slam-nn": {"association": "nearest"}, "ekf-sl
 
 @dataclass(frozen=True)
 class TrialConfig:
-    """A world and who is compared in it.
+    """A world and the algorithms compared in it.
 
     Parameters
     ----------
     world : str
-        Preset of the landmark field; the layout is drawn anew in every run.
+        Preset of the landmark field; the layout is random in every run.
     changes : tuple of (str, float)
-        Figures of the world that differ from the preset.
+        Parameters of the world that differ from the preset.
     metres : float
-        Length of a submap [m]; cut by scans, the same for all algorithms.
+        Length of a submap [m]; cut by number of scans, the same for all algorithms.
     local, single : tuple of str
-        Algorithms with local maps, and with a single map.
+        Algorithms with local maps, and algorithms with a single map.
     max_nodes : int
-        Hypotheses that joint compatibility may test in a scan.
+        Maximum number of hypotheses that joint compatibility tests per scan.
     """
 
     world: str
@@ -83,14 +83,14 @@ class TrialConfig:
 
 
 def run_trial(config: TrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run (see :mod:`graphslam_studies.association_ambiguity` for their names)."""
+    """All metrics of one run (see :mod:`graphslam_studies.association_ambiguity` for their names)."""
     with one_blas_thread():
         return list(Trial(config, seed).run())
 
 
 @dataclass
 class Trial:
-    """The log of one run, and every algorithm on it."""
+    """Log of one run, and all algorithms on it."""
 
     config: TrialConfig
     seed: int
@@ -102,7 +102,7 @@ class Trial:
         self.observations = self.log["landmarks"]
 
     def run(self) -> Iterator[Measurement]:
-        """Every algorithm in turn. One that gives up has the figure ``failed`` and counts as diverged."""
+        """Metrics of every algorithm. One that fails with an error has ``failed`` = 1 and counts as diverged."""
         for name in (*self.config.local, *self.config.single):
             start = perf_counter()
             try:
@@ -137,14 +137,14 @@ class Trial:
         return list(front.submaps(self.log, seed=SeedTree(self.seed).child("frontend")))
 
     def join(self, submaps: list[Submap], *, known: bool = False) -> JoinResult:
-        """Joined in sequence by joint compatibility (or by the ids they bear), and polished."""
+        """Join in sequence by joint compatibility (``known``: by identities), and polish."""
         rule = None if known else MapAssociationConfig(rule="joint", sensor_range=float(self.observations.max_range))
         return optimise_from_join(submaps, join_sequential(submaps, association=rule))
 
     # ---------------------------------------------------------------- figures
 
     def labels(self, submap: Submap) -> Ints:
-        """Landmark of the submap that every observation of the log was assigned to ``(q,)``, -1 = none."""
+        """Landmark index in the submap for every observation of the log ``(q,)``, -1 = none."""
         out = np.full(len(self.observations.ranges), -1, dtype=np.int64)
         assert submap.landmarks is not None
         assert submap.landmarks.sightings is not None
@@ -160,7 +160,7 @@ class Trial:
         return slice(int(self.observations.offsets[first]), int(self.observations.offsets[last]))
 
     def identified(self, submap: Submap) -> Submap:
-        """The submap with every landmark named by what it is by majority; -1 = clutter."""
+        """The submap with the majority true identity of every landmark; -1 = clutter."""
         names, what = majority_identity(self.labels(submap), self.truth_ids)
         assert submap.landmarks is not None
         ids = np.full(len(submap.landmarks), -1, dtype=np.int64)
@@ -174,7 +174,7 @@ class Trial:
         return np.asarray(self.observations.ids)
 
     def judge_local(self, name: str) -> Iterator[Measurement]:
-        """Local maps by themselves, then the map that they make."""
+        """Metrics of the local maps, then of the joined map."""
         start = perf_counter()
         submaps = self.submaps(name)
         yield Measurement(name, "seconds_frontend", perf_counter() - start, timing=True)
@@ -191,7 +191,7 @@ class Trial:
             entry += len(s.landmarks)
             yield Measurement(name, "local_pose_nees", submap_nees(s, self.log.truth).exit, s.key)
         yield from self._association(name, errors, len(submaps))
-        # within submaps: the same landmark seen from two submaps is two things here
+        # within submaps: a landmark observed from two submaps counts as two here
         owner = np.repeat(np.arange(len(submaps)), [len(s.landmarks or ()) for s in named])
         inside = pair_agreement(whole, np.where(self.truth_ids >= 0, self.truth_ids + 1_000_000 * self._submap_of, -1))
         yield Measurement(name, "local_pair_precision", inside.precision)
@@ -211,7 +211,7 @@ class Trial:
         )
 
     def judge_single(self, name: str) -> Iterator[Measurement]:
-        """A single map over the whole run."""
+        """Metrics of a single map over the whole run."""
         start = perf_counter()
         (submap,) = self.submaps(name)
         yield Measurement(name, "seconds_frontend", perf_counter() - start, timing=True)
@@ -226,7 +226,7 @@ class Trial:
 
     @property
     def _submap_of(self) -> Ints:
-        """Number of the submap that every observation belongs to ``(q,)``."""
+        """Submap number of every observation ``(q,)``."""
         world = self.log.meta["config"]
         scans = max(round(self.config.metres / world["speed"] * world["scan_rate"]), 2)
         return np.repeat(np.arange(len(self.observations.times)) // scans, np.diff(self.observations.offsets))
@@ -239,7 +239,7 @@ class Trial:
             yield Measurement(name, f"local_{quantity}", getattr(e, quantity) / submaps)
 
     def _merges(self, name: str, owner: Ints, ids: Ints, what: Ints) -> Iterator[Measurement]:
-        """Entries of different submaps: merged though they differ, or not merged though they are the same."""
+        """Landmarks of different submaps: wrong merges and missed merges."""
         between = owner[:, None] < owner[None]
         together, same = ids[:, None] == ids[None], (what[:, None] == what[None]) & (what >= 0)[:, None]
         merged = int(np.sum(between & together))
@@ -261,7 +261,7 @@ class Trial:
         poses: Array,
         covariance: Array,
     ) -> Iterator[Measurement]:
-        """The final map against the truth in the frame of the first base."""
+        """Errors of the final map against ground truth, in the frame of the first base."""
         truth = self.log.truth
         assert truth is not None
         agreement = pair_agreement(labels, self.truth_ids)

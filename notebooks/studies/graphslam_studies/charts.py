@@ -1,23 +1,23 @@
-"""The study ``charts``: in which coordinates local maps are consistent, and what that does to the maps joined of them.
+"""The study ``charts``: consistency of local maps in different parametrisations, and its effect on joined maps.
 
-A robot drives at random (the slow one in rows, like a lawn mower) through features whose identities are known; every
-run draws its own route, features and noise. Odometry is white, and stated as it is. Worlds differ in how much the
-heading drifts within a submap of 35 m: ``base``, ``good`` and ``poor`` sensors, ``slow`` (0.6 m/s), ``drift`` (exit
-heading uncertain by about 2.5°) and ``strong-drift`` (7°). In ``space`` and ``space-drift`` (exit rotation uncertain by
-about 6°) a robot flies through points (:mod:`graphslam_studies.sim.point_field`).
+A robot drives a random path (``slow``: in parallel rows) among features with known identities; route, features and
+noise are random in every run. Odometry noise is white, with the true covariance in the log. Worlds differ in heading
+drift within a submap of 35 m: ``base``, ``good`` and ``poor`` sensors, ``slow`` (0.6 m/s), ``drift`` (σ of the exit
+heading about 2.5°) and ``strong-drift`` (7°). In ``space`` and ``space-drift`` (σ of the exit rotation about 6°), a
+robot flies among points (:mod:`graphslam_studies.sim.point_field`).
 
 Quantities
 ----------
 Of local map k (``local``): ``local_joint_nees``, ``local_joint_nees_plain``, ``local_joint_dof``. Of a joined map:
-``nees`` and ``nees_plain`` of all poses and landmarks by degree of freedom, in the group chart and of the plain vector;
-``nees_ends`` of the ends of the submaps alone, in the group chart; ``rms`` of the poses [m]; ``objective_ratio``:
-objective of the joiner over that of the optimum of the same factors; ``exit_sigma``: median σ of the exit headings
-(in space of a component of the rotation) [deg]; ``failed``.
+``nees`` and ``nees_plain`` of all poses and landmarks per degree of freedom, in the group chart and as a plain vector;
+``nees_ends`` of the end poses of the submaps only, in the group chart; ``rms`` of the poses [m]; ``objective_ratio``:
+objective of the joined map over that of the optimum of the same factors; ``exit_sigma``: median σ of the exit headings
+(in 3-D: of one component of the rotation) [deg]; ``failed``.
 
-Algorithms: ``eif-tree``, ``eif-sequential``, both ``-classical``; ``batch``, which starts at the chain of the exits,
-that is from odometry alone, and ``eif-tree+polish``, which starts at the tree; ``batch-cartesian``: the optimum of the
-same maps, their residuals taken as plain vectors; ``unknown-eif-tree`` and its polish: nobody tells who is who, neither
-within the submaps nor between them.
+Algorithms: ``eif-tree``, ``eif-sequential``, both ``-classical``; ``batch``: optimum, started from the chained end
+poses, i.e. from odometry; ``eif-tree+polish``: optimum, started from the tree; ``batch-cartesian``: optimum of the
+same maps with Cartesian residuals; ``unknown-eif-tree`` and its polish: identities are unknown, both within submaps
+and between them.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from graphslam_studies.sim.point_field import PRESETS, PointFieldConfig, simulat
 
 RATE, SENSOR_RATE = 10.0, 2.0
 PARTICLES = 40
-"""Where identities are not told."""
+"""Number of particles if identities are unknown."""
 JOINED = ("eif-tree", "eif-tree-classical", "eif-sequential", "eif-sequential-classical")
 
 
@@ -64,7 +64,7 @@ class ChartConfig:
     Parameters
     ----------
     odometry : (3,)
-        σ of x, y [m] and heading [deg] in a tenth of a second.
+        σ of x, y [m] and heading [deg] per 0.1 s.
     sensor : (2,)
         σ of ranges [m] and bearings [deg].
     """
@@ -80,7 +80,7 @@ class ChartConfig:
 
 
 def drive(c: ChartConfig, rng: np.random.Generator) -> Array:
-    """True poses ``(n, 3)`` at the rate of the odometry: at random inside a box, or in rows."""
+    """True poses ``(n, 3)`` at the odometry rate: random turns around the origin, or parallel rows."""
     n, dt = round(c.seconds * RATE), 1.0 / RATE
     poses = np.zeros((n + 1, 3))
     if c.rows:
@@ -105,7 +105,7 @@ def drive(c: ChartConfig, rng: np.random.Generator) -> Array:
 
 
 def draw_log(c: ChartConfig, seed: SeedTree) -> SensorLog:
-    """A log with its truth; odometry states the noise that it has."""
+    """A random log with ground truth; its odometry covariance is the true one."""
     rng = seed.child("world").generator()
     poses = drive(c, rng)
     low, high = poses[:, :2].min(axis=0) - 12.0, poses[:, :2].max(axis=0) + 12.0
@@ -144,7 +144,7 @@ def draw_log(c: ChartConfig, seed: SeedTree) -> SensorLog:
 
 
 def run_trial(c: ChartConfig | PointFieldConfig, seed: int) -> list[Measurement]:
-    """All figures of one run (see the module)."""
+    """All metrics of one run (see the module)."""
     with one_blas_thread():
         return list(_trial_in_space(c, seed) if isinstance(c, PointFieldConfig) else _trial(c, SeedTree(seed)))
 
@@ -229,7 +229,7 @@ def _judged(
 
 
 def _objective(estimate: MapEstimate) -> float:
-    """Of the map as it is: that of the optimum where it was polished."""
+    """Objective of the map; that of the optimum if it was polished."""
     polished = estimate.objective_polished
     return estimate.objective if polished is None else polished
 
@@ -268,16 +268,16 @@ class ChartStudy(WorldsStudy[ChartConfig | PointFieldConfig]):
     run_one = staticmethod(run_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``local``: NEES of local maps by degree of freedom in both charts; ``joined``: means over the runs."""
+        """``local``: NEES per degree of freedom of local maps in both charts; ``joined``: means over the runs."""
         return {"local": local_table(table), "joined": joined_table(table)}
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Honesty of all runs."""
+        """NEES of all runs."""
         return draw_runs(table, {"nees": "joint NEES/dof, group chart"}, folder)
 
 
 def local_table(table: pd.DataFrame) -> pd.DataFrame:
-    """A row a world: maps, median σ of their exit headings, NEES by degree of freedom in both charts, 95 % bounds."""
+    """One row per world: maps, median σ of exit headings, NEES per degree of freedom in both charts, 95 % bounds."""
     out = []
     for world in table["world"].unique():
         own = table[table["world"] == world]
@@ -299,7 +299,7 @@ def local_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def joined_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Means over the runs, a row for each world and way of joining."""
+    """Means over the runs, one row per world and algorithm."""
     names = ["nees", "nees_plain", "nees_ends", "rms", "objective_ratio", "failed"]
     rows = table[table["quantity"].isin(names) & (table["submap"] == -1)]
     if rows.empty:

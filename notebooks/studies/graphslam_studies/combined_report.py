@@ -1,7 +1,7 @@
-"""Tables of the Combined SLAM study, from its tidy table.
+"""Tables of the Combined SLAM study, computed from its tidy table.
 
-The run is the unit: errors of one run hang together through its heading. Means are ruled by the worst run, so medians
-stand beside them; bounds are two-sided at 95 %.
+The run is the statistical unit, because errors within a run are correlated through its heading. Means depend strongly
+on the worst run, so medians are given too; bounds are two-sided at 95 %.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ GLOBAL = (
 )
 LOCAL = ("local-default", "local-ekf", "local-paper", "local-paper-1.0", "local-paper-inflated")
 JOINT_TARGET = {"A": (0.0, 1.05), "B": (0.0, 1.20), "C": (0.95, 1.02)}
-"""What joint feature NEES/n of the default maps at their optimum should lie in."""
+"""Target interval of the joint feature NEES/n of the default maps at their optimum."""
 
 
 def final(world: pd.DataFrame, algorithm: str, quantity: str) -> Array:
-    """Values ``(runs,)`` of a figure of whole runs, in order of run."""
+    """Values ``(runs,)`` of a metric of whole runs, in order of run."""
     rows = world[(world["algorithm"] == algorithm) & (world["quantity"] == quantity) & (world["submap"] < 0)]
     return rows.sort_values("run")["value"].to_numpy(dtype=np.float64)
 
 
 def online(world: pd.DataFrame, algorithm: str, quantity: str) -> pd.DataFrame:
-    """Runs × submaps."""
+    """Values after each submap, as runs × submaps."""
     rows = world[(world["algorithm"] == algorithm) & (world["quantity"] == quantity) & (world["submap"] >= 0)]
     return rows.pivot(index="run", columns="submap", values="value")
 
@@ -51,7 +51,7 @@ def mean_bounds(dof: float, units: int) -> tuple[float, float]:
 
 
 def local_maps(table: pd.DataFrame) -> pd.DataFrame:
-    """Honesty of local maps: every map is a unit of its own, since maps of a run use different data."""
+    """Consistency of local maps; each map is a unit, because the maps of a run use different data."""
     rows = []
     for world, t in _worlds(table):
         for name in LOCAL:
@@ -118,18 +118,18 @@ def global_maps(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _by_dof(world: pd.DataFrame, algorithm: str, quantity: str) -> float:
-    """Of whole maps, by degree of freedom, all runs together; NaN where a method keeps no joint Gaussian of its map."""
+    """Value per degree of freedom of whole maps, pooled over runs; NaN if a method has no joint Gaussian of its map."""
     value, dof = (final(world, algorithm, q) for q in (quantity, "map_dof"))
     return float(value.sum() / dof.sum()) if value.size else np.nan
 
 
 def online_consistency(table: pd.DataFrame, quantity: str = "pose_nees") -> pd.DataFrame:
-    """Mean pose CI along the run against the two-sided bounds of a mean over the runs.
+    """Mean pose CI along the run compared with the two-sided bounds of a mean over the runs.
 
     Parameters
     ----------
     quantity : str
-        ``pose_nees``, or ``pose_nees_tangent``: the same covariance, the error taken as a right perturbation.
+        ``pose_nees``, or ``pose_nees_tangent``: the same covariance, with the error as a right perturbation.
     """
     rows = []
     for world, t in _worlds(table):
@@ -166,7 +166,7 @@ def online_consistency(table: pd.DataFrame, quantity: str = "pose_nees") -> pd.D
 
 
 def paired(table: pd.DataFrame) -> pd.DataFrame:
-    """How one algorithm compares with another, run by run."""
+    """Paired comparison of algorithms, run by run."""
     pairs = (
         *(("rbpf", "ekf"), ("ekf-eif", "ekf"), ("rbpf-eif", "rbpf"), ("rbpf-eif", "ekf"), ("rbpf-eif", "ekf-eif")),
         *(("default-eif-tree", "default-eif-tree-classical"), ("default-eif", "default-eif-classical")),
@@ -210,7 +210,7 @@ def _common(t: pd.DataFrame, a: str, b: str, quantity: str) -> tuple[Array, Arra
 
 
 def agreement(table: pd.DataFrame) -> pd.DataFrame:
-    """Do all least-squares methods end at the same objective, and is the EKF join the sequential EIF?"""
+    """Whether all least-squares methods reach the same objective, and whether EKF join equals sequential EIF."""
     rows = []
     for world, t in _worlds(table):
         every = {a: final(t, a, "objective_optimum") for a in sorted(set(t["algorithm"])) if a.startswith("default")}
@@ -234,7 +234,7 @@ def agreement(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def targets(table: pd.DataFrame) -> pd.DataFrame:
-    """What the default is held to, and whether it does."""
+    """Targets for the default method, and whether they are met."""
     rows: list[dict[str, Any]] = []
 
     def add(world: str, what: str, value: float, low: float, high: float) -> None:
@@ -279,7 +279,7 @@ def targets(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def joining_times(timings: pd.DataFrame) -> pd.DataFrame:
-    """Seconds by part as in Table 1: median over runs. Taken while other trials ran: indicative."""
+    """Median time over runs by part [s], as in Table 1. Other trials ran in parallel, so it is only indicative."""
     rows = timings[(timings["submap"] < 0) & timings["quantity"].str.startswith("seconds_")]
     wide = rows.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", aggfunc="median")
     return wide.reset_index()

@@ -1,23 +1,23 @@
-"""The study ``combined-slam``: every algorithm of the second paper, and the honest defaults, on the same data.
+"""The study ``combined-slam``: all algorithms of the Combined SLAM paper, and the defaults, on the same data.
 
 Algorithms
 ----------
 ``ekf``, ``rbpf``: single-map filters. ``ekf-eif``, ``ekf-eif-tree``: EKF local maps joined by the information filter in
-sequence or by binary tree. ``rbpf-ekf``, ``rbpf-eif``, ``rbpf-eif-tree``: moment-matched particle maps (the paper's),
-joined by EKF, EIF in sequence (SS), EIF by tree (BS). ``default-…``: the same with the default, smoothed maps: in the
-group chart, and, ``…-classical``, as the paper joins.
+sequence or by binary tree. ``rbpf-ekf``, ``rbpf-eif``, ``rbpf-eif-tree``: moment-matched particle maps (as in the
+paper), joined by EKF, EIF in sequence (SS), EIF by tree (BS). ``default-…``: the same with the default, smoothed
+maps, in the group chart; ``…-classical``: joined as in the paper.
 ``…+polish``: the least-squares optimum of those maps. ``default-isam2``; ``default-online``: sequence with
-relinearisation at loop closures; ``default-optimum``: relinearised at every submap. ``full-batch``: no submaps at all.
-``local-…``: the local maps by themselves.
+relinearisation at loop closures; ``default-optimum``: relinearised at every submap. ``full-batch``: without submaps.
+``local-…``: the local maps only.
 
 Quantities
 ----------
-After submap k ≥ 0: ``pose_nees`` (3 degrees of freedom; of the plain vector x, y, θ as in the paper) and
+After submap k ≥ 0: ``pose_nees`` (3 degrees of freedom; of the vector x, y, θ as in the paper) and
 ``pose_nees_tangent`` (of the right perturbation ``Log(T_est⁻¹ T_true)``), ``error_*``, ``sigma_*``, and, after every
 ninth, ``feature_nees`` (mean over features, 2 degrees of freedom each) and ``feature_rms``. At the end (submap -1):
 ``pose_nees``, ``feature_nees``, ``feature_inside``, ``feature_joint_nees`` with ``feature_joint_dof``, ``feature_rms``,
 ``feature_median_error``, ``pose_rms``, ``heading_rms`` [rad], ``objective`` and ``objective_optimum``, ``diverged``; of
-joined maps ``map_nees`` (all ends and features together, in the group chart), ``map_nees_plain`` (of the plain vector)
+joined maps ``map_nees`` (all end poses and features jointly, in the group chart), ``map_nees_plain`` (as plain vector)
 and ``map_dof``.
 Of local map k: ``local_joint_nees`` with ``local_joint_dof``, ``local_pose_nees``, ``local_inside``, …
 """
@@ -38,7 +38,7 @@ from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.plots.study_figures import save_paper_figures
 from graphslam_studies.plots.study_growth import plot_growth_panels
 
-# Scans a submap, so that the route makes 126 submaps as in the paper: 35.4 m in A and C, 44.4 m in B.
+# Scans per submap, chosen for 126 submaps as in the paper: 35.4 m in A and C, 44.4 m in B.
 _WORLDS = {"A": TrialConfig("A", 59), "B": TrialConfig("B", 74), "C": TrialConfig("C", 59)}
 _QUICK = {"quick": TrialConfig("quick", 20)}
 

@@ -1,10 +1,10 @@
-"""One run of a world, from the SegMap to one graph: what each step towards a consistent map is worth.
+"""One run of a world, from the SegMap to one graph: the effect of each step towards a consistent map.
 
-Beside the filters' own figures (``rbpf-N``, ``segslam-N``: the likeliest map sample) the settled segments become a
-graph, named after what is in it: ``chain``, the exits alone; ``matches``, with the front end's entries into older maps;
-``ties``, with those along the segments too; ``loops``, also with those that were looked for between the submaps;
-``gps``, the same with fixes; ``clearest``, of such graphs of the settled chain and of map samples the one along whose
-path all scans are clearest. Every loop is decided on, and the decisions are held against the truth.
+Besides the metrics of the filters (``rbpf-N``; ``segslam-N``: the most likely map sample), graphs are built from the
+settled segments. ``chain``: exits only; ``matches``: with the matches of the front end to older maps; ``ties``: also
+with constraints along the segments; ``loops``: also with loop closures searched between submaps; ``gps``: the same with
+fixes; ``clearest``: of such graphs of the settled chain and of map samples, the one whose map has the least entropy.
+Accepted loop closures are compared with ground truth.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from graphslam_studies.montecarlo.worlds_study import WorldsStudy
 from graphslam_studies.segslam_trial import GridTrial, GridTrialConfig, Outcome
 
 RIGHT_DISTANCE, RIGHT_ANGLE = 0.8, 0.1
-"""A loop is right if it is off by less [m], [rad]: three σ of a good registration, and half a pillar's breadth."""
+"""Error limits of a right loop closure [m], [rad]: 3 σ of a good registration, half the width of a pillar."""
 
 
 GRAPHS = ("chain", "matches", "ties", "loops", "gps", "clearest")
@@ -51,46 +51,46 @@ GRAPHS = ("chain", "matches", "ties", "loops", "gps", "clearest")
 
 @dataclass(frozen=True, kw_only=True)
 class FixConfig:
-    """Fixes of the graph ``gps``, drawn from the true path: white, in a frame of their own."""
+    """Simulated fixes of the graph ``gps``: true path with white noise, in their own frame."""
 
     period: float = 2.0
     """[s]"""
     sigma: float = 1.0
-    """Of every coordinate [m]."""
+    """σ of every coordinate [m]."""
     lever: tuple[float, float, float] = (0.3, 0.0, 0.6)
     """Antenna in the base frame [m]."""
     heading: float = 0.7
-    """Of the first base in the frame of the fixes [rad]."""
+    """Heading of the first base in the frame of the fixes [rad]."""
     start: tuple[float, float, float] = (250.0, -40.0, 12.0)
-    """Its position there [m]."""
+    """Position of the first antenna in that frame [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraphTrialConfig:
-    """A world with its filters, and how the graph is made."""
+    """A world with its filters, and settings of the graph."""
 
     grid: GridTrialConfig
-    """World, robot, steps, filters; the graph is that of its last SegSLAM."""
+    """World, robot, steps, filters; each SegSLAM result becomes a graph."""
     spacing: float = 3.0
-    """Between nodes [m]."""
+    """Distance between nodes [m]."""
     level_sigma: float = 0.006
-    """Of a levelled base, as the exits assume it [rad]."""
+    """σ of roll and pitch of a levelled base, as in the exits [rad]."""
     find: FindConfig = field(default_factory=lambda: FindConfig(front_end=True))
-    """How loops are looked for and decided on."""
+    """Search and selection of loop closures."""
     samples: int = 8
-    """Map samples that become graphs beside the settled chain."""
+    """Number of map samples that become graphs besides the settled chain."""
     fixes: FixConfig = field(default_factory=FixConfig)
 
 
 def run_graph_trial(config: GraphTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run."""
+    """All metrics of one run."""
     with one_blas_thread():
         return list(GraphTrial(config.grid, seed, graph=config).run())
 
 
 @dataclass(frozen=True)
 class BuiltGraph:
-    """A graph, its solution, and how its loops were decided (None: it has none)."""
+    """A graph, its solution, and its loop closer (None: no loops)."""
 
     graph: FactorGraph
     solution: Solution
@@ -100,12 +100,12 @@ class BuiltGraph:
 
 @dataclass
 class GraphTrial(GridTrial):
-    """The filters of a run, and the graph of what the last SegSLAM settled."""
+    """The filters of a run, and the graphs of the settled segments of SegSLAM."""
 
     graph: GraphTrialConfig = field(kw_only=True)
 
     def figures(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
-        """Those of the filters; after the last SegSLAM those of its graphs."""
+        """Metrics of an algorithm; for SegSLAM also those of its graphs."""
         yield from super().figures(name, outcome)
         result = outcome.result
         if not isinstance(result, SegSlamResult):
@@ -125,7 +125,7 @@ class GraphTrial(GridTrial):
     # ---------------------------------------------------------------- graphs
 
     def submaps(self, result: SegSlamResult) -> list[Submap]:
-        """The settled chain of the likeliest particle, with maps."""
+        """Submaps of the settled chain of the most likely particle, with maps."""
         segmap = result.segmap
         chain = common_ancestor_chain(segmap, int(result.closed[result.best]))
         return submaps_of_segments(segmap, chain, drift_by_path(segmap, chain, self.config.drift, result.steps))
@@ -139,7 +139,7 @@ class GraphTrial(GridTrial):
         solver = BatchSolver(graph)
         solver.solve_to_optimum()
         closer = None
-        if kind == "gps":  # what fixes say is known when loops are looked for
+        if kind == "gps":  # fixes are used before the search for loops
             graph.add_sensor(self.fixes(submaps[0].dim))
             graph.finish_sensors()
             solver.solve_to_optimum()
@@ -150,7 +150,7 @@ class GraphTrial(GridTrial):
         return BuiltGraph(graph, solver.solution(), closer, perf_counter() - begin)
 
     def clearest(self, result: SegSlamResult, submaps: Sequence[Submap], loops: BuiltGraph) -> BuiltGraph:
-        """Of graphs with all loops, that of the settled chain and those of map samples, the one of least entropy."""
+        """The graph with the least entropy among those of the settled chain and of map samples, with all loops."""
         segmap = result.segmap
         found = [loops]
         chains = {tuple(int(s.report["segment"]) for s in submaps)}
@@ -171,13 +171,13 @@ class GraphTrial(GridTrial):
         return replace(best, seconds=seconds)
 
     def clarity(self, built: BuiltGraph) -> MapEntropy:
-        """Of all scans along the path of a graph."""
+        """Entropy of the map of all scans along the path of a graph."""
         at = built.solution.trajectory().interpolate(self.steps.times)
         model = self.config.filter.beam_model()
         return judge.clarity(self.steps, at, voxel_size=0.2, model=model, count=self.config.placements)
 
     def fixes(self, dim: int) -> Gps:
-        """Fixes along the true path."""
+        """Simulated fixes along the true path."""
         c, t = self.graph.fixes, self.steps.times
         times = np.arange(t[0] + c.period, t[-1], c.period)
         body = self._truth_at(times)
@@ -191,7 +191,7 @@ class GraphTrial(GridTrial):
         return Gps(times=times, positions=start + z + c.sigma * noise, sigma=np.full(len(z), c.sigma), lever=lever)
 
     def graph_figures(self, kind: str, result: SegSlamResult, built: BuiltGraph) -> Iterator[Measurement]:
-        """Errors and honesty of the full-rate path, entropy of the scans along it, decisions against the truth."""
+        """Errors and NEES of the full-rate path, entropy of the scans along it, correctness of loop closures."""
         path = built.solution.trajectory()
         e = judge.path_errors(path, self._truth_at(path.times))
         yield Measurement(kind, "final_error", e.final)
@@ -216,10 +216,10 @@ class GraphTrial(GridTrial):
             yield from self._decisions(kind, built.graph, built.closer)
 
     def node_nees(self, result: SegSlamResult, built: BuiltGraph) -> Mapping[str, Array]:
-        """Squared errors of the body at the nodes in units of the graph's covariance, a degree of freedom ``(m,)``.
+        """NEES per degree of freedom ``(m,)`` of the body poses at the nodes, with the covariance of the graph.
 
-        The frame of the first base is the true one: level, and as low as maps are begun. ``pose``: position and
-        heading together; what gravity shows of roll and pitch is in ``level``.
+        Frame: the true first base, levelled and lowered as at the start of a map. ``pose``: position and heading;
+        ``level``: roll and pitch.
         """
         path = built.solution.trajectory()
         node_times = np.unique(np.concatenate([np.asarray(s.times) for s in built.graph.submaps]))[1:]
@@ -260,7 +260,7 @@ class GraphTrial(GridTrial):
 
 
 def is_right(loop: Loop, truth: Array) -> bool:
-    """Whether a loop says what is true of its places, whose true bodies are ``truth (n, 7|3)``; not of their tilt."""
+    """Whether the relative pose of a loop is right, given true body poses ``(n, 7|3)``; roll and pitch are ignored."""
     g = group_of(truth)
     error = g.between(g.between(truth[loop.i], truth[loop.j]), loop.T_ij)
     turned = abs(float(heading_of(error)))
@@ -268,6 +268,6 @@ def is_right(loop: Loop, truth: Array) -> bool:
 
 
 class GraphStudy(WorldsStudy[GraphTrialConfig]):
-    """A study of graphs: as of grids, with trials of their own."""
+    """Base of studies of graphs."""
 
     run_one = staticmethod(run_graph_trial)

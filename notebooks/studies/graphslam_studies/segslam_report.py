@@ -1,7 +1,7 @@
-"""Tables of the studies of grid front ends: errors by particles, run times, honesty of exits, loops, entropies.
+"""Tables of the studies of grid front ends: errors by particles, run times, consistency of exits, loops, entropies.
 
-Every table is made of the tidy one of a study (``world, run, algorithm, submap, quantity, value``). Intervals are of
-95 %: Student's for means, Clopper and Pearson's for shares, a bootstrap over the runs for ratios and for NEES.
+Input is the tidy table of a study (``world, run, algorithm, submap, quantity, value``). Intervals are 95 %: Student for
+means, Clopper–Pearson for shares, bootstrap over the runs for ratios and NEES.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ PAPER_SECONDS: Mapping[str, float] = {
     "rbpf-1": 2.6, "rbpf-5": 11.0, "rbpf-10": 22.0, "rbpf-20": 47.0, "rbpf-40": 98.0, "rbpf-100": 280.0,
     "segslam-1": 4.2, "segslam-5": 13.0, "segslam-10": 26.0, "segslam-20": 41.0, "segslam-40": 83.0,
 }  # fmt: skip
-"""Table III: run time [s] on the paper's computer."""
+"""Table III of the paper: run time on its computer [s]."""
 PAPER_ENTROPY: Mapping[str, float] = {"segslam-40": 10_755.0, "rbpf": 13_561.0}
-"""Of the paper's building: SegSLAM with 40 particles, and the best RBPF; another building, so only the ratio counts."""
+"""Entropy in the building of the paper: SegSLAM with 40 particles, and best RBPF; only their ratio is comparable."""
 GOOD = 1.5
-"""A run whose final error is below this closed its loop [m]."""
+"""A run with a smaller final error counts as loop closed [m]."""
 COVARIANCES = {
     "exit_nees": "particles + drift",
     "exit_nees_stated": "particles + stated motion",
@@ -43,14 +43,14 @@ COVARIANCES = {
 
 
 def values(table: pd.DataFrame, world: str, algorithm: str, quantity: str) -> Array:
-    """One figure of every run ``(n,)``, in the order of the runs."""
+    """One metric of every run ``(n,)``, in the order of the runs."""
     rows = whole(table, quantity)
     rows = rows[(rows["world"] == world) & (rows["algorithm"] == algorithm)].sort_values("run")
     return np.asarray(rows["value"], dtype=np.float64)
 
 
 def cases(table: pd.DataFrame) -> Iterable[tuple[str, str]]:
-    """World and algorithm of all that ran, worlds and algorithms as they come."""
+    """Pairs of world and algorithm, in the order of the table."""
     rows = table[table["quantity"] == "failed"]
     yield from dict.fromkeys(zip(rows["world"].astype(str), rows["algorithm"].astype(str)))
 
@@ -67,9 +67,9 @@ def _mean(v: Array, name: str) -> Row:
 
 
 def error_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Table II: error at the end by algorithm and particles, beside the paper's; and the share of runs below `GOOD`.
+    """Table II: final error by algorithm and particles, with values of the paper; and the share of runs below `GOOD`.
 
-    A run that gave up counts as one that did not close, and has no error.
+    A failed run counts as not closed, and has no error.
     """
     out: list[Row] = []
     for world, name in cases(table):
@@ -96,7 +96,7 @@ def error_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def ratio_table(table: pd.DataFrame, quantity: str = "final_error") -> pd.DataFrame:
-    """Ratio of the means of SegSLAM and RBPF with as many particles, over the runs that both finished."""
+    """Ratio of the means of SegSLAM and RBPF with equal numbers of particles, over the runs that both finished."""
     out: list[Row] = []
     names = list(cases(table))
     rows = whole(table, quantity)
@@ -118,7 +118,7 @@ def ratio_table(table: pd.DataFrame, quantity: str = "final_error") -> pd.DataFr
 
 
 def time_table(table: pd.DataFrame, timings: pd.DataFrame) -> pd.DataFrame:
-    """Table III: run times [s] (mean, and least, which other load on the machine disturbs least), and their ratio."""
+    """Table III: run times [s], mean and minimum (least affected by other load on the machine), and their ratio."""
     out: list[Row] = []
     for world in dict.fromkeys(table["world"].astype(str)):
         recorded = values(table, world, "all", "seconds_recorded")
@@ -143,10 +143,10 @@ def time_table(table: pd.DataFrame, timings: pd.DataFrame) -> pd.DataFrame:
 
 
 def nees_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Honesty of the segments' exits by covariance: mean NEES per degree of freedom, 1 if consistent.
+    """Consistency of segment exits by covariance model: mean NEES per degree of freedom, 1 if consistent.
 
-    ``low … high``: bounds of the mean over the runs, whose segments hang together. ``honest_low … honest_high``: where
-    the mean of as many independent honest ones lies. ``inside``: share in the 95 % region, over all segments.
+    ``low … high``: interval of the mean; segments of a run are treated as correlated. ``honest_low … honest_high``:
+    bounds of this mean for independent, consistent exits. ``inside``: share in the 95 % region, over all segments.
     """
     out: list[Row] = []
     for world, name in cases(table):
@@ -171,7 +171,7 @@ def nees_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def exit_table(table: pd.DataFrame) -> pd.DataFrame:
-    """RMS errors of the segments' exits: heading [rad], each of x and y [m], z [m]; and the mean length [m]."""
+    """RMS errors of segment exits: heading [rad], per axis in x, y [m], z [m]; and mean length [m]."""
     out: list[Row] = []
     for world, name in cases(table):
         of = table[(table["world"] == world) & (table["algorithm"] == name) & (table["submap"] >= 0)]
@@ -186,7 +186,7 @@ def exit_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def match_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Entries into older maps, those that were false, and how far off the others were; segments a run."""
+    """Matches with older maps: number, false ones, median error of the others; intervals per run."""
     out: list[Row] = []
     for world, name in cases(table):
         matches, false = (values(table, world, name, q) for q in ("matches", "false_matches"))
@@ -209,7 +209,7 @@ def match_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def means_table(table: pd.DataFrame, quantities: Iterable[str]) -> pd.DataFrame:
-    """Mean of figures with Student's interval, a row for each world and algorithm."""
+    """Means of metrics with Student's interval, one row per world and algorithm."""
     out: list[Row] = []
     for world, name in cases(table):
         row: Row = {"world": world, "algorithm": name, "runs": len(values(table, world, name, "failed"))}
@@ -222,14 +222,14 @@ def means_table(table: pd.DataFrame, quantities: Iterable[str]) -> pd.DataFrame:
 
 
 def seconds_table(timings: pd.DataFrame) -> pd.DataFrame:
-    """Mean wall time of every part [s]."""
+    """Mean time of every part [s]."""
     rows = timings[timings["submap"] == -1]
     wide = rows.groupby(["world", "algorithm", "quantity"], sort=False)["value"].mean().unstack("quantity")
     return wide.reset_index()
 
 
 def loop_table(table: pd.DataFrame, timings: pd.DataFrame) -> pd.DataFrame:
-    """Loops: closed ones, runs that closed all, runs that merged none of the parallel stretches, runs that did both.
+    """Loops: closed ones, runs that closed all, runs that merged no parallel sections, runs that did both.
 
     ``cost_growth``: time of a step in the last quarter of the run over that in the first.
     """
@@ -259,9 +259,9 @@ def loop_table(table: pd.DataFrame, timings: pd.DataFrame) -> pd.DataFrame:
 
 
 def entropy_table(table: pd.DataFrame, champion: str = "segslam-40") -> pd.DataFrame:
-    """Least entropy over the map samples of a run [nat m³], and the champion's over it, run by run.
+    """Minimum entropy over the map samples of a run [nat m³], and ratio of the means of the champion and of this one.
 
-    ``ratio`` below one: the champion's map is clearer. ``paper_ratio`` is that of its building and of its best RBPF.
+    ``ratio`` below 1: the map of the champion has less entropy. ``paper_ratio``: SegSLAM over best RBPF in the paper.
     """
     out: list[Row] = []
     rows = whole(table, "entropy_min")

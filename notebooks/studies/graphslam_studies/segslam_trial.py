@@ -1,7 +1,7 @@
-"""One run of a world for grid front ends: the log, its steps, every algorithm on them, and all figures.
+"""One run of a world for grid front ends: the log, its steps, every algorithm on them, and all metrics.
 
-Algorithms are named ``dead-reckoning``, ``rbpf-N`` and ``segslam-N`` with N particles. They read the same steps; their
-filters have the same noise, beams and weights.
+Algorithms are ``dead-reckoning``, ``rbpf-N`` and ``segslam-N`` with N particles. All use the same steps; the two
+filters have their own settings (:class:`GridTrialConfig`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from graphslam_studies.montecarlo.worlds_study import WorldsStudy
 Figure = Literal["matches", "exits", "entropy", "loops", "legs", "path", "climbs"]
 DEAD_RECKONING = "dead-reckoning"
 PATH_POINTS = 100
-"""Points of a path that are kept for the picture."""
+"""Number of path points that are stored for the plot."""
 
 
 def family_of(algorithm: str) -> tuple[str, int]:
@@ -65,7 +65,7 @@ def family_of(algorithm: str) -> tuple[str, int]:
 
 
 def drawn_algorithm(names: Iterable[str]) -> str | None:
-    """Whose path is kept for the picture: the last SegSLAM of at most 20 particles, else the last; or None."""
+    """Algorithm whose path is stored for the plot: last SegSLAM with ≤ 20 particles, else last SegSLAM, or None."""
     found = [a for a in names if family_of(a)[0] == "segslam"]
     found = [a for a in found if family_of(a)[1] <= 20] or found
     return found[-1] if found else None
@@ -73,36 +73,36 @@ def drawn_algorithm(names: Iterable[str]) -> str | None:
 
 @dataclass(frozen=True, kw_only=True)
 class GridTrialConfig:
-    """A world, who is compared in it, and what is measured."""
+    """A world, the algorithms compared in it, and the metrics."""
 
     world: str
-    """``garage``, ``mine``, ``building``; ``court``, the small one."""
+    """``garage``, ``mine``, ``building``, or the small ``court``."""
     layout: str | None = None
-    """Of the world; ``drawn``: drawn anew in each run."""
+    """Layout of the world; ``drawn``: random in each run."""
     algorithms: tuple[str, ...] = (DEAD_RECKONING,)
-    """In the order in which they run."""
+    """Algorithms in run order."""
     figures: tuple[Figure, ...] = ()
-    """What is measured beside the errors of the path and the times."""
+    """Metrics besides path errors and times."""
     samples: int = 1
-    """Map samples, or particles of a filter, whose entropy is taken at most."""
+    """Maximum number of map samples, or particles, whose entropy is computed."""
     placements: int = 1
-    """Ways in which the grid of each stands (see :func:`~graphslam_studies.evaluate.segslam_judge.clarity`)."""
+    """Number of grid placements per entropy (see :func:`~graphslam_studies.evaluate.segslam_judge.clarity`)."""
     crawler: CrawlerConfig = field(default_factory=CrawlerConfig)
-    """The robot."""
+    """Settings of the robot."""
     speed: float = 1.0
-    """Its speed by that of the world's robot."""
+    """Factor on the speed of the robot in the world."""
     steps: StepConfig = field(default_factory=lambda: StepConfig(max_range=25.0))
-    """How its log becomes steps."""
+    """Conversion of its log to steps."""
     filter: GridFilterConfig = field(default_factory=GridFilterConfig)
-    """Of the RBPF; the number of particles is the algorithm's."""
+    """Filter of the RBPF; the number of particles is that of the algorithm."""
     segslam_filter: GridFilterConfig = field(default_factory=lambda: GridFilterConfig(walk_scale=0.5))
-    """Of SegSLAM: each family has the noise that suits it."""
+    """Filter of SegSLAM; each family has its own tuned noise."""
     segslam: SegSlamConfig = field(default_factory=SegSlamConfig)
-    """What SegSLAM adds."""
+    """Further settings of SegSLAM."""
     drift: FilterDrift = field(default_factory=FilterDrift)
-    """In the covariance of exits of SegSLAM."""
+    """Drift in the exit covariance of SegSLAM."""
     rbpf_drift: DriftModel = field(default_factory=DriftModel)
-    """The same of an RBPF, whose errors that are passed on are those of ``drift``."""
+    """Drift in the end-pose covariance of an RBPF."""
 
     def __post_init__(self) -> None:
         for name in self.algorithms:
@@ -111,7 +111,7 @@ class GridTrialConfig:
             raise ConfigError("trial of grids: an algorithm is repeated, or no sample or placement is wanted")
 
     def make_world(self, seed: int) -> World:
-        """The world of a seed, which moves what can be moved in it."""
+        """World of a seed; the seed determines its random parts."""
         layout = self.layout
         if layout == "drawn":
             layout = f"{DRAWN}{1 + int(SeedTree(seed).child('layout').generator().integers(10**9))}"
@@ -120,14 +120,14 @@ class GridTrialConfig:
 
 
 def run_trial(config: GridTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run."""
+    """All metrics of one run."""
     with one_blas_thread():
         return list(GridTrial(config, seed).run())
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an algorithm came to."""
+    """Result of an algorithm."""
 
     path: Trajectory
     final_pose: Array
@@ -137,7 +137,7 @@ class Outcome:
 
 @dataclass
 class GridTrial:
-    """The steps of one run, and every algorithm on them."""
+    """Steps of one run, and all algorithms on them."""
 
     config: GridTrialConfig
     seed: int
@@ -146,7 +146,7 @@ class GridTrial:
     truth: Array = field(init=False)
     """True poses at the steps ``(n, 7)``."""
     arc: Array = field(init=False)
-    """Arc length of the way at the steps ``(n,)`` [m]."""
+    """Arc length of the true path at the steps ``(n,)`` [m]."""
     seconds_steps: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -160,7 +160,7 @@ class GridTrial:
         self.arc = judge.steps_of_way(self.steps.truth, self.steps.times, self.world.route().length)
 
     def run(self) -> Iterator[Measurement]:
-        """Every algorithm in turn; one that gives up has the figure ``failed`` 1 and no other."""
+        """Metrics of every algorithm; if one fails with an error, only ``failed`` = 1."""
         yield Measurement("all", "seconds_steps", self.seconds_steps, timing=True)
         yield Measurement("all", "seconds_recorded", float(self.steps.times[-1] - self.steps.times[0]))
         yield Measurement("all", "path_length", float(self.steps.path_length[-1]))
@@ -176,7 +176,7 @@ class GridTrial:
     # ---------------------------------------------------------------- algorithms
 
     def outcome(self, name: str) -> Outcome:
-        """An algorithm on the steps. The seed of a filter is that of the run: all algorithms have the same."""
+        """Run one algorithm on the steps. The filter seed depends on the run and the family only."""
         family, particles = family_of(name)
         if family == DEAD_RECKONING:
             path = judge.dead_reckoned(self.steps)
@@ -198,7 +198,7 @@ class GridTrial:
     # ---------------------------------------------------------------- figures
 
     def figures(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
-        """All figures of one algorithm."""
+        """All metrics of one algorithm."""
         wanted, result = self.config.figures, outcome.result
         e = judge.path_errors(outcome.path, self.truth, outcome.final_pose)
         yield Measurement(name, "final_error", e.final)
@@ -233,7 +233,7 @@ class GridTrial:
             yield from self._end(name, result)
 
     def leg_angle(self, poses: Array) -> float:
-        """How far straight pieces of the way on different levels are from parallel, along poses at the steps [rad]."""
+        """Error of the angles between straight path sections on different levels, for poses at the steps [rad]."""
         pieces = judge.legs(self.world.route(), self.arc, 10.0 if self.config.world != "court" else 4.0)
         return judge.leg_angle_error(poses, self.truth, pieces)
 
@@ -263,7 +263,7 @@ class GridTrial:
         yield Measurement(name, "exit_dof", e.default.dof)
 
     def _end(self, name: str, result: RbpfResult) -> Iterator[Measurement]:
-        """The one exit of a filter over the whole way."""
+        """Metrics of the end pose of a filter over the whole path."""
         c = self.config
         submap = rbpf_submap(result, c.rbpf_drift, steps=self.steps, passed=PASSED)
         e = judge.end_errors(submap, self.truth)
@@ -274,7 +274,7 @@ class GridTrial:
         yield Measurement(name, "exit_dof", e[""].dof)
 
     def _climbs(self, name: str, path: Trajectory) -> Iterator[Measurement]:
-        """Climbs of the ramps up and down apart, mean error of a run; what is left of the path seen from above."""
+        """Mean errors of the climb of ramps, separately up and down; errors in height, in the plane and in heading."""
         found = judge.climbs(path.poses, self.truth)
         for way, of in (("up", found.true > 0), ("down", found.true < 0)):
             if of.any():
@@ -287,7 +287,7 @@ class GridTrial:
         yield Measurement(name, "heading_rms", heading_error(path, Trajectory(path.times, self.truth)))
 
     def _entropy(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
-        """Entropy of the scans fused along map samples, or along particles' own paths, the best first."""
+        """Entropy of the map of all scans along map samples, or along particles' paths, the best particle first."""
         found = []
         for poses in self._hypotheses(outcome):
             model = self.config.filter.beam_model()
@@ -312,7 +312,7 @@ class GridTrial:
             yield outcome.path.poses
 
     def _loops(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
-        """Places visited twice: where each ends to be one, is it known to be the same?"""
+        """Errors between first and second visit of a place; a loop is closed if the error is small."""
         closed = []
         for k, r in enumerate(self.world.meta["revisits"]):
             first, again = (judge.nearest(self.arc, float(r[which][1])) for which in ("first", "again"))
@@ -328,7 +328,7 @@ class GridTrial:
         yield Measurement(name, "all_closed", float(all(closed)))
 
     def _path(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
-        """Points of the path seen from above, with the number of the segment each is in; and of the truth."""
+        """Path points x, y with the number of their segment; and the true ones."""
         at = np.unique(np.linspace(0, len(self.steps) - 1, PATH_POINTS).astype(np.int64))
         segment: npt.NDArray[np.int64] = np.zeros(len(at), dtype=np.int64)
         if isinstance(outcome.result, SegSlamResult):
@@ -349,7 +349,7 @@ class GridStudy(WorldsStudy[GridTrialConfig]):
 
 
 LEVEL = StepConfig(max_range=25.0, level_floors=True)
-"""Garages and buildings: their floors are level on the whole, so that gravity's lasting error shows in the median."""
+"""For garages and buildings: floors are level on average, so the median tilt shows the constant gravity error."""
 QUICK = GridTrialConfig(
     world="court",
     crawler=CrawlerConfig(drift=0.08, max_range=8.0),
@@ -363,4 +363,4 @@ QUICK = GridTrialConfig(
         choice=ChoiceConfig(every=2.0),
     ),
 )
-"""The small world: segments of some metres, and a loop of 37 m."""
+"""The small world: segments of a few metres, and a loop of 37 m."""

@@ -1,25 +1,25 @@
-"""The study ``terrain-drives``: drives in closed loop. A robot plans on the map that it makes, drives, and plans anew.
+"""The study ``terrain-drives``: closed-loop drives. A robot plans a path on its own map, drives, and plans again.
 
-Every trial draws a street with one target, half of them with a passage through what reaches across, and drives through
-it with each of five maps, from the same seed of all errors:
+Every trial has a random street with one target and drives through it with each of five maps and the same random errors.
+In half of the streets, a target across the full width has a passage. Maps:
 
-* ``bands``: a map a range band; as fast as falls can be seen, and as the known way ahead is long;
+* ``bands``: one map per range band; speed limited by the detection range of falls and by the known free path ahead;
 * ``bands, no bound``: the same map, always 1 m/s;
-* ``one grid, learnt``: one grid of 0.2 m with the same learnt weights, all ranges added, with both bounds;
-* ``one grid, OctoMap``: one grid of 0.2 m, +0.85 for a hit and −0.4 for a miss, with both bounds;
+* ``one grid, learnt``: one grid of 0.2 m with the same learnt weights, all ranges added, with both speed limits;
+* ``one grid, OctoMap``: one grid of 0.2 m, log-odds +0.85 for a hit and −0.4 for a miss, with both limits;
 * ``one grid, equal``: the same with ±0.4.
 
-Twice a second the robot reads the lines measured so far and plans the cheapest way to a line 6 m behind the target;
-what it decides takes effect half a second later. A drive ends at the goal, at the first harm, after it stood still for
-7 s for want of a way, or after 90 s.
+The robot adds the lines measured so far and plans the cheapest path to a line 6 m behind the target, once per reaction
+time; a command takes effect one reaction time later. A drive ends at the goal, at the first harm, after standing still
+for 7 s, or after 90 s.
 
 Quantities
 ----------
 ``fall``, ``curb``, ``crash``, ``steep``: 1 if a circle as wide as the vehicle touched a fall, a step up, an obstacle,
-or ground that is too steep. ``arrived``; ``way``: 1 if there is one in truth; ``right``: 1 if it arrived where there is
-a way, or stood still unharmed where there is none. ``coverage``: share of the free lane 0.8–8 m ahead, within ±60°,
-that was known, mean over plans. ``speed``: mean while it had a way [m/s]. ``detour``: of those that arrived, length
-driven over that of the best way on a map of the truth; ``cost``: the same of the costs of both ways on that map.
+or ground that is too steep. ``arrived``; ``way``: 1 if a path exists on the true map; ``right``: 1 if it arrived and a
+path exists, or did not arrive, without harm, and none exists. ``coverage``: known share of the free lane 0.8–8 m ahead,
+within ±60°, mean over plans. ``speed``: mean while there was a plan [m/s]. ``detour``: if arrived, length driven over
+the length of the best path on the true map; ``cost``: ratio of the costs of these paths on that map.
 """
 
 from __future__ import annotations
@@ -72,26 +72,26 @@ from graphslam_studies.terrain_trial import (
 FIXED = {"one grid, OctoMap": (0.85, 0.4), "one grid, equal": (0.4, 0.4)}
 """Maps with fixed weights: log-odds of a hit and of a miss."""
 CLOSING = 2
-"""Bands whose hazards close ways: those with cells narrower than half the vehicle."""
+"""Number of bands whose hazards block paths: those with cells narrower than half the vehicle."""
 HARMS = ("fall", "curb", "crash", "steep")
 PATIENCE = 7.0
-"""A drive that stood still for so long ends: three sweeps, and a plan [s]."""
+"""A drive ends after standing still for this time: three sweeps and one plan [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DriveTrialConfig:
-    """What is driven through, and how."""
+    """Settings of the drives."""
 
     maps: tuple[str, ...] = ("bands", "bands, no bound", "one grid, learnt", *FIXED)
     targets: tuple[str, ...] = tuple(TARGETS)
     fastest: float = 1.0
     """[m/s]"""
     begin: float = 8.0
-    """It starts so far before the target [m]."""
+    """Start distance before the target [m]."""
     beyond: float = 6.0
-    """The goal lies so far behind where the target begins [m]."""
+    """Distance of the goal behind the beginning of the target [m]."""
     spare: float = 0.1
-    """Added to either side of the vehicle when it plans: errors of the pose and of cells [m]."""
+    """Safety margin on either side of the vehicle when planning, for errors of pose and cells [m]."""
     longest: float = 90.0
     """[s]"""
     trial: TerrainTrialConfig = field(default_factory=TerrainTrialConfig)
@@ -99,7 +99,7 @@ class DriveTrialConfig:
 
 @dataclass(frozen=True)
 class Course:
-    """A street to drive through, and what is true of it."""
+    """A street with its ground truth."""
 
     street: Street
     start: Array
@@ -108,9 +108,9 @@ class Course:
     hazards: dict[str, Array]
     """Distance to the nearest hazard of each kind, on cells of 0.05 m [m]."""
     best: PlannedPath | None
-    """Way over a map of the truth."""
+    """Best path on the true map."""
     costs: CostMap
-    """Of the truth."""
+    """Costs of the true map."""
     free_lane: Mask
     """Free cells of 0.1 m in the lane."""
 
@@ -142,19 +142,19 @@ def draw_course(seed: int, config: DriveTrialConfig) -> Course:
 
 
 def _closes(street: Street, v: Vehicle) -> bool:
-    """Whether a curb, stairs, a drop or a ramp reaches across the street, which the vehicle does not drive."""
+    """Whether a curb, stairs, a drop or a ramp across the street is not drivable for the vehicle."""
     f = street.figures
     step = street.kind in ("curb", "stairs") and abs(f["height"]) > v.climbable_step
     return step or (street.kind == "ramp" and abs(math.radians(f["angle"])) > v.max_slope)
 
 
 def _near(mask: Mask) -> Mask:
-    """Cells of a mask and their neighbours."""
+    """A mask dilated by its neighbouring cells."""
     return np.asarray(distance_transform_edt(~mask) < 2.0) if mask.any() else mask
 
 
 def _plain_map(origin: Array, cell: float, classes: npt.NDArray[np.int8]) -> TerrainMap:
-    """A map of classes that are certain."""
+    """A terrain map with certain classes."""
     known = classes != TerrainClass.UNKNOWN
     p = np.where(known, (classes > TerrainClass.ABOVE_REACH).astype(np.float64), np.nan)
     nothing, nowhere = np.full(p.shape, np.nan), np.zeros(p.shape, np.bool_)
@@ -162,14 +162,14 @@ def _plain_map(origin: Array, cell: float, classes: npt.NDArray[np.int8]) -> Ter
 
 
 class Navigator:
-    """A map of the trial, and the way over it.
+    """One of the compared maps, and path planning on it.
 
     Parameters
     ----------
     name : str
-        Of the map, see the module.
+        Name of the map, see the module.
     start : (2,)
-        There the robot stands: what is under it is free.
+        Start position [m]; the ground under the robot is assumed free.
     """
 
     def __init__(self, name: str, config: DriveTrialConfig, start: Array) -> None:
@@ -193,7 +193,7 @@ class Navigator:
             self.fixed.add(rows)
 
     def plan(self, place: Array, goal: float) -> Command | None:
-        """Way from a place to the goal and the speed on it; None where there is none."""
+        """Path from a place to the goal and its speed; None if there is no path."""
         found = self._map()
         x, y = found.centres()
         under = np.hypot(x[None] - self.start[0], y[:, None] - self.start[1]) < 1.5
@@ -221,7 +221,7 @@ class Navigator:
         return _plain_map(np.array(BOX[:2]), CELLS[0], classes)
 
     def _speed(self, way: Array, found: TerrainMap) -> float:
-        """As fast as falls are seen, and as it can stop where known ground ends or a fall is not excluded."""
+        """Speed limit [m/s]: detection range of falls, and stopping before unknown ground or possible falls."""
         sure = found.known & ~found.provisional
         sure = binary_closing(sure, np.ones((3, 3), np.bool_), border_value=0) | sure
         room = distance_transform_edt(sure) * found.cell
@@ -234,13 +234,13 @@ class Navigator:
 
 
 def _plan(costs: CostMap, place: Array, goal: float) -> PlannedPath | None:
-    """Way to the line x = ``goal``."""
+    """Cheapest path to the line x = ``goal``."""
     y = costs.origin[1] + costs.cell * (np.arange(len(costs.cost)) + 0.5)
     return plan_vehicle_path(costs, place, np.column_stack([np.full(len(y), goal), y]))
 
 
 def _smooth(points: Array, costs: CostMap) -> Array:
-    """Corners of a way from cell to cell rounded, as far as that leads through no closed cell."""
+    """Smooth a cell path by a moving average, unless the result crosses a blocked cell."""
     for reach in (3, 1):
         k = 2 * reach + 1
         ends = np.repeat(points[:1], reach, 0), np.repeat(points[-1:], reach, 0)
@@ -253,7 +253,7 @@ def _smooth(points: Array, costs: CostMap) -> Array:
 
 
 def run_drive_trial(config: DriveTrialConfig, seed: int) -> Iterator[Measurement]:
-    """Drive through the street of a seed with each map; see the module for what is measured."""
+    """Drive through the street of a seed with each map; the module lists the quantities."""
     course = draw_course(seed, config)
     for name in config.maps:
         yield from _drive(name, config, course, seed)
@@ -272,12 +272,12 @@ def _drive(name: str, c: DriveTrialConfig, course: Course, seed: int) -> Iterato
     spent, plans = 0.0, 0
     while state.time < c.longest and not harm and state.place[0] < course.goal - 0.5 and stood < PATIENCE:
         planned = None
-        if state.time + 1e-9 >= c.trial.robot.sweep:  # at first it stands and looks everywhere once
+        if state.time + 1e-9 >= c.trial.robot.sweep:  # it stands still for the first sweep
             begin = process_time()
             planned = navigator.plan(rover.after(state, command, tick).place, course.goal)
             spent, plans = spent + process_time() - begin, plans + 1
             covered.append(_coverage(navigator.found, course, state.place))
-        # what was decided takes effect a reaction time later: until then it goes on as before
+        # the new command takes effect one reaction time later; until then the old one is driven
         there = state.place
         state, scans, believed, places = rover.drive(state, command, tick)
         navigator.read(lines_of_scans(scans, believed, c.trial.robot.height))
@@ -301,11 +301,11 @@ def _drive(name: str, c: DriveTrialConfig, course: Course, seed: int) -> Iterato
     if speeds:
         yield Measurement(name, "speed", float(np.mean(speeds)))
     if arrived and course.best is not None:
-        track = track[::25]  # not the white part of the pose errors
+        track = track[::25]  # subsampled, so that white pose errors do not add to the length
         steps = np.linalg.norm(np.diff(track, axis=0), axis=1)
         at = np.floor((track[1:] - course.costs.origin) / course.costs.cell).astype(np.int64)
         cost = course.costs.cost[at[:, 1], at[:, 0]]
-        worst = float(cost[np.isfinite(cost)].max())  # where pose errors lead into the spare room
+        worst = float(cost[np.isfinite(cost)].max())  # used where pose errors lead into the safety margin
         yield Measurement(name, "detour", float(steps.sum()) / course.best.length)
         yield Measurement(name, "cost", float(steps @ np.where(np.isfinite(cost), cost, worst)) / course.best.cost)
     if plans:
@@ -313,7 +313,7 @@ def _drive(name: str, c: DriveTrialConfig, course: Course, seed: int) -> Iterato
 
 
 def harm_of(places: Array, course: Course, v: Vehicle) -> str:
-    """What the circle of the vehicle touched first; empty: nothing."""
+    """Kind of hazard that the circle of the vehicle touched first; empty: none."""
     at = np.floor((places - np.array(BOX[:2])) / 0.05).astype(np.int64)
     first = {k: np.flatnonzero(away[at[:, 1], at[:, 0]] < 0.5 * v.width) for k, away in course.hazards.items()}
     hit = {k: int(n[0]) for k, n in first.items() if len(n)}
@@ -368,7 +368,7 @@ class DrivesStudy(WorldsStudy[DriveTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; the tables say it all."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; no plots."""
         return []
 
 

@@ -1,4 +1,4 @@
-"""One trial of the study of the terrain: drives towards every kind of target, and what five maps say on the way."""
+"""One trial of the terrain study: drives towards every kind of target, and detections by five maps on the way."""
 
 from __future__ import annotations
 
@@ -33,32 +33,32 @@ from graphslam_studies.sim.street import (
 )
 
 DISTANCES = (7.5, 5.25, 3.5, 2.25)
-"""From the sensor to the target where the maps are asked [m]."""
+"""Distances from the sensor to the target at which the maps are evaluated [m]."""
 SINGLE = (0.2, 0.2, 0.2, 0.2)
 """Cells of the maps of a single resolution [m]."""
 FINE = (0.1, 0.1, 0.1, 0.1)
-"""… and of one as fine as the finest band [m]."""
+"""Cells of a map as fine as the finest band [m]."""
 WEIGHTS = {"single-octomap": (0.85, 0.4), "single-equal": (0.4, 0.4)}
-"""Log-odds of a hit and of a miss of the maps with fixed weights; not clamped, decided at 0."""
+"""Log-odds of a hit and of a miss of the maps with fixed weights; not clamped, threshold 0."""
 HIT_CM = 6
-"""A step or a depth from which on they count a hit [cm]."""
+"""Smallest step or depth that these maps count as a hit [cm]."""
 RINGS = {"0.8-3.5": (0.8, 3.5), "3.5-7": (3.5, 7.0), "7-11": (7.0, 11.0)}
 CORRIDOR = 0.5
 LANE = 2.4
 BOX: Box = (-5.6, -6.4, 30.4, 6.4)
-"""The street and a little more: whole cells of every band."""
+"""Map area: the street and a margin, in whole cells of every band [m]."""
 Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainTrialConfig:
-    """What is driven towards, and with what."""
+    """Targets, robot and vehicle of a trial."""
 
     laser: str = "panning"
-    """``panning``, or ``fixed``: it looks to the side, and the robot drives past the target."""
+    """``panning``, or ``fixed``: it points to the side, and the robot drives past the target."""
     targets: tuple[str, ...] = tuple(TARGETS)
     start: float = 16.0
-    """A drive of the panning laser begins so far before the target [m]."""
+    """Start distance before the target, for the panning laser [m]."""
     distances: tuple[float, ...] = DISTANCES
     robot: StreetRobot = field(default_factory=StreetRobot)
     vehicle: Vehicle = field(default_factory=Vehicle)
@@ -69,29 +69,29 @@ class TerrainTrialConfig:
 
     @property
     def sensor(self) -> LineSensor:
-        """The robot's laser."""
+        """Model of the laser of the robot."""
         sweep = self.robot.sweep if self.laser == "panning" else 1.0 / self.robot.line_rate
         return LineSensor(height=self.robot.height, beam_step=math.radians(self.robot.beam_step), sweep_time=sweep)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a map says, on cells of 0.1 m of :data:`BOX`: hazards, what it knows, probabilities where it has them."""
+    """Output of a map on cells of 0.1 m of :data:`BOX`: hazards, known cells, and probabilities if it has them."""
 
     hazard: Mask
     known: Mask
     probability: Array | None = None
     width: npt.NDArray[np.int64] | None = None
-    """Of the cell that speaks of steps there, in cells of 0.1 m; 0 none."""
+    """Width of the cell that is responsible there, in cells of 0.1 m; 0: none."""
 
 
 class FixedGrid:
-    """A map of a single resolution with fixed weights: a hit where any detector of a line says so, else a miss.
+    """A map of a single resolution with fixed weights: a hit if any detector of a line has one, else a miss.
 
     Parameters
     ----------
     like : Pyramid
-        Of a single resolution, for its box and cells.
+        Single-resolution pyramid that defines box and cells.
     """
 
     def __init__(self, like: Pyramid) -> None:
@@ -114,7 +114,7 @@ class FixedGrid:
         np.add.at(self.misses, cell[~any_hit], 1)
 
     def verdict(self, weights: tuple[float, float]) -> Verdict:
-        """Hazard where the log-odds are above 0."""
+        """Hazard if the log-odds are above 0."""
         ny, nx = self.shape
         total = (weights[0] * self.hits - weights[1] * self.misses).reshape(ny, nx)
         known = (self.hits + self.misses).reshape(ny, nx) > 0
@@ -133,14 +133,14 @@ def statements(lines: ScanLines, pyramid: Pyramid) -> Rows:
 
 
 def snapshots(drive: StreetDrive, distances: tuple[float, ...]) -> list[int]:
-    """Numbers of lines that were seen before the sensor came so near to the target."""
+    """Numbers of lines measured before the sensor reached each distance to the target."""
     x = drive.truth.interpolate(drive.scans.times)[:, 0]
     return [int(np.searchsorted(x, drive.street.target_at - d)) for d in distances]
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """The truth of the finest cells of :data:`BOX`; see :meth:`graphslam_studies.sim.street.Street.labels`."""
+    """Ground truth of the finest cells of :data:`BOX`; see :meth:`graphslam_studies.sim.street.Street.labels`."""
 
     x: Array
     y: Array
@@ -152,7 +152,7 @@ class Labelled:
 
 
 def labelled(street: Street, c: TerrainTrialConfig) -> Labelled:
-    """What every cell of a street is to the vehicle."""
+    """Ground-truth class of every cell of a street for the vehicle."""
     cell, v = CELLS[0], c.vehicle
     nx, ny = (round((BOX[k + 2] - BOX[k]) / cell) for k in (0, 1))
     labels = street.labels(np.array(BOX[:2]), cell, (ny, nx), step=v.climbable_step, slope=v.max_slope, height=v.height)
@@ -164,14 +164,14 @@ def labelled(street: Street, c: TerrainTrialConfig) -> Labelled:
 
 
 def run_terrain_trial(config: TerrainTrialConfig, seed: int) -> Iterator[Measurement]:
-    """Drive towards every target and judge the maps.
+    """Drive towards every target and evaluate the maps.
 
     Yields
     ------
     Measurement
-        ``seen_<target>`` (0 or 1), ``width_<target>``, ``blocked_<target>`` with ``submap`` the distance [cm];
-        ``false_<ring>``, ``false_open_<ring>`` and ``coverage`` of whole drives; ``calibration_<n|p|h>`` with
-        ``submap`` a tenth of P; the cost of a line.
+        ``seen_<target>`` (0 or 1), ``width_<target>``, ``blocked_<target>`` (``submap`` is the distance [cm]);
+        ``false_<ring>``, ``false_open_<ring>`` and ``coverage`` of whole drives; ``calibration_<n|p|h>``
+        (``submap`` is the decile of P); the time per line.
     """
     c, tables = config, read_tables()
     sums: dict[tuple[str, str, int], float] = {}
@@ -237,14 +237,14 @@ def run_terrain_trial(config: TerrainTrialConfig, seed: int) -> Iterator[Measure
 
 
 def verdict_of(found: TerrainMap, threshold: float) -> Verdict:
-    """Hazards of a map by its probabilities."""
+    """Hazards where the probability is above the threshold."""
     known = found.known
     widths = np.array([0, *(round(w / CELLS[0]) for w in CELLS)])[found.band.astype(np.int64) + 1]
     return Verdict(known & (np.nan_to_num(found.probability) > threshold), known, found.probability, widths)
 
 
 def _single(found: TerrainMap, threshold: float, like: TerrainMap) -> Verdict:
-    """Of a map with wider cells, on the cells of another one of the same box."""
+    """Hazards of a map with other cells, resampled to the cells of ``like``."""
     v = verdict_of(found, threshold)
     k = round(found.cell / like.cell)
     p = found.probability.repeat(k, axis=0).repeat(k, axis=1)
@@ -254,11 +254,11 @@ def _single(found: TerrainMap, threshold: float, like: TerrainMap) -> Verdict:
 def _judged(
     name: str, v: Verdict, street: Street, target: str, distance: float, truth: Labelled, c: TerrainTrialConfig
 ) -> Iterator[Measurement]:
-    """Whether a target was seen, over how much of its width, and whether the lane is closed."""
+    """Whether a target was detected, over what share of its width, and whether the lane is blocked."""
     x, y = truth.x, truth.y
     along = (x > street.target_at - 0.25) & (x < street.target_at + 3.2)
     zone = along[None] & (np.abs(y) < CORRIDOR)[:, None]
-    if np.any((truth.labels > 0) & zone):  # a real hazard: what is seen of it, within a cell
+    if np.any((truth.labels > 0) & zone):  # a real hazard: detections within one cell of it
         zone &= truth.to_hazard < 0.16
     at = round(100 * distance)
     columns = np.any(v.hazard & zone, axis=1)[np.abs(y) < CORRIDOR]
@@ -273,7 +273,7 @@ def _judged(
 def _count(
     sums: dict[tuple[str, str, int], float], name: str, v: Verdict, target: str, robot_x: float, truth: Labelled
 ) -> None:
-    """Add up false alarms, what is known ahead, and probabilities against truth."""
+    """Add up false alarms, coverage ahead, and calibration of probabilities."""
 
     def add(what: str, value: float, k: int = -1) -> None:
         sums[name, what, k] = sums.get((name, what, k), 0.0) + value
@@ -299,7 +299,7 @@ def _count(
     if v.probability is None or v.width is None:
         return
     for width in {round(w / CELLS[0]) for w in CELLS}:
-        mine = v.width == width  # once for each cell of the band that speaks there
+        mine = v.width == width  # each responsible cell once
         corner = np.zeros_like(mine)
         corner[::width, ::width] = True
         judged = mine & corner & v.known & ahead & (r < 11.0)
@@ -314,15 +314,15 @@ def _count(
 
 
 def channel_labels(truth: Array) -> tuple[Array, Array]:
-    """Of cells: 1 a hazard, 0 free, −1 neither; for steps, which see nothing of what hangs
-    nor of the bottom of a hole, and for support."""
+    """Labels of cells (1 hazard, 0 free, −1 ignored) for the step detector, which sees neither overhangs
+    nor the bottom of a hole, and for the support detector."""
     step = np.where((truth == OBSTACLE) | (truth == HOLE), -1, np.where(truth > 0, 1, truth))
     support = np.where(truth == HOLE, 1, np.where(truth > 0, -1, truth))
     return step, support
 
 
 def coarser(truth: npt.NDArray[Any], k: int) -> npt.NDArray[Any]:
-    """Labels of cells ``k`` times as wide: a hazard where any of their parts is one, free where all are."""
+    """Labels of cells ``k`` times as wide: hazard if any part is one, free if all parts are."""
     if k == 1:
         return truth
     ny, nx = truth.shape

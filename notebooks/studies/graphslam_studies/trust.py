@@ -1,22 +1,20 @@
-"""The study ``trust``: the word of a verdict that knows no ground truth, beside what is true.
+"""The study ``trust``: verdicts computed without ground truth, compared with the true consistency of the map.
 
-Worlds are drawn: robots among landmarks (:mod:`graphslam_studies.trust_worlds`: route, landmarks, robot, noise,
-receiver), and robots with scans (:class:`ScanWorld`: a park with a building, garages, lidars). Half of the landmark
-worlds are as stated; the others have one or two errors that are not stated, or a fault of ``docs/faults.md``
-(:mod:`graphslam_studies.trust_faults`). ``graphslam.run`` maps each with its default options: front end, calibration,
-refinement and loop closures are chosen as for a newcomer's log.
+Worlds are random: robots among landmarks (:mod:`graphslam_studies.trust_worlds`: route, landmarks, robot, noise,
+GPS receiver), and robots with scans (:class:`ScanWorld`: a park with a building, garages, lidars). Half of the random
+landmark worlds have the noise that the log states; the others have one or two unmodelled errors. Further worlds have
+one fault of ``docs/faults.md`` (:mod:`graphslam_studies.trust_faults`). ``graphslam.run`` maps each with default
+options, i.e. front end, calibration, refinement and loop closures are chosen automatically.
 
-Among landmarks the score has nothing in common with what it judges: it is made here of the simulator's poses and the
-covariances that the graph reports. With fixes poses are scored in the frame of the fixes, else in that of the first
-base.
+In landmark worlds, the score is computed here, independently of the verdict, from the simulated poses and the
+covariances of the graph. With GPS, poses are scored in the frame of the fixes, else in the frame of the first base.
 
 Quantities
 ----------
-``node``: NEES of the nodes, each by itself, over its dimension, mean; ``node_dof``: the degrees of freedom of this mean
-(errors of nodes are correlated: ``n² / ‖C‖²``); ``joint``, ``joint_dof``: NEES/n of all nodes together; ``rms`` of
-of their positions [m]; ``word``: index into :data:`WORDS`, alone where the log is refused; ``clean``. Worlds with
-scans are scored by the run's own NEES of its nodes or of its refined path (``nees_per_dof``), as ``joint`` and
-``node``.
+``node``: mean NEES/n of the single nodes; ``node_dof``: effective degrees of freedom of this mean (node errors are
+correlated: ``n² / ‖C‖²``); ``joint``, ``joint_dof``: NEES/n of all nodes jointly; ``rms``: position error [m];
+``word``: index into :data:`WORDS`, the only metric if the log is refused; ``clean``. Runs with a 3-D graph or
+without a graph are scored by the NEES of the run (``nees_per_dof``), as both ``joint`` and ``node``.
 """
 
 from __future__ import annotations
@@ -47,28 +45,28 @@ from graphslam_studies.trust_faults import FaultWorld, fault_worlds
 from graphslam_studies.trust_worlds import TrustWorld, draw_world, true_in_frame, world_log
 
 WORDS = ("consistent", "overconfident", "conservative", "not tested", "wrong", "refused")
-"""Of a verdict; the last: there is no map."""
+"""Verdicts; ``refused``: there is no map."""
 WRONG = 1.5
-"""NEES/n from which on a map must not be called consistent or conservative."""
+"""Above this NEES/n, the verdicts consistent and conservative are wrong."""
 LARGE = 9.0
-"""NEES/n from which on a map is wrong: errors of three standard deviations on average."""
+"""Above this NEES/n, a map is wrong: its RMS error is 3 σ."""
 WORLDS_DRAWN = range(800, 860)
-"""Worlds of the study. Of those before some were looked at while rules and defaults were made: they judge no more."""
+"""World numbers of the study. Some with lower numbers were used to develop rules and defaults, so they are excluded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScanWorld:
-    """A world with scans in which everything is as stated.
+    """A world with scans and correct noise models.
 
     Parameters
     ----------
     kind : {"park", "laser", "garage", "lidar"}
-        Landmarks and a planar laser in a building and a park around it; the laser alone; a panning laser in a drawn
-        garage; a drawn lidar.
+        Landmarks and a planar laser in a building and the park around it; the same with the laser only; a panning laser
+        in a random garage; a random lidar.
     number : int
-        Of the place, the robot and its noise, together with the seed of a run.
+        With the seed of a run, it determines the place, the robot and its noise.
     seconds : float
-        Of the log, at most [s].
+        Maximum duration of the log [s].
     """
 
     kind: str
@@ -79,7 +77,7 @@ class ScanWorld:
     gps: str = "none"
 
     def log(self, seed: int) -> SensorLog:
-        """A log of the world; no preset is known by its name."""
+        """A log of the world, under a name without a preset."""
         number = int(SeedTree(seed).child("trust", self.kind, self.number).generator().integers(10**6))
         if self.kind == "lidar":
             config = replace(drawn_lidar(number), imu=drawn_imu(number), points=4000)
@@ -100,7 +98,7 @@ World = TrustWorld | ScanWorld | FaultWorld
 
 
 def scored(found: Run, log: SensorLog) -> dict[str, float]:
-    """Errors of the nodes against the simulator, by what the graph reports of them."""
+    """Metrics of the node errors against the simulator, with the covariance from the graph."""
     if found.graph is None or found.graph.dim == 3:
         value = found.metrics.set_index("key")["value"]
         joint, dof = float(value.get("nees_per_dof", np.nan)), float(value.get("nees_dof", np.nan))
@@ -109,14 +107,14 @@ def scored(found: Run, log: SensorLog) -> dict[str, float]:
 
 
 def _scored_in_plane(found: Run, log: SensorLog) -> dict[str, float]:
-    """Errors of all nodes against the simulator, by what the graph claims of them."""
+    """The same for a 2-D graph, computed from the joint covariance of its nodes."""
     g = found.graph
     assert g is not None
     nodes = np.array([s.node for s in g.submaps] + [g.submaps[-1].exit_node])
     times = np.array([s.interval[0] for s in g.submaps] + [g.submaps[-1].interval[1]])
     assert log.truth is not None
     known = log.truth.trajectory.times
-    times = np.clip(times, known[0], known[-1])  # a clock that was corrected moves the ends of the log
+    times = np.clip(times, known[0], known[-1])  # a corrected clock shifts the ends of the log
     fixes = g.values.datum is not None
     true, poses, lay = true_in_frame(log, times, gps=fixes), g.values.poses[nodes], g.flat().layout
     at = (
@@ -132,7 +130,7 @@ def _scored_in_plane(found: Run, log: SensorLog) -> dict[str, float]:
     if fixes:
         datum = np.asarray(g.values.datum).copy()
         datum[:2] += np.asarray(g.gps_origin)
-        J[:, :, :3] = se2_adjoint(se2_inverse(poses))  # an error of the datum, carried to the node
+        J[:, :, :3] = se2_adjoint(se2_inverse(poses))  # effect of a datum error on the node
         poses = se2_compose(np.broadcast_to(datum, poses.shape), poses)
     else:
         J, poses, true = J[1:], poses[1:], true[1:]
@@ -142,7 +140,7 @@ def _scored_in_plane(found: Run, log: SensorLog) -> dict[str, float]:
 
 
 def honesty(error: Array, covariance: Array) -> dict[str, float]:
-    """Figures of errors ``(k, 3)`` with their joint covariance ``(3k, 3k)``."""
+    """NEES and RMS of errors ``(k, 3)`` with their joint covariance ``(3k, 3k)``."""
     k = len(error)
     white, L = [], np.zeros_like(covariance)
     for i in range(k):
@@ -161,14 +159,14 @@ def honesty(error: Array, covariance: Array) -> dict[str, float]:
 
 
 def word_without_truth(found: Run) -> int:
-    """The word of a verdict that does not know the ground truth, as a number into :data:`WORDS`."""
+    """Verdict without ground truth, as an index into :data:`WORDS`."""
     figures = RunMetrics.of_table(found.report, found.metrics, found.events)
     lines = [f for f in found.verdict if f.code not in ("headline", "nees")]
     return WORDS.index(verdict_word(lines, [], covariance_assessment(figures))[0])
 
 
 def run_trial(w: World, seed: int) -> Iterator[Measurement]:
-    """All figures of one run (see the module)."""
+    """All metrics of one run (see the module)."""
     log = world_log(w, SeedTree(seed)) if isinstance(w, TrustWorld) else w.log(seed)
     yield Measurement("run", "clean", float(w.clean))
     try:
@@ -187,23 +185,23 @@ class TrustStudy(WorldsStudy[World]):
     run_one = staticmethod(run_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``confusion``: truth against words; ``summary``: is it ever green where it must not be; ``worlds``."""
+        """``confusion``: true class by verdict; ``summary``: rates of wrong verdicts; ``worlds``."""
         known = {**self.full, **self.quick}
         worlds = world_table(table, known)
         return {"confusion": confusion_table(worlds, known), "summary": summary_table(worlds), "worlds": worlds}
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Honesty of all runs."""
+        """NEES/n of all runs."""
         return draw_runs(table, {"joint": "NEES/n of all nodes"}, folder)
 
 
 def world_table(table: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
-    """A row a world: what is wrong with it, NEES/n pooled over its runs, and how often each word was said.
+    """One row per world: its errors, NEES/n pooled over its runs, and the number of runs with each verdict.
 
-    ``bad map`` where the nodes, each by itself or all together, have more than :data:`WRONG`, and more than chance
-    explains (97.5 %): a mean over a dozen correlated errors of few runs is above 1.5 now and then.
-    ``true`` is what a verdict that knew the truth would say: ``wrong`` from :data:`LARGE` on, ``conservative`` where
-    both are below 1/1.5, and below chance.
+    ``bad map``: NEES/n of the single nodes or of all jointly is above :data:`WRONG` and above its 97.5 % bound, because
+    a mean over a dozen correlated errors of few runs may exceed 1.5 by chance.
+    ``true``: verdict by ground truth: ``wrong`` above :data:`LARGE`; ``conservative`` if both are below 1/1.5 and below
+    their 2.5 % bound.
     """
     out = []
     for world in table["world"].unique():
@@ -230,7 +228,7 @@ def world_table(table: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
 
 
 def confusion_table(worlds: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
-    """What is true (rows) against what was said (columns), of clean worlds, of those with errors, and with faults."""
+    """True class (rows) by verdict (columns), for clean worlds, worlds with errors, and worlds with faults."""
     rows = []
     kind = [
         "clean" if known[w].clean else "fault" if isinstance(known[w], FaultWorld) else "error" for w in worlds["world"]
@@ -241,7 +239,7 @@ def confusion_table(worlds: pd.DataFrame, known: dict[str, World]) -> pd.DataFra
 
 
 def summary_table(worlds: pd.DataFrame) -> pd.DataFrame:
-    """How often which word was said of wrong worlds, of clean ones, and of the rest; and the shares that count."""
+    """Verdicts in worlds with bad maps, in clean ones, and in the others; and the shares of wrong verdicts."""
     out = []
     for name, rows in (
         ("NEES/n > 1.5", worlds[worlds["bad map"]]),

@@ -1,23 +1,22 @@
-"""The study ``withheld-fixes``: positions that nobody was told, foretold by an IMU or by steady motion from others.
+"""The study ``withheld-fixes``: prediction of withheld positions by an IMU or a constant-velocity model.
 
-One position in so many seconds is used, all others are withheld and scored: how far off their prediction is, and
-whether its covariance says so. There is a node at every position, so that what comes before and what comes after it
-both tell where it is.
+One position every few seconds is used; all others are withheld and scored: error of their prediction, and consistency
+of its covariance. There is a node at every position, so the prediction uses measurements before and after it.
 
-``euroc-…``: EuRoC machine hall 01, IMU and tracked prism. Attitudes and the gyro's bias start from the used positions
-(:mod:`graphslam_studies.graph.inertial_start`); path, velocities, biases, tilt and the place of the map in the frame of
-the positions are solved for. ``kitti-…``: fixes of a car without its IMU; between them it goes on as it went, with
-white noise of the acceleration. Its density is that of the second differences of the used fixes in the plane, times a
-factor (a car's acceleration is smoother than white noise) that is chosen on the first half of the drive, whose withheld
-fixes are then known; the second half is scored.
+``euroc-…``: EuRoC machine hall 01, IMU and tracked prism. Initial attitudes and gyro bias come from the used positions
+(:mod:`graphslam_studies.graph.inertial_start`); path, velocities, biases, tilt and the pose of the map in the frame
+of the positions are estimated. ``kitti-…``: fixes of a car without its IMU; the motion model is constant velocity with
+white acceleration noise. Its density is computed from second differences of the used fixes in the plane, times a factor
+(the acceleration of a car is smoother than white noise). The factor is chosen on the first half of the drive with its
+withheld fixes; the second half is scored.
 
 Quantities
 ----------
 ``rmse``, ``median`` and ``worst`` error of the withheld positions [m]; ``rmse_plane``; ``straight``: root mean square
-error of straight lines between the used ones; ``nees`` and ``nees_plane``: squared error over its covariance (with the
-position's own noise), by 3 and by 2, mean over at most 240 of them; ``inside``: share inside their 95 % ellipsoid;
-``sigma``: root mean square of what is claimed, a coordinate; ``chi2_…`` by degree of freedom, of used positions and of
-the IMU; ``share`` and ``nees_chosen``: the factor that was chosen, and ``nees_plane`` where it was.
+error of straight lines between the used ones; ``nees`` and ``nees_plane``: NEES (covariance with position noise) per
+degree of freedom, 3 and 2, mean over at most 240 positions; ``inside``: share inside the 95 % ellipsoid; ``sigma``: RMS
+of the predicted σ per coordinate [m]; ``chi2_…`` per degree of freedom, of the used positions and of the IMU; ``share``
+and ``nees_chosen``: the chosen factor, and ``nees_plane`` on the first half.
 """
 
 from __future__ import annotations
@@ -52,30 +51,30 @@ from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
 
 Mask = npt.NDArray[np.bool_]
 NOTHING = np.repeat([0.5, 3.0], 3)
-"""σ of the motion from a node to the next [rad], [m]: nothing is known of it but what the IMU says."""
+"""σ of the motion between nodes [rad], [m]: a weak prior, so that the IMU determines the motion."""
 MOST = 240
-"""Withheld positions whose covariances are looked at."""
+"""Maximum number of withheld positions whose covariances are computed."""
 EDGE = 0.1
-"""Readings reach so far beyond the first and the last node [s]."""
+"""IMU readings extend beyond the first and the last node by this time [s]."""
 STEADY_STEP = 0.25
-"""Between the records by which steady motion is told [s]."""
+"""Sampling time of the simulated IMU of the constant-velocity model [s]."""
 SHARES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
-"""Factors on the density of the acceleration that are tried."""
+"""Candidate factors on the acceleration density."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WithheldConfig:
-    """A recording, and which of its positions are used."""
+    """A recording, and the selection of its positions."""
 
     source: str
     every: float
-    """One position in so many seconds is used [s]."""
+    """Interval of the used positions [s]."""
     span: tuple[float, float] = (0.0, np.inf)
     """Part of the recording [s]."""
 
 
 def used_of(times: Array, every: float) -> Mask:
-    """The first of ``times`` ``(n,)``, each that is at least so many seconds after the one before, and the last."""
+    """Mask ``(n,)``: the first of ``times``, each about ``every`` seconds after the last used one, and the last."""
     used = np.zeros(len(times), dtype=np.bool_)
     last = -np.inf
     for k, t in enumerate(times.tolist()):
@@ -86,10 +85,10 @@ def used_of(times: Array, every: float) -> Mask:
 
 
 def steady_motion(fixes: Gps, share: float = 1.0) -> Imu:
-    """Readings of a body that goes on as it went: none of turning, gravity alone, and noise as its fixes bend.
+    """Constant-velocity model as IMU readings: no rotation, gravity only, acceleration noise estimated from the fixes.
 
-    A second difference of positions T apart has the variance ``2/3 q T³ + 6 σ²``, where q is the density of the
-    acceleration's white noise; the mean of the squares over the plane says q. ``share`` is a factor on its root.
+    A second difference of positions with interval T has the variance ``2/3 q T³ + 6 σ²``, where q is the power spectral
+    density of the acceleration noise; q is computed from the mean square in the plane. ``share`` is a factor on √q.
     """
     T = np.diff(fixes.times)
     alike = np.abs(T[1:] - T[:-1]) < 0.1 * T[1:]
@@ -108,22 +107,22 @@ def steady_motion(fixes: Gps, share: float = 1.0) -> Imu:
 
 
 def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> FactorGraph:
-    """A node at every position, the IMU between them, the used ones as fixes; at its optimum.
+    """Graph with a node at every position, IMU factors between them, and the used positions as fixes; optimised.
 
     Parameters
     ----------
     fixes : Gps
-        Inside the readings.
+        Within the time span of the IMU.
     used : (n,) bool
     attitudes : (n, 4)
-        To start from, in the frame of the positions.
+        Initial values (quaternions), in the frame of the positions.
     """
     at = fixes.times
     line = np.stack([np.interp(at, at[used], c) for c in fixes.positions[used].T], axis=-1)
     path = np.concatenate([line - line[0], attitudes], axis=1)
     path[:, :3] -= quat_rotate(attitudes, np.broadcast_to(fixes.lever, (len(at), 3)))
     graph, P = FactorGraph(3), np.diag(NOTHING**2)
-    frame = np.append(path[0, :3], [0.0, 0.0, 0.0, 1.0])  # the first base is level, the others stand as the body does
+    frame = np.append(path[0, :3], [0.0, 0.0, 0.0, 1.0])  # first base: level; others: attitude of the body
     for k in range(len(at) - 1):
         local = SE3.between(np.stack([frame, frame]), path[k : k + 2])
         rows = Trajectory(at[k : k + 2], local, np.stack([1e-12 * np.eye(6), P]))
@@ -146,7 +145,7 @@ def graph_of_fixes(imu: Imu, fixes: Gps, used: Mask, attitudes: Array) -> Factor
 
 
 def predicted(graph: FactorGraph, fixes: Gps) -> Array:
-    """Where the graph of :func:`graph_of_fixes` has the positions ``(n, 3)``, used or not."""
+    """All positions ``(n, 3)``, used or not, as estimated by a graph of :func:`graph_of_fixes` [m]."""
     nodes = np.array([s.node for s in graph.submaps] + [graph.submaps[-1].exit_node])
     T = graph.values.poses[nodes]
     first = graph.submaps[0].trajectory
@@ -159,7 +158,7 @@ def predicted(graph: FactorGraph, fixes: Gps) -> Array:
 
 
 def run_withheld_trial(config: WithheldConfig, seed: int) -> list[Measurement]:
-    """All figures of one run; nothing of it is drawn."""
+    """All metrics of one run; it is deterministic."""
     with one_blas_thread():
         return list(_figures(config))
 
@@ -190,14 +189,14 @@ def _figures(config: WithheldConfig) -> Iterator[Measurement]:
 
 
 def scores_steady(fixes: Gps, every: float, share: float) -> dict[str, float]:
-    """Figures of fixes alone; see :func:`steady_motion`."""
+    """Metrics of fixes with the constant-velocity model; see :func:`steady_motion`."""
     used = used_of(fixes.times, every)
     level = np.tile([0.0, 0.0, 0.0, 1.0], (len(fixes.times), 1))
     return scores(graph_of_fixes(steady_motion(fixes.take(used), share), fixes, used, level), fixes, used)
 
 
 def scores(graph: FactorGraph, fixes: Gps, used: Mask) -> dict[str, float]:
-    """Figures of a graph of :func:`graph_of_fixes`; see the module."""
+    """Metrics of a graph of :func:`graph_of_fixes`; see the module."""
     off = predicted(graph, fixes) - fixes.positions
     wrong = np.linalg.norm(off[~used], axis=1)
     told = fixes.take(used)
@@ -231,18 +230,18 @@ class WithheldStudy(WorldsStudy[WithheldConfig]):
     run_one = staticmethod(run_withheld_trial)
 
     def default_trials(self, quick: bool) -> int:
-        """One: nothing is drawn."""
+        """One, because the study is deterministic."""
         return 1
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``errors`` and ``honesty``, a row for each world."""
+        """``errors`` and ``honesty`` (consistency), one row per world."""
         wide = table.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", sort=False)
         errors = ["used", "withheld", "rmse", "median", "worst", "rmse_plane", "straight"]
         honesty = ["nees", "nees_plane", "inside", "sigma", "chi2_gps", "chi2_imu"]
         return {"errors": wide[errors].reset_index(), "honesty": wide[honesty].reset_index()}
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Error and honesty of all runs."""
+        """Error and NEES of all runs."""
         return draw_runs(table, {"rmse": "error of withheld positions [m]", "nees": "NEES/n"}, folder)
 
 

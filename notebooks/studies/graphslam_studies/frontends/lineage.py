@@ -91,7 +91,7 @@ class SingleMapParticles(ParticleSet):
         self.resamplings += 1
 
     def _stretches(self) -> list[tuple[int, int, Ints]]:
-        """Intervals between resamplings: first scan, scan after the last, rows of the ancestors of present particles."""
+        """Intervals between resamplings: first scan, scan after the last, rows of the ancestors of the particles."""
         row, end, out = np.arange(len(self.pose)), self.scans, []
         for scan, source in reversed(self._parents):
             out.append((scan, end, row))
