@@ -151,7 +151,7 @@ def choose_topics(
             ranked = [(_rank(kind, t.name), -t.count, t.name, t) for t in there[kind]]
             chosen[kind] = min(ranked, key=lambda row: row[:3])[3]
     if asked["clouds"] is None and asked["laser"] is None and {"clouds", "laser"} <= chosen.keys():
-        # clouds that are probably no lidar (depth camera) give way to a laser; otherwise clouds are used
+        # the laser is used if the clouds are probably not from a lidar (depth camera); otherwise the clouds
         cloud_topic: BagTopic = chosen["clouds"]
         del chosen["clouds" if _rank("clouds", cloud_topic.name) else "laser"]
     if asked["laser"] not in (None, "none") and asked["clouds"] is None:

@@ -192,7 +192,7 @@ def _present(c: Card, file: CardFile) -> Path:
         path = find_file(root / c.folder, file)
         if path is not None:
             return path
-    locate(c)  # raises with what to do, unless only this optional file is missing
+    locate(c)  # raises an error with instructions, unless only this optional file is missing
     raise MissingDataError("no such file", where=file.path, wanted=f"data set {c.name!r} complete")
 
 

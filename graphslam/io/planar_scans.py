@@ -19,8 +19,9 @@ def resample_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
     Parameters
     ----------
     ranges, own : (n,)
-        Ranges of the scan [m] and their increasing directions [rad]; ``beams``: new directions [rad].
+        Ranges of the scan [m] and their increasing directions [rad].
     beams : (m,)
+        New directions [rad].
     """
     k = np.clip(np.searchsorted(own, beams), 1, len(own) - 1)
     k = k - (beams - own[k - 1] < own[k] - beams)
@@ -29,7 +30,7 @@ def resample_beams(ranges: Ranges, own: Array, beams: Array) -> Ranges:
 
 
 def unify_layout(scans: Sequence[tuple[Ranges, Array]]) -> tuple[Ranges, Array, int]:
-    """Scans with different beams as one table.
+    """Scans with different beams as one table, in the most frequent layout ``beams``.
 
     Parameters
     ----------
@@ -40,7 +41,6 @@ def unify_layout(scans: Sequence[tuple[Ranges, Array]]) -> tuple[Ranges, Array, 
     -------
     ranges : (k, m)
     beams : (m,)
-        The most frequent layout.
     moved : int
         Number of resampled scans.
     """

@@ -200,7 +200,7 @@ def read_submaps(path: str | os.PathLike[str], *, load_grid: GridLoader | None =
 
 
 def write_submaps(path: str | os.PathLike[str], submaps: list[Submap], *, truth: MapTruth | None = None) -> None:
-    """Replace ``path/submaps/``, and write ``path/truth.npz`` if ground truth is given."""
+    """Replace ``path/submaps/``, and write ``path/truth.npz`` with ground truth, if any."""
     store = SubmapStore(Path(path) / "submaps")
     store.truncate(0)
     for submap in submaps:
