@@ -1,23 +1,23 @@
-"""The study ``association-ambiguity``: who is who is not known. Where do particles win, and where do they not?
+"""The study ``association-ambiguity``: particle filters and EKFs with unknown data association.
 
-Worlds: ``clutter`` (false and missed observations), ``pairs`` (every feature has a twin), ``rows`` (an avenue, and a
-motion noise of a quarter of its period a scan), ``hard`` (the avenue with pairs, clutter and missed observations).
+Worlds: ``clutter`` (false and missed observations), ``pairs`` (every feature has a close neighbour), ``rows`` (an
+avenue, with motion noise of a quarter of its period per scan), ``hard`` (avenue, pairs, clutter, missed observations).
 
 Algorithms
 ----------
-``known``: identities given, in the local maps and in the join: the floor. ``ekf-nn``, ``ekf-jcbb``: EKF local maps with
-gated nearest neighbour, with joint compatibility; ``…-smoothed``: the latter handed over after one smoothing.
+``known``: identities given, in the local maps and in the join (lower bound). ``ekf-nn``, ``ekf-jcbb``: EKF local maps
+with gated nearest neighbour, with joint compatibility; ``…-smoothed``: the latter, output after smoothing.
 ``rbpf-N``: FastSLAM 2.0 local maps with per-particle maximum likelihood, smoothed under the winning association;
-``rbpf1-N`` the same with the proposal of FastSLAM 1.0, where every particle draws its pose *before* it associates;
+``rbpf1-N`` the same with the proposal of FastSLAM 1.0, where every particle samples its pose *before* association;
 ``rbpf-paper``: moment matching instead of smoothing. ``ekf-slam-nn``, ``ekf-slam-jcbb``: a single map. All have the
-same noise figures, gates, confirmation rules and cuts; all local maps are joined by joint compatibility and polished.
+same noise model, confirmation rule and cuts; all local maps are joined by joint compatibility and polished.
 
 Quantities
 ----------
-Inside the submaps: ``wrong_share`` of the sightings handed over are of something else than their landmark is by
-majority; ``used_share`` of the true observations are in a landmark that is theirs; per submap ``local_landmarks``, and
+Inside the submaps: ``wrong_share``: share of output observations that differ from the majority identity of their
+landmark; ``used_share``: share of true observations that are in the right landmark; per submap ``local_landmarks``, and
 of these ``local_spurious`` (clutter), ``local_duplicated``; ``local_missed`` features seen three times without a
-landmark; ``local_pair_precision`` and ``local_pair_recall`` of sightings; ``local_pose_nees`` (3 degrees of freedom).
+landmark; ``local_pair_precision`` and ``local_pair_recall`` of observations; ``local_pose_nees`` (3 DoF).
 Between them: ``merges`` of landmarks of two submaps, ``wrong_merges``, ``wrong_merge_share``, ``missed_merge_share``.
 Of the final map: ``pair_precision``, ``pair_recall`` over the whole run, ``end_error`` [m], ``end_nees``, ``diverged``
 (``end_nees`` beyond 5 σ, or no map at all), ``pose_rmse``, ``map_rmse``, ``map_median`` [m], ``map_landmarks``,
@@ -108,7 +108,7 @@ class AssociationAmbiguity:
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """One figure a quantity: every run of every algorithm, a panel a world."""
+        """One plot per quantity, with one panel per world: every run of every algorithm."""
         runs = table[table["submap"] == -1]
         made = []
         for quantity, label in DRAWN.items():
@@ -126,7 +126,7 @@ def _wide(values: pd.Series, order: tuple[str, ...] = SUMMARY) -> pd.DataFrame:
 
 
 def local_nees(table: pd.DataFrame) -> pd.DataFrame:
-    """Honesty of the local maps' end poses: every submap is a unit, for each has data of its own."""
+    """Consistency of the end poses of local maps; each submap is a unit, because submaps use different data."""
     rows = []
     some = table[table["quantity"] == "local_pose_nees"]
     for (world, algorithm), part in some.groupby(["world", "algorithm"], sort=False):
@@ -156,9 +156,9 @@ def local_nees(table: pd.DataFrame) -> pd.DataFrame:
 def paired(table: pd.DataFrame) -> pd.DataFrame:
     """Pairs of algorithms on the same runs.
 
-    ``difference`` is the mean over the runs of the algorithm's figure less the reference's, ``half_width`` 1.96 of its
-    standard errors; ``ratio`` is that of the geometric means and ``ratio_low … ratio_high`` its 95 % interval, over the
-    runs where both are positive (``ratio_runs``). ``local_pose_nees`` is a run's median over its submaps.
+    ``difference``: mean over the runs of algorithm minus reference; ``half_width``: 1.96 standard errors of it;
+    ``ratio``: ratio of the geometric means, with 95 % interval ``ratio_low … ratio_high``, over the runs where both are
+    positive (``ratio_runs``). ``local_pose_nees`` of a run is the median over its submaps.
     """
     per_run = table[table["quantity"].isin(COMPARED)]
     per_run = per_run.groupby(["world", "run", "algorithm", "quantity"], sort=False)["value"].median()

@@ -1,18 +1,18 @@
-"""The study ``calibration``: noise and lasting errors told from a log itself, and the maps made with them.
+"""The study ``calibration``: noise and systematic errors estimated from a log, and the maps made with them.
 
-Worlds: ``drawn`` robots whose wheels no default knows and whose logs state a quarter of their noise
-(``drawn-lasting``: with errors that last for seconds; ``planted``: one constant error at a time, and none);
-``plaza1`` with 0.31 deg/s added; the robots of MRCLAM 7 as if each were unknown; and scans of recorded sets to whose
-odometry a yaw bias, a scale and noise are added, drawn in each run. The recorded sets must be found
-(``GRAPHSLAM_DATA``).
+Worlds: ``drawn``: random robots whose logs state a quarter of their true σ (``drawn-lasting``: with errors correlated
+over seconds; ``planted``: one constant error at a time, and none); ``plaza1`` with a yaw-rate bias of 0.31 deg/s added;
+the robots of MRCLAM 7, each without its preset; and recorded sets with scans, with a random yaw bias, scale and
+odometry noise added in each run. The recorded sets must be available (``GRAPHSLAM_DATA``).
 
 Quantities
 ----------
-``…_ratio``: an estimated σ over the true one; ``…_error``: an estimated constant less the true one (rad/s, a factor, s,
-m, rad); ``path``, ``landmarks`` [m], ``nees_poses``, ``nees_landmarks`` by degree of freedom, ``join_chi2_per_dof``.
-Of scans: ``relations`` of pairs of poses drawn at random [m], ``…_input`` of the odometry that came in; ``input_told``:
-the verdict says that this is better; ``worse_untold``: it is, by a tenth of its error, and the verdict does not.
-Planted errors: ``within`` 3σ of the estimate, ``corrected``, ``strength`` error/σ, ``false`` other constants corrected.
+``…_ratio``: estimated over true σ; ``…_error``: estimated minus true constant (rad/s, a factor, s, m, rad); ``path``,
+``landmarks`` [m]; ``nees_poses``, ``nees_landmarks`` per degree of freedom; ``join_chi2_per_dof``.
+Of scans: ``relations``: error of relative poses of random pairs [m]; ``…_input``: that of the input odometry;
+``input_told``: the verdict reports that the input is better; ``worse_untold``: the path error is more than 10 % larger
+than that of the input, without such a report. Planted errors: ``within``: true value within 3σ of the estimate;
+``corrected``; ``strength``: error/σ; ``false``: number of other constants that were corrected.
 Algorithms: ``stated``, ``calibrated``, ``oracle``, ``preset``; of scans as in
 :func:`graphslam_studies.calibration_scanned.scanned`.
 """
@@ -49,7 +49,7 @@ WORLDS |= {
     )
     for name in names
 }
-"""Of the long logs the first ten minutes."""
+"""Only the first ten minutes of the logs with scans are used."""
 QUICK_WORLDS = {
     "drawn-quick": CalibrationTrialConfig(seconds=40.0),
     "planted-quick": CalibrationTrialConfig(seconds=40.0, planted=("yaw rate 0.3 deg/s",)),
@@ -67,7 +67,7 @@ class CalibrationStudy(WorldsStudy[CalibrationTrialConfig]):
     run_one = staticmethod(run_calibration_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``maps`` of each way to get the noise, ``found``: ratios and errors of the estimates, ``cpu`` [s]."""
+        """``maps`` for each noise model, ``found``: ratios and errors of estimates, ``planted`` errors, ``cpu`` [s]."""
         out = {"maps": maps_table(table), "found": found_table(table), "planted": planted_table(table)}
         out = {name: rows for name, rows in out.items() if not rows.empty}
         if not timings.empty:
@@ -76,12 +76,12 @@ class CalibrationStudy(WorldsStudy[CalibrationTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Honesty and errors of all runs."""
+        """NEES and errors of all runs."""
         return draw_runs(table, {"nees_poses": "NEES/dof of poses", "path": "path error [m]"}, folder)
 
 
 def maps_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Means over the runs, a row for each world and way to get the noise."""
+    """Means over the runs, one row per world and noise model."""
     rows = table[table["quantity"].isin(MAPS) & (table["submap"] == -1) & table["value"].notna()]
     if rows.empty:
         return pd.DataFrame(columns=["world", "algorithm", *MAPS])
@@ -90,7 +90,7 @@ def maps_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def found_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Of each ratio the median and the extremes, of each error the root of the mean square and the largest."""
+    """Median, minimum, maximum and RMS over the runs of each ratio and error."""
     out = []
     ends = ("_ratio", "_error", "_told", "_applied", "refused")
     names = [q for q in table["quantity"].unique() if q.endswith(ends) and q not in MAPS]
@@ -105,7 +105,7 @@ def found_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def planted_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Of each planted error the share of runs, the mean strength (error / σ) and the RMS of the normalised error."""
+    """One row per planted error: means over the runs, e.g. of the strength (error / σ); RMS of the normalised error."""
     out = []
     rows = table[table["quantity"].isin(["false"])]
     for (world, name), _ in rows.groupby(["world", "algorithm"], sort=False):

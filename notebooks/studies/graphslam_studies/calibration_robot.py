@@ -1,4 +1,4 @@
-"""Robots drawn by chance whose wheels no default knows, and logs of them that state a quarter of their noise."""
+"""Random robots of the calibration study, and simulated logs that state a quarter of their true σ."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ FINE = 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrawnRobot:
-    """What is true of a robot.
+    """True parameters of a robot.
 
-    Sigmas as in :class:`graphslam.calibrate.corrections.Corrections`; ``lasting`` are Gauss-Markov errors of yaw rate
-    [rad/s] and speed [m/s] with a memory of ``memory`` seconds.
+    Sigmas as in :class:`graphslam.calibrate.corrections.Corrections`; ``lasting_…``: σ of Gauss–Markov errors of yaw
+    rate [rad/s] and speed [m/s] with time constant ``memory`` [s].
     """
 
     speed: float
@@ -44,7 +44,7 @@ class DrawnRobot:
 
 
 def draw_robot(seed: int, *, lasting: bool = False) -> DrawnRobot:
-    """A robot whose sigmas are log-uniform over a decade or more, its constants normal."""
+    """A random robot: log-uniform sigmas; normally distributed constants, except for a uniform clock offset."""
     rng = SeedTree(seed).child("calibration", "robot").generator()
 
     def between(a: float, b: float) -> float:
@@ -70,14 +70,14 @@ def draw_robot(seed: int, *, lasting: bool = False) -> DrawnRobot:
 
 
 def drive(robot: DrawnRobot, seed: int, seconds: float = 120.0, *, rate: float = 10.0, scans: float = 4.0) -> SensorLog:
-    """A log of the robot on a path of its own, with truth; its σ are stated too small by four.
+    """A log of the robot on a random path, with ground truth; the stated σ are a quarter of the true ones.
 
     Parameters
     ----------
     rate : float
-        Records of odometry a second.
+        Rate of odometry [1/s].
     scans : float
-        Scans of landmarks a second.
+        Rate of landmark scans [1/s].
     """
     rng = SeedTree(seed).child("calibration", "drive").generator()
     t, poses = _path(robot, seconds, rng)
@@ -97,9 +97,9 @@ def drive(robot: DrawnRobot, seed: int, seconds: float = 120.0, *, rate: float =
 
 
 def _path(robot: DrawnRobot, seconds: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Times and poses of a drive that turns by chance and comes back to the middle when it is far."""
+    """Times and poses of a drive with random turns that returns towards the origin when it is far away."""
     n = int((seconds + 2.0) / FINE) + 1
-    t: Array = np.arange(n, dtype=np.float64) * FINE - 1.0  # clocks that are off ask for what was before
+    t: Array = np.arange(n, dtype=np.float64) * FINE - 1.0  # starts at -1 s, because of clock offsets
     poses: Array = np.zeros((n, 3))
     turn, speed, reach = 0.0, robot.speed, 12.0 * robot.speed + 10.0
     hold = np.exp(-FINE / 4.0)

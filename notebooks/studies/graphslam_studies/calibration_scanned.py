@@ -1,4 +1,4 @@
-"""One trial of the study of calibration on a recorded log of scans, to whose odometry errors are added by chance."""
+"""One trial of the calibration study on a recorded log of scans, with random errors added to its odometry."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from graphslam_studies.evaluate.relations import covered_part, random_pairs, rel
 from graphslam_studies.montecarlo.trials import Measurement
 
 UNKNOWN = "unknown"
-"""Name of a recorded log here: no preset is made for it."""
+"""Name given to recorded logs, so that no preset applies."""
 SURELY = float(np.deg2rad(0.05))
-"""σ of a yaw bias that is told to 0.1 deg/s [rad/s]."""
+"""Largest σ of a yaw bias that counts as estimated [rad/s]."""
 PAIRS = 5000
-"""Pairs of poses whose relation is scored."""
+"""Number of pairs of poses whose relative pose is scored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,17 +40,17 @@ class Added:
     """Errors that are added to the motion of a recorded log."""
 
     bias: float = 0.0
-    """Of the yaw rate, while it moves [rad/s]."""
+    """Bias of the yaw rate during motion [rad/s]."""
     scale: float = 1.0
-    """Its distances are multiplied by this."""
+    """Factor on distances."""
     along: float = 0.0
-    """Noise of each position axis after one metre [m/√m]."""
+    """σ of each position axis after one metre [m/√m]."""
     heading: float = 0.0
-    """Noise of the heading after one metre [rad/√m]."""
+    """σ of the heading after one metre [rad/√m]."""
 
     @classmethod
     def drawn(cls, seed: int) -> Added:
-        """Bias and scale of either sign, noise over a decade."""
+        """Random bias and scale error of either sign; log-uniform noise over a decade."""
         rng = SeedTree(seed).child("calibration", "added").generator()
         return cls(
             bias=float(np.deg2rad(rng.uniform(0.1, 0.6)) * rng.choice([-1, 1])),
@@ -61,7 +61,7 @@ class Added:
 
 
 def faulty(log: SensorLog, added: Added, seed: int = 0) -> SensorLog:
-    """The log with errors in its motion, under a name that no preset knows."""
+    """The log with errors added to its motion, under a name without a preset."""
     streams = dict(log.streams)
     for name, s in log.streams.items():
         if isinstance(s, VelocityControls):
@@ -73,7 +73,7 @@ def faulty(log: SensorLog, added: Added, seed: int = 0) -> SensorLog:
 
 
 def _worse(odometry: Odometry, added: Added, rng: np.random.Generator) -> Odometry:
-    """Errors of the heading are turns about the vertical of the first pose: what knows gravity does not tilt."""
+    """Odometry with errors added; heading errors are rotations about the vertical of the first pose, without tilt."""
     g = group_of(odometry.increments)
     xi = g.log(odometry.increments)
     dt = np.concatenate([[0.0], np.diff(odometry.times)])
@@ -99,17 +99,17 @@ def _worse(odometry: Odometry, added: Added, rng: np.random.Generator) -> Odomet
 def scanned(
     source: str, presets: str, frontend: str, added: Added | None, first: float | None, ways: Sequence[str], seed: int
 ) -> Iterator[Measurement]:
-    """What a log of scans says before and after errors were added to its odometry, and its maps.
+    """Calibrate a log of scans before and after errors are added to its odometry, and map it.
 
     Parameters
     ----------
     added : Added or None
-        None: drawn by the seed.
+        None: random, from the seed.
     first : float or None
-        Seconds of the log that are used; None: all.
+        Duration of the part of the log that is used [s]; None: all.
     ways : sequence of str
-        Maps that are made: of the log as recorded by its ``preset``, and as if it were unknown (``recorded``); with the
-        errors as if it were unknown (``calibrated``), and by the preset (``stated``).
+        Maps to make. Without added errors: with the preset (``preset``), or calibrated (``recorded``). With added
+        errors: calibrated (``calibrated``), or with the preset (``stated``).
     """
     recorded = load(source)
     begin = float(recorded["reference"].times[0])
@@ -118,7 +118,7 @@ def scanned(
     own, added = preset(presets), added or Added.drawn(seed)
     worse = faulty(recorded, added, seed)
     planar = any(isinstance(s, Odometry) and s.increments.shape[1] == 3 for s in recorded.streams.values())
-    for quick in (True, False) if planar else (True,):  # matches in space take minutes
+    for quick in (True, False) if planar else (True,):  # 3-D scan matching takes minutes
         found, spent = [], []
         for log in (replace(recorded, name=UNKNOWN), worse):
             clock = process_time()
@@ -140,10 +140,10 @@ def scanned(
 
 
 def _told(name: str, before: Calibration, after: Calibration, added: Added, speed: float) -> Iterator[Measurement]:
-    """Errors of what was found of the additions: the difference between the two calibrations less what was added.
+    """Errors of the estimated additions: difference between the two calibrations minus the true addition.
 
-    A yaw bias is told where it is a constant of its own in both, with a σ that leaves no doubt of 0.1 deg/s. What bias
-    and turn per metre do together at the log's own speed (``turning``) is told in any case.
+    The yaw bias is scored only if both calibrations estimate it separately, with a combined σ below `SURELY`. The joint
+    effect of bias and turn per metre at the mean speed (``turning``) is always scored.
     """
     a, b = ({e.name: e for e in found.estimates} for found in (before, after))
     scale = float(np.exp(b["distance_scale"].value - a["distance_scale"].value))
@@ -166,7 +166,7 @@ def _told(name: str, before: Calibration, after: Calibration, added: Added, spee
 
 
 def _speed(log: SensorLog) -> float:
-    """Of its odometry while it moves [m/s]."""
+    """Mean odometry speed during motion [m/s]."""
     s = next(s for s in log.streams.values() if isinstance(s, Odometry))
     g = group_of(s.increments)
     metres = np.linalg.norm(g.log(s.increments[1:])[:, g.position], axis=1)
@@ -176,7 +176,7 @@ def _speed(log: SensorLog) -> float:
 
 
 def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str, seed: int) -> Iterator[Measurement]:
-    """Errors of the map of a log and of its odometry, and whether the verdict says which is better."""
+    """Errors of the map of a log and of its odometry, and whether the verdict reports a better input."""
     result = run(log, frontend=frontend, solver="batch", config=options, seed=seed, progress=False)
     said = {f.code for f in findings_of_json(result.report["verdict"])}
     path = result.map.trajectory
@@ -193,7 +193,7 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], frontend: str
 
 
 def path_errors(path: Trajectory, reference: Any) -> dict[str, float]:
-    """Relations of pairs drawn at random [m, deg], and ATE after an alignment [m]."""
+    """Relative-pose errors of random pairs [m, deg], and ATE after alignment [m]."""
     part = covered_part(Trajectory(reference.times, reference.poses), path)
     pairs = random_pairs(len(part), PAIRS, np.random.default_rng(0))
     row = relation_error(path, part, pairs).as_row()

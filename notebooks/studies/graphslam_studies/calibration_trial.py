@@ -1,4 +1,4 @@
-"""One trial of the study of calibration: a log whose noise nobody states rightly, with and without calibration."""
+"""One trial of the calibration study: a log with a wrong noise model, mapped with and without calibration."""
 
 from __future__ import annotations
 
@@ -37,29 +37,29 @@ FIGURES = {
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationTrialConfig:
-    """A world."""
+    """A world of the study."""
 
     source: str = ""
-    """Recorded set; empty: a drawn robot."""
+    """Recorded set; empty: a random robot."""
     seconds: float = 120.0
-    """Of a drawn robot's drive."""
+    """Duration of the drive of a random robot [s]."""
     lasting: bool = False
-    """Do its wheels err for seconds on end?"""
+    """Whether its odometry has time-correlated errors."""
     planted: tuple[str, ...] = ()
-    """Of a drawn robot without constant errors: those of ``PLANTED`` that are added, one at a time; no maps."""
+    """Keys of ``PLANTED``: errors added one at a time to a random robot without constant errors; no maps are made."""
     added: Added | None = field(default_factory=Added)
-    """To the motion of a recorded log; None: drawn in each run."""
+    """Errors added to the motion of a recorded log; None: random in each run."""
     first: float | None = None
-    """Seconds of a log of scans that are used; None: all."""
+    """Duration of the used part of a log of scans [s]; None: all."""
     ways: tuple[str, ...] = ()
-    """Maps that are made of a log of scans."""
+    """Maps to make of a log of scans."""
     presets: str = ""
-    """Preset whose map is compared, and whose way of reading the log is taken over without its noise."""
+    """Preset whose map is compared; its options except for the noise are used for the other maps too."""
     frontend: str = "rbpf-ekf"
 
 
 def run_calibration_trial(config: CalibrationTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one trial."""
+    """All metrics of one trial."""
     with one_blas_thread():
         if config.planted:
             return list(_planted(config, seed))
@@ -95,14 +95,14 @@ PLANTED: dict[str, tuple[dict[str, float], str, float]] = {
     "distances 2 % long": ({"distance_scale": 1.02}, "distance_scale", float(np.log(1.02))),
     "yaw rate 0.3 deg/s": ({"yaw_bias": float(np.deg2rad(0.3))}, "yaw_bias", float(np.deg2rad(0.3))),
     "sensor turned 1 deg": ({"sensor_yaw": float(np.deg2rad(1.0))}, "sensor_yaw", float(np.deg2rad(1.0))),
-    # only the ratio of the two scales can be observed, and it is given as that of the distances
+    # only the ratio of the two scales is observable; it is estimated as the distance scale
     "ranges 5 % long": ({"range_scale": 1.05}, "distance_scale", -float(np.log(1.05))),
 }
-"""Changes of an exact robot, the constant that has to show them, and its value."""
+"""Changes of an exact robot, the constant that should be estimated, and its true value."""
 
 
 def _planted(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
-    """Of each planted error: whether it lies within 3 sigma of its estimate, and what was corrected besides."""
+    """For each planted error: whether it is within 3σ of its estimate, and which other constants were corrected."""
     exact = replace(draw_robot(seed, lasting=config.lasting), **EXACT)
     for name in config.planted:
         changes, constant, true = PLANTED[name]
@@ -126,7 +126,7 @@ def _planted(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]
 
 
 def true_figures(r: DrawnRobot) -> Corrections:
-    """What a calibration would say that knows everything; errors that last as the white noise of the long run."""
+    """Perfect calibration; time-correlated errors are included as white noise with the same long-term variance."""
     long = float(np.sqrt(2.0 * r.memory))
     return Corrections(
         yaw_bias=r.yaw_bias,
@@ -146,7 +146,7 @@ def true_figures(r: DrawnRobot) -> Corrections:
 
 
 def _recovered(robot: DrawnRobot, log: SensorLog, found: Calibration) -> Iterator[Measurement]:
-    """Ratios of σ over a typical second, and errors of the constants."""
+    """Ratios of σ for one second of mean motion, and errors of the constants."""
     true, got = true_figures(robot), found.corrections
     xi = log["odometry"].increments
     seconds = float(log["odometry"].times[-1] - log["odometry"].times[0])
@@ -177,7 +177,7 @@ def _mapped(name: str, log: SensorLog, options: Mapping[str, Any], seed: int) ->
 
 
 def _recorded(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
-    """A log of landmarks as if unknown, and as its preset has it (without the errors that were added)."""
+    """A log of landmarks with added errors, calibrated; and without them, with its preset."""
     recorded, added = load(config.source), config.added or Added.drawn(seed)
     log, own = faulty(recorded, added), preset(config.presets)
     begin = process_time()

@@ -1,18 +1,18 @@
-"""The study ``campus``: what fixes outside are worth inside (Montemerlo and Thrun 2005, Figure 3).
+"""The study ``campus``: effect of outdoor GPS fixes on the indoor map (Montemerlo and Thrun 2005, Figure 3).
 
-Every run draws its campus, its robot and its noise, follows the path by scans once, and solves the same graph without
-fixes and with them. What is compared is paired, so a sign test needs no other assumption.
+Every run has a random campus and noise, computes the scan odometry once, and solves the same graph without fixes and
+with them. The comparison is paired, so a sign test needs no other assumption.
 
 Quantities
 ----------
-``ate``, ``ate_indoor``, ``ate_outdoor``: after one alignment of the whole path [m]; ``ate_indoor_own``: the inside part
-aligned by itself, its shape; ``ate_indoor_anchored``: as the map has it, first base held. ``angle_error``: of the angle
-between the two legs of a corridor [deg]. ``nees_<block>_<where>``: squared error a degree of freedom at one place of
-the way; without ``<where>``: mean over the way.
+``ate``, ``ate_indoor``, ``ate_outdoor``: after one alignment of the whole path [m]; ``ate_indoor_own``: indoor part
+aligned separately; ``ate_indoor_anchored``: in the map frame, with the first base fixed. ``angle_error``: of the angle
+between the two legs of a corridor [deg]. ``nees_<block>_<where>``: NEES per degree of freedom at one place of the
+path; without ``<where>``: mean over the path.
 
-All graphs of a run are aligned alike: ``ate`` and its parts by the truth of the whole way, ``…_own`` by that of the
-inside, ``…_anchored`` by the first base, which every graph holds, with fixes and without: there fixes help by no more
-than they know of that first base. ``ate_indoor_world`` aligns nothing: where fixes have the inside in the campus.
+All graphs of a run are aligned in the same way: ``ate`` and its parts with the true whole path, ``…_own`` with the true
+indoor path, ``…_anchored`` with the first base, which is fixed in every graph. ``ate_indoor_world`` has no alignment:
+indoor error in the campus frame, for graphs with fixes.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ WORLDS = {
     "block": CampusTrialConfig(campus=campus_preset("block", **_THIN)),
     "whole": CampusTrialConfig(campus=campus_preset("full", **{**_WIDE, "size": (600.0, 800.0), "movers": 20})),
 }
-"""``blocks``: 310 m × 310 m, three buildings on a way of 1.0 to 1.3 km that sees little twice; ``block``: one block,
-round and through; ``whole``: the whole campus, 1.6 to 2.9 km."""
+"""``blocks``: 310 m × 310 m, path of 1.0 to 1.3 km through three buildings with few revisits; ``block``: one block,
+around and through; ``whole``: the whole campus, 1.6 to 2.9 km."""
 QUICK_WORLDS = {
     "quick": replace(WORLDS["block"], campus=campus_preset("quick", size=(66.0, 66.0), block=55.0, every=3, speed=1.5))
 }
@@ -52,9 +52,9 @@ SESSIONS = {
         campus=campus_preset("full", size=(70.0, 215.0), block=59.0, visits=1, open_share=1.0, movers=4, **_THIN)
     )
 }
-"""Three blocks one behind the other: two sessions round the first, one round the last."""
+"""Three blocks in a row: two sessions around the first, one around the last."""
 MOVING = {"moving": CampusTrialConfig(campus=campus_preset("quick", movers=8, **_THIN))}
-"""One small block with eight cars and people: what is left of them in the map."""
+"""One small block with eight cars and people, to count their voxels in the map."""
 ERRORS = ("ate_indoor", "ate_indoor_own", "ate_indoor_anchored", "ate_outdoor", "ate", "end_error", "angle_error")
 DRAWN = {"ate_indoor": "ATE inside, path aligned as a whole [m]", "angle_error": "corridor's angle off [°]"}
 PLACES = ("middle", "indoor", "end")
@@ -66,17 +66,17 @@ class CampusStudy(WorldsStudy[CampusTrialConfig]):
     run_one = staticmethod(run_campus_trial)
 
     def worlds(self, quick: bool) -> tuple[str, ...]:
-        """The paired runs, the sessions, and what moves."""
+        """Worlds of the paired runs, of the sessions, and of moving objects."""
         return super().worlds(quick) + (() if quick else (*SESSIONS, *MOVING))
 
     def trial(self, world: str, quick: bool) -> Callable[[int], Iterable[Measurement]]:
-        """See the base."""
+        """See the base class."""
         if world in SESSIONS:
             return partial(run_sessions_trial, SESSIONS[world])
         return partial(run_moving_trial, MOVING[world]) if world in MOVING else super().trial(world, quick)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``errors`` of every kind, ``pairs`` of each with fixes and without, with a sign test, ``nees``, ``cpu``."""
+        """``errors``, ``pairs`` with and without fixes with sign tests, ``nees``, ``sessions``, ``moving``, ``cpu``."""
         pairs = table[~table["world"].isin((*SESSIONS, *MOVING))]
         out = {"errors": error_table(pairs), "pairs": pair_table(pairs), "nees": nees_table(pairs)}
         for name, worlds in (("sessions", SESSIONS), ("moving", MOVING)):
@@ -92,7 +92,7 @@ class CampusStudy(WorldsStudy[CampusTrialConfig]):
 
 
 def error_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean over the runs of every error, of every kind of graph."""
+    """Mean over the runs of every error, one row per kind of graph."""
     out: list[tables.Row] = []
     for world in dict.fromkeys(table["world"].astype(str)):
         for kind in KINDS:
@@ -105,10 +105,10 @@ def error_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def pair_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Every kind with fixes against the same graph without, run by run.
+    """Every kind with fixes compared with the same graph without, run by run.
 
-    ``ratio``: of the means; ``median_ratio``: of the middle pair; ``half``: share of the runs at half the error or
-    less; ``p``: two-sided sign test of better against worse; ``p_half``: that of half against more than half.
+    ``ratio``: ratio of the means; ``median_ratio``: median of the ratios; ``half``: share of runs with half the error
+    or less; ``p``: two-sided sign test of better against worse; ``p_half``: the same for half the error or less.
     """
     out: list[tables.Row] = []
     for world in dict.fromkeys(table["world"].astype(str)):
@@ -133,7 +133,7 @@ def pair_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def nees_table(table: pd.DataFrame) -> pd.DataFrame:
-    """NEES a degree of freedom at one place of each run, mean over the runs, with bounds of 95 % on either side."""
+    """NEES per degree of freedom at one place of each run, mean over the runs, with two-sided 95 % bounds."""
     out: list[tables.Row] = []
     for world in dict.fromkeys(table["world"].astype(str)):
         for kind in KINDS:
@@ -155,7 +155,7 @@ def nees_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def mean_table(table: pd.DataFrame, worlds: Iterable[str]) -> pd.DataFrame:
-    """Mean over the runs of everything said of some worlds; of what is yes or no, the share."""
+    """Mean over the runs of all metrics of some worlds; for binary ones this is the share."""
     rows = table[table["world"].isin(list(worlds)) & (table["quantity"] != "failed")]
     wide = rows.pivot_table(index="algorithm", columns="quantity", values="value", aggfunc="mean", sort=False)
     wide.insert(0, "runs", rows.groupby("algorithm")["run"].nunique())

@@ -1,11 +1,10 @@
-"""Cars and people on the campus: which of their voxels are left in a map, and what of the rest goes with them.
+"""Moving cars and people on the campus: share of their voxels removed from a map, and of static voxels lost.
 
-``gone``: share of the voxels in which only things that move were met, that are not occupied in the map. ``lost``:
-share of those occupied in a map drawn without these things that are not occupied in the map drawn with them. Both maps
-are drawn along the path that the run found. ``evidence``: the beams added up. ``outvoted``: besides, without voxels
-that more moments saw through than were stopped by: evidence adds up beam by beam, so a person who stands for a second
-before a scanner is hundreds of hits, and the few beams that pass later do not outweigh them. Where every moment has one
-vote, they do.
+``gone``: share of voxels hit by moving objects only that are not occupied in the map. ``lost``: share of the occupied
+voxels of a map without moving objects that are not occupied in the map with them. Both maps use the estimated path.
+``evidence``: map by sum of log-odds. ``outvoted``: also without voxels that were free in more moments than they were
+occupied in. Evidence is summed per beam, so a person who stands for a second in front of a scanner gives hundreds of
+hits, which a few later beams through the same voxels do not outweigh. With one vote per moment, they do.
 """
 
 from __future__ import annotations
@@ -33,24 +32,24 @@ from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.sim.campus import simulate_campus
 
 ALL = 1_000_000
-"""Beams of a step: every one of them is scored."""
+"""Maximum number of beams of a step; large, so that all are used."""
 
 
 def seen_through_voxels(grid: EvidenceGrid, moments: Iterable[EvidenceGrid]) -> tuple[Array, Mask]:
-    """Occupied voxels of a map that more moments saw through than were stopped by.
+    """Occupied voxels of a map that were free in more moments than they were occupied in.
 
     Parameters
     ----------
     grid : EvidenceGrid
-        In space, z up.
+        3-D, z up.
     moments : iterable of EvidenceGrid
-        Of single moments (one to a few seconds of scans each), in the lattice of the map. They need only half of
-        :data:`~graphslam.maps.moving.FREE`, since few beams pass a voxel in one.
+        Grids of single moments (one to a few seconds of scans each), with the lattice of the map. The threshold is
+        half of :data:`~graphslam.maps.moving.FREE`, because few beams cross a voxel in one moment.
 
     Returns
     -------
     centres : (n, 3)
-        Of the occupied voxels [m].
+        Centres of the occupied voxels [m].
     moved : (n,) bool
     """
     occupied = np.asarray(grid.occupied_cloud())
@@ -64,13 +63,13 @@ def seen_through_voxels(grid: EvidenceGrid, moments: Iterable[EvidenceGrid]) -> 
 
 
 def run_moving_trial(config: CampusTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run."""
+    """All metrics of one run."""
     with one_blas_thread():
         return list(moving_figures(config, seed))
 
 
 def moving_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement]:
-    """Simulate, follow the path, draw the map with what moves and without, and compare."""
+    """Simulate, estimate the path, build the map with and without moving objects, and compare."""
     begin = process_time()
     log = simulate_campus(config.campus, seed)
     end = BackEnd(config.back_end, "batch")
@@ -111,7 +110,7 @@ class Drawn:
         self.path, self.steps, self.empty = path, steps, empty
 
     def grid(self, log: SensorLog) -> tuple[EvidenceGrid, Array]:
-        """The map, and the ends of all beams that met something ``(n, 3)``."""
+        """The map, and the end points of all beams with a return ``(n, 3)`` [m]."""
         out, hits = self.empty.empty(), [np.zeros((0, 3))]
         for points, origins, returns, T, reach in self._scans(log):
             out.insert_scan(points, origins, pose=T, max_range=reach, returns=returns)
@@ -119,7 +118,7 @@ class Drawn:
         return out, np.concatenate(hits)
 
     def moments(self, log: SensorLog) -> Iterator[EvidenceGrid]:
-        """A map of every step by itself."""
+        """One map per step."""
         for points, origins, returns, T, reach in self._scans(log):
             out = self.empty.empty()
             out.insert_scan(points, origins, pose=T, max_range=reach, returns=returns)
@@ -135,7 +134,7 @@ class Drawn:
 
 
 def parted(log: SensorLog) -> tuple[SensorLog, SensorLog]:
-    """The log without the beams that met things which move, and with no others."""
+    """The log without the beams that hit moving objects, and the log with only these beams."""
     assert log.truth is not None
     still, only = dict(log.streams), dict(log.streams)
     for name, labels in log.truth.moving.items():

@@ -1,7 +1,7 @@
-"""Three sessions of one campus in one map: two that overlap, and one that overlaps nothing and hangs by GPS alone.
+"""Three sessions of one campus merged in one map: two overlap; the third is connected by GPS only.
 
-``overlap`` and ``far``: where the second and the third session begin in the frame of the first, against the truth and
-the covariance that the merged graph states. ``untied``: the third session without fixes, which must be refused by name.
+``overlap`` and ``far``: error of the start of the second and the third session in the frame of the first, compared
+with its covariance in the merged graph. ``untied``: the third session without fixes; an error must name it.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from graphslam_studies.sim.campus import simulate_campus
 
 NAMES = ("first", "overlap", "far")
 THREE_SIGMA = float(stats.chi2.cdf(9.0, 1))
-"""Probability of being within 3 σ of one number; of more numbers the quantile of that probability is taken."""
+"""Probability of one scalar within 3 σ; for more dimensions the quantile of this probability is used."""
 
 
 def run_sessions_trial(config: CampusTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one set of three sessions."""
+    """All metrics of one set of three sessions."""
     with one_blas_thread():
         return list(session_figures(config, seed))
 
@@ -77,7 +77,7 @@ def start_of(log: SensorLog, config: CampusTrialConfig) -> Array:
 
 
 def seam(merged: MergedSubmaps, k: int, name: str, true: Array) -> Iterator[Measurement]:
-    """A session's first base in the frame of the first session's: its error, by its stated covariance, and its ties."""
+    """First base of a session in the frame of the first session: error, NEES, and number of constraints."""
     s = merged.sessions[k]
     e = SE3.log(SE3.between(s.T_world_base, true))
     yield Measurement(name, "seam_error", float(np.linalg.norm(e[3:])))

@@ -1,9 +1,9 @@
-"""One run over the campus: what fixes outside are worth inside.
+"""One run over the campus: effect of outdoor fixes on the indoor map.
 
-``odometry``: scan-to-window odometry, its submaps one behind the other; ``odometry-fixes``: with fixes besides.
-``alone``: odometry with loops; ``joint-white`` and ``joint``: the same graph, the same loops, and fixes: every one as
-if its error was a new one; or, as in ``odometry-fixes``, as :attr:`CampusTrialConfig.gps` has it, which says how long
-errors last. So the graphs of a pair (:data:`PAIRS`) differ in the fixes alone.
+``odometry``: chained submaps of scan-to-window odometry; ``odometry-fixes``: the same with fixes.
+``alone``: odometry with loop closures; ``joint-white`` and ``joint``: the same graph and loop closures with fixes.
+Fixes have independent errors in ``joint-white``; in ``joint`` and ``odometry-fixes`` their errors are modelled by
+:attr:`CampusTrialConfig.gps`, with time correlation. The graphs of a pair (:data:`PAIRS`) differ in the fixes only.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ BLOCKS = {"position": slice(3, 6), "plan": slice(3, 5), "heading": slice(2, 3), 
 
 @dataclass(frozen=True, kw_only=True)
 class CampusTrialConfig:
-    """A campus, and how its log becomes a graph."""
+    """A campus, and the settings to make a graph from its log."""
 
     campus: CampusConfig
     front_end: ScanWindowFrontEndConfig = field(
@@ -60,17 +60,17 @@ class CampusTrialConfig:
     )
     back_end: BackEndConfig = field(default_factory=lambda: BackEndConfig(loops=True, level_sigma=0.006, look_every=0))
     gps: GpsOptions = field(default_factory=lambda: GpsOptions(use="all", every=20.0, bias_sigma=0.8, bias_time=300.0))
-    """Reflections last for 10 s, so that one fix in 20 s says all; errors of orbits last for minutes."""
+    """Multipath errors are correlated over 10 s, so one fix per 20 s is used; orbit errors over minutes."""
 
 
 def run_campus_trial(config: CampusTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run."""
+    """All metrics of one run."""
     with one_blas_thread():
         return list(campus_figures(config, seed))
 
 
 def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement]:
-    """Simulate, follow the path, build the graph, and add the fixes to it step by step."""
+    """Simulate, run the front end, build the graph, and solve it with and without fixes."""
     begin = process_time()
     log = simulate_campus(config.campus, seed)
     made = process_time()
@@ -102,7 +102,7 @@ def campus_figures(config: CampusTrialConfig, seed: int) -> Iterator[Measurement
 
 
 def with_fixes(end: BackEnd, gps: Gps, how: GpsOptions) -> tuple[Solution, Array]:
-    """The graph as it is, with these fixes and no others; and its frame in that of the fixes."""
+    """Solve the graph with these fixes only; returns the solution, and the map frame in the frame of the fixes."""
     without_fixes(end)
     end.add_gps(split_fixes(gps, how)[0], how)
     end.graph.finish_sensors()
@@ -116,7 +116,7 @@ def with_fixes(end: BackEnd, gps: Gps, how: GpsOptions) -> tuple[Solution, Array
 
 
 def without_fixes(end: BackEnd) -> None:
-    """Take all fixes out of the graph, and solve."""
+    """Remove all fixes from the graph, and solve it."""
     graph = end.graph
     for fid in [k for k, r in graph.records.items() if isinstance(r, GpsRecord)]:
         graph.remove(fid, reason="the graph is solved without fixes")
@@ -124,21 +124,21 @@ def without_fixes(end: BackEnd) -> None:
 
 
 def submap_lift(config: WindowSubmapConfig) -> float:
-    """Height of a body over the frame of the submap that begins with it [m]."""
+    """Height of the first body of a submap above the submap frame [m]."""
     return LIFT * config.voxel_size
 
 
 class Judge:
-    """A solved path against the truth of its log.
+    """Scores a solved path against ground truth.
 
     Parameters
     ----------
     log : SensorLog
-        Of the campus.
+        Log of the campus.
     begin : float
         Time of the first node [s].
     lift : float
-        Height of the first body over the frame of the map [m].
+        Height of the first body above the map frame [m].
     """
 
     def __init__(self, log: SensorLog, begin: float, lift: float) -> None:
@@ -149,7 +149,7 @@ class Judge:
         base[2] -= lift
         self.base = base
         self.T_world_base = SE3.compose(np.asarray(log.meta["T_world_frame"], dtype=np.float64), base)
-        """The frame of the map in the campus."""
+        """The map frame in the campus frame."""
 
     def true_at(self, times: Array) -> Array:
         """True poses in the frame of the map ``(n, 7)``."""
@@ -157,14 +157,14 @@ class Judge:
         return SE3.between(np.broadcast_to(self.base, poses.shape), poses)
 
     def inside(self, times: Array) -> np.ndarray:
-        """Which times are under a roof."""
+        """Mask of the times that are indoors."""
         out = np.zeros(len(times), dtype=bool)
         for a, b in self.meta["indoor"]:
             out |= (times >= a) & (times <= b)
         return out
 
     def figures(self, kind: str, solution: Solution, T_world_map: Array | None = None) -> Iterator[Measurement]:
-        """Errors and honesty of one graph, and where in the campus fixes have its map, if any do."""
+        """Errors and NEES of one graph; with ``T_world_map`` (from fixes) also the error in the campus frame."""
         path = solution.trajectory()
         true = self.true_at(path.times)
         inside = self.inside(path.times)
@@ -188,7 +188,7 @@ class Judge:
         yield Measurement(kind, "failed", 0.0)
 
     def honesty(self, kind: str, path: Trajectory, true: Array, inside: np.ndarray) -> Iterator[Measurement]:
-        """NEES a degree of freedom, first base held: in the middle of the way, inside, at the end, and on the mean."""
+        """NEES per degree of freedom, first base fixed: mid-path, indoors, at the end, and mean over the path."""
         assert path.covariances is not None
         e = SE3.log(SE3.between(path.poses, true))
         n = len(e)
@@ -205,18 +205,18 @@ class Judge:
 
 
 def rms(x: Array) -> float:
-    """Root of the mean square; NaN of nothing."""
+    """Root mean square; NaN if empty."""
     return float(np.sqrt(np.mean(x**2))) if len(x) else float("nan")
 
 
 def off_as_a_whole(poses: Array, true: Array) -> Array:
-    """Distances ``(n,)`` [m] from the true places after one turn and shift of all poses ``(n, 7)``."""
+    """Position errors ``(n,)`` [m] after rigid alignment of all poses ``(n, 7)``."""
     T, _ = fit_alignment(true, poses, "se")
     return np.asarray(np.linalg.norm(SE3.compose(np.broadcast_to(T, poses.shape), poses)[:, :3] - true[:, :3], axis=1))
 
 
 def angle_errors(legs: list[list[list[float]]], path: Trajectory, true: Array) -> list[float]:
-    """Error of the angle between the two legs of a corridor [rad], for every drive through it."""
+    """Errors of the angle between the two legs of a corridor [rad], one per traversal."""
     turned: list[list[tuple[float, float]]] = []
     for leg in legs:
         turned.append([])
@@ -226,5 +226,5 @@ def angle_errors(legs: list[list[list[float]]], path: Trajectory, true: Array) -
                 p, q = path.poses[k, :2] - path.poses[k, :2].mean(axis=0), true[k, :2] - true[k, :2].mean(axis=0)
                 turn = np.arctan2(np.sum(q[:, 0] * p[:, 1] - q[:, 1] * p[:, 0]), np.sum(p * q))
                 turned[-1].append((0.5 * (a + b), float(turn)))
-    # the two legs of one drive are those nearest in time
+    # the two legs of one traversal are those closest in time
     return [float(wrap_angle(min(turned[1], key=lambda y: abs(y[0] - x[0]))[1] - x[1])) for x in turned[0] if turned[1]]

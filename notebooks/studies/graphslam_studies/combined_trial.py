@@ -1,7 +1,7 @@
 """One run of the Combined SLAM study: every algorithm on exactly the same simulated data.
 
-The log is drawn once; every front end cuts it at the same scans; every joiner gets the same submaps. Known association
-throughout, as in the paper.
+The log is simulated once. All front ends cut it at the same scans, and all map-joining methods get the same submaps.
+Data association is known, as in the paper.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ CLASSICAL: dict[str, Callable[..., JoinResult]] = {
     "eif": partial(join_sequential, classical=True),
     "eif-tree": partial(join_tree, classical=True),
 }
-"""The paper's joiners: Cartesian, each join linearised once."""
+"""Map-joining methods of the paper: Cartesian, each join linearised once."""
 
 
 @dataclass(frozen=True)
 class TrialConfig:
-    """What is compared, on which world.
+    """World and settings of a trial.
 
     Parameters
     ----------
     world : str
         Preset of the landmark field.
     scans : int
-        Scans of a submap, the same for all algorithms.
+        Scans per submap, the same for all algorithms.
     layout_seed : int, optional
-        Holds the features where they are over the runs. Every run draws its own features where it is not given.
+        Fixes the features for all runs. By default they are random in every run.
     particles, default_particles : int
-        Of the paper's filters, and of the default front end.
+        Number of particles of the filters of the paper, and of the default front end.
     """
 
     world: str
@@ -68,7 +68,7 @@ class TrialConfig:
 
 
 def run_trial(config: TrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run (see :mod:`graphslam_studies.combined_slam` for their names)."""
+    """All metrics of one run (see :mod:`graphslam_studies.combined_slam` for their names)."""
     with one_blas_thread():
         return list(_Trial(config, seed).run())
 
@@ -85,7 +85,7 @@ class _Trial:
         self.judge = Judge(self.log.truth, scans[ends - 1], world["laps"] * world["lap_length"])
 
     def run(self) -> Iterator[Measurement]:
-        """Single-map filters, local maps, and what becomes of them."""
+        """Metrics of single-map filters, local maps, and joined maps."""
         yield from self._single_map("ekf", ekf_snapshots, "ekf-slam")
         yield from self._single_map("rbpf", rbpf_snapshots, "rbpf-slam", particles=self.config.particles)
         paper = {"handover": "moments", "particles": self.config.particles}
@@ -113,7 +113,7 @@ class _Trial:
     # ---------------------------------------------------------------- front ends
 
     def _options(self, front_end: str, options: dict[str, Any]) -> dict[str, Any]:
-        """The preset's options with those of the study on top: noise as the log states it, equal cuts."""
+        """Options of the preset, overridden by those of the study (known association, equal cuts)."""
         own = {"association": "known", "stopping": {"scans": self.config.scans}}
         merged: dict[str, Any] = merge_options(
             recommended_options(self.log, front_end), {"frontend": merge_options(own, options)}
@@ -135,7 +135,7 @@ class _Trial:
         watched = snapshots(self.log, config, seed=self.seed.child("single-map"), cuts=self.cuts, joint="last")
         try:
             rows, kept = watch_snapshots(self.judge, name, watched)
-        except GraphSlamError:  # the filter broke down (its covariance did): that is a result, not a failed trial
+        except GraphSlamError:  # numerical failure of the filter: a result, not a failed trial
             yield Measurement(name, "diverged", 1.0)
             return
         yield from rows
@@ -155,7 +155,7 @@ class _Trial:
     def _joined(
         self, family: str, submaps: list[Submap], joiners: dict[str, Callable[..., JoinResult]]
     ) -> Iterator[Measurement]:
-        """The classical ways, and from the tree to the optimum."""
+        """Joined maps, and the optimum started from the tree."""
         done: dict[str, JoinResult] = {}
         for kind, join in joiners.items():
             name = f"{family}-{kind}"
@@ -185,7 +185,7 @@ class _Trial:
         yield Measurement(name, "polish_iterations", float(polished.iterations))
 
     def _least_squares(self, submaps: list[Submap]) -> Iterator[Measurement]:
-        """Every way to the optimum of the default submaps, the optimum at every submap, and the full batch."""
+        """Optimum of the default submaps by every method, online methods, and the full batch."""
         best = solve_submaps(submaps)
         yield Measurement("default-batch", "objective_optimum", best.objective)
         yield Measurement("default-batch", "objective_dof", float(_degrees_of_freedom(submaps, best)))
@@ -211,7 +211,7 @@ class _Trial:
         yield from self._full_batch(submaps, best)
 
     def _full_batch(self, submaps: list[Submap], best: SubmapEstimate) -> Iterator[Measurement]:
-        """All scan poses at once, from the submaps' optimum."""
+        """Batch over all scan poses, started from the optimum of the submaps."""
         front_end = make_front_end("rbpf-ekf", self._options("rbpf-ekf", {}))
         data = prepare_log(self.log, front_end.config, DropCounter())
         start = np.concatenate(

@@ -1,4 +1,4 @@
-"""``graphslam study``, ``terrain-tables``."""
+"""Commands ``graphslam study`` and ``graphslam terrain-tables``."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def study(
     )
     try:
         reports = {k: v.to_dict("records") for k, v in result.report().items()} if len(result.table) else {}
-    except GraphSlamError:  # already said, and written in report.md
+    except GraphSlamError:  # already printed, and written to report.md
         reports = {}
     failures = result.failures.to_dict("records")
     rows = [{"world": w, "runs": n} for w, n in result.runs.items()]

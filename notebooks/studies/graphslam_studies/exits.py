@@ -1,15 +1,15 @@
-"""The study ``exits``: are exits honest on robots that nothing was fitted on?
+"""The study ``exits``: consistency of exits (end poses of submaps) of robots that were not used for tuning.
 
-A robot is drawn, wheels, gyro, attitude, laser and speed, and drives garages that are drawn in each run, with other
-clutter and errors. The estimator is told what a data sheet says: the σ of the wheels, of their scale, of the gyro's
-bias and of the attitude. Shares and walks of the exits' covariance stay those that the program has.
+A robot has random parameters (wheels, gyro, attitude, laser, speed) and drives in garages with random layout, clutter
+and errors in each run. The estimator gets data-sheet values: σ of the wheels, of their scale and of the attitude bias.
+The parameters of the exit covariance are the defaults.
 
-Worlds: ``robot-1`` to ``robot-6``, always the same six; ``robot-0``, that of the other studies.
+Worlds: ``robot-1`` to ``robot-6``, six fixed random robots; ``robot-0``, the robot of the other studies.
 
 Quantities
 ----------
 ``exit_nees`` of all four components (heading, x, y, z) of every exit; ``exit_nees_heading``, ``…_plan``, ``…_height``
-by block, a degree of freedom. SegSLAM: of each settled segment; RBPF: where the whole log ends.
+by block, per degree of freedom. SegSLAM: of each settled segment; RBPF: of the end pose of the log.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ FACTOR = {
     **{"gyro": 4.0, "gyro_bias_across": 4.0, "drift": 3.0, "attitude_sigma": 4.0, "attitude_bias": 4.0},
     **{"scan_rate": 1.6, "spin_rate": 1.6, "beams": 2.0, "speed": 2.0},
 }
-"""Figures of a robot are drawn between the default by this and the default times this; their logarithms are uniform."""
+"""Parameters are log-uniform between the default divided by this factor and the default times this factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExitsTrialConfig:
-    """A robot, and what is run on its logs."""
+    """A robot, and the settings of its runs."""
 
     grid: GridTrialConfig
-    """Filters, and world."""
+    """World and filters."""
     robot: int = 1
-    """Which robot is drawn."""
+    """Number of the random robot; 0: default robot."""
 
 
 def drawn_robot(number: int, base: CrawlerConfig | None = None) -> tuple[CrawlerConfig, float]:
-    """Robot ``number``, 0 being the ``base``, and its speed by that of a world's robot."""
+    """Random robot ``number`` (0: the ``base``), and the factor on its speed."""
     if number == 0:
         return CrawlerConfig() if base is None else base, 1.0
     rng = SeedTree(number).child("robot-of-exits").generator()
@@ -62,12 +62,12 @@ def drawn_robot(number: int, base: CrawlerConfig | None = None) -> tuple[Crawler
 
 
 def told(robot: CrawlerConfig) -> DeadReckoningNoise:
-    """What the data sheets of a robot say, of which its log does not speak."""
+    """Noise parameters from the data sheet of a robot, which are not in its log."""
     return DeadReckoningNoise(wheel=robot.wheel_sigma, wheel_scale=robot.wheel_scale, attitude_bias=robot.attitude_bias)
 
 
 def run_exits_trial(config: ExitsTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run."""
+    """All metrics of one run."""
     grid = config.grid
     robot, speed = drawn_robot(config.robot, grid.crawler)
     steps = replace(grid.steps, noise=told(robot))
@@ -93,7 +93,7 @@ class ExitsStudy(WorldsStudy[ExitsTrialConfig]):
     run_one = staticmethod(run_exits_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``exits``: NEES a degree of freedom by robot and block, with its interval over runs; ``inside``: the share of
+        """``exits``: NEES per degree of freedom by robot and block, with its interval over runs; ``inside``: share of
         exits in their 95 % region; ``matches``."""
         return {
             "exits": exit_table(table),
@@ -102,12 +102,12 @@ class ExitsStudy(WorldsStudy[ExitsTrialConfig]):
         }
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """None."""
+        """No plots."""
         return []
 
 
 def inside_table(table: pd.DataFrame, probability: float = 0.95) -> pd.DataFrame:
-    """Share of the exits of a robot inside the region that should hold ``probability`` of them."""
+    """Share of the exits of a robot inside their confidence region of ``probability``."""
     out: list[tables.Row] = []
     for world, name in tables.cases(table):
         of = table[(table["world"] == world) & (table["algorithm"] == name) & (table["quantity"] == "exit_nees")]

@@ -1,19 +1,19 @@
-"""The study ``heights``: do floors stay where they are if particles are weighed by upright surfaces and casts?
+"""The study ``heights``: height errors of particle filters with two likelihoods.
 
-End points of floors and ceilings pull a particle filter down on ramps. Here every run is filtered twice, with the same
-world, robot, errors and seed: by the end points of all beams (``endpoint``), and by those of upright surfaces with some
-casts beside them (``upright``). Figures are those of the filters themselves, before a graph or a refinement; in worlds
-``…-refined`` each of the two also becomes a graph and a path refined by its scans.
+End points on floors and ceilings bias a particle filter on ramps. Here every run is filtered twice, with the same
+world, robot, errors and seed: with the end points of all beams (``endpoint``), and with those on vertical surfaces plus
+some ray casts (``upright``). Metrics are those of the filters, without graph and refinement; in worlds ``…-refined``
+the graph and the refined path are scored too.
 
-Worlds: ``garage-drawn``, layout and robot drawn in each run; the garages ``garage-B`` and ``garage-D``; ``building``.
+Worlds: ``garage-drawn``, random layout and robot in each run; the garages ``garage-B`` and ``garage-D``; ``building``.
 
 Quantities
 ----------
-``climb_up``, ``climb_down``: mean error of the climb of the ramps of a run, as a share of it, above 0 where ramps come
-out too steep; ``…_size``: mean of its size. ``height_rmse`` from the start and ``height_std`` about its mean [m].
-``ate_aligned`` and, seen from above, ``ate_plan`` [m], ``heading_rms`` [rad], ``final_error`` [m]. Of the exits of
+``climb_up``, ``climb_down``: mean relative error of the climb of the ramps of a run, positive if too steep; ``…_size``:
+mean absolute value. ``height_rmse``, anchored at the start, and ``height_std``, about the mean [m].
+``ate_aligned`` and, in the plane, ``ate_plan`` [m], ``heading_rms`` [rad], ``final_error`` [m]. Of the exits of
 SegSLAM ``exit_nees`` and its blocks ``exit_nees_heading``, ``…_plan``, ``…_height``. ``rounds`` of the refinement.
-Timings: ``cpu``, of a filter with all that it prepares; ``cpu_share`` of a refinement.
+Timings: ``cpu``, of a filter with its preparation; ``cpu_share`` of a refinement.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ from graphslam_studies.segslam_trial import LEVEL, QUICK, Figure, GridTrial, Gri
 
 Likelihood = Literal["endpoint", "cast", "upright"]
 PAIR: tuple[Likelihood, Likelihood] = ("endpoint", "upright")
-"""As it is, and the rival."""
+"""Reference and alternative."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeightsTrialConfig:
-    """A world, and what is compared in it."""
+    """A world, and settings of its runs."""
 
     grid: GridTrialConfig
-    """World, robot, steps, filters; how they weigh is set by the study."""
+    """World, robot, steps, filters; the study sets their likelihood."""
     drawn: bool = False
-    """Draw the robot, and the layout of the garage."""
+    """Random robot and layout of the garage."""
     refined: bool = False
-    """Also make a graph of what SegSLAM settled, and refine its path by the scans."""
+    """Also make a graph of the settled segments of SegSLAM, and refine its path by the scans."""
 
 
 def run_heights_trial(config: HeightsTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run, of both ways to weigh."""
+    """All metrics of one run, with both likelihoods."""
     with one_blas_thread():
         grid = drawn_garage(config.grid, seed) if config.drawn else config.grid
         trial: GridTrial
@@ -69,7 +69,7 @@ def run_heights_trial(config: HeightsTrialConfig, seed: int) -> list[Measurement
 
 
 def both(trial: GridTrial) -> Iterator[Measurement]:
-    """Figures of all algorithms of a trial with each likelihood, named after it as well."""
+    """Metrics of all algorithms of a trial with each likelihood, whose name is appended to the algorithm."""
     grid = trial.config
     for likelihood in PAIR:
         weigh = [replace(filter, likelihood=likelihood) for filter in (grid.filter, grid.segslam_filter)]
@@ -110,7 +110,7 @@ class HeightsStudy(WorldsStudy[HeightsTrialConfig]):
     run_one = staticmethod(run_heights_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``pairs``: both ways run by run; ``exits`` by block; ``cost``: CPU time in pairs; ``matches``."""
+        """``pairs``: paired comparison; ``exits`` by block; ``errors`` of exits; ``cost``: CPU time; ``matches``."""
         out = {"pairs": pair_table(table, COMPARED), "exits": exit_table(table), "errors": tables.exit_table(table)}
         out["matches"] = tables.match_table(table)
         if not timings.empty:
@@ -118,14 +118,14 @@ class HeightsStudy(WorldsStudy[HeightsTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Heights and errors seen from above of all runs."""
+        """Height errors and errors in the plane of all runs."""
         return draw_runs(table, DRAWN, folder)
 
 
 def pair_table(table: pd.DataFrame, quantities: tuple[str, ...]) -> pd.DataFrame:
-    """Mean of a figure with each likelihood over the runs that have both, and of the difference with its 95 % interval.
+    """Mean of a metric with each likelihood over the runs that have both, and of the difference with its 95 % interval.
 
-    ``less``: runs in which the rival's is smaller.
+    ``less``: number of runs in which the alternative is smaller.
     """
     old, new = PAIR
     out: list[tables.Row] = []
@@ -148,7 +148,7 @@ def pair_table(table: pd.DataFrame, quantities: tuple[str, ...]) -> pd.DataFrame
 
 
 def exit_table(table: pd.DataFrame) -> pd.DataFrame:
-    """NEES a degree of freedom of the exits by block, with bounds over the runs and those of honest exits (95 %)."""
+    """NEES per degree of freedom of the exits by block, with 95 % interval, and 95 % bounds of consistent exits."""
     out: list[tables.Row] = []
     for world, name in tables.cases(table):
         of = table[(table["world"] == world) & (table["algorithm"] == name)]

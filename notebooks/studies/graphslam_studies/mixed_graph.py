@@ -1,8 +1,8 @@
 """The study ``mixed``: one graph with landmark submaps, dense submaps, matches, GPS and IMU, by every method.
 
-Every run draws a mixed world (building, trees, route, biases, all noise levels; :mod:`graphslam.sim.mixed`). Both front
-ends map it, ``rbpf-ekf`` where trees are seen and ``segslam`` elsewhere, and the graph is solved four times: with GPS
-and IMU, with one of them, and with neither. Identities of the trees are known, so that landmarks are scored as well.
+Every run has a random mixed world (building, trees, route, biases, all noise levels; :mod:`graphslam.sim.mixed`). Both
+front ends map it, ``rbpf-ekf`` where trees are visible and ``segslam`` elsewhere. The graph is solved four times: with
+GPS and IMU, with one of them, and with neither. Identities of the trees are known, so landmarks are scored too.
 
 Algorithms
 ----------
@@ -10,8 +10,8 @@ Algorithms
 
 Quantities
 ----------
-``nees_before``, ``nees_after``: joint NEES of the ends of all submaps and of all trees, first base held, before and
-after relinearisation; ``dof`` its dimension. ``objective_before``, ``objective_after``; ``rmse_poses``,
+``nees_before``, ``nees_after``: joint NEES of all submap end poses and all trees, first base fixed, before and after
+relinearisation; ``dof`` its dimension. ``objective_before``, ``objective_after``; ``rmse_poses``,
 ``rmse_landmarks`` [m] after. Of ``batch`` besides: ``nees_poses`` with ``dof_poses``, ``nees_landmarks`` with
 ``dof_landmarks``, and ``chi2_<class>`` with ``dof_<class>`` of ``submaps`` (of both kinds, with matches), ``gps``,
 ``imu``.
@@ -45,9 +45,9 @@ from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
 from graphslam_studies.segslam_report import values
 
 SENSORS = ("+gps+imu", "+gps", "+imu", "")
-"""Besides the submaps."""
+"""Sensors besides the submaps."""
 WANTED = (0.9, 1.12)
-"""NEES/n of the optimum over all runs."""
+"""Target interval of NEES/n of the optimum over all runs."""
 OPTIONS: dict[str, Any] = {
     "frontend": {"rbpf-ekf": {"association": "known"}},
     "imu": {"use": "auto"},
@@ -56,7 +56,7 @@ OPTIONS: dict[str, Any] = {
 
 
 def run_mixed_trial(config: MixedConfig, seed: int) -> list[Measurement]:
-    """All figures of one world."""
+    """All metrics of one run."""
     with one_blas_thread():
         return list(_figures(config, seed))
 
@@ -106,7 +106,7 @@ def _parts(name: str, problem: JoinProblem, truth: MapTruth) -> Iterator[Measure
     score = problem.graph.objective(best.values)
     sums: dict[str, list[float]] = {}
     for group in problem.factor_counts():
-        # both kinds of submaps measure the nodes, so their degrees of freedom are known together alone
+        # both kinds of submaps measure the nodes, so only the sum of their degrees of freedom is known
         whole = sums.setdefault(group.split("-")[0] if group.startswith(("gps", "imu")) else "submaps", [0.0, 0.0])
         whole[0] += score[group].chi2
         whole[1] += score[group].dof
@@ -145,13 +145,13 @@ PARTS = ("poses", "landmarks")
 
 
 def _cases(table: pd.DataFrame, *methods: str) -> list[tuple[str, str]]:
-    """World and algorithm of all that ran, of some methods."""
+    """Pairs of world and algorithm, for some methods."""
     names = [f"{m}{s}" for s in SENSORS for m in methods]
     return [(w, a) for w in dict.fromkeys(table["world"].astype(str)) for a in names]
 
 
 def _ratio(table: pd.DataFrame, world: str, algorithm: str, prefix: str, part: str) -> dict[str, Any]:
-    """Sum of a χ² over all runs by its degrees of freedom, with two-sided bounds of 95 %."""
+    """Sum of a χ² over all runs per degree of freedom, with two-sided 95 % bounds."""
     x, n = (values(table, world, algorithm, f"{p}{part}") for p in (prefix, "dof_"))
     total = float(n.sum())
     row: dict[str, Any] = {"world": world, "graph": algorithm, "part": part, "runs": len(x), "n": total}
@@ -164,8 +164,8 @@ def _ratio(table: pd.DataFrame, world: str, algorithm: str, prefix: str, part: s
 def consistency_table(table: pd.DataFrame) -> pd.DataFrame:
     """NEES/n of the joint map of every method before and after relinearisation, over all runs.
 
-    ``low`` and ``high``: two-sided bounds of 95 % of a consistent estimator, of all scalars of all runs. ``±``: half of
-    Student's interval of 95 % of the mean of NEES/n over the runs.
+    ``low`` and ``high``: two-sided 95 % bounds of a consistent estimator, pooled over all runs. ``±``: half of
+    Student's 95 % interval of the mean of NEES/n over the runs. ``gap``: largest relative change of the objective.
     """
     out = []
     for world, algorithm in _cases(table, *DEFAULT_METHODS):
@@ -189,14 +189,14 @@ RMSE = ("rmse_poses", "rmse_landmarks")
 
 
 def factor_table(table: pd.DataFrame) -> pd.DataFrame:
-    """χ² by degree of freedom of every class of factors at the optimum, over all runs."""
+    """χ² per degree of freedom of every class of factors at the optimum, over all runs."""
     groups = [q.removeprefix("chi2_") for q in dict.fromkeys(table["quantity"]) if q.startswith("chi2_")]
     rows = [_ratio(table, *case, "chi2_", g) for case in _cases(table, "batch") for g in groups]
     return pd.DataFrame([r for r in rows if r["n"] > 0])
 
 
 def sentences(found: pd.DataFrame) -> list[str]:
-    """One for every graph: is the map at the optimum consistent, and how far off are the filters before it?"""
+    """One sentence per graph: consistency of the map at the optimum, and NEES/n before relinearisation."""
     out = []
     for (world, sensors), rows in found.assign(s=found["algorithm"].str.extract(r"(\+.*|)$")[0]).groupby(
         ["world", "s"], sort=False

@@ -1,14 +1,14 @@
-"""The study ``refinement``: how near the truth scans bring the solved path, how honestly, and what they forgive.
+"""The study ``refinement``: accuracy, consistency and robustness of the path after refinement by scans.
 
-Worlds: two garages, the mine (once and twice round), the building; ``garage-drawn``: layouts and robots drawn anew in
-each run, with wrong loops in the start and faults of the robot. Clutter and every sensor error are drawn in each run.
+Worlds: two garages, the mine (one and two rounds), the building; ``garage-drawn``: random layouts and robots in each
+run, with wrong loop closures in the initial graph, and robot faults. Clutter and sensor errors are random in each run.
 
 Quantities
 ----------
-``ate_start``, ``ate_aligned``, ``height_rmse``, ``heading_rms`` of the path; ``worse``: 1 where the refinement was
-taken and is farther off than its start. ``nees…``: squared error a degree of freedom, mean over the steps, from
-the start and by block; ``nees_relative``: over 30 s. ``entropy_min``: entropy of all scans along the path; of SegSLAM
-the least over its map samples. ``cpu_share``: CPU time by the length of the log.
+``ate_start``, ``ate_aligned``, ``height_rmse``, ``heading_rms`` of the path; ``worse``: 1 if the refined path was
+accepted and has a larger error than its start. ``nees…``: NEES per degree of freedom, mean over the steps, relative to
+the first pose, and by block; ``nees_relative``: over 30 s. ``entropy_min``: entropy of all scans along the path; of
+SegSLAM the minimum over its map samples. ``cpu_share``: CPU time over the duration of the log.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graphslam_studies.segmap_trial import GraphTrialConfig
 
 
 def _alone(config: GraphTrialConfig) -> GraphTrialConfig:
-    """With SegSLAM alone."""
+    """The same with SegSLAM only."""
     grid = config.grid
     return replace(config, grid=replace(grid, algorithms=tuple(a for a in grid.algorithms if a.startswith("segslam"))))
 
@@ -61,12 +61,12 @@ class RefinementStudy(WorldsStudy[RefinementTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Errors, honesty and entropies of all runs."""
+        """Errors, NEES and entropies of all runs."""
         return draw_runs(table, DRAWN, folder)
 
 
 def gain_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Each refinement: mean and worst error, runs in which it is worse than its start, clearer than the samples."""
+    """Each refinement: mean and worst error, runs worse than their start, share with less entropy than the samples."""
     out: list[tables.Row] = []
     for world, kind in tables.cases(table):
         ate = tables.values(table, world, kind, "ate_aligned")

@@ -1,8 +1,8 @@
-"""One run of a world refined by its scans: the graph's path, the refined one, what wrong starts do to it.
+"""One run of refinement by scans: the path of the graph, the refined path, and refinements from wrong starts.
 
-Beside SegSLAM's own figures: ``loops``, the graph where the refinement begins; ``refined``; ``wrong-N``, the same begun
-at the graph with N wrong loops between far places, each with a small covariance; ``mount``, ``clock``, ``moving``: the
-scanner turned by a degree, the motion's stamps late by 50 ms, a tenth of the returns from things that walk about.
+Besides the metrics of SegSLAM: ``loops``: initial graph; ``refined``; ``wrong-N``: refinement started from the graph
+with N wrong loop closures between distant places, each with a small covariance; ``mount``: scanner rotated by 1°;
+``clock``: motion stamps late by 50 ms; ``moving``: 10 % of the returns from moving people.
 """
 
 from __future__ import annotations
@@ -46,33 +46,33 @@ ROBOTS = {
     "attitude_sigma": (0.002, 0.009),
     "drift": (0.01, 0.05),
 }
-"""Least and greatest of figures of a drawn robot, whose logarithms are uniform."""
+"""Ranges of the parameters of a random robot; log-uniform."""
 FAULTS = ("mount", "clock", "moving")
 WRONG_SIGMA = (0.005, 0.005, 0.005, 0.02, 0.02, 0.02)
-"""σ that a wrong loop claims [rad], [m]."""
+"""σ of a wrong loop closure in the graph [rad], [m]."""
 SETTLED = 10
-"""Steps that are not scored at the start: what is anchored has no error there."""
+"""Number of first steps that are not scored, because the anchored path has almost no error there."""
 APART = 30.0
 """Time between poses whose relative error is scored [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefinementTrialConfig:
-    """A world, and what is done to the refinement in it."""
+    """A world, and the variants of its refinement."""
 
     graph: GraphTrialConfig
-    """The world, and how its graph is made."""
+    """World, and settings of its graph."""
     drawn: bool = False
-    """Draw the robot, and the layout of the garage."""
+    """Random robot and layout of the garage."""
     wrong: tuple[int, ...] = ()
-    """Numbers of wrong loops."""
+    """Numbers of wrong loop closures."""
     faults: tuple[str, ...] = ()
-    """Of :data:`FAULTS`."""
+    """Faults to test, of :data:`FAULTS`."""
     refine: RefineConfig = field(default_factory=RefineConfig)
 
 
 def run_refinement_trial(config: RefinementTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run."""
+    """All metrics of one run."""
     with one_blas_thread():
         grid = config.graph.grid
         if config.drawn:
@@ -81,7 +81,7 @@ def run_refinement_trial(config: RefinementTrialConfig, seed: int) -> list[Measu
 
 
 def drawn_garage(config: GridTrialConfig, seed: int) -> GridTrialConfig:
-    """With the robot and the layout that a seed draws."""
+    """The config with a random robot and layout."""
     rng = SeedTree(seed).child("robot").generator()
     found = {k: float(np.exp(rng.uniform(np.log(a), np.log(b)))) for k, (a, b) in ROBOTS.items()}
     return replace(config, crawler=crawler_preset("light", **found), layout=str(rng.choice(list("ABCD"))))
@@ -89,12 +89,12 @@ def drawn_garage(config: GridTrialConfig, seed: int) -> GridTrialConfig:
 
 @dataclass
 class RefinementTrial(GraphTrial):
-    """SegSLAM of a run, its graph, and refinements of that."""
+    """SegSLAM of a run, its graph, and refinements."""
 
     study: RefinementTrialConfig = field(kw_only=True)
 
     def figures(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
-        """Those of SegSLAM, of its graph, and of the refinements."""
+        """Metrics of SegSLAM, of its graph, and of the refinements."""
         yield from super(GraphTrial, self).figures(name, outcome)
         result = outcome.result
         if not isinstance(result, SegSlamResult):
@@ -116,7 +116,7 @@ class RefinementTrial(GraphTrial):
     def refined(
         self, kind: str, scans: Scans, start: Array, base: Array, *, entropy: bool = False
     ) -> Iterator[Measurement]:
-        """Figures of a refinement from a start."""
+        """Metrics of a refinement from an initial path."""
         true = self.true_at(scans.times, base)
         start = Trajectory(self.steps.times, start).interpolate(
             np.clip(scans.times, self.steps.times[0], self.steps.times[-1])
@@ -162,7 +162,7 @@ class RefinementTrial(GraphTrial):
         return SE3.between(np.broadcast_to(base, truth.shape), truth)
 
     def bent(self, submaps: Sequence[Submap], count: int) -> Array:
-        """Path of the graph with wrong loops between places more than 8 m and 30 s apart."""
+        """Path of the graph with wrong loop closures between places 8 to 40 m and more than 30 s apart."""
         c = self.graph
         graph = FactorGraph(3)
         for s in submaps:
@@ -189,7 +189,7 @@ class RefinementTrial(GraphTrial):
         return solver.solution().trajectory().interpolate(self.steps.times)
 
     def faulty(self, fault: str, scans: Scans) -> Scans:
-        """The scans of a robot with a fault."""
+        """Scans with one of :data:`FAULTS`."""
         if fault == "mount":
             a = np.deg2rad(1.0)
             R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
@@ -205,7 +205,7 @@ class RefinementTrial(GraphTrial):
         t = scans.times[np.repeat(np.arange(len(scans)), np.diff(scans.offsets))]
         rows = np.flatnonzero(scans.returns)
         rows = rows[rng.random(len(rows)) < 0.1]
-        who = rng.integers(0, 5, len(rows))  # five that walk about the robot at 1 m/s, on circles of 2 to 6 m
+        who = rng.integers(0, 5, len(rows))  # five people walk around the robot at 1 m/s, on circles of 2 to 6 m
         angle = t[rows] / (2.0 + who) * (1 - 2 * (who % 2)) + 1.3 * who
         skin = rng.uniform(0, 2 * np.pi, len(rows))
         points[rows, 0] = (2.0 + who) * np.cos(angle) + 0.25 * np.cos(skin)
@@ -215,7 +215,7 @@ class RefinementTrial(GraphTrial):
 
 
 def nees_of(found: Refinement, true: Array) -> dict[str, float]:
-    """Squared errors by degree of freedom, mean over the steps: anchored, by block, and relative over 30 s."""
+    """NEES per degree of freedom, mean over the steps: anchored, by block, and relative over 30 s."""
     g = group_of(found.poses)
     e = g.log(g.between(found.poses, true))[SETTLED:]
     C = found.covariances[SETTLED:]

@@ -1,15 +1,15 @@
-"""The study ``scale``: ways to relax a skeleton network, what its approximations cost, and which starts it survives.
+"""The study ``scale``: methods to relax a skeleton network, costs of approximations, convergence from bad starts.
 
-Worlds: ``laps-…``, every method from dead reckoning; ``collapse-…``, wrong unions, links that are dropped, passes
-averaged; ``stability-…``, growing errors of the odometry's turns without GPS and tilt, from dead reckoning:
-relinearised, linearised once (an information form), and links between pairs of poses that are fixed once (Lu and
-Milios). Times and memory by size are measured elsewhere (``tests/benchmarks/bench_scale.py``).
+Worlds: ``laps-…``: every method, started from dead reckoning; ``collapse-…``: wrong unions of landmarks, dropped links,
+averaged traversals; ``stability-…``: increasing odometry heading errors without GPS and tilt, from dead reckoning:
+relinearised, linearised once (information form), and links between pairs of poses computed once (Lu and Milios).
+Times and memory by size are measured elsewhere (``tests/benchmarks/bench_scale.py``).
 
 Quantities
 ----------
-``gap`` to the least objective; ``chi2`` per degree of freedom; ``residual``: length of the gradient over that at the
+``gap`` to the minimum objective; ``chi2`` per degree of freedom; ``residual``: norm of the gradient over that at the
 start; ``to_optimum``, ``to_truth``: rms distance of positions [m]; ``iterations``, ``products`` with the Schur
-complement; ``split``: landmarks found to be wrong unions.
+complement; ``split``: landmarks detected as wrong unions.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ class ScaleStudy(WorldsStudy[ScaleTrialConfig]):
     run_one = staticmethod(run_scale_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """A table for each world: means over the runs, a row for each method; ``cpu``: seconds of the methods."""
+        """One table per world: means over the runs, one row per method; ``cpu``: time of the methods [s]."""
         out = {world: mean_table(table, world) for world in dict.fromkeys(table["world"])}
         if not timings.empty:
             out["cpu"] = timings.groupby(["world", "algorithm"], sort=False)["value"].mean().reset_index()
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Distances to optimum and truth of all runs."""
+        """Distances to optimum and ground truth of all runs."""
         return draw_runs(table, DRAWN, folder)
 
 

@@ -1,4 +1,4 @@
-"""One trial of the study ``scale``: one laps world, relaxed in every way, or approximated, or with a bad start."""
+"""One trial of the study ``scale``: one laps world, relaxed by every method, or approximated, or from a bad start."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class ScaleTrialConfig:
     ----------
     what : {"methods", "approximations", "stability"}
     wrong : tuple of float
-        Shares of the landmarks of several passes that are merged with another one.
+        Shares of the landmarks with several traversals that are wrongly merged with another one.
     kept : tuple of float
-        Shares of the landmarks of several passes that stay so; the others fall apart into one for each pass.
+        Shares of the landmarks with several traversals that are kept; others are split, one per traversal.
     turns : tuple of float
-        Stability: σ of the odometry's turn in each step [rad].
+        Stability: σ of the odometry heading per step [rad].
     """
 
     what: Literal["methods", "approximations", "stability"] = "methods"
@@ -91,7 +91,7 @@ def _said(name: str, found: RelaxationResult, best: RelaxationResult, truth: Pos
 
 
 def _methods(config: ScaleTrialConfig, seed: int) -> Rows:
-    """Every method from dead reckoning, the same start for all."""
+    """Every method, started from dead reckoning."""
     world = draw_laps(config.world, seed)
     problem = world.problem()
     start = problem.dead_reckoning()
@@ -103,7 +103,7 @@ def _methods(config: ScaleTrialConfig, seed: int) -> Rows:
 
 
 def _approximations(config: ScaleTrialConfig, seed: int) -> Rows:
-    """The optimum of the exact network, and those of what is approximated."""
+    """Optimum of the exact network, and of approximate ones."""
     world = draw_laps(config.world, seed)
     landmark, _ = world.collapsed()
     points = world.points()
@@ -125,10 +125,10 @@ def _approximations(config: ScaleTrialConfig, seed: int) -> Rows:
 def _labels(
     config: ScaleTrialConfig, world: Laps, landmark: Labels, rng: np.random.Generator
 ) -> Iterator[tuple[str, Labels, bool]]:
-    """Names and landmarks of the variants, and whether wrong unions are looked for."""
+    """Names and landmarks of the variants, and whether wrong unions are searched and split."""
     yield "exact", landmark, True
     passes, _ = pass_labels(landmark, world.first)
-    # a landmark of several passes holds several labels of passes
+    # a landmark with several traversals has several traversal labels
     pairs = np.unique(np.column_stack([landmark, passes]), axis=0)
     several = np.flatnonzero(np.bincount(pairs[:, 0]) > 1)
     for share in config.wrong:
@@ -149,7 +149,7 @@ def _labels(
 
 
 def pass_labels(landmark: Labels, first: npt.NDArray[np.int64], gap: int = 20) -> tuple[Labels, int]:
-    """A label of its own for every pass of every landmark ``(M,)``, and how many there are."""
+    """Labels ``(M,)``, one per traversal of each landmark, and their number."""
     pose = np.repeat(np.arange(len(first) - 1), np.diff(first))
     collapse = Collapse(len(landmark))
     order = np.lexsort((pose, landmark))
@@ -159,10 +159,10 @@ def pass_labels(landmark: Labels, first: npt.NDArray[np.int64], gap: int = 20) -
 
 
 def averaged_passes(problem: SkeletonProblem) -> SkeletonProblem:
-    """Every pass of a landmark becomes one sighting from its middle pose, with the noise of their mean.
+    """Replace every traversal of a landmark by one observation from its middle pose, with the noise of the mean.
 
-    Sightings are carried to the middle pose by the odometry. Passes shorter than the longest are left out, as the noise
-    is one for all.
+    Observations are transformed to the middle pose by the odometry. Shorter traversals than the longest are omitted,
+    because all observations have one noise.
     """
     passes, n = pass_labels(problem.landmark, problem.first)
     pose = np.repeat(np.arange(problem.poses), np.diff(problem.first))
@@ -194,7 +194,7 @@ def averaged_passes(problem: SkeletonProblem) -> SkeletonProblem:
 
 
 def _stability(config: ScaleTrialConfig, seed: int) -> Rows:
-    """From dead reckoning, without GPS and tilt: relinearised, linearised once, and links fixed once."""
+    """From dead reckoning, without GPS and tilt: relinearised, linearised once, and links computed once."""
     for turn in config.turns:
         world = draw_laps(replace(config.world, odometry=(turn, config.world.odometry[1])), seed)
         nothing: Array = np.empty((0, 3))
@@ -222,7 +222,7 @@ def _stability(config: ScaleTrialConfig, seed: int) -> Rows:
 
 
 def linked(problem: SkeletonProblem, start: Poses) -> Poses:
-    """Poses from links between pairs of poses alone, each fixed once, and the odometry."""
+    """Poses from odometry and links between pairs of poses, each link computed once."""
     links = relative_links(problem)
     N = problem.poses
     chain = np.column_stack([np.arange(N - 1), np.arange(1, N)])

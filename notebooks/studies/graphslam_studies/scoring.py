@@ -1,7 +1,7 @@
-"""Scores of maps against the truth: one figure a row, in the frame of the first base (nothing is aligned).
+"""Scores of maps against ground truth, one metric per row, in the frame of the first base (without alignment).
 
-NEES is eq. 18 of Combined SLAM, of the end pose (3 degrees of freedom), of every feature by itself (2), and of all
-features together. The index CI of eq. 20 is NEES over its 95 % quantile and is formed where tables are read.
+NEES is eq. 18 of Combined SLAM: of the end pose (3 degrees of freedom), of each feature (2), and of all features
+jointly. The consistency index CI (eq. 20), NEES over its 95 % quantile, is computed with the tables.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from graphslam_studies.montecarlo.trials import Measurement
 
 Ids = npt.NDArray[np.int64]
 FEATURE_STRIDE = 9
-"""Features are scored after every ninth submap and at the end: their marginals cost more than the join."""
+"""Features are scored after every ninth submap and at the end, because their marginals take longer than the join."""
 _DIVERGED = 0.05
 
 
 @dataclass(frozen=True)
 class MapState:
-    """What a method believes: the pose at the end of a submap and features, with their marginal covariances."""
+    """Estimate of a method: pose at the end of a submap, and features, with their marginal covariances."""
 
     pose: Array
     pose_covariance: Array
@@ -45,12 +45,12 @@ class MapState:
 
 @dataclass(frozen=True)
 class Judge:
-    """Truth of one run at the ends of its submaps.
+    """Ground truth of one run at the ends of its submaps, and scoring with it.
 
     Parameters
     ----------
     times : (m,)
-        Stamps at which the submaps end.
+        End times of the submaps [s].
     distance : float
         Distance driven [m].
     """
@@ -77,7 +77,7 @@ class Judge:
         return k == len(self.times) - 1 or (k + 1) % FEATURE_STRIDE == 0
 
     def online(self, algorithm: str, k: int, state: MapState) -> Iterator[Measurement]:
-        """Figures of the state right after submap k."""
+        """Metrics of the state after submap k."""
         e = vector_pose_error(state.pose, self.end_poses[k])
         sigma = np.sqrt(np.diag(state.pose_covariance))
         yield Measurement(algorithm, "pose_nees", float(nees(e, state.pose_covariance)), k)
@@ -102,16 +102,16 @@ class Judge:
         poses: Array,
         pose_covariance: Array,
     ) -> Iterator[Measurement]:
-        """Figures of a whole run.
+        """Metrics of a whole run.
 
         Parameters
         ----------
         covariance : (2 L, 2 L)
             Joint covariance of the features.
         poses : (m, 3)
-            Ends of all submaps as the method sees them at the end of the run (or saw them, where it keeps none).
+            End poses of all submaps, estimated at the end of the run (or online, if the method does not keep them).
         pose_covariance : (3, 3)
-            Of the last.
+            Covariance of the last pose.
         """
         d = self.landmarks(ids) - landmarks
         at = landmark_scalars(2 * np.arange(len(ids)))
@@ -136,7 +136,7 @@ class Judge:
             yield Measurement(algorithm, quantity, value)
 
     def estimate(self, algorithm: str, estimate: SubmapEstimate) -> Iterator[Measurement]:
-        """Figures of a joined or solved map."""
+        """Metrics of a joined or solved map."""
         m = len(estimate.poses) - 1
         at = 3 * m + np.arange(2 * len(estimate.landmark_ids))
         yield from self.final(
@@ -159,7 +159,7 @@ class Judge:
         yield Measurement(algorithm, "map_dof", float(dof))
 
     def local(self, algorithm: str, submaps: list[Submap]) -> Iterator[Measurement]:
-        """Honesty of local maps, each in its own frame, and what their front end says of them."""
+        """Consistency of local maps, each in its own frame, and metrics from the report of the front end."""
         for k, s in enumerate(submaps):
             r = submap_nees(s, self.truth)
             figures = {
@@ -180,7 +180,7 @@ class Judge:
 
 
 class Watch:
-    """``on_join`` that scores every map on its way and keeps the time of joining apart from the time of scoring."""
+    """``on_join`` callback that scores every intermediate map, and measures joining time without scoring time."""
 
     def __init__(self, judge: Judge, algorithm: str) -> None:
         self.judge, self.algorithm = judge, algorithm
@@ -189,7 +189,7 @@ class Watch:
         self._left = perf_counter()
 
     def __call__(self, k: int, view: JoinedMapView) -> None:
-        """Score the map right after submap k."""
+        """Score the map after submap k."""
         self._seconds += perf_counter() - self._left
         self.rows.append(Measurement(self.algorithm, "seconds_cumulative", self._seconds, k, timing=True))
         marginals = view.landmark_marginals() if self.judge.wants_features(k) else None
@@ -202,7 +202,7 @@ class Watch:
 def watch_snapshots(
     judge: Judge, algorithm: str, snapshots: Iterator[Snapshot]
 ) -> tuple[list[Measurement], list[Snapshot]]:
-    """Score a single-map filter at the ends of the submaps; the snapshots themselves come back too."""
+    """Score a single-map filter at the ends of the submaps; returns the scores and the snapshots."""
     rows: list[Measurement] = []
     kept: list[Snapshot] = []
     seconds, left = 0.0, perf_counter()
@@ -218,7 +218,7 @@ def watch_snapshots(
 
 
 def timed(algorithm: str, parts: dict[str, float]) -> Iterator[Measurement]:
-    """Seconds of a joiner by part, as timings."""
+    """Times of a map-joining method by part, as timings [s]."""
     for part, seconds in parts.items():
         yield Measurement(algorithm, f"seconds_{part}", seconds, timing=True)
     yield Measurement(algorithm, "seconds_total", sum(parts.values()), timing=True)
@@ -228,7 +228,7 @@ Clocked = Callable[[], list[Submap]]
 
 
 def clock(algorithm: str, make: Clocked) -> tuple[list[Submap], Measurement]:
-    """Local maps, and what it took to make them."""
+    """Make local maps and measure the time [s]."""
     start = perf_counter()
     submaps = make()
     return submaps, Measurement(algorithm, "seconds_total", perf_counter() - start, timing=True)

@@ -1,18 +1,18 @@
-"""The study ``segmap-graph``: from the SegMap to one globally consistent map, and what of it can be trusted.
+"""The study ``segmap-graph``: from the SegMap to one graph: accuracy, entropy and consistency.
 
-Worlds: two garages, the mine, the building; clutter and every sensor error are drawn anew in each run. Algorithms:
-``rbpf-40``, ``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``ties``, ``loops``, ``gps``,
-``clearest`` of what SegSLAM settled.
+Worlds: two garages, the mine, the building; clutter and sensor errors are random in each run. Algorithms: ``rbpf-40``,
+``segslam-20`` (in the building 40), and the graphs ``chain``, ``matches``, ``ties``, ``loops``, ``gps``, ``clearest``
+of the settled segments of SegSLAM (:mod:`graphslam_studies.segmap_trial`).
 
 Quantities
 ----------
-``ate_aligned``, ``height_rmse``, ``final_error`` of the path [m]; of SegSLAM also ``ate_best_sample``, the least over
-twenty map samples. ``entropy_min``: entropy of all scans along the path [nat m³], of filters the least over their
-samples. ``nees_…``: squared error of the body at the nodes, a degree of freedom, mean over a run (``…_last``: at its
+``ate_aligned``, ``height_rmse``, ``final_error`` of the path [m]; of SegSLAM also ``ate_best_sample``, the minimum
+over the map samples. ``entropy_min``: entropy of all scans along the path [nat m³], of filters the minimum over their
+samples. ``nees_…``: NEES per degree of freedom of the body poses at the nodes, mean over a run (``…_last``: at its
 end).
-``loops_measured``: registrations that passed their gates, ``…_right``: those that are true; ``loops_taken`` and
+``loops_measured``: registrations that passed their gates, ``…_right``: right ones; ``loops_taken`` and
 ``loops_taken_right``: those in the graph. ``chi2_per_dof`` of the graph. ``leg_angle``: RMS error of the angles between
-straight pieces of the way on different levels [rad].
+straight path sections on different levels [rad].
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ WORLDS = {
         )
     ),
 }
-# The small world's robot drifts three times as much a second, and turns more.
+# The robot of the small world has three times the drift per second, and turns more.
 _COURT = FilterDrift(heading_walk=0.02, position_walk=0.03)
 QUICK_WORLDS = {
     "court-quick": GraphTrialConfig(
@@ -98,7 +98,7 @@ class SegMapGraph(GraphStudy):
 
 
 def gain_table(table: pd.DataFrame) -> pd.DataFrame:
-    """The graph with all loops against what SegSLAM has, run by run."""
+    """The graph with all loops compared with the map samples of SegSLAM, run by run."""
     out: list[tables.Row] = []
     for world in dict.fromkeys(table["world"].astype(str)):
         filters = [a for w, a in tables.cases(table) if w == world and a.startswith("segslam")]
@@ -122,7 +122,7 @@ def gain_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def nees_table(table: pd.DataFrame) -> pd.DataFrame:
-    """NEES a degree of freedom by block: the mean over runs, and at the end with the bounds of honest ones (95 %)."""
+    """NEES per degree of freedom by block: mean over runs, and at the end with 95 % bounds of consistent graphs."""
     dof = {"position": 3, "heading": 1, "pose": 4, "level": 2}
     out: list[tables.Row] = []
     for world, name in tables.cases(table):
@@ -141,7 +141,7 @@ def nees_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def decision_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Loops over all runs: how many were measured and taken, how many of these are right."""
+    """Loop closures over all runs: numbers measured and accepted, and how many of these are right."""
     quantities = ("loops_tried", "loops_measured", "loops_measured_right", "loops_taken", "loops_taken_right")
     out: list[tables.Row] = []
     for world, name in tables.cases(table):

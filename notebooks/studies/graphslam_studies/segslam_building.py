@@ -1,17 +1,17 @@
-"""The study ``segslam-building``: which map of three levels of out-and-back corridors is the clearest?
+"""The study ``segslam-building``: map entropy in a building with corridors on three levels, driven out and back.
 
-Worlds: ``building``; clutter and every sensor error are drawn anew in each run. Algorithms: ``dead-reckoning``,
-``rbpf-N``, ``segslam-40``.
+Worlds: ``building``, ``building-drawn`` (random layout); clutter and sensor errors are random in each run. Algorithms:
+``dead-reckoning``, ``rbpf-N``, ``segslam-40``.
 
-Quantities, beside errors of the path and times
------------------------------------------------
-``entropy_min``: least entropy [nat m³] (SegSLAM eq. 20–22) over at most 20 hypotheses of a run: of SegSLAM its map
-samples, of an RBPF its particles' own paths, the likeliest first, each once (few are left that differ). Of each the
-scans are inserted anew into maps of 0.2 m along its path, the same way for all: four maps whose voxels lie differently,
-of which the mean is taken, since it makes ± 70 nat m³ where the floors happen to lie in theirs. ``entropy`` is that of
-the first, ``entropy_samples`` how many there were. ``known_volume``: what the clearest map knows [m³]. Entropy is a sum
-over what was observed, so a map whose levels are pressed into each other has less of it: read it beside
-``height_rmse`` [m]. ``leg_angle``: RMS error of the angles between straight stretches of different levels [rad].
+Quantities, besides path errors and times
+-----------------------------------------
+``entropy_min``: minimum entropy [nat m³] (SegSLAM eq. 20–22) over at most 20 hypotheses of a run: map samples of
+SegSLAM, or distinct particle paths of an RBPF, the best particle first. For each, all scans are inserted into four maps
+with 0.2 m voxels and different placements of the lattice. The mean entropy is used, because the position of floors in
+their voxels changes it by ± 70 nat m³. ``entropy``: that of the first hypothesis; ``entropy_samples``: number of
+hypotheses. ``known_volume``: observed volume of the map with the least entropy [m³]. Entropy is a sum over observed
+voxels, so it is too small if levels of a map overlap: compare ``height_rmse`` [m]. ``leg_angle``: RMS error of the
+angles between straight path sections on different levels [rad].
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from graphslam_studies.segslam_trial import DEAD_RECKONING, LEVEL, QUICK, Figure
 
 _FIGURES: tuple[Figure, ...] = ("matches", "entropy", "legs", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "rbpf-40", "rbpf-100", "segslam-40")
-# Twice the default of new ground: segments end in rooms and halls more often than half-way along a corridor, and what
-# is driven back along is in the map that the body works in. Chosen in worlds that the study does not use.
+# Twice the default length, so that segments end in rooms and halls more often than in a corridor, and the way back is
+# in the same map as the way out. Chosen in worlds that the study does not use.
 SEGSLAM = SegSlamConfig(segmentation=SegmentationConfig(max_length=120.0))
 _BUILDING = GridTrialConfig(
     world="building",

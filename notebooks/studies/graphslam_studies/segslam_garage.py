@@ -1,22 +1,22 @@
-"""The study ``segslam-garage``: does a loop through two levels close, with how many particles, at what price?
+"""The study ``segslam-garage``: loop closing over two levels of a garage, by number of particles, and run time.
 
-Worlds: the garages ``garage-A`` to ``garage-D`` (nothing was tuned on the last), and ``garage-drawn``, whose plan is
-drawn anew in each run. Parked cars, clutter and every sensor error are drawn in all of them.
+Worlds: the garages ``garage-A`` to ``garage-D`` (the last was not used for tuning), and ``garage-drawn``, with a random
+plan in each run. Parked cars, clutter and sensor errors are random in all of them.
 
-Algorithms: ``dead-reckoning``; ``rbpf-N``, one filter over the whole log; ``segslam-N``. N particles; the same steps,
-beams, noise and weights for both.
+Algorithms: ``dead-reckoning``; ``rbpf-N``, one filter over the whole log; ``segslam-N``. N particles; both use the same
+steps.
 
 Quantities
 ----------
-``final_error`` [m], ``final_yaw`` [rad]: last pose seen from the first, against the truth; ``ate_anchored`` with the
-first poses in one place, ``ate_aligned`` after a rigid alignment [m]. ``matches``: entries into older maps, by segment,
-also of particles that died out; ``false_matches``: those 1 m or 5° of heading off, judged beside the place of the old
-map where the body had passed nearest; ``false_match_weight``: the greatest weight of one. ``segments`` closed in all,
-``intervals`` between boundaries. Per settled segment ``exit_nees`` (particles and drift model), ``exit_nees_stated``
-(particles and the stated noise of the motion), ``exit_nees_matched`` (moment matching), of ``exit_dof`` degrees of
+``final_error`` [m], ``final_yaw`` [rad]: error of the last pose relative to the first; ``ate_anchored`` with the first
+poses aligned, ``ate_aligned`` after a rigid alignment of all [m]. ``matches``: matches with older maps, by segment,
+also of extinct particles; ``false_matches``: those with an error above 1 m or 5° of heading, relative to the closest pose
+in the old map; ``false_match_weight``: the largest weight of one. ``segments``: total number closed; ``intervals``
+between boundaries. Per settled segment ``exit_nees`` (particles and drift model), ``exit_nees_stated``
+(particles and motion noise model), ``exit_nees_matched`` (moment matching), of ``exit_dof`` degrees of
 freedom; its errors ``exit_yaw`` [rad], ``exit_x``, ``exit_y``, ``exit_z`` [m]; ``exit_length`` [m]. ``entropy`` of one
 map of all scans along the estimated path [nat m³]. ``effective_median``: N_eff / N. ``path_…``: points of the path, for
-the picture. Timings: ``seconds_…`` by part.
+the plot. Timings: ``seconds_…`` by part.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class SegSlamGarage(GridStudy):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Of every world error and run time by particles, and the path of one run by segments; all runs' errors."""
+        """For every world: error and run time by particles, and path of one run by segments; errors of all runs."""
         made = []
         for world in dict.fromkeys(table["world"].astype(str)):
             errors = tables.error_table(table)
@@ -120,14 +120,14 @@ class SegSlamGarage(GridStudy):
 
 
 def error_curves(table: pd.DataFrame, world: str) -> Iterator[tuple[str, Curve]]:
-    """Mean final error by particles of each family, with its interval, all runs and the paper's means."""
+    """Mean final error of each family by particles, with interval, all runs, and means of the paper."""
     errors = tables.error_table(table)
     errors = errors[(errors["world"] == world) & (errors["particles"] > 0) & errors["mean"].notna()]
     for family, part in errors.groupby("family", sort=True):
         rows = part.sort_values("particles")
         n = rows["particles"].to_numpy()
         points = {int(k): tables.values(table, world, f"{family}-{k}", "final_error") for k in n}
-        least = 0.5 * min(float(v.min()) for v in points.values())  # the axis is logarithmic
+        least = 0.5 * min(float(v.min()) for v in points.values())  # positive, because the axis is logarithmic
         yield (
             str(family),
             Curve(
@@ -142,7 +142,7 @@ def error_curves(table: pd.DataFrame, world: str) -> Iterator[tuple[str, Curve]]
 
 
 def time_curves(table: pd.DataFrame, timings: pd.DataFrame, world: str) -> Iterator[tuple[str, Curve]]:
-    """Least run time by particles of each family; all runs."""
+    """Minimum run time of each family by particles; all runs."""
     names = [a for w, a in tables.cases(table) if w == world]
     for family in ("rbpf", "segslam"):
         found = {}
@@ -156,7 +156,7 @@ def time_curves(table: pd.DataFrame, timings: pd.DataFrame, world: str) -> Itera
 
 
 def path_figure(table: pd.DataFrame, world: str, folder: Path) -> list[Path]:
-    """Draw the path that was kept of the first run, a colour a segment; nothing where none was kept."""
+    """Plot the stored path of the first run, one colour per segment; no plot if none is stored."""
     of = table[(table["world"] == world) & table["quantity"].str.startswith("path_") & (table["submap"] >= 0)]
     if of.empty:
         return []

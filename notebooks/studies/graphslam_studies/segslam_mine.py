@@ -1,15 +1,15 @@
-"""The study ``segslam-mine``: loops within loops, and two galleries side by side that must not become one.
+"""The study ``segslam-mine``: nested loops, and two parallel galleries that must not be merged.
 
-Worlds: ``mine``; what lies about and every sensor error are drawn anew in each run. Algorithms: ``dead-reckoning``,
-``rbpf-20``, ``segslam-20``.
+Worlds: ``mine``, ``mine-drawn`` (random layout); clutter and sensor errors are random in each run. Algorithms:
+``dead-reckoning``, ``rbpf-20``, ``segslam-20``.
 
-Quantities, beside those of ``segslam-garage``
-----------------------------------------------
-``visit_error``, for every stretch of the way that is driven twice: where the first visit was, seen from the body at the
-end of the second, against the truth [m]; SegSLAM is asked through a map sample grown from where it was then.
-``loops``: such stretches driven in the same direction (the scanner looks ahead, so that a way back shows it other
-sides of things); ``loops_closed``: those whose error is below 1 m; ``all_closed``. ``merged_parallels``: entries that
-take one of two parallel stretches for the other. Timings: ``seconds_step_first_quarter`` and ``…_last_quarter``, mean
+Quantities, besides those of ``segslam-garage``
+-----------------------------------------------
+``visit_error``: for every path section that is driven twice, error of the relative position of the two visits, at the
+end of the second [m]; for SegSLAM from a map sample that starts at that time.
+``loops``: such sections driven in the same direction (the scanner points ahead, so it sees other surfaces on the way
+back); ``loops_closed``: those with an error below 1 m; ``all_closed``. ``merged_parallels``: matches of one of two
+parallel sections with the other. Timings: ``seconds_step_first_quarter`` and ``…_last_quarter``, mean
 time of a step; ``maps_megabytes``.
 """
 
@@ -29,7 +29,7 @@ from graphslam_studies.segslam_trial import DEAD_RECKONING, QUICK, Figure, GridS
 
 _FIGURES: tuple[Figure, ...] = ("matches", "exits", "loops", "path")
 _ALGORITHMS = (DEAD_RECKONING, "rbpf-20", "segslam-20")
-# Galleries do not lie above each other, so that heights may drift: at 6 mrad of gravity 2.4 m on the first loop.
+# Galleries are not above each other, so heights may drift: 2.4 m on the first loop with a gravity error of 6 mrad.
 SEGSLAM = SegSlamConfig(winnowing=SegmentCandidateConfig(height_per_metre=7e-3))
 _MINE = GridTrialConfig(world="mine", algorithms=_ALGORITHMS, figures=_FIGURES, segslam=SEGSLAM)
 WORLDS = {"mine": _MINE, "mine-drawn": replace(_MINE, layout="drawn")}
@@ -65,7 +65,7 @@ class SegSlamMine(GridStudy):
 
 
 def visit_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Median and greatest error of every second visit over the runs, and how often it was below the limit."""
+    """Median and maximum error of every second visit over the runs, and number of runs below the limit of 1 m."""
     rows = table[table["quantity"] == "visit_error"].rename(columns={"submap": "visit"})
     groups = rows.groupby(["world", "algorithm", "visit"], sort=False)["value"]
     out = groups.agg(["median", "max", "count"]).reset_index()

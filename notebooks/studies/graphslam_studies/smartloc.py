@@ -1,21 +1,21 @@
-"""The study ``smartloc``: positions of a car by raw pseudoranges among high buildings, and how honest they are.
+"""The study ``smartloc``: accuracy and consistency of car positions from raw pseudoranges among high buildings.
 
-The log is cut in two. Hyper-parameters of every algorithm are chosen on one half, by its truth, and the other half is
-solved by itself and scored: world ``first-to-second`` and world ``second-to-first``. Errors of one half are alike over
-minutes, so that one solution of it says little of which settings are good: the half that chooses is cut in windows,
-each is solved by itself, and their scores are taken together. Of a grid of settings the one with the least error is
-chosen among those whose NEES/n lies in [0.7, 1.4]; where there is none, the one whose NEES/n is nearest to 1. Quick
-mode does the same with a simulated street of two minutes, of which no recording is needed.
+The log is cut in two halves. Hyper-parameters of every algorithm are chosen on one half with its ground truth; the
+other half is solved separately and scored: worlds ``first-to-second`` and ``second-to-first``. Errors are correlated
+over minutes, so one solution of a half is not enough to compare settings: the training half is cut into windows, each
+is solved separately, and their scores are pooled. From a grid of settings, the one with the smallest error is chosen
+among those with NEES/n in [0.7, 1.4]; if there is none, the one with NEES/n closest to 1. Quick mode does the same with
+a simulated street of two minutes and needs no recording.
 
-Algorithms: ``naive`` believes the stated σ of every pseudorange; ``robust`` puts a Cauchy kernel on it; ``density``
-lets σ grow as the carrier-to-noise density falls, too; ``gauss-markov`` gives every satellite a bias besides that stays
-alike for some time. All have the same odometer and the same clock.
+Algorithms: ``naive`` uses the stated σ of every pseudorange; ``robust`` adds a Cauchy kernel; ``density`` also
+increases σ as the carrier-to-noise density falls; ``gauss-markov`` also adds a time-correlated bias per satellite. All
+use the same odometer and clock model.
 
 Quantities
 ----------
-``rmse`` and ``nees`` (squared error over its covariance, by 2) in the plane, on the half that is scored;
-``rmse_chosen`` and ``nees_chosen`` on the half that chose; ``sigma``: what is claimed, root mean square over epochs
-[m]; ``east`` and ``north``: mean error [m]; what was chosen by name.
+``rmse`` [m] and ``nees`` (NEES/2) in the plane, on the scored half; ``rmse_chosen`` and ``nees_chosen`` on the
+training half; ``sigma``: RMS over epochs of the estimated position σ [m]; ``east`` and ``north``: mean error [m]; and
+the chosen settings by name.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
 from graphslam_studies.sim.satellites import SatelliteConfig, simulate_satellites
 
 HONEST = (0.7, 1.4)
-"""NEES/n that counts as honest."""
+"""NEES/n that counts as consistent."""
 LEVEL = 0.02
-"""σ of roll and pitch of a car on a street [rad]."""
+"""σ of roll and pitch of a car on a road [rad]."""
 CAUCHY = "robust_width"
 Settings = Mapping[str, float]
 
@@ -65,7 +65,7 @@ GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
         "bias_every": (1.0,),
     },
 }
-"""By algorithm: values of every setting that is chosen."""
+"""Algorithm → candidate values of every setting."""
 QUICK_GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
     "naive": {},
     "robust": {CAUCHY: (1.0,), "sigma_scale": (1.0, 5.0)},
@@ -76,7 +76,7 @@ QUICK_GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class SmartLocTrialConfig:
-    """Which log, which half of it is scored, and what is chosen from."""
+    """Log, scored half, and candidate settings."""
 
     scored: int = 1
     """0: the first half; 1: the second."""
@@ -84,14 +84,14 @@ class SmartLocTrialConfig:
     """A simulated street; None: the recorded log ``smartloc-gnss``."""
     grids: Mapping[str, Mapping[str, tuple[float, ...]]]
     windows: int = 4
-    """Parts of the half that chooses."""
+    """Number of windows of the training half."""
     every: int = 5
-    """Every so manieth epoch is scored."""
+    """Every n-th odometry record is scored."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """A solved half against its reference, in the plane."""
+    """Scores of a solution against its reference, in the plane."""
 
     rmse: float
     nees: float
@@ -110,14 +110,14 @@ def settings_of(grid: Mapping[str, tuple[float, ...]]) -> list[dict[str, float]]
 
 
 def config_of(settings: Settings) -> PseudorangeConfig:
-    """How pseudoranges enter the graph by some settings."""
+    """Pseudorange options from settings."""
     rest = {k: v for k, v in settings.items() if k != CAUCHY}
     robust = RobustKernel("cauchy", settings[CAUCHY]) if CAUCHY in settings else RobustKernel()
     return PseudorangeConfig(**rest, robust=robust)
 
 
 def solve_street(log: SensorLog, config: PseudorangeConfig) -> FactorGraph:
-    """The graph of a log at its optimum: a node at every record of the odometry, level but for some degrees."""
+    """The optimised graph of a log: a node at every odometry record, with priors that the car is level."""
     graph = FactorGraph(3)
     nodes = add_odometer(graph, log["odometry"])
     for node in nodes[::5].tolist():
@@ -134,7 +134,7 @@ Errors = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
 
 def errors(log: SensorLog, graph: FactorGraph, every: int) -> Errors:
-    """Errors ``(k, 2)`` of the antenna in the plane at every so manieth record of the odometry, and covariances."""
+    """Errors ``(k, 2)`` [m] of the antenna in the plane at every n-th odometry record, and their covariances."""
     times, reference = log["odometry"].times, log["reference"]
     k = np.arange(0, len(times), every)
     k = k[(times[k] >= reference.times[0]) & (times[k] <= reference.times[-1])]
@@ -143,7 +143,7 @@ def errors(log: SensorLog, graph: FactorGraph, every: int) -> Errors:
 
 
 def score_of(parts: Sequence[Errors]) -> Score:
-    """Several solutions taken together."""
+    """Pooled score of several solutions."""
     e, C = (np.concatenate(a) for a in zip(*parts))
     nees = np.einsum("ki,ki->k", e, np.linalg.solve(C, e[..., None])[..., 0])
     rmse, sigma = np.sqrt(np.mean(np.sum(e**2, axis=1))), np.sqrt(np.mean(np.trace(C, axis1=1, axis2=2)))
@@ -152,12 +152,12 @@ def score_of(parts: Sequence[Errors]) -> Score:
 
 
 def scored(logs: Sequence[SensorLog], settings: Settings, every: int) -> Score:
-    """Every log solved by itself, and their scores together."""
+    """Solve every log separately, and pool their scores."""
     return score_of([errors(log, solve_street(log, config_of(settings)), every) for log in logs])
 
 
 def windows(log: SensorLog, count: int) -> list[SensorLog]:
-    """A log cut into parts of about the same length; no record is in two of them."""
+    """Cut a log into windows with about equal numbers of odometry records, without overlap."""
     t = log["odometry"].times
     first = np.linspace(0, len(t), count + 1).astype(int)
     return [log.slice(float(t[a]), float(t[b - 1])) for a, b in pairwise(first)]
@@ -166,7 +166,7 @@ def windows(log: SensorLog, count: int) -> list[SensorLog]:
 def chosen(
     logs: Sequence[SensorLog], grid: Mapping[str, tuple[float, ...]], every: int
 ) -> tuple[dict[str, float], Score]:
-    """The settings of a grid that are best on logs, and their score there; see the module for what is best."""
+    """The best settings of a grid on some logs, and their score there; the criterion is described in the module."""
     found: list[tuple[dict[str, float], Score]] = []
     for settings in settings_of(grid):
         try:
@@ -182,7 +182,7 @@ def chosen(
 
 
 def run_smartloc_trial(config: SmartLocTrialConfig, seed: int) -> list[Measurement]:
-    """All figures of one run."""
+    """All metrics of one run."""
     with one_blas_thread():
         return list(_figures(config, seed))
 
@@ -210,7 +210,7 @@ class SmartLocStudy(WorldsStudy[SmartLocTrialConfig]):
     run_one = staticmethod(run_smartloc_trial)
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``scores``: error and honesty beside each other, on the scored half and on the one that chose."""
+        """``scores``: error and NEES on the scored half and on the training half; ``chosen`` settings; ``cpu``."""
         names = ["rmse", "nees", "sigma", "east", "north", "rmse_chosen", "nees_chosen"]
         wide = table.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", sort=False)
         settings = [c for c in (CAUCHY, "sigma_scale", "density_scale", "bias_sigma", "bias_time") if c in wide]
@@ -220,7 +220,7 @@ class SmartLocStudy(WorldsStudy[SmartLocTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """Error and honesty of all runs."""
+        """Error and NEES of all runs."""
         return draw_runs(table, {"rmse": "error in the plane [m]", "nees": "NEES/n"}, folder)
 
 

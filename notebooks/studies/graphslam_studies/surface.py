@@ -1,21 +1,21 @@
-"""The study ``surface``: how well several ways find the surface of a simulated world again.
+"""The study ``surface``: comparison of methods for surface reconstruction in simulated worlds.
 
-Every run carries a lidar along the first stretch of a world, with errors of ranges and of the pose of each scan, and
-makes surfaces of the same scans with voxels of 5 cm:
+Every run moves a lidar along the first part of a world, with errors of ranges and scan poses, and reconstructs surfaces
+from the same scans with voxels of 5 cm:
 
-* ``level-set λ``: distances to local planes, carving, curvature of weight λ;
-* ``planes, no carving``: the data alone;
+* ``level-set λ``: distances to local planes, free-space carving, curvature term with weight λ;
+* ``planes, no carving``: distances to local planes only;
 * ``ray tsdf``: a truncated signed distance along the beams, in the same bricks;
 * ``log-odds``: marching cubes on an evidence grid;
-* ``poisson``: Open3D's screened Poisson surface, without what lies farther than three voxels from every point.
+* ``poisson``: screened Poisson surface of Open3D, without parts farther than three voxels from every point.
 
 Quantities
 ----------
-``f_5cm``, ``f_2cm``: harmonic mean of the share of the surface within that of the true one, and of the seen part of the
-true one within that of it. ``mean_mm``: mean distance to the true surface. ``area_ratio``: area over that of the seen
-part. ``bricks_per_m2``, ``kb_per_m2``: of the layer. ``follow_same``: 1 if the surface after a move of a tenth of the
-pieces is bit for bit the one made anew. Timings: ``seconds``, ``us_per_point``, ``us_per_m2`` (of evolving and
-meshing), ``follow_over_rebuild`` (to what it takes from scans).
+``f_5cm``, ``f_2cm``: F-score, i.e. harmonic mean of precision (share of the surface within this distance of the true
+surface) and recall (share of the observed true surface within it of the result). ``mean_mm``: mean distance to the true
+surface. ``area_ratio``: area over that of the observed part. ``bricks_per_m2``, ``kb_per_m2``: of the layer.
+``follow_same``: 1 if the updated surface after a move of a tenth of the pieces is identical to a rebuilt one. Timings:
+``seconds``, ``us_per_point``, ``us_per_m2``, ``follow_over_rebuild`` (update time over reconstruction time).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SHOWN = (
 
 
 class SurfaceStudy(WorldsStudy[SurfaceTrialConfig]):
-    """Surfaces against the truth."""
+    """Reconstructed surfaces compared with ground truth."""
 
     run_one: Callable[[SurfaceTrialConfig, int], Iterable[Measurement]] = staticmethod(run_surface_trial)
 
@@ -61,7 +61,7 @@ class SurfaceStudy(WorldsStudy[SurfaceTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; the tables say it all."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; no plots."""
         return []
 
 

@@ -1,4 +1,4 @@
-"""One trial of the study of surfaces: a stretch of a simulated world, and what several ways make of its scans."""
+"""One trial of the surface study: scans along a part of a simulated world, and surfaces by several methods."""
 
 from __future__ import annotations
 
@@ -30,29 +30,29 @@ from graphslam_studies.sim.campus_world import campus
 from graphslam_studies.sim.lidar import LidarConfig, simulate_lidar
 
 SAMPLES = 60_000
-"""Points of each surface that are compared."""
+"""Number of sample points per surface."""
 SEEN = 0.1
-"""A place of the true surface is seen where three true ends of beams lie within this [m]."""
+"""A point of the true surface is observed if three true beam end points are within this distance [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceTrialConfig:
-    """A world, a lidar, and what is made of its scans."""
+    """World, lidar, and settings of the surfaces."""
 
     world: str = "garage"
-    """``garage`` (a layout drawn with the seed) or ``campus``."""
+    """``garage`` (with a random layout) or ``campus``."""
     voxel: float = 0.05
     """[m]"""
     seconds: float = 10.0
-    """Of the drive."""
+    """Duration of the drive [s]."""
     per_piece: int = 4
-    """Scans of a piece."""
+    """Scans per piece."""
     smoothings: tuple[float, ...] = (0.0, 0.1, 0.3)
     """λ of the level sets; 0.1 is the default of the package."""
     beside: bool = True
-    """Other ways as well."""
+    """Also compute the other methods."""
     pose_sigma: tuple[float, float] = (0.005, math.radians(0.1))
-    """Of the place [m] and of the turn [rad] of each scan, about each axis."""
+    """σ of position [m] and rotation [rad] of each scan, per axis."""
     lidar: LidarConfig = field(
         default_factory=lambda: LidarConfig(rate=4.0, points=32_000, lines=64, elevation=(-45.0, 45.0))
     )
@@ -65,18 +65,18 @@ class SurfaceTrialConfig:
 
 @dataclass(frozen=True)
 class Seen:
-    """Scans of a stretch with noise, and places of the true surface that they saw."""
+    """Noisy scans of a drive, and the points of the true surface that they observed."""
 
     world: World
     scans: list[Scan]
     poses: Array
     places: Array
     area: float
-    """Of the seen part of the true surface [m²]."""
+    """Area of the observed part of the true surface [m²]."""
 
 
 def look(c: SurfaceTrialConfig, seed: int) -> Seen:
-    """Carry the lidar along the first stretch of the world."""
+    """Simulate the lidar along the first part of the world."""
     tree = SeedTree(int(seed)).child("surface study", c.world)
     r = tree.generator()
     world = garage("ABC"[int(r.integers(3))], seed=seed) if c.world == "garage" else campus(CampusConfig(), seed=seed)
@@ -92,7 +92,7 @@ def look(c: SurfaceTrialConfig, seed: int) -> Seen:
     for k, t in enumerate(clouds.times):
         age = clouds.ages(k)
         assert age is not None
-        at = path.interpolate(t - age)  # each point from where the lidar was: a scan without the error of its sweep
+        at = path.interpolate(t - age)  # pose at the time of each point: the scan has no motion distortion
         T = path.interpolate(np.array([t]))[0]
         error = se3.se3_exp(r.normal(0.0, [c.pose_sigma[1]] * 3 + [c.pose_sigma[0]] * 3))
         noisy = se3.se3_compose(T, error)
@@ -111,7 +111,7 @@ def look(c: SurfaceTrialConfig, seed: int) -> Seen:
 
 
 def _near_samples(mesh: Mesh, places: Array, reach: float, r: np.random.Generator) -> tuple[Array, float]:
-    """Even samples of the part of a mesh that may lie near places, and their area."""
+    """Samples of the part of a mesh within the bounding box of places plus ``reach``, and the area of this part."""
     low, high = places.min(axis=0) - reach, places.max(axis=0) + reach
     corners = mesh.vertices[mesh.triangles]
     inside = np.all((corners.max(axis=1) > low) & (corners.min(axis=1) < high), axis=1)
@@ -121,7 +121,7 @@ def _near_samples(mesh: Mesh, places: Array, reach: float, r: np.random.Generato
 
 
 def surface_of(scans: list[Scan], poses: Array, c: SurfaceConfig, per_piece: int) -> SurfaceLayer:
-    """A layer of scans, so many for each piece."""
+    """A surface layer of scans, with ``per_piece`` scans per piece."""
     layer = SurfaceLayer(c)
     for k in range(0, len(scans), per_piece):
         layer.read(k // per_piece, scans[k : k + per_piece], poses[k])
@@ -129,13 +129,13 @@ def surface_of(scans: list[Scan], poses: Array, c: SurfaceConfig, per_piece: int
 
 
 def run_surface_trial(config: SurfaceTrialConfig, seed: int) -> Iterator[Measurement]:
-    """Make surfaces of a stretch and compare them with the truth.
+    """Reconstruct surfaces and compare them with ground truth.
 
     Yields
     ------
     Measurement
-        ``f_2cm``, ``f_5cm``, ``mean_mm``, ``area_ratio`` of every way; its CPU time; memory and bricks a square metre;
-        ``follow`` and ``follow_same`` of a move of a tenth of the pieces.
+        ``f_2cm``, ``f_5cm``, ``mean_mm``, ``area_ratio`` of every method; its CPU time; memory and bricks per m²;
+        ``follow_same`` and ``follow_over_rebuild`` of a move of a tenth of the pieces.
     """
     c = config
     seen = look(c, seed)
@@ -173,7 +173,7 @@ def run_surface_trial(config: SurfaceTrialConfig, seed: int) -> Iterator[Measure
 
 
 def _follow(name: str, layer: SurfaceLayer, c: SurfaceTrialConfig, rebuild_s: float) -> Iterator[Measurement]:
-    """Move a tenth of the pieces as a loop closure does; the share of the time of a rebuild that takes."""
+    """Move a tenth of the pieces, as after a loop closure; time of the update relative to the reconstruction."""
     from graphslam.maps.surface.mesh import Mesher
 
     mesher = Mesher(c.voxel)
@@ -198,14 +198,14 @@ def _follow(name: str, layer: SurfaceLayer, c: SurfaceTrialConfig, rebuild_s: fl
 
 
 class Judge:
-    """Compares surfaces with the truth, both ways."""
+    """Compares surfaces with ground truth in both directions (precision and recall)."""
 
     def __init__(self, seen: Seen, r: np.random.Generator) -> None:
         self.seen, self.r = seen, r
         self.truth = RayCaster.of(seen.world).distances
 
     def of(self, name: str, mesh: Mesh) -> Iterator[Measurement]:
-        """Figures of one surface."""
+        """Metrics of one surface."""
         if not len(mesh.triangles):
             return
         to_truth = self.truth(mesh.samples(SAMPLES, self.r))
@@ -223,7 +223,7 @@ class Judge:
 
 
 def log_odds_mesh(scans: list[Scan], voxel: float, most_range: float) -> Mesh:
-    """Marching cubes on the log-odds of an evidence grid: the zero set of what is as likely free as occupied."""
+    """Marching cubes on the log-odds of an evidence grid: surface where the probability is 0.5."""
     grid = EvidenceGrid(voxel)
     for points, origin in scans:
         grid.insert_scan(points[np.linalg.norm(points - origin, axis=1) < most_range], origin=origin)
@@ -232,8 +232,8 @@ def log_odds_mesh(scans: list[Scan], voxel: float, most_range: float) -> Mesh:
 
 
 def poisson_mesh(scans: list[Scan], c: SurfaceConfig) -> Mesh:
-    """Open3D's screened Poisson surface of the same points and normals, cells as wide as voxels or narrower, without
-    what lies farther than three voxels from every point."""
+    """Screened Poisson surface of Open3D from the same points and normals, with cells not larger than voxels, without
+    parts farther than three voxels from every point."""
     o3d = import_extra("open3d", "a Poisson surface")
     points = np.concatenate([p[np.linalg.norm(p - o, axis=1) < c.most_range] for p, o in scans])
     origins = np.concatenate(

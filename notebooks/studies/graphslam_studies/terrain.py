@@ -1,24 +1,24 @@
-"""The study ``terrain``: which obstacles, edges and holes a vehicle sees, from how far, and what it sees wrongly.
+"""The study ``terrain``: detection distance and false alarms for obstacles, edges and holes.
 
-Every run draws a street for each kind of target and drives towards it (world ``panning``), or past it with the laser
-fixed (``fixed``), or stands 30 s at 9 m before a curb and then drives (``standing``). Five maps read the same lines:
+Every run has a random street per kind of target, and drives towards it (world ``panning``), or past it with the laser
+fixed (``fixed``), or stands for 30 s at 9 m before a curb and then drives (``standing``). Five maps use the same lines:
 
-* ``multigrid``: a map a range band, learnt weights; the finest that knows a cell wins;
+* ``multigrid``: one map per range band, learnt weights; the finest map with a known cell is used;
 * ``single-learnt``: one grid of 0.2 m, the same learnt weights, all ranges added;
-* ``single-fine``: one grid of 0.1 m, as fine as the finest band, with the weights that were learnt for 0.2 m;
-* ``single-octomap``: one grid of 0.2 m, +0.85 for a hit (a step or a depth of 6 cm, or something hanging), −0.4 for a
+* ``single-fine``: one grid of 0.1 m, as fine as the finest band, with the weights learnt for 0.2 m;
+* ``single-octomap``: one grid of 0.2 m, log-odds +0.85 for a hit (step or depth ≥ 6 cm, or overhang), −0.4 for a
   miss, hazard above 0;
 * ``single-equal``: the same with ±0.4.
 
 Quantities
 ----------
-``seen_<target>``: 1 if any cell of the target (within a cell) in the 1 m corridor is called a hazard; for targets that
-are none, if any cell there is. ``width_<target>``: share of the corridor's columns. ``blocked_<target>``: 1 if no
-straight gap as wide as the vehicle is left in the lane. ``submap`` is the distance of the sensor [cm].
-``false_<ring>``: share of free known cells ahead that are called a hazard, ``false_open_<ring>`` of those farther than
-0.5 m from any hazard; ``false_flat``: the same within 7 m on streets without a target. ``coverage``: share of the free
-lane 0.8–8 m ahead, within ±60°, that is known. ``calibration_n, _p, _h``: cells, sum of P and hazards by tenth of P,
-each band in its own cells. Timings: ``line_us``, ``times_real_time``.
+``seen_<target>``: 1 if any cell of the target (± 1 cell) in the 1 m corridor is classified as a hazard; for harmless
+targets, if any cell there is. ``width_<target>``: share of the corridor width with such a cell. ``blocked_<target>``: 1
+if no straight gap as wide as the vehicle is left in the lane. ``submap`` is the distance of the sensor [cm].
+``false_<ring>``: share of free known cells ahead classified as a hazard; ``false_open_<ring>``: of those farther than
+0.5 m from any cell that is not free; ``false_flat``: the same within 7 m on streets without a target.
+``coverage``: known share of the free lane 0.8–8 m ahead, within ±60°. ``calibration_n, _p, _h``: cells, sum of P and
+hazards by decile of P, each band in its own cells. Timings: ``line_us``, ``times_real_time``.
 """
 
 from __future__ import annotations
@@ -78,12 +78,12 @@ class TerrainStudy(WorldsStudy[TerrainTrialConfig]):
         return out
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; the tables say it all."""
+        """See :class:`~graphslam_studies.montecarlo.definition.StudyDefinition`; no plots."""
         return []
 
 
 def by_distance(rows: pd.DataFrame, what: str) -> pd.DataFrame:
-    """Mean over runs by target and map; one column a distance."""
+    """Mean over runs by target and map, one column per distance."""
     mine = rows[rows["quantity"].str.startswith(f"{what}_")].copy()
     mine["target"] = mine["quantity"].str.removeprefix(f"{what}_")
     mine["distance"] = mine["submap"] / 100.0
@@ -95,7 +95,7 @@ def by_distance(rows: pd.DataFrame, what: str) -> pd.DataFrame:
 
 
 def whole_runs(rows: pd.DataFrame, quantities: list[str]) -> pd.DataFrame:
-    """Mean over runs by map; one column a quantity."""
+    """Mean over runs by map, one column per quantity."""
     mine = rows[rows["quantity"].isin(quantities) & (rows["submap"] == -1)]
     if mine.empty:
         return mine
@@ -104,7 +104,7 @@ def whole_runs(rows: pd.DataFrame, quantities: list[str]) -> pd.DataFrame:
 
 
 def calibration(rows: pd.DataFrame) -> pd.DataFrame:
-    """Expected calibration error: over all cells, and over those with P in 0.1–0.9."""
+    """Expected calibration error over all cells, and over cells with P in 0.1–0.9."""
     out = []
     mine = rows[rows["quantity"].str.startswith("calibration_")]
     for name, of in mine.groupby("algorithm", sort=False):

@@ -1,4 +1,4 @@
-"""Learns the tables of the terrain on drives through teaching streets, which no test drives through."""
+"""Learning of the terrain tables on drives through training streets, which are not used in tests."""
 
 from __future__ import annotations
 
@@ -33,44 +33,44 @@ from graphslam_studies.terrain_trial import (
 )
 
 FIRST_SEED = 10_000
-"""Of the teaching drives; test drives have the seeds of their study."""
+"""First seed of the training drives; test drives have the seeds of their study."""
 ASKED = (7.0, 4.5, 2.0)
-"""Distances to the target at which the cells of a drive are taken [m]."""
+"""Distances to the target at which cells are sampled [m]."""
 JUDGED = 11.0
-"""So far from the sensor cells teach, and are judged in a study [m]."""
+"""Maximum range of training cells from the sensor [m]."""
 CANDIDATES = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 RAMP_ROUND = 0.4
-"""Cells so near before the foot and behind the top of a ramp go with it [m]: as wide as the widest but one."""
+"""Margin before the foot and behind the top of a ramp that counts as ramp [m]: the second-largest cell width."""
 MOST_FALSE = 0.03
-"""The threshold is the lowest candidate at which at most this share of free cells within 7 m is called a hazard …"""
+"""The threshold is the lowest candidate with at most this share of free cells within 7 m classified as hazard …"""
 MOST_FALSE_FLAT = 0.001
-"""… and at most this of those on flat ground, farther than 0.5 m from any hazard: half of what a test allows."""
+"""… and at most this share on flat ground, farther than 0.5 m from cells that are not free: half the test limit."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What lines said until each of the places where they are asked, and labels of the cells of each band."""
+    """Statements of lines up to each sampling place, and labels of the cells of each band."""
 
     target: str
     parts: list[Rows]
     places: Array
     labels: list[Array]
     slopes: list[npt.NDArray[np.bool_]]
-    """Columns of the cells of each band that lie on or beside a legal ramp ``(nx,)``."""
+    """Mask of the cell columns of each band on or next to a drivable ramp ``(nx,)``."""
 
 
 class LabelledCells(NamedTuple):
-    """Cells of a band and their truth."""
+    """Cells of a band and their ground truth."""
 
     ratios: Array
     """Sums of ratios of steps and of support ``(2, k)``."""
     counts: Array
-    """Statements about steps, about support, and lines that saw something hang ``(3, k)``."""
+    """Numbers of statements about steps, about support, and about overhangs ``(3, k)``."""
     hazard: npt.NDArray[np.bool_]
     slope: npt.NDArray[np.bool_]
-    """Free cells on a slope that may be driven ``(k,)``."""
+    """Free cells on a drivable slope ``(k,)``."""
     probability: Array
-    """That the map gives to them ``(k,)``."""
+    """Hazard probability in the map ``(k,)``."""
 
 
 def learn_tables(
@@ -80,12 +80,12 @@ def learn_tables(
     config: TerrainTrialConfig | None = None,
     progress: bool = True,
 ) -> TerrainWeights:
-    """Tables of a sensor and a vehicle.
+    """Learn the tables of a sensor and a vehicle.
 
     Parameters
     ----------
     seeds : sequence of int
-        Of the teaching streets; each is driven through once for every target.
+        Seeds of the training streets; each is driven once per target.
     config : TerrainTrialConfig, optional
         Robot and vehicle.
     progress : bool
@@ -167,7 +167,7 @@ def row_labels(
     rows: Rows, labels: list[Array], slopes: list[npt.NDArray[np.bool_]], shape: Pyramid
 ) -> npt.NDArray[np.int8]:
     """Kinds ``(2, k)`` of the cells of statements, for steps and for support: 0 free, 1 free on or beside a ramp,
-    2 a hazard, −1 neither or outside."""
+    2 a hazard, −1 ignored or outside."""
     out = np.full((2, len(rows)), -1, np.int8)
     for b, truth in enumerate(labels):
         mine = np.flatnonzero(rows[:, 1] == b)
@@ -181,7 +181,7 @@ def row_labels(
 
 
 def _until(rows: Rows, ends: list[int]) -> list[Rows]:
-    """Statements of the lines before each of the ends, and after the end before."""
+    """Split statements at the line numbers ``ends``; those after the last are omitted."""
     at = np.searchsorted(rows[:, 0], ends)
     return [rows[a:b] for a, b in zip([0, *at[:-1].tolist()], at.tolist())]
 
@@ -199,9 +199,9 @@ def _pyramids(
 def labelled_cells(
     kept: list[Drive], tables: TerrainWeights, c: TerrainTrialConfig, cells: tuple[float, ...] = CELLS
 ) -> list[LabelledCells]:
-    """Of every band: cells for which it speaks of steps, ahead of the sensor and within 11 m, at all distances asked.
+    """For every band: cells that use this band, ahead of the sensor and within 11 m, at all sampling distances.
 
-    Of cells with a wire, only those in which a beam met it.
+    Of cells with a wire, only those where a beam hit it.
     """
     parts: list[list[tuple[Array, ...]]] = [[] for _ in range(tables.bands)]
     for pyramid, drive, place in _pyramids(kept, tables, c, cells):
@@ -215,7 +215,7 @@ def labelled_cells(
             )
             near = (x[None] > place) & (np.hypot(x[None] - place, y[:, None]) < JUDGED)
             judged = (truth >= 0) & (found.band[::k, ::k] == b) & near
-            if drive.target.startswith("wire"):  # a wire between two beams teaches nothing
+            if drive.target.startswith("wire"):  # a wire between two beams is not measured
                 judged &= (truth != OBSTACLE) | (counts[OVERHANG] > 0)
             slope = (truth == 0) & drive.slopes[b]
             p = found.probability[::k, ::k]
@@ -225,8 +225,8 @@ def labelled_cells(
 
 
 def false_alarms(kept: list[Drive], tables: TerrainWeights, c: TerrainTrialConfig) -> dict[float, tuple[float, float]]:
-    """Share of free cells within 7 m that are called a hazard, by threshold: all, and those of streets without a target
-    that are farther than 0.5 m from any hazard."""
+    """Shares of free cells within 7 m classified as hazard, by threshold: of all, and of those on streets without a
+    target that are farther than 0.5 m from cells that are not free."""
     counts = {t: np.zeros(4) for t in CANDIDATES}
     for pyramid, drive, place in _pyramids(kept, tables, c):
         found = pyramid.classify()

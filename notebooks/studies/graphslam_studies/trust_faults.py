@@ -1,7 +1,7 @@
-"""Faults of the study ``trust``: those of ``docs/faults.md`` that can be put into a drawn world, one at a time.
+"""Faults of the study ``trust``: those of ``docs/faults.md`` that can be injected into a random world, one at a time.
 
-The world is clean but for the fault, and the run does not know of it. What the faults do to a log is in
-:mod:`graphslam_studies.faults`.
+Except for the fault the world is clean, and the run gets no information about it. The functions that change a log are
+in :mod:`graphslam_studies.faults`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from graphslam_studies.faults import scans as b
 from graphslam_studies.trust_worlds import TrustWorld, draw_world, world_log
 
 FIRST = 1200
-"""Number of the first drawn world: no rule or default was made with those from there on."""
+"""Number of the first random world; worlds from here on were not used to develop rules or defaults."""
 SECONDS = 80.0
 TEN_DEGREES = float(np.deg2rad(10.0))
 
 
 def odometry(distance: float = 1.0, turn: float = 1.0, bias: float = 0.0, slip: float = 1.0) -> a.Inject:
-    """Distances and turns times factors; turns off by a rate [rad/s]; distances times ``slip`` in one second of ten."""
+    """Fault: factors on distances and turns, yaw-rate bias [rad/s], factor ``slip`` on distances in 1 s of 10 s."""
 
     def inject(log: SensorLog) -> SensorLog:
         o = log["odometry"]
@@ -38,7 +38,7 @@ def odometry(distance: float = 1.0, turn: float = 1.0, bias: float = 0.0, slip: 
 
 
 def both(first: a.Inject, second: a.Inject) -> a.Inject:
-    """Two faults."""
+    """Two faults at once."""
     return lambda log: second(first(log))
 
 
@@ -94,7 +94,7 @@ GPS: Mapping[str, a.Inject] = {
 
 @dataclass(frozen=True)
 class FaultWorld:
-    """A clean drawn world with one fault.
+    """A clean random world with one fault.
 
     Parameters
     ----------
@@ -110,11 +110,11 @@ class FaultWorld:
 
     @property
     def gps(self) -> str:
-        """Receiver of the world."""
+        """Kind of GPS receiver of the world."""
         return self.world.gps
 
     def log(self, seed: int) -> SensorLog:
-        """A log with the fault; the truth is that of the world."""
+        """A log with the fault; its ground truth is that of the world."""
         log = world_log(self.world, SeedTree(seed))
         return replace(FAULTS[self.wrong](log), truth=log.truth)
 
@@ -123,7 +123,7 @@ FAULTS: Mapping[str, a.Inject] = {**ODOMETRY, **SIGHTINGS, **GPS}
 
 
 def fault_worlds() -> dict[str, FaultWorld]:
-    """A world a fault: without fixes, or with fixes of white noise where the fault is in the receiver."""
+    """One world per fault: with white-noise fixes for GPS faults, else without fixes."""
     out = {}
     for k, name in enumerate(FAULTS):
         world = replace(draw_world(FIRST + 4 * k, seconds=SECONDS), gps="white" if name in GPS else "none")

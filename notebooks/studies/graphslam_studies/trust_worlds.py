@@ -1,7 +1,7 @@
-"""Worlds that are drawn for the study ``trust``: a robot, its noise, what is wrong with it, and its receiver.
+"""Random worlds of the study ``trust``: robot, assumed noise, unmodelled errors, and GPS receiver.
 
-Nothing here is told to the estimator but what a data sheet would say: σ of the odometry, of the sightings and of the
-fixes, as stated. What is true may differ from it in six ways, each drawn by itself.
+The estimator gets only the σ of odometry, landmark observations and fixes, as from a data sheet. The true errors may
+differ: wrong σ, wheel scale, outliers, time-correlated odometry errors, time-correlated GPS errors or multipath.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ FRONT_ENDS = ("rbpf-ekf", "ekf")
 
 @dataclass(frozen=True, kw_only=True)
 class TrustWorld:
-    """A drawn world.
+    """Parameters of a random world.
 
     Parameters
     ----------
     robot : ChartConfig
-        With the noise as it is stated.
+        Robot, with the noise as stated in the log.
     understated : float
-        True over stated σ of odometry and sightings.
+        Ratio of true to stated σ of odometry and landmark observations.
     scale : float
-        Distances of the wheels over the true ones.
+        Ratio of measured to true wheel distances.
     tails : float
-        Share of the sightings whose noise is eight times as large.
+        Share of outlier observations; they have additional noise of eight times the stated σ.
     lasting_odometry : tuple of float
-        σ of the lasting part of a tenth of a second over that of its white noise, and its time constant [s].
+        σ of the time-correlated odometry error per 0.1 s over the stated white σ, and its time constant [s].
     gps : str
         One of :data:`GPS_KINDS`.
     gps_sigma : float
-        As stated, and the size of the errors, white or lasting [m].
+        Stated σ; the true errors, white or time-correlated, have this σ as well [m].
     gps_time : float
-        For which lasting errors last [s].
+        Time constant of time-correlated GPS errors [s].
     number : int
-        Of the world: routes and errors of worlds of one seed differ by it.
+        World number; worlds with one seed differ by it in routes and errors.
     """
 
     robot: ChartConfig = field(default_factory=ChartConfig)
@@ -59,13 +59,13 @@ class TrustWorld:
 
     @property
     def clean(self) -> bool:
-        """Is everything as it is stated?"""
+        """Whether all errors agree with the stated noise model."""
         right = self.understated == 1.0 and self.scale == 1.0 and self.tails == 0.0 and self.lasting_odometry[0] == 0.0
         return right and self.gps in ("none", "white", "rtk")
 
     @property
     def wrong(self) -> str:
-        """What is not as it is stated, in words."""
+        """Description of the unmodelled errors."""
         out = []
         if self.understated != 1.0:
             out.append(f"noise ×{self.understated:.1f}")
@@ -81,7 +81,7 @@ class TrustWorld:
 
 
 def draw_world(number: int, *, seconds: float = 250.0) -> TrustWorld:
-    """World ``number``: every other one is clean; the others have one or two things wrong."""
+    """World ``number``: even numbers are clean; the others have one or two unmodelled errors."""
     rng = SeedTree(7_000).child("trust-world", number).generator()
 
     def between(low: float, high: float) -> float:
@@ -111,7 +111,7 @@ def draw_world(number: int, *, seconds: float = 250.0) -> TrustWorld:
         return world
     wrong = rng.permutation(5)[: int(rng.integers(1, 3))].tolist()
     if gps in GPS_KINDS[3:]:
-        wrong = wrong[: int(rng.integers(2))]  # half of them have nothing wrong but their receiver
+        wrong = wrong[: int(rng.integers(2))]  # about half of them have GPS errors only
     drawn = (between(1.3, 3.0), 1.0 + rng.choice([-1.0, 1.0]) * between(0.01, 0.05), between(0.02, 0.1),
              (between(0.3, 1.5), between(5.0, 60.0)), between(0.4, 0.7))  # fmt: skip
     for k in wrong:
@@ -124,12 +124,12 @@ def draw_world(number: int, *, seconds: float = 250.0) -> TrustWorld:
         elif k == 3:
             world = replace(world, lasting_odometry=drawn[3])
         elif world.understated == 1.0:
-            world = replace(world, understated=drawn[4])  # a data sheet that is too careful
+            world = replace(world, understated=drawn[4])  # the stated noise is conservative
     return world
 
 
 def lasting(rng: np.random.Generator, n: int, dt: float, time: float, width: int) -> Array:
-    """A Gauss–Markov process of unit size ``(n, width)``, stationary from the start."""
+    """Stationary Gauss–Markov process ``(n, width)`` with unit variance."""
     keep = np.exp(-dt / time)
     out = rng.standard_normal((n, width))
     for k in range(1, n):
@@ -138,7 +138,7 @@ def lasting(rng: np.random.Generator, n: int, dt: float, time: float, width: int
 
 
 def world_log(w: TrustWorld, seed: SeedTree) -> SensorLog:
-    """A log of a world with its truth; it states what the data sheets say."""
+    """A log of a world with its ground truth; it states the σ of the data sheets."""
     true, seed = w.understated, seed.child("world", w.number)
     c = w.robot
     (x, y, heading), (ranges, bearings) = c.odometry, c.sensor
@@ -175,11 +175,11 @@ def world_log(w: TrustWorld, seed: SeedTree) -> SensorLog:
 
 
 GPS_FRAME = np.array([120.0, -40.0, 0.7])
-"""``T_gps_world``: nobody is told."""
+"""``T_gps_world`` (x, y [m], heading [rad]); unknown to the estimator."""
 
 
 def fixes_of(w: TrustWorld, times: Array, poses: Array, rng: np.random.Generator) -> Gps:
-    """One fix a second, of the kind that the world has."""
+    """One fix per second, with the errors of :attr:`TrustWorld.gps`."""
     at = np.arange(round(0.5 * RATE), len(times), round(RATE))
     n = len(at)
     exact = se2_transform(GPS_FRAME, poses[at, :2])
@@ -200,7 +200,7 @@ def fixes_of(w: TrustWorld, times: Array, poses: Array, rng: np.random.Generator
 
 
 def true_in_frame(log: SensorLog, times: Array, *, gps: bool) -> Array:
-    """True poses ``(k, 3)`` at instants, in the frame of the fixes or in that of the first of them."""
+    """True poses ``(k, 3)`` at ``times``, in the frame of the fixes, or relative to the first of these poses."""
     assert log.truth is not None
     poses = log.truth.trajectory.interpolate(times)
     return se2_compose(np.broadcast_to(GPS_FRAME, poses.shape), poses) if gps else se2_between(poses[0], poses)
