@@ -180,10 +180,10 @@ def _insert_serial(
         while not mark_grids(
             0, n, poses, *scan, scale, pool.half, ends, s.window, s.slot_key, s.slot_next, s.marks, count
         ):
-            s.resize(int(count[NEED_SLOTS]))  # and once more from the start: the marks are thrown away
+            s.resize(int(count[NEED_SLOTS]))  # the marks are discarded; start again
             count[:] = 0
         slots = int(ends[-1])
-        # every touched brick may need itself and a path of its own; the root is there
+        # every marked brick may need a new brick and new nodes on its path, except the root
         pool.reserve(slots * (levels - 1), slots)
         s.reserve_left(slots)
         t = pool.tree
@@ -229,7 +229,7 @@ def _insert_threads(
             cuts[i], cuts[i + 1], poses, *scan, scale, pool.half, ends, s.window, s.slot_key, s.slot_next, s.marks,
             counts[i],
         ):  # fmt: skip
-            s.resize(int(counts[i][NEED_SLOTS]))  # and once more from the start: the marks are thrown away
+            s.resize(int(counts[i][NEED_SLOTS]))  # the marks are discarded; start again
             counts[i][:] = 0
 
     def apply(i: int) -> None:
@@ -242,7 +242,7 @@ def _insert_threads(
     try:
         _in_threads(mark, threads)
         slots = [int(ends[cuts[i + 1] - 1]) for i in range(threads)]
-        # every touched brick may need itself and a path of its own; the root is there
+        # every marked brick may need a new brick and new nodes on its path, except the root
         pool.reserve(sum(slots) * (pool.levels - 1), sum(slots))
         shared.reserve_left(sum(slots))
     except BaseException:

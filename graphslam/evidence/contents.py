@@ -216,7 +216,7 @@ def entropy(grid: GridTree) -> float:
 
 
 def entropy_of_counts(counts: Ints) -> float:
-    """Sum of the entropies of voxels counted by value, as :func:`value_counts` gives them [nat]."""
+    """Sum of the entropies of voxels, from the counts of :func:`value_counts` [nat]."""
     return float(np.sum(counts * _entropies()))
 
 

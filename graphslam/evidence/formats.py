@@ -89,7 +89,7 @@ def to_dense(grid: EvidenceGrid, *, bounds: npt.ArrayLike | None = None, dtype: 
         if bounds is None:
             low, high = known_bounds(grid)
             if grid.dim == 2:
-                high[2] = 1  # the layer k = 0, also where nothing is known
+                high[2] = 1  # the layer k = 0, also for an empty map
         else:
             low, high = _checked_bounds(bounds, grid.dim)
         shape = tuple((high - low).tolist())

@@ -96,7 +96,7 @@ class GridPool:
         with self.lock:
             self._scratches.clear()
 
-    # --- room ------------------------------------------------------------------------------------------------
+    # --- capacity --------------------------------------------------------------------------------------------
 
     def reserve(self, nodes: int, bricks: int) -> None:
         """Ensure capacity for this number of new nodes and bricks; raises MemoryError if there is none."""

@@ -104,7 +104,7 @@ def resolve_writes(
     for g in range(begin, end):
         path[levels - 1] = roots[g]
         px, py, pz = 0, 0, 0
-        known = levels - 1  # lowest level at which path holds
+        known = levels - 1  # lowest level at which path is valid
         while s < ends[g]:
             key = slot_key[s]
             bx, by, bz = key & 0xFFFFF, (key >> 20) & 0xFFFFF, key >> 40

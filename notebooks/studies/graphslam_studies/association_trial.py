@@ -153,7 +153,7 @@ class Trial:
         return out
 
     def rows_of(self, submap: Submap) -> slice:
-        """Observations of the scans that a submap was built from."""
+        """Observations of the scans of a submap."""
         t0, t1 = submap.interval
         first = 0 if submap.key == 0 else int(np.searchsorted(self.observations.times, t0, side="right"))
         last = int(np.searchsorted(self.observations.times, t1, side="right"))

@@ -3,8 +3,8 @@
 ``gone``: share of voxels hit by moving objects only that are not occupied in the map. ``lost``: share of the occupied
 voxels of a map without moving objects that are not occupied in the map with them. Both maps use the estimated path.
 ``evidence``: map by sum of log-odds. ``outvoted``: also without voxels that were free in more moments than they were
-occupied in. Evidence is summed per beam, so a person who stands for a second in front of a scanner gives hundreds of
-hits, which a few later beams through the same voxels do not outweigh. With one vote per moment, they do.
+occupied in. Evidence is summed per beam, so a person in front of a scanner for one second gives hundreds of hits,
+ which a few later beams through the same voxels do not outweigh. With one vote per moment, they do.
 """
 
 from __future__ import annotations

@@ -167,7 +167,7 @@ class _Trial:
                     joined = join(submaps, on_join=watch)
                     yield from watch.rows
                 yield from self.judge.estimate(name, joined)
-            except GraphSlamError:  # a collapsed particle cloud makes a singular covariance
+            except GraphSlamError:  # a collapsed particle set has a singular covariance
                 yield Measurement(name, "diverged", 1.0)
                 continue
             yield from timed(name, dict(joined.times))

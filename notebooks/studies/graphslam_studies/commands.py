@@ -73,7 +73,7 @@ def terrain_tables(
     seed: int = typer.Option(10_000, help="Seed of the first drive; the others follow."),
     as_json: bool = JSON,
 ) -> None:
-    """Learn what scan lines say of obstacles, edges and holes, on simulated streets that no study drives through."""
+    """Learn the tables for obstacles, edges and holes in scan lines, on simulated streets that no study uses."""
     from graphslam_studies.terrain_learning import write_learnt_tables
 
     tables = write_learnt_tables(out, drives=drives, first_seed=seed, progress=not as_json)

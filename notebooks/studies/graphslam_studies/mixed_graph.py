@@ -86,17 +86,17 @@ def _figures(config: MixedConfig, seed: int) -> Iterator[Measurement]:
 
 
 def with_sensors(graph: FactorGraph, sensors: str) -> FactorGraph:
-    """A copy of a graph without the fixes and the IMU that ``sensors`` does not name."""
+    """A copy of a graph without fixes or IMU, unless ``sensors`` contains their name."""
     out = copy.deepcopy(graph)
     unwanted = tuple(name for name in ("gps", "imu") if f"+{name}" not in sensors)
     for fid in [k for k, r in out.records.items() if r.group.startswith(unwanted or ("-",))]:
-        if fid in out.records:  # biases go with the last factor that uses them
+        if fid in out.records:  # biases are removed with the last factor that uses them
             out.remove(fid, reason="the graph is solved without this sensor")
     return out
 
 
 def _parts(name: str, problem: JoinProblem, truth: MapTruth) -> Iterator[Measurement]:
-    """NEES of poses and of landmarks alone, and χ² of every class of factors, at the optimum."""
+    """NEES of poses and of landmarks separately, and χ² of every class of factors, at the optimum."""
     best: GraphEstimate = join_by_method(problem, "batch")  # type: ignore[assignment]
     no_poses = replace(truth, keys=truth.keys[:0], exit_poses=truth.exit_poses[:0])
     for part, one in (("poses", poses_only(truth)), ("landmarks", no_poses)):

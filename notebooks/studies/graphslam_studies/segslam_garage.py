@@ -10,8 +10,8 @@ Quantities
 ----------
 ``final_error`` [m], ``final_yaw`` [rad]: error of the last pose relative to the first; ``ate_anchored`` with the first
 poses aligned, ``ate_aligned`` after a rigid alignment of all [m]. ``matches``: matches with older maps, by segment,
-also of extinct particles; ``false_matches``: those with an error above 1 m or 5° of heading, relative to the closest pose
-in the old map; ``false_match_weight``: the largest weight of one. ``segments``: total number closed; ``intervals``
+also of extinct particles; ``false_matches``: those with an error above 1 m or 5° of heading, relative to the closest
+pose in the old map; ``false_match_weight``: the largest weight of one. ``segments``: total number closed; ``intervals``
 between boundaries. Per settled segment ``exit_nees`` (particles and drift model), ``exit_nees_stated``
 (particles and motion noise model), ``exit_nees_matched`` (moment matching), of ``exit_dof`` degrees of
 freedom; its errors ``exit_yaw`` [rad], ``exit_x``, ``exit_y``, ``exit_z`` [m]; ``exit_length`` [m]. ``entropy`` of one
@@ -164,7 +164,7 @@ def path_figure(table: pd.DataFrame, world: str, folder: Path) -> list[Path]:
     p = of[of["run"] == run].pivot(index="submap", columns="quantity", values="value").sort_index()
     segment = p["path_segment"].to_numpy(dtype=np.int64)
     xy = p[["path_x", "path_y"]].to_numpy(dtype=np.float64)
-    # a piece ends where the next begins
+    # each piece ends at the first point of the next one
     pieces = [
         xy[first : last + 2] for first, last in ((np.flatnonzero(segment == k)[[0, -1]]) for k in np.unique(segment))
     ]

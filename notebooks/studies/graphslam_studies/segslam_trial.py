@@ -195,7 +195,7 @@ class GridTrial:
         seconds["step_first_quarter"], seconds["step_last_quarter"] = judge.quarters(segslam.step_seconds)
         return Outcome(segslam.trajectory(), segslam.final_pose, seconds, segslam)
 
-    # ---------------------------------------------------------------- figures
+    # ---------------------------------------------------------------- metrics
 
     def figures(self, name: str, outcome: Outcome) -> Iterator[Measurement]:
         """All metrics of one algorithm."""

@@ -1,7 +1,7 @@
 """The study ``terrain``: detection distance and false alarms for obstacles, edges and holes.
 
 Every run has a random street per kind of target, and drives towards it (world ``panning``), or past it with the laser
-fixed (``fixed``), or stands for 30 s at 9 m before a curb and then drives (``standing``). Five maps use the same lines:
+fixed (``fixed``), or waits 30 s at 9 m before a curb and then drives (``standing``). Five maps use the same lines:
 
 * ``multigrid``: one map per range band, learnt weights; the finest map with a known cell is used;
 * ``single-learnt``: one grid of 0.2 m, the same learnt weights, all ranges added;

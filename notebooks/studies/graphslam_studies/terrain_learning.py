@@ -166,7 +166,7 @@ def _on_ramp(street: Street, shape: Pyramid) -> list[npt.NDArray[np.bool_]]:
 def row_labels(
     rows: Rows, labels: list[Array], slopes: list[npt.NDArray[np.bool_]], shape: Pyramid
 ) -> npt.NDArray[np.int8]:
-    """Kinds ``(2, k)`` of the cells of statements, for steps and for support: 0 free, 1 free on or beside a ramp,
+    """Kinds ``(2, k)`` of the cells of statements, for steps and for support: 0 free, 1 free on or next to a ramp,
     2 a hazard, −1 ignored or outside."""
     out = np.full((2, len(rows)), -1, np.int8)
     for b, truth in enumerate(labels):

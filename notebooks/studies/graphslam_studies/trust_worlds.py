@@ -59,7 +59,7 @@ class TrustWorld:
 
     @property
     def clean(self) -> bool:
-        """Whether all errors agree with the stated noise model."""
+        """Whether all errors agree with the noise model in the log."""
         right = self.understated == 1.0 and self.scale == 1.0 and self.tails == 0.0 and self.lasting_odometry[0] == 0.0
         return right and self.gps in ("none", "white", "rtk")
 
@@ -124,7 +124,7 @@ def draw_world(number: int, *, seconds: float = 250.0) -> TrustWorld:
         elif k == 3:
             world = replace(world, lasting_odometry=drawn[3])
         elif world.understated == 1.0:
-            world = replace(world, understated=drawn[4])  # the stated noise is conservative
+            world = replace(world, understated=drawn[4])  # the noise model is conservative
     return world
 
 

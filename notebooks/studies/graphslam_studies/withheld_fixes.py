@@ -152,7 +152,7 @@ def predicted(graph: FactorGraph, fixes: Gps) -> Array:
     assert first is not None
     assert graph.values.datum is not None
     assert graph.gps_origin is not None
-    T[0] = SE3.compose(T[0], first.poses[0])  # the body on the level first base
+    T[0] = SE3.compose(T[0], first.poses[0])  # first body pose, relative to the level first base
     arm = np.broadcast_to(fixes.lever, (len(nodes), 3))
     return antenna_terms(T, graph.values.datum, graph.values.tilt, arm)[0] + graph.gps_origin
 

@@ -129,12 +129,12 @@ class SingleMapParticles(ParticleSet):
         Parameters
         ----------
         min_hits : int
-            Features seen less often by the standard particle are left out.
+            Features observed less often by the standard particle are omitted.
 
         Returns
         -------
         kept : (k,)
-            Particles that hold all of them.
+            Particles that have all of these features.
         slots : (k, L)
             Their slots.
         """
