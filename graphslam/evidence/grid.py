@@ -41,6 +41,7 @@ class EvidenceGrid(GridTree):
     ----------
     voxel_size : float
         Edge of a voxel [m].
+    model : BeamModel, optional
     pool : GridPool, optional
         Storage shared with other grids; default: a new pool.
     dim : {3, 2}
