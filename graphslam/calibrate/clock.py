@@ -19,10 +19,10 @@ def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
     """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
 
     Only shifts by whole periods of the motion's records are compared: a shift by half a period averages two records,
-    so that independent noise looks smaller, and its likelihood is larger whatever the clocks are. Shifts that are
-    nearer to each other than the time between sightings share records, and their likelihoods differ by the
-    noise of the others: that has minima of its own, so the shifts are so far apart. The offset between two of them is
-    that of a parabola through the likelihood of three.
+    so that independent noise looks smaller, and its likelihood is larger whatever the clocks are. The search first goes
+    in steps of the time between observations: likelihoods of nearer shifts differ by the noise of the records that they
+    do not share, which has minima of its own. Then it goes in steps of one period. The offset between two periods is
+    that of a parabola through the likelihood of three shifts.
 
     Parameters
     ----------
@@ -36,23 +36,24 @@ def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
 
     def score(k: int) -> float:
         if k not in scores:
-            moved = L.shift_motion(s, seen, k * stride * period)
+            moved = L.shift_motion(s, seen, k * period)
             moved.settle(8)
             moved.fit(budget=60, rounds=1)
             scores[k] = moved.objective()
         return scores[k]
 
     best = 0
-    while abs(best) * stride < MOST_PERIODS:
-        near = min((best, best - 1, best + 1), key=score)
-        if near == best:
-            break
-        best = near
+    for step in (stride, 1):
+        while abs(best) < MOST_PERIODS:
+            near = min((best, best - step, best + step), key=score)
+            if near == best:
+                break
+            best = near
     a, b, c = score(best - 1), score(best), score(best + 1)
     bend = max(a - 2.0 * b + c, 1e-6)
     at = float(np.clip(0.5 * (a - c) / bend, -0.5, 0.5))
     # of a straight course every offset fits; noise of the records themselves blurs it by their spacing
-    sigma = max(stride * period / math.sqrt(bend), 0.1 * period)
-    value = (best + at) * stride * period
+    sigma = max(period / math.sqrt(bend), 0.1 * period)
+    value = (best + at) * period
     gain = score(0) - (b - 0.5 * bend * at**2)
     return Estimate(name="clock", value=value, sigma=sigma, gain=gain, other=value, other_sigma=sigma).gated()

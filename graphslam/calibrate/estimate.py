@@ -97,14 +97,14 @@ class Prediction:
     gains : mapping of str to float
         Increase of the log-likelihood [nats]: with ``all`` of the estimate, and with its ``noise`` without its
         constants, if it has any.
-    timed : float
-        The same with the clock offset and the wheel slip only.
+    timed : Corrections
+        Clock offset above half the time between observations, and wheel slip, unless the data contradict them.
     """
 
     what: str
     count: int
     gains: dict[str, float]
-    timed: float = 0.0
+    timed: Corrections = field(default_factory=Corrections)
 
     @property
     def supported(self) -> str:
@@ -153,15 +153,15 @@ class Calibration:
     prediction: Prediction | None = None
 
     def validated(self, prediction: Prediction) -> Calibration:
-        """Copy without estimates that fail the cross-validation. Few withheld observations depend on clock and slip, so
-        these are rejected only if they reduce the log-likelihood by :data:`GAIN` or more.
+        """Copy without estimates that fail the cross-validation. Few withheld observations depend on large clock offsets
+        and slip, so these are rejected only if they reduce the log-likelihood by :data:`GAIN` or more.
         """
         found, supported = replace(self, prediction=prediction), prediction.supported
         if supported == "all":
             return found
         kept = self.corrections.without_constants() if supported == "noise" else Corrections()
-        if prediction.timed > -GAIN:
-            kept = replace(kept, clock=self.corrections.clock, slips=self.corrections.slips)
+        own, timed = self.corrections, prediction.timed
+        kept = replace(kept, clock=own.clock if timed.clock else 0.0, slips=own.slips if timed.slips else ())
         refused = [
             replace(e, why_not=prediction.text()) if e.applied and not (e.name == "clock" and kept.clock) else e
             for e in self.estimates
