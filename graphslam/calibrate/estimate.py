@@ -153,8 +153,8 @@ class Calibration:
     prediction: Prediction | None = None
 
     def validated(self, prediction: Prediction) -> Calibration:
-        """Copy without estimates that fail the cross-validation. Few withheld observations depend on large clock offsets
-        and slip, so these are rejected only if they reduce the log-likelihood by :data:`GAIN` or more.
+        """Copy without estimates that fail the cross-validation. Few withheld observations depend on large clock
+        offsets and slip, so these are rejected only if they reduce the log-likelihood by :data:`GAIN` or more.
         """
         found, supported = replace(self, prediction=prediction), prediction.supported
         if supported == "all":
