@@ -186,7 +186,7 @@ def verdict_word(
     Parameters
     ----------
     tests : sequence of ChiSquareTest
-        NEES if ground truth is known; χ² if there is no assessment.
+        NEES if the log has ground truth; χ² if there is no assessment.
     assessment : CovarianceAssessment or None
         Tests without ground truth.
     """
