@@ -96,6 +96,7 @@ ADVICE: dict[str, str] = {
     "particles": "use more particles, or rbpf-ekf",
     "one-particle": "use more than one particle",
     "motion-gap": "check the pose after the gap in the motion",
+    "wheels-slipped": "check the wheels at these times",
     "residuals": "check units and signs of odometry and observations, or increase their noise",
     "imu-contradicted": "increase the IMU noise, or leave the IMU out (--set imu.use=none)",
     "consistency-test": "check the measurements that are named below: they contradict the others",
