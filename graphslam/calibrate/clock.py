@@ -29,9 +29,8 @@ def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
     s : Smoothing
         Fitted without an offset.
     """
-    between = np.median([np.median(np.diff(w.times)) for w in s.windows])
     period = seen.period
-    stride = max(round(between / period), 1)
+    stride = max(round(min(seen.spacing / period, MOST_PERIODS)), 1)
     scores: dict[int, float] = {}
 
     def score(k: int) -> float:

@@ -151,7 +151,7 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
         if two or lasts or alike > ALIKE:
             notes.append(_lasting_note(short, long, alike))
     if seen.slips:
-        notes.append(slip_finding(seen.slips, seen.span[0]))
+        notes.append(slip_finding(seen.slips, short, seen.span))
     made = calibration_of("sightings", estimates, noise, notes, _data(short))
     slips = () if made.contradictions() else with_untested(seen.slips, seen)
     return replace(made, corrections=replace(made.corrections, slips=slips))
@@ -161,11 +161,11 @@ def _without_slips(seen: SightingLog, count: int | None, free: tuple[str, ...]) 
     """The log with its intervals of wheel slip, and a fit of short windows that does not use distances there."""
     for _ in range(ROUNDS):
         short, value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
-        slips = find_slips(short)
+        slips = find_slips(short, seen.spacing)
         if not slips:
-            break
+            return seen, short, value
         seen = replace(seen, slips=tuple(sorted((*seen.slips, *slips))))
-    return seen, short, value
+    return seen, *L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
 
 
 def _again(seen: SightingLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:

@@ -84,7 +84,7 @@ def predict_withheld_sightings(
     if c.without_constants() != c:
         gains["noise"] = before - score(c.without_constants())[0]
     # likelihoods of offsets within the time between observations differ by chance: these must predict better
-    far = abs(c.clock) > 0.5 * float(np.median(np.diff(np.unique(seen.sightings.times))))
+    far = abs(c.clock) > 0.5 * seen.spacing
     timed = Corrections(clock=c.clock if far else 0.0, slips=c.slips)
     if not timed.neutral and before - score(timed)[0] <= -GAIN:
         timed = Corrections()

@@ -22,19 +22,23 @@ ROUNDS = 4
 """Maximal number of fits: slip inflates the noise of the test, so the fit is repeated without the found intervals."""
 
 
-def find_slips(s: Smoothing) -> Stretches:
+def find_slips(s: Smoothing, spacing: float) -> Stretches:
     """Disjoint intervals ``(begin, end)`` whose distances contradict the observations [s].
 
     The statistic is the decrease of χ² without the distances of an interval. Its threshold is scaled by its median over
     all intervals, because slip inflates the fitted noise, but changes the median little.
+
+    Parameters
+    ----------
+    spacing : float
+        Time between observations [s].
     """
-    if not s.windows:
-        return ()
-    between = np.median(np.concatenate([np.diff(w.times) for w in s.windows]))
-    count = max(round(LONG / between), 1)
+    count = max(round(LONG / spacing), 1)
     stride = max(count // 2, 1)
     gains = s.gain_without_distances(count, stride)
-    tested = np.concatenate(gains)
+    tested = np.concatenate([np.zeros(0), *gains])
+    if not len(tested):
+        return ()
     least = special.chdtri(count, CHANCE / len(tested)) / special.chdtri(count, 0.5) * float(np.median(tested))
     out: list[tuple[float, float]] = []
     for w, gain in zip(s.windows, gains):
@@ -59,8 +63,12 @@ def with_untested(slips: Stretches, seen: SightingLog) -> Stretches:
     return tuple(sorted(out))
 
 
-def slip_finding(slips: Stretches, begin: float) -> Finding:
-    """Line of the verdict, with times since ``begin`` [s]."""
-    at = ", ".join(f"{a - begin:.1f}" for a, _ in slips[:8]) + ", …" * (len(slips) > 8)
-    text = f"wheels slipped at t = {at} s: distances of the odometry contradict the observations for a second."
+def slip_finding(slips: Stretches, s: Smoothing, span: tuple[float, float]) -> Finding:
+    """Line of the verdict, with times since the start of the motion, and the part of the log that was searched [s]."""
+    at = ", ".join(f"{a - span[0]:.1f}" for a, _ in slips[:8]) + ", …" * (len(slips) > 8)
+    searched = sum(float(np.ptp(w.times)) for w in s.windows)
+    text = (
+        f"wheels slipped at t = {at} s: distances of the odometry contradict the observations for a second. Slip was "
+        f"searched in {searched:.0f} s of {span[1] - span[0]:.0f} s."
+    )
     return Finding("look", "wheels-slipped", text)

@@ -77,6 +77,12 @@ class SightingLog:
         """Median time between motion records [s]."""
         return float(np.median(np.diff(self.clock[0])))
 
+    @property
+    def spacing(self) -> float:
+        """Median time between scans with observations [s]; infinite with fewer than two."""
+        times = np.unique(self.sightings.times[np.diff(self.sightings.offsets) > 0])
+        return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+
     def steps(self, stamps: Array, shift: float = 0.0) -> Array:
         """Motion between stamps ``(n, 8)``: dx, dy, turn, seconds in motion, metres, variances; row 0 is zero.
 

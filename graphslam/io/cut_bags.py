@@ -11,6 +11,7 @@ import io
 import mmap
 import shutil
 import sqlite3
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
@@ -41,16 +42,16 @@ Record = tuple[BagChannel, int, bytes]
 """Topic, stamp in the bag [ns], message."""
 
 
-class RecordFile:
+class RecordFile(ABC):
     """A file that is read sequentially; with those methods of the rosbags readers that are used here."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.connections: list[BagChannel] = []
 
+    @abstractmethod
     def records(self) -> Iterator[Record]:
         """All messages; an exception at the end of a truncated file."""
-        raise NotImplementedError
 
     def open(self) -> None:
         """Find the topics by reading all records."""
@@ -70,7 +71,7 @@ class RecordFile:
         topics = {c.topic for c in chosen}
         return (r for r in self.records() if r[0].topic in topics)
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Does nothing: no file stays open between calls."""
 
 

@@ -38,11 +38,11 @@ def clean(log):
     return fit_noise(smooth_sightings(seen_in(log), SHORT, 20, FREE))[0]
 
 
-def test_statistic_of_noise_that_is_fitted_has_the_distribution_it_is_compared_with(clean) -> None:
+def test_statistic_of_noise_that_is_fitted_has_the_distribution_it_is_compared_with(log, clean) -> None:
     gain = np.concatenate(clean.gain_without_distances(4))
     assert np.all(gain > -1e-6)
     assert 0.75 < np.median(gain) / special.chdtri(4, 0.5) < 1.3
-    assert find_slips(clean) == ()
+    assert find_slips(clean, seen_in(log).spacing) == ()
 
 
 def test_distances_left_out_take_away_what_they_cost(clean) -> None:
