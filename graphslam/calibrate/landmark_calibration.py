@@ -161,7 +161,7 @@ def _without_slips(seen: SightingLog, count: int | None, free: tuple[str, ...]) 
     """The log with its intervals of wheel slip, and a fit of short windows that does not use distances there."""
     for _ in range(ROUNDS):
         short, value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
-        slips = find_slips(short, seen.spacing)
+        slips = find_slips(short, seen.spacing, seen.slips)
         if not slips:
             return seen, short, value
         seen = replace(seen, slips=tuple(sorted((*seen.slips, *slips))))

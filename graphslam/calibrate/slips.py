@@ -22,8 +22,8 @@ ROUNDS = 4
 """Maximal number of fits: slip inflates the noise of the test, so the fit is repeated without the found intervals."""
 
 
-def find_slips(s: Smoothing, spacing: float) -> Stretches:
-    """Disjoint intervals ``(begin, end)`` whose distances contradict the observations [s].
+def find_slips(s: Smoothing, spacing: float, known: Stretches = ()) -> Stretches:
+    """Disjoint intervals ``(begin, end)`` whose distances contradict the observations, without the known ones [s].
 
     The statistic is the decrease of χ² without the distances of an interval. Its threshold is scaled by its median over
     all intervals, because slip inflates the fitted noise, but changes the median little.
@@ -32,6 +32,9 @@ def find_slips(s: Smoothing, spacing: float) -> Stretches:
     ----------
     spacing : float
         Time between observations [s].
+    known : tuple of (float, float)
+        Intervals that were found before. An interval that overlaps with one of them is not returned: if the odometry
+        reports no distance there, it is found in each round.
     """
     count = max(round(LONG / spacing), 1)
     stride = max(count // 2, 1)
@@ -48,7 +51,7 @@ def find_slips(s: Smoothing, spacing: float) -> Stretches:
             if gain[i] > least and np.all(free[k : k + count]):
                 free[k : k + count] = False
                 out.append((float(w.times[k]), float(w.times[k + count])))
-    return tuple(sorted(out))
+    return tuple(sorted((a, b) for a, b in set(out) if all(b <= c or d <= a for c, d in known)))
 
 
 def with_untested(slips: Stretches, seen: SightingLog) -> Stretches:

@@ -72,6 +72,19 @@ def test_slipping_wheels_are_named_and_leave_the_noise_as_it_is(log, clean) -> N
     assert all(f.code != "wheels-slipped" for f in calibrate_sightings(seen_in(log), QUICK).findings())
 
 
+def test_wheels_that_report_nothing_while_the_robot_moves_are_found_once(log) -> None:
+    o = log["odometry"]
+    xi = o.increments.copy()
+    xi[(o.times > 20.0) & (o.times < 23.0)] = 0.0  # their σ in slip is zero, too: they stay in contradiction
+    stuck = seen_in(replace(log, streams={**log.streams, "odometry": replace(o, increments=xi)}))
+    s = fit_noise(smooth_sightings(stuck, SHORT, 20, FREE))[0]
+    found = find_slips(s, stuck.spacing)
+    assert any(a < 22.0 and b > 21.0 for a, b in found)
+    assert find_slips(s, stuck.spacing, found) == ()
+    at = np.array(calibrate_sightings(stuck, QUICK).corrections.slips)
+    assert len(at) < 12 and np.all(at[1:, 0] >= at[:-1, 1])
+
+
 def test_variance_of_a_stretch_is_its_length_squared(log) -> None:
     times, metres = np.arange(10.0), np.full(10, 0.3)
     found = slip_noise(times, metres, [(2.0, 5.0)])
