@@ -82,7 +82,8 @@ def test_wheels_that_report_nothing_while_the_robot_moves_are_found_once(log) ->
     assert any(a < 22.0 and b > 21.0 for a, b in found)
     assert find_slips(s, stuck.spacing, found) == ()
     at = np.array(calibrate_sightings(stuck, QUICK).corrections.slips)
-    assert len(at) < 12 and np.all(at[1:, 0] >= at[:-1, 1])
+    assert len(at) < 12
+    assert np.all(at[1:, 0] >= at[:-1, 1])
 
 
 def test_variance_of_a_stretch_is_its_length_squared(log) -> None:
