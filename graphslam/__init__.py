@@ -30,6 +30,7 @@ _VERBS = {
     **dict.fromkeys(("local_maps", "first_particles"), "graphslam.app.run.local_maps"),
     **dict.fromkeys(("study", "open_study", "find_study"), "graphslam.app.studies"),
     **dict.fromkeys(("open_run", "compare", "join_submaps", "solve_file", "refine_path"), "graphslam.app.verbs"),
+    "solve_graph": "graphslam.app.verbs",
     "merge": "graphslam.app.sessions.merge",
     "localise": "graphslam.app.sessions.localise",
     **dict.fromkeys(("export", "to_open3d"), "graphslam.app.export"),

@@ -60,6 +60,7 @@ def test_page_for_users_is_short(name: str) -> None:
         ["joiners.md"],
         ["live.md"],
         ["maps.md"],
+        ["own-factor.md"],
         ["registration.md"],
         ["quick-start.md"],
         ["simulated-robots.md"],

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import TracebackType
 
 import graphslam
+from graphslam.core.errors import ConfigError
 from graphslam.core.heap import trim_heap
 from graphslam.io.submap_store import read_submaps, write_submaps
 from graphslam.join.registry import Material, compile_method, join_by_method
@@ -52,7 +53,12 @@ class MemoryProbe:
             if isinstance(self._submaps, Sequence):
                 write_submaps(self._folder.name, list(self._submaps))
             else:
-                self._submaps.save(Path(self._folder.name) / _GRAPH)
+                try:
+                    self._submaps.save(Path(self._folder.name) / _GRAPH)
+                except ConfigError as error:
+                    logger.warning("peak memory is not measured: %s", error)
+                    self._folder.cleanup()
+                    self._folder = None
         return self
 
     def __exit__(

@@ -35,12 +35,13 @@ from graphslam.refine.refine import refine_by_scans
 from graphslam.refine.result import Refinement
 from graphslam.refine.scans import Scans
 from graphslam.solve import registry
+from graphslam.solve.solution import Solution
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.recorded import chain_odometry
 from graphslam_frontends.odometry.step_config import StepConfig
 
 __all__ = ["compare", "front_ends", "join_submaps", "joiners", "open_run", "options", "refine_path", "solve_file"]
-__all__ += ["solvers", "worlds"]
+__all__ += ["solve_graph", "solvers", "worlds"]
 
 
 def front_ends() -> list[str]:
@@ -136,7 +137,7 @@ def open_run(path: str | Path) -> Run:
     >>> opened = gs.open_run("runs/field")
     >>> opened.metric("submaps")
     7.0
-    >>> opened.solution.marginal(3).shape
+    >>> opened.solution.covariance(3).shape
     (3, 3)
     """
     run = read_run(path)
@@ -305,6 +306,45 @@ def join_submaps(
     options.setdefault("covariance_scale", s.covariance_scale)
     with one_blas_thread():
         return joining.join_by_method(s.material, method, polish=polish, **options)
+
+
+def solve_graph(graph: FactorGraph, solver: str = "lm", **options: Any) -> Solution:
+    """Solve a graph to its optimum; its values become those of the solution.
+
+    Parameters
+    ----------
+    graph : FactorGraph
+        Of a run (``run.graph``), :meth:`FactorGraph.from_submaps`, or made factor by factor.
+    solver : str
+        One of :func:`solvers`.
+    **options
+        Of the class of the solver in :mod:`graphslam.solve`.
+
+    Returns
+    -------
+    Solution
+        Values, covariances, and whether they are the optimum.
+
+    Raises
+    ------
+    UnknownNameError
+        There is no such solver.
+    IndeterminateError
+        Some variables are not constrained; the message names them.
+    SolverError
+        A factor is not finite.
+
+    Examples
+    --------
+    >>> graph = gs.FactorGraph.from_submaps(gs.local_maps(log)[:3])
+    >>> solution = gs.solve_graph(graph)
+    >>> solution.converged, solution.covariance(1, 2).shape
+    (True, (3, 3))
+    """
+    made = registry.make_solver(solver, graph, **options)
+    with one_blas_thread():
+        made.solve_to_optimum()
+        return made.solution()
 
 
 def solve_file(path: str | Path, solver: str = "lm", **options: Any) -> Mapping[str, Any]:

@@ -14,6 +14,7 @@ from graphslam.core.errors import DataError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.markup import html_element, html_table, item_list, join_parts
 from graphslam.core.records import Stream, check_times
+from graphslam.core.sketch import coverage_bar, plan_sketch
 from graphslam.core.trajectory import Trajectory
 
 FAR_FIX = "far from all other fixes"
@@ -166,16 +167,20 @@ class SensorLog:
         return f"SensorLog({self.name!r}: {streams}; truth {'known' if self.truth else 'unknown'})"
 
     def _repr_html_(self) -> str:
-        rows = []
+        rows: list[dict[str, object]] = []
+        ends = [float(t) for s in self.streams.values() if len(s.times) for t in (s.times[0], s.times[-1])]
         for name, s in self.streams.items():
             first, last = (f"{s.times[0]:.2f}", f"{s.times[-1]:.2f}") if len(s.times) else (None, None)
             kind, n = type(s).__name__, len(s.times)
-            rows.append({"stream": name, "kind": kind, "records": n, "from s": first, "to s": last})
+            bar = coverage_bar(s.times, min(ends), max(ends)) if len(s.times) else None
+            rows.append({"stream": name, "kind": kind, "records": n, "from s": first, "to s": last, "when": bar})
         span = f"{self.duration:.1f} s" if any(len(s.times) for s in self.streams.values()) else "empty"
-        parts: list[str] = [
+        lost = sum(self.dropped.values())
+        parts: list[str | None] = [
             html_element("b", f"SensorLog {self.name}"),
-            f", {span}, truth {'known' if self.truth else 'unknown'}",
-            html_table(rows, ["stream", "kind", "records", "from s", "to s"]),
+            f": {span}, {len(rows)} streams, {lost} records dropped, truth {'known' if self.truth else 'unknown'}",
+            None if self.truth is None else plan_sketch([self.truth.trajectory.positions], points=self.truth.landmarks),
+            html_table(rows, ["stream", "kind", "records", "from s", "to s", "when"]),
         ]
         if self.dropped:
             parts += ["dropped:", item_list(f"{k}: {v}" for k, v in self.dropped.items())]

@@ -162,3 +162,19 @@ def compose_increments(increments: Array) -> Array:
         poses[reach:] = g.compose(poses[:-reach], poses[reach:])
         reach *= 2
     return poses
+
+
+def position_covariances(poses: Array, covariances: Array) -> Array:
+    """Covariances of positions ``(n, 2, 2)`` or ``(n, 3, 3)`` in the axes of the frame the poses are in.
+
+    Parameters
+    ----------
+    poses : (n, 3) or (n, 7)
+    covariances : (n, 3, 3) or (n, 6, 6)
+        Right tangents.
+    """
+    if poses.shape[-1] == 3:
+        R, C = geometry.rotation2(poses[..., 2]), covariances[..., :2, :2]
+    else:
+        R, C = se3.quat_to_matrix(poses[..., 3:]), covariances[..., 3:, 3:]
+    return np.asarray(R @ C @ np.swapaxes(R, -1, -2))

@@ -21,9 +21,11 @@ from graphslam.core.gaussian import check_covariance
 from graphslam.core.geometry import Array, vector_to_tangent_covariance, wrap_angle
 from graphslam.core.markup import html_element, join_parts, pair_list
 from graphslam.core.path_points import PathPoints
+from graphslam.core.poses import position_covariances
 from graphslam.core.reading import finite_mask
 from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.sensor_biases import SensorBiases
+from graphslam.core.sketch import plan_sketch
 from graphslam.core.trajectory import Trajectory
 
 
@@ -329,10 +331,18 @@ class Submap:
         return f"Submap({self.key}, [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks)"
 
     def _repr_html_(self) -> str:
+        d = self.dim
+        P = position_covariances(self.exit_pose[None], self.exit_covariance[None])[:, :2, :2]
         s = np.sqrt(np.diag(self.exit_covariance))
-        n = 0 if self.landmarks is None else len(self.landmarks)
-        said = (
-            f" [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s, {n} landmarks, "
-            f"exit {np.array2string(self.exit_pose, precision=3)} σ {np.array2string(s, precision=4)}"
-        )
-        return join_parts([html_element("b", f"Submap {self.key}"), said, pair_list(self.report)])
+        metres, radians = (s[:2], s[2:]) if d == 2 else (s[3:], s[:3])
+        lm, sure = self.landmarks, f"σ at most {metres.max():.3g} m and {np.degrees(radians.max()):.3g}°"
+        n = 0 if lm is None else len(lm)
+        said = f": end pose {sure}; {n} landmarks, [{self.interval[0]:.2f}, {self.interval[1]:.2f}] s"
+        path = np.stack([np.zeros(d), self.exit_pose[:d]]) if self.trajectory is None else self.trajectory.positions
+        ellipses = [(self.exit_pose[None, :2], P)]
+        if lm is not None and d == 2 and n:
+            rows = 3 + 2 * np.arange(n)[:, None] + np.arange(2)
+            ellipses.append((lm.positions, lm.dense_covariance()[rows[:, :, None], rows[:, None, :]]))
+        seen = lm.positions if lm is not None else None if self.cloud is None else self.cloud.points
+        picture = plan_sketch([path], points=seen, ellipses=ellipses)
+        return join_parts([html_element("b", f"Submap {self.key}"), said, picture, pair_list(self.report)])

@@ -11,8 +11,11 @@ import numpy.typing as npt
 from graphslam.core import se3
 from graphslam.core.errors import DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike, se2_between, se2_compose, se2_exp, se2_log, se2_transform
+from graphslam.core.markup import html_element, join_parts
+from graphslam.core.poses import position_covariances
 from graphslam.core.reading import finite_mask
 from graphslam.core.records import check_times
+from graphslam.core.sketch import plan_sketch
 
 Index = npt.NDArray[np.intp]
 
@@ -81,6 +84,23 @@ class Trajectory:
             tangent = names if plane else ["roll", "pitch", "yaw", "x", "y", "z"]
             columns |= {f"sigma_{n}": np.sqrt(self.covariances[:, k, k]) for k, n in enumerate(tangent)}
         return pd.DataFrame(columns, index=pd.Index(self.times, name="time"))
+
+    def to_numpy(self) -> Array:
+        """Times and poses in one array: ``(n, 4)`` of t, x, y, θ; in 3-D ``(n, 8)`` of t, x, y, z, qx, qy, qz, qw."""
+        return np.column_stack([self.times, self.poses])
+
+    def _repr_html_(self) -> str:
+        from graphslam.core.gaussian import largest_sigmas  # loads SciPy
+
+        sigma = "no covariances"
+        P: Array | None = None
+        if self.covariances is not None and len(self):
+            P = position_covariances(self.poses, self.covariances)[:, :2, :2]
+            sigma = f"σ of the position at most {largest_sigmas(P).max():.3g} m"
+        text = f": {self.length():.1f} m, {sigma}; {len(self)} poses"
+        when = f", {self.times[0]:.2f} to {self.times[-1]:.2f} s" if len(self) else ""
+        picture = plan_sketch([self.positions], ellipses=[] if P is None else [(self.positions, P)])
+        return join_parts([html_element("b", "Trajectory"), text, when, picture])
 
     def __repr__(self) -> str:
         when = f", {self.times[0]:.6g} to {self.times[-1]:.6g} s" if len(self) else ""

@@ -26,7 +26,7 @@ One call per finished submap, and the end of a run::
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -35,23 +35,28 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GeometryError
 from graphslam.core.geometry import Array, ArrayLike
+from graphslam.core.markup import Markup, html_element, join_parts
 from graphslam.core.records import Stream
 from graphslam.core.se3 import quat_normalize
 from graphslam.core.sensor_biases import SensorBiases
+from graphslam.core.sketch import plan_sketch
 from graphslam.core.submap import Match, Submap
 from graphslam.graph.factor_graph_state import BetweenBlock, FactorGraphState
 from graphslam.graph.factors.attitude import DOWN, LEVELLED, AttitudeRecord, without_tilt
 from graphslam.graph.factors.batch import FactorRecord
 from graphslam.graph.factors.between import BetweenRecord
+from graphslam.graph.factors.function import USABLE, FunctionRecord, check_group
 from graphslam.graph.factors.landmark_submap import CONSTANT, SubmapRecord
 from graphslam.graph.factors.range import RangeRecord
 from graphslam.graph.factors.sensor_biases import SIZE, SensorBiasRecord, bias_variable_names, sensor_biases_at
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
+from graphslam.graph.gtsam_values import value_of
 from graphslam.graph.inner_nodes import cut_submap
 from graphslam.graph.ledger import EXCLUSIVE, EvidenceUse
 from graphslam.graph.noise import NO_KERNEL, RobustKernel, covariance_whiteners, whitener
 from graphslam.graph.sensors import kind_of
 from graphslam.graph.submap_node import InnerPoints, SubmapNode
+from graphslam.graph.variables import split_name, variable_name
 
 __all__ = ["FactorGraph", "SubmapNode"]
 
@@ -78,6 +83,19 @@ class FactorGraph(FactorGraphState):
 
     def __repr__(self) -> str:
         return f"FactorGraph({len(self.submaps)} submaps, {len(self.values.landmarks)} landmarks, dim={self.dim})"
+
+    def _repr_html_(self) -> str:
+        score, x, d = self.objective(), self.values.poses, self.dim
+        said = (
+            f": χ² {score.total:.4g} at its values, for {score.dof} degrees of freedom; {len(x)} nodes, "
+            f"{len(self.values.landmarks)} landmarks, {len(self.records)} factors"
+        )
+        ties = [r for r in self.records.single.values() if isinstance(r, BetweenRecord)]
+        links = [(r.i, r.j) for r in ties if abs(r.i - r.j) > 1]
+        links += [pair for b in self.records.blocks for pair in b.ends[b.kept & (np.ptp(b.ends, axis=1) > 1)].tolist()]
+        ends = x[np.array(links, dtype=np.intp).reshape(-1, 2), :d]
+        picture = plan_sketch([x[:, :d]], points=self.values.landmarks, links=ends)
+        return join_parts([html_element("b", "FactorGraph"), said, picture, Markup(score._repr_html_())])
 
     @classmethod
     def from_submaps(
@@ -447,6 +465,79 @@ class FactorGraph(FactorGraphState):
         kind = self.ledger.enter(record.factor_id, record.label(), evidence)
         self.insert(record)
         self._event("range", factor_id=record.factor_id, i=i, j=j, evidence=kind)
+        return record.factor_id
+
+    def add_factor(
+        self,
+        variables: Sequence[str | int],
+        residual: Callable[..., ArrayLike],
+        covariance: ArrayLike,
+        *,
+        evidence: EvidenceUse | str,
+        jacobian: Callable[..., ArrayLike] | None = None,
+        robust: RobustKernel = NO_KERNEL,
+        group: str = "user",
+    ) -> int:
+        """A factor of your own: a residual as a function of the values of some variables.
+
+        Every solver and every map-joining method uses it. A method that works in frames of submaps adds it in the
+        frame of the first base if its residual depends on the frame. It is in memory only: files of a graph refuse it.
+
+        Parameters
+        ----------
+        variables : sequence of str or int
+            Poses, landmarks, datum or tilt, each once: ``"x3"`` or 3, ``"l17"``, ``"datum"``, ``"tilt"``.
+        residual : callable
+            Gets their values in that order (poses ``T_world_node`` ``(3,)`` or ``(7,)``, landmarks ``(dim,)``) and
+            returns predicted minus measured ``(d,)``; angles wrapped to [-π, π].
+        covariance : (d, d)
+            Of the measurement, in the units of the residual.
+        evidence : EvidenceUse or str
+            Streams and interval of the measurement; the ledger refuses to use them twice. Or a declared kind, as
+            ``"prior"``.
+        jacobian : callable, optional
+            Gets the same values, returns ``(d, Σ dof)`` by right tangents of poses. Default: central differences, which
+            call the residual twice for each degree of freedom.
+        robust : RobustKernel
+        group : str
+            Class of the factor in :meth:`objective`.
+
+        Returns
+        -------
+        int
+            Factor id.
+
+        Raises
+        ------
+        ConfigError, DataError, SolverError, CovarianceError, EvidenceReusedError
+            The graph is unchanged then.
+
+        Examples
+        --------
+        A tape measure between the bases of two submaps, 18.0 m ± 5 cm:
+
+        >>> graph = gs.FactorGraph.from_submaps(gs.local_maps(log)[:3])
+        >>> tape = lambda a, b: [np.linalg.norm(a[:2] - b[:2]) - 18.0]
+        >>> added = graph.add_factor([0, 1], tape, [[0.05**2]], evidence=gs.EvidenceUse(["tape"], (0.0, 0.0)))
+        >>> gs.solve_graph(graph).score["user"].factors
+        1
+        """
+        names = tuple(variable_name(v) for v in variables)
+        known = {"x0", *self.structure.layout().names()}
+        bad = [n for n in names if n not in known or split_name(n)[0].word not in USABLE]
+        if bad or len(set(names)) < len(names) or not set(names) - {"x0"}:
+            wanted = f"names of {', '.join(USABLE)} that are in the graph, each once, and not x0 alone"
+            raise DataError("a factor cannot use these variables", got=bad or names, wanted=wanted)
+        check_group(group)
+        P = np.atleast_2d(np.asarray(covariance, dtype=np.float64))
+        W = whitener(P, what=f"covariance of the {group} factor")
+        record = FunctionRecord(self._next_factor, names, residual, jacobian, W, robust, group)
+        r, J = record.linearised([value_of(self.values, n, self._row) for n in names], self.dim)
+        if not (np.all(np.isfinite(r)) and np.all(np.isfinite(J))):
+            raise DataError(f"{record.label()} is not finite at the values of the graph", got=r, wanted="numbers")
+        kind = self.ledger.enter(record.factor_id, record.label(), evidence)
+        self.insert(record)
+        self._event("factor", factor_id=record.factor_id, variables=list(names), evidence=kind, group=group)
         return record.factor_id
 
     def start_session(self, T_world_base: ArrayLike) -> int:

@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError
 from graphslam.core.geometry import Array
-from graphslam.core.markup import Markup, html_element, join_parts
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.diagnose import Diagnosis, diagnose
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.attitude import AttitudeRecord
 from graphslam.graph.factors.batch import FactorRecord, batch_of
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
+from graphslam.graph.factors.function import FunctionRecord
 from graphslam.graph.factors.landmark_submap import PathRecord, SubmapRecord
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.ledger import Ledger
@@ -189,6 +189,7 @@ class FactorGraphState:
         self._seen_in: dict[int, set[int]] = {}  # landmark id -> factor ids
         self._attitude_of: dict[int, int] = {}  # node -> number of its attitude factors
         self._robots: dict[frozenset[str], int] = {}  # streams -> robot, whose submaps share constant errors
+        self._user: set[int] = set()  # ids of the factors of a user
         self._retired: set[int] = set()  # ids of merged or removed landmarks, never reused
         self._next_factor = 0
         self._next_landmark = 0
@@ -259,6 +260,9 @@ class FactorGraphState:
                 self._place.pop(self.submaps.pop().key)
         for sensor in self.sensors.values():
             sensor.remove_unused(removed)
+        known = {"x0", *self.structure.layout().names()} if self._user else set()
+        for fid in [i for i in self._user if not known.issuperset(self.records[i].variables())]:
+            self.take_out(fid, "one of its variables was removed")
         if self.structure.count("tilt") and not any("tilt" in r.variables() for r in self.records.values()):
             self.values.tilt = None
             self.revision += 1
@@ -267,6 +271,7 @@ class FactorGraphState:
         """Remove one factor, its evidence, and landmarks that have no factor left."""
         block = self.records.block_of(factor_id)
         record = self.records.pop(factor_id)
+        self._user.discard(factor_id)
         if isinstance(record, AttitudeRecord):
             self._attitude_of[record.node] -= 1
         if block is None or not block.kept.any():  # the factors of a block have one ledger entry
@@ -290,6 +295,12 @@ class FactorGraphState:
             self.records[fid] = replace(record, landmark_ids=ids)  # a new object, so that solvers detect the change
             self._seen_in[keep].add(fid)
             self._path_follows(record.submap_key, ids)
+        for fid in list(self._user):
+            own = cast(FunctionRecord, self.records[fid])
+            if f"l{drop}" in own.names:
+                self.records[fid] = replace(own, names=tuple(f"l{keep}" if n == f"l{drop}" else n for n in own.names))
+                if len(set(self.records[fid].variables())) < len(own.names):
+                    self.take_out(fid, "two of its landmarks are one")
         for fid, r in list(self.records.single.items()) if "control" in self.sensors else ():
             moved = {n: keep for n in ("landmark", "landmark_to") if getattr(r, n, None) == drop}
             if moved:
@@ -403,10 +414,6 @@ class FactorGraphState:
         waiting = sum(sensor.waiting_readings() for sensor in self.sensors.values())
         return diagnose(self.flat(), values or self.values, waiting_fixes=waiting)
 
-    def _repr_html_(self) -> str:
-        said = f" {len(self.values.poses)} nodes, {len(self.values.landmarks)} landmarks, {len(self.records)} factors"
-        return join_parts([html_element("b", "FactorGraph"), said, Markup(self.objective()._repr_html_())])
-
     # ---------------------------------------------------------------- inside
 
     def insert(self, record: FactorRecord) -> None:
@@ -414,6 +421,8 @@ class FactorGraphState:
         self.records[record.factor_id] = record
         self._next_factor = max(self._next_factor, record.factor_id + 1)
         self.revision += 1
+        if isinstance(record, FunctionRecord):
+            self._user.add(record.factor_id)
         if isinstance(record, AttitudeRecord):
             self._attitude_of[record.node] = self._attitude_of.get(record.node, 0) + 1
         if isinstance(record, LANDMARK_SUBMAPS):

@@ -144,6 +144,15 @@ def split_name(name: str) -> tuple[VariableKind, int]:
     return kind, int(name[len(word) :])
 
 
+def variable_name(key: str | int) -> str:
+    """Name of a variable: a name itself, a number k for the pose ``xk``, or GTSAM's 64-bit key."""
+    if isinstance(key, str):
+        return key
+    if not hasattr(key, "__index__"):
+        raise SolverError(f"no variable {key!r}: wanted a name, the number of a pose, or a key of GTSAM")
+    return f"x{key:d}" if key < 1 << 56 else key_name(key)
+
+
 def _names_in_words() -> str:
     return ", ".join(k.word if k.single else f"{k.word}<number>" for k in KINDS.values())
 

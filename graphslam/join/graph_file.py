@@ -15,9 +15,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from graphslam.core.atomic import read_npz
-from graphslam.core.errors import FormatError, GraphSlamError
+from graphslam.core.errors import ConfigError, FormatError, GraphSlamError
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.batch import FactorRecord, factor_kinds
+from graphslam.graph.factors.function import FunctionRecord
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.variables import KINDS, Values
 from graphslam.linear.space_maps import SpaceMap
@@ -37,6 +38,9 @@ def graph_arrays(graph: FactorGraph, parts: Mapping[str, Any]) -> dict[str, Any]
         Those of :data:`PARTS`, of a :class:`~graphslam.join.graph_problem.JoinProblem`.
     """
     values, factors = graph.values, list(graph.records.values())
+    own = [r.label() for r in factors if isinstance(r, FunctionRecord)]
+    if own:
+        raise ConfigError(f"a file cannot hold the function of {own[0]}; remove it from the graph")
     out: dict[str, Any] = {"format": GRAPH_FORMAT, "dim": values.dim, "landmark_ids": values.landmark_ids}
     out |= {f"values.{w}": values[w] for w in KINDS if values.count(w)}
     out |= {name: parts[name] for name in PARTS}

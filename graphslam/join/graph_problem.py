@@ -35,7 +35,9 @@ from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factor_graph_state import LANDMARK_SUBMAPS
 from graphslam.graph.factors.batch import FactorRecord
+from graphslam.graph.factors.function import FunctionRecord
 from graphslam.graph.factors.landmark_submap import PathRecord
+from graphslam.graph.gtsam_values import value_of
 from graphslam.graph.ledger import EvidenceUse
 from graphslam.graph.variables import KINDS, Values, VariableLayout, split_name
 from graphslam.join.frames import Rule, rows_in_frame, rule_of
@@ -258,6 +260,20 @@ class JoinProblem:
         return rules
 
     @cached_property
+    def needs_first_base(self) -> npt.NDArray[np.bool_]:
+        """Factors that hold in the frame of the first base only ``(f,)``: by the rule of a variable, or, of a user's
+        function, because its residual changes with the frame."""
+        fixed = [any(self.rules[v] == "first-base" for v in at.tolist()) for at in self.variables]
+        T = self.group.exp(np.linspace(0.5, -0.7, self.group.dof))  # any frame
+        for f, r in enumerate(self.factors):
+            if isinstance(r, FunctionRecord) and not fixed[f]:
+                rows = [value_of(self.graph.values, n, self.graph.landmark_rows) for n in r.names]
+                rules = [rule_of(split_name(n)[0].word, self.dim) for n in r.names]
+                moved = [rows_in_frame(rule, self.group, T, x[None])[0][0] for rule, x in zip(rules, rows)]
+                fixed[f] = not np.allclose(r.error(moved), r.error(rows), rtol=1e-7, atol=1e-7)
+        return np.array(fixed, dtype=bool)
+
+    @cached_property
     def variables(self) -> list[Index]:
         """Numbers of the variables of each factor."""
         number = self.number
@@ -403,7 +419,7 @@ class JoinProblem:
         new: dict[int, int] = {}
         for f in waiting.tolist():
             unknown = [int(v) for v in self.variables[f] if not known[v]]
-            if base > 0 and not force and any(rules[v] == "first-base" for v in self.variables[f].tolist()):
+            if base > 0 and not force and self.needs_first_base[f]:
                 later.append(f)
                 continue
             open_ = [v for v in unknown if rules[v] != "constant"]

@@ -6,7 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.gaussian import largest_sigmas
 from graphslam.core.geometry import Array, rotation2, se2_transform
+from graphslam.core.markup import html_element, join_parts, pair_list
+from graphslam.core.poses import position_covariances
+from graphslam.core.sketch import plan_sketch
 from graphslam.core.submap import Submap
 from graphslam.core.trajectory import Trajectory
 from graphslam.loops.places import Ints
@@ -47,6 +51,22 @@ class GlobalMap:
     def __repr__(self) -> str:
         nodes, landmarks = len(self.node_poses), len(self.landmarks)
         return f"GlobalMap({self.trajectory!r}, {nodes} nodes, {landmarks} landmarks, in the frame of the first base)"
+
+    def _repr_html_(self) -> str:
+        d, P = self.dim, position_covariances(self.node_poses, self.node_covariances)[:, :2, :2]
+        worst = f"σ of a position at most {largest_sigmas(P).max():.3g} m" if len(P) else "empty"
+        text = (
+            f": {worst}; {len(self.node_poses)} nodes, {len(self.landmarks)} landmarks, in the frame of the first base"
+        )
+        ellipses = [(self.node_poses[:, :2], P), (self.landmarks, self.landmark_covariances)]
+        picture = plan_sketch([self.trajectory.positions[:, :d]], points=self.landmarks, ellipses=ellipses)
+        figures = {
+            "path [m]": self.trajectory.length(),
+            "largest σ of a landmark [m]": largest_sigmas(self.landmark_covariances).max(initial=0.0),
+            "observations of landmarks": int(self.landmark_hits.sum()),
+            "in the frame of GPS": self.T_gps_world is not None,
+        }
+        return join_parts([html_element("b", "GlobalMap"), text, picture, pair_list(figures)])
 
     def landmarks_in(self, T: Array) -> tuple[Array, Array]:
         """Landmarks ``(n, 2)`` and their covariances ``(n, 2, 2)`` in another frame, ``T_frame_world`` ``(3,)``."""

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from graphslam.core.errors import ConfigError, DataError
-from graphslam.core.geometry import Array, arc_length, rotation2
-from graphslam.core.se3 import quat_to_matrix
+from graphslam.core.geometry import Array, arc_length
+from graphslam.core.poses import position_covariances
 from graphslam.core.trajectory import Trajectory
 from graphslam.plots import style
 from graphslam.plots.map import plot_ellipses
@@ -20,22 +20,6 @@ _COLOURS = {
     "RBPF": style.VERMILION,
     "SegSLAM": style.ESTIMATE,
 }
-
-
-def position_covariances(poses: Array, covariances: Array) -> Array:
-    """Covariances of positions ``(n, 2, 2)`` or ``(n, 3, 3)`` in the axes of the frame the poses are in.
-
-    Parameters
-    ----------
-    poses : (n, 3) or (n, 7)
-    covariances : (n, 3, 3) or (n, 6, 6)
-        Right tangents.
-    """
-    if poses.shape[-1] == 3:
-        R, C = rotation2(poses[..., 2]), covariances[..., :2, :2]
-    else:
-        R, C = quat_to_matrix(poses[..., 3:]), covariances[..., 3:, 3:]
-    return np.asarray(R @ C @ np.swapaxes(R, -1, -2))
 
 
 def plot_paths(

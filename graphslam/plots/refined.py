@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
+from graphslam.core.poses import position_covariances
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.plots import style
-from graphslam.plots.paths import position_covariances
 
 
 def plot_before_after(

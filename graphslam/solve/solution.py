@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,15 +23,11 @@ from graphslam.graph.factors.landmark_submap import SubmapRecord
 from graphslam.graph.factors.sensor_biases import bias_variable_names, sensor_biases_at
 from graphslam.graph.network import network_of
 from graphslam.graph.score import GraphScore, score_graph
-from graphslam.graph.variables import Values, vector_form
+from graphslam.graph.variables import Values, variable_name, vector_form
 from graphslam.solve.descent import Optimum
 
 if TYPE_CHECKING:
     from graphslam.solve.network.certificate import Certificate
-
-
-def _name_of(name: str | int) -> str:
-    return name if isinstance(name, str) else f"x{operator.index(name)}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -147,38 +142,48 @@ class Solution:
         return self.values.datum + np.append(self.gps_origin, 0.0)
 
     @cached_property
-    def covariance(self) -> JointCovariance:
+    def _joint(self) -> JointCovariance:
         """Joint covariance at these values; cached."""
         return JointCovariance(self._flat.layout, self._flat.evaluate(self.values).A)
 
-    def marginal(self, name: str | int) -> Array:
-        """Covariance of one variable ``(d, d)``; of a pose in its right tangent: ``[δx, δy, δθ]`` or ``[δω, δv]``.
+    def covariance(self, a: str | int, b: str | int | None = None) -> Array:
+        """Covariance of one variable ``(d, d)``, or of two with each other ``(d_a, d_b)``.
+
+        Of a pose in its right tangent: ``[δx, δy, δθ]`` or ``[δω, δv]``; zeros for the fixed first base ``x0``.
 
         Parameters
         ----------
-        name : str or int
-            Such as ``"x3"``, ``"l17"``, ``"datum"``, ``"bias0"``; a number k is the pose ``"xk"``.
+        a, b : str or int
+            Such as ``"x3"``, ``"l17"``, ``"datum"``, ``"bias0"``; a number k is the pose ``"xk"``; or a key of GTSAM.
         """
-        return self.covariance.marginal(_name_of(name))
+        first = variable_name(a)
+        second = first if b is None else variable_name(b)
+        lay, P = self._flat.layout, self._joint
+        if first == second:
+            return P.marginal(first)
+        if "x0" in (first, second):
+            return np.zeros([lay.pose_dof if n == "x0" else len(lay.columns(n)) for n in (first, second)])
+        d = len(lay.columns(first))
+        return P.joint([first, second])[:d, d:]
 
     def joint_marginal(self, names: Iterable[str | int]) -> Array:
-        """Joint covariance of several variables in that order, named as in :meth:`marginal`."""
-        return self.covariance.joint(map(_name_of, names))
+        """Joint covariance of several variables in that order, named as in :meth:`covariance`; none of ``x0``."""
+        return self._joint.joint(map(variable_name, names))
 
     def node_covariances(self) -> Array:
         """``(m + 1, d, d)``, right tangent; zeros for the fixed first base."""
-        return self.covariance.poses()
+        return self._joint.poses()
 
     def landmark_covariances(self) -> Array:
         """``(n, 2, 2)``."""
-        return self.covariance.landmarks()
+        return self._joint.landmarks()
 
     def joint_covariance(self) -> Array:
         """Dense covariance of ``[x_1 … x_m (x, y, θ vectors), landmarks]`` in the frame of the first base."""
         lay = self._flat.layout
         if lay.dim != 2:
             raise GeometryError("poses in space have no covariance as vectors", wanted="joint_marginal")
-        P = self.covariance.columns(np.arange(lay.stop("l")))
+        P = self._joint.columns(np.arange(lay.stop("l")))
         return vector_form(P, self.values.poses[1:], [3 * k for k in range(lay.nodes - 1)])
 
     def certificate(self) -> Certificate:
@@ -253,7 +258,7 @@ class Solution:
     def _lasting_covariances(self) -> dict[int, Array]:
         """Covariance of the constant errors of each robot ``(6, 6)``."""
         robots = range(self.values.count("wheels"))
-        return {k: self.covariance.joint(bias_variable_names(k)) for k in robots}
+        return {k: self._joint.joint(bias_variable_names(k)) for k in robots}
 
     def _bent(self, s: SubmapNode, rows: npt.NDArray[np.bool_], P_nodes: Array | None) -> tuple[Array, Array]:
         """Poses and covariances of a path between the nodes of its submap, conditioned on both neighbours."""
@@ -268,7 +273,7 @@ class Solution:
         if P_nodes is None:
             return poses, np.zeros((0, group.dof, group.dof))
         P = P_nodes[nodes]
-        P_ab = self.covariance.cross(nodes[:-1], nodes[1:])[at]
+        P_ab = self._joint.cross(nodes[:-1], nodes[1:])[at]
         # δ_t = F δ_a + K δ_b + w, F = Ad(T_at⁻¹) - K Ad(T_ab⁻¹)
         F = group.adjoint(group.inverse(b.T_node_body)) - b.gain @ group.adjoint(group.inverse(T_ab))[at]
         Ft, Kt = np.swapaxes(F, 1, 2), np.swapaxes(b.gain, 1, 2)

@@ -180,7 +180,9 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
     ),
     "graphslam.graph.ledger.Ledger": a_ledger,
     "graphslam.graph.score.GraphScore": lambda _: GraphScore({"class": ClassScore(1.0, 1, 1, 1)}),
-    "graphslam.graph.factor_graph_state.FactorGraphState": a_graph,
+    "graphslam.graph.factor_graph.FactorGraph": a_graph,
+    "graphslam.core.trajectory.Trajectory": lambda path: a_run(path).trajectory,
+    "graphslam.maps.global_map.GlobalMap": lambda path: a_run(path).map,
     "graphslam.join.submap_solver.SubmapEstimate": lambda _: SubmapEstimate(
         np.zeros((1, 3)), NOTHING, np.zeros((0, 2)), None, 0.0, None, 1, True, 0.0, np.zeros((0, 0))
     ),
@@ -197,7 +199,9 @@ MAKERS: dict[str, Callable[[Path], Any]] = {
 }
 # texts of these stand in the code, not in a file: their HTML has no place for a foreign one
 OWN_WORDS = {
-    "graphslam.graph.factor_graph_state.FactorGraphState",
+    "graphslam.core.trajectory.Trajectory",
+    "graphslam.maps.global_map.GlobalMap",
+    "graphslam.graph.factor_graph.FactorGraph",
     "graphslam.join.submap_solver.SubmapEstimate",
     "graphslam.join.graph_join.GraphEstimate",
     "graphslam.evidence.grid.EvidenceGrid",
@@ -216,6 +220,46 @@ def test_names_are_text_and_never_markup(name: str, tmp_path: Path) -> None:
     assert "<img" not in shown.replace('<img src="data:image/png;base64,', "")  # our own pictures
     if name not in OWN_WORDS:
         assert "&lt;script&gt;alert(1)" in shown  # it is there, as text
+
+
+def test_results_show_a_verdict_then_a_picture_then_figures() -> None:
+    import graphslam as gs
+
+    log = gs.simulate("landmark-field", preset="quick", seed=1)
+    run = gs.run(log, frontend="ekf", config={"calibrate": {"use": "none"}}, progress=False)
+    assert run.graph is not None
+    for thing in (run, run.submaps[0], run.graph, run.trajectory, run.map, log):
+        shown = thing._repr_html_()
+        first = shown.index(type(thing).__name__ if thing is not run else run.headline.text[:20])
+        picture = shown.index("<svg" if thing is not run else "<img")
+        assert first < picture, type(thing)
+        if thing is not run.trajectory:
+            assert picture < shown.index("<table"), type(thing)
+        assert len(shown) < 200_000
+    assert str(run.verdict).count("\n") == len(run.verdict) - 1
+    assert run.trajectory.to_numpy().shape == (len(run.to_pandas()), 4)
+    # links of the graph: as many as factors that close loops
+    run.graph.add_between(0, 3, run.map.base_poses[3], np.eye(3), evidence="prior")
+    assert run.graph._repr_html_().count("<polyline") == 3  # path, loop, scale
+
+
+def test_a_sketch_is_to_scale_and_says_nothing_of_nothing() -> None:
+    from graphslam.core.sketch import coverage_bar, plan_sketch
+
+    assert plan_sketch([np.zeros((0, 2))]) is None
+    assert plan_sketch([np.ones((3, 2))]) is None
+    assert plan_sketch([np.full((2, 2), np.nan)]) is None
+    shown = plan_sketch([np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 20.0]])])
+    lines = [
+        np.array([p.split(",") for p in part.split('"')[0].split()], dtype=float)
+        for part in str(shown).split('points="')[1:]
+    ]
+    scale_bar, path = sorted(lines, key=len)
+    metres = float(str(shown).partition("<text")[2].partition(">")[2].split(" m")[0])
+    per_metre = (scale_bar[1, 0] - scale_bar[0, 0]) / metres
+    np.testing.assert_allclose(np.diff(path, axis=0) / per_metre, [[40.0, 0.0], [0.0, -20.0]], atol=0.05)
+    bar = coverage_bar(np.concatenate([np.linspace(0, 10, 200), np.linspace(50, 60, 200)]), 0.0, 100.0)
+    assert bar.count("<rect") == 3  # the ground, and two intervals with records
 
 
 def test_an_empty_log_shows_itself() -> None:

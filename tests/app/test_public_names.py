@@ -15,7 +15,7 @@ from graphslam.solve.registry import make_solver
 VERBS = {
     *("compare", "export", "find_loops", "find_study", "first_particles", "join_submaps", "load", "local_maps"),
     *("localise", "merge", "open_run", "open_study", "refine_path", "run", "simulate", "solve_file", "study"),
-    *("calibrate_log", "relax_skeleton", "to_open3d"),
+    *("calibrate_log", "relax_skeleton", "solve_graph", "to_open3d"),
 }
 LISTS = {"front_ends", "joiners", "options", "solvers", "worlds"}
 STREAMS = {

@@ -11,8 +11,9 @@ from graphslam.core import se3
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import se2_compose, se2_exp
+from graphslam.core.poses import position_covariances
 from graphslam.core.trajectory import Trajectory
-from graphslam.plots.paths import plot_paths, position_covariances
+from graphslam.plots.paths import plot_paths
 
 
 def straight(n: int = 11, *, covariance: bool = True) -> Trajectory:

@@ -37,16 +37,25 @@ def test_marginals_are_blocks_of_the_dense_inverse(solved):
         c = lay.columns_of(names)
         np.testing.assert_allclose(solution.joint_marginal(names), P[np.ix_(c, c)], rtol=1e-7, atol=1e-12)
     np.testing.assert_array_equal(solution.joint_marginal([1, 2]), solution.joint_marginal(["x1", "x2"]))
+    np.testing.assert_array_equal(
+        solution.joint_marginal([gtsam_key("x2"), gtsam_key(landmark)]), solution.joint_marginal([2, landmark])
+    )
+    rows, columns = lay.columns(landmark), lay.columns("x3")
+    np.testing.assert_allclose(solution.covariance(landmark, 3), P[np.ix_(rows, columns)], rtol=1e-7, atol=1e-12)
+    np.testing.assert_array_equal(solution.covariance(3, landmark), solution.covariance(landmark, 3).T)
+    np.testing.assert_array_equal(solution.covariance(landmark, 0), np.zeros((2, 3)))
+    with pytest.raises(SolverError, match=r"no variable 1\.5"):
+        solution.covariance(1.5)
     for k, C in enumerate(solution.node_covariances()[1:]):
         np.testing.assert_allclose(C, P[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-7, atol=1e-12)
     for r, C in enumerate(solution.landmark_covariances()):
         c = lay.landmark_start + 2 * r
         np.testing.assert_allclose(C, P[c : c + 2, c : c + 2], rtol=1e-7, atol=1e-12)
-    np.testing.assert_array_equal(solution.marginal("x0"), np.zeros((3, 3)))
+    np.testing.assert_array_equal(solution.covariance("x0"), np.zeros((3, 3)))
     with pytest.raises(SolverError, match="no variable 'x99'"):
-        solution.marginal("x99")
+        solution.covariance("x99")
     with pytest.raises(SolverError, match="no variable 'banana'"):
-        solution.marginal("banana")
+        solution.covariance("banana")
 
 
 def test_sparse_covariances_are_the_dense_ones(solved):
@@ -71,7 +80,7 @@ def test_joint_covariance_is_in_vector_form(solved):
     assert P.shape == (n, n)
     t = g.values.poses[4, 2]
     G = np.array([[np.cos(t), -np.sin(t), 0], [np.sin(t), np.cos(t), 0], [0, 0, 1]])
-    np.testing.assert_allclose(P[9:12, 9:12], G @ solution.marginal("x4") @ G.T, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(P[9:12, 9:12], G @ solution.covariance("x4") @ G.T, rtol=1e-9, atol=1e-14)
     np.testing.assert_allclose(P[24:26, 24:26], solution.landmark_covariances()[0], rtol=1e-9)
 
 
@@ -85,14 +94,16 @@ def test_trajectory_is_node_after_local_path(solved):
     np.testing.assert_allclose(path.poses[k], se2_compose(g.values.poses[5], s.trajectory.poses[4]), atol=1e-12)
     node = np.searchsorted(path.times, 50.0)  # on a boundary the later submap has it: the node itself
     np.testing.assert_allclose(path.poses[node], g.values.poses[5], atol=1e-12)
-    np.testing.assert_allclose(path.covariances[node], solution.marginal("x5") + s.trajectory.covariances[0], rtol=1e-6)
+    np.testing.assert_allclose(
+        path.covariances[node], solution.covariance("x5") + s.trajectory.covariances[0], rtol=1e-6
+    )
     assert solution.trajectory(covariances=False).covariances is None
 
 
 def test_trajectory_covariance_by_monte_carlo(solved, rng):
     chain, g, solution = solved
     local = chain.submaps[5].trajectory
-    P, C, T = solution.marginal("x5"), local.covariances[6], local.poses[6]
+    P, C, T = solution.covariance("x5"), local.covariances[6], local.poses[6]
     node = se2_compose(g.values.poses[5], se2_exp(rng.multivariate_normal(np.zeros(3), P, 100_000)))
     body = se2_compose(node, se2_compose(T, se2_exp(rng.multivariate_normal(np.zeros(3), C, 100_000))))
     xi = se2_log(se2_between(se2_compose(g.values.poses[5], T), body))
@@ -109,12 +120,12 @@ def test_gps_frame_is_the_streams_own(solved):
 
 def test_a_solution_outlives_the_graph(solved):
     _, g, solution = solved
-    P, poses = solution.marginal("x3").copy(), solution.poses.copy()
+    P, poses = solution.covariance("x3").copy(), solution.poses.copy()
     g.merge_landmarks(*map(int, g.values.landmark_ids[:2]))
     g.add_between(0, 3, [50.0, 0, 0], 1e-4 * np.eye(3), evidence="shared-scan")
     BatchSolver(g).update()
     np.testing.assert_array_equal(solution.poses, poses)
-    np.testing.assert_allclose(solution.marginal("x3"), P)
+    np.testing.assert_allclose(solution.covariance("x3"), P)
     assert "Solution" in solution._repr_html_()
 
 

@@ -14,12 +14,12 @@ from graphslam.app.report.packed import base64_floats, packed_points, space
 from graphslam.app.run.files import read_gps_residuals, read_map
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.geometry import Array, se2_inverse, se2_transform
+from graphslam.core.poses import position_covariances
 from graphslam.io.cloud_files import read_cloud
 from graphslam.io.submap_store import read_truth
 from graphslam.io.tum import read_tum
 from graphslam.maps.global_map import GlobalMap
 from graphslam.plots import style
-from graphslam.plots.paths import position_covariances
 
 MOST_POINTS = 60_000
 """Largest number of map points in the page; larger maps are subsampled."""

@@ -165,6 +165,11 @@ class Run:
         return headline_of_json(self.report.get("verdict")) or Finding("", "headline", "No verdict.")
 
     @property
+    def trajectory(self) -> Trajectory:
+        """The path at full rate with covariances, in the frame of the first base."""
+        return self.map.trajectory
+
+    @property
     def points_of_survey(self) -> int:
         """Control rows and check rows that were used."""
         return int(self.report.get("control_points", {}).get("used", 0)) + len(self.check_points)
@@ -178,8 +183,8 @@ class Run:
         return pd.DataFrame(self.report.get("check_points", {}).get("rows", []), columns=columns)
 
     def to_pandas(self) -> pd.DataFrame:
-        """The path at full rate, one row per pose, in the frame of the first base: :meth:`Trajectory.to_pandas`."""
-        return self.map.trajectory.to_pandas()
+        """:attr:`trajectory` as a table, one row per pose (:meth:`Trajectory.to_pandas`)."""
+        return self.trajectory.to_pandas()
 
     def plot(self, ax: Any = None, *, plane: str = "xy") -> Any:
         """Map with path, landmarks and 95 % ellipses, GPS fixes and ground truth.

@@ -78,10 +78,10 @@ def _score(
     fit = landmark_error(ids, points, true_ids, true_points, gauge="rigid")
     out.add("landmark_rmse_aligned", fit.statistics.rmse, "m", "lower")
     out.add("landmark_max_aligned", fit.statistics.maximum, "m", "lower")
-    columns = solution.covariance.layout.columns_of([f"l{k}" for k in ids.tolist()])
     if len(ids) > 2:
         none = np.zeros((0, 3))
-        nees = aligned_nees(none, points, (none, true_points[j]), solution.covariance.columns(columns))
+        P = solution.joint_marginal(f"l{k}" for k in ids.tolist())
+        nees = aligned_nees(none, points, (none, true_points[j]), P)
         add_nees(out, "nees_aligned_landmarks", nees, 2 * len(ids) - 3)
     for s in sessions:
         truth, path = s.run.truth, s.run.truth_path

@@ -78,7 +78,7 @@ def _write_landmarks(folder: FolderTransaction, merged: MergedMap) -> None:
     for s in merged.sessions:
         write_tum(path / f"trajectory_{s.name}.tum", s.map.trajectory)
     folder.write_text("landmarks.csv", landmarks_csv(merged.sessions[0].map))
-    columns = merged.solution.covariance.layout.columns_of([f"l{i}" for i in merged.landmark_ids.tolist()])
+    joint = merged.solution.joint_marginal(f"l{i}" for i in merged.landmark_ids.tolist())
     write_npz(
         path / "merged.npz",
         {
@@ -88,7 +88,7 @@ def _write_landmarks(folder: FolderTransaction, merged: MergedMap) -> None:
             "first_base_covariances": np.array([s.map.node_covariances[0] for s in merged.sessions]),
             "landmark_ids": merged.landmark_ids,
             "landmarks": merged.landmarks,
-            "landmark_joint_covariance": merged.solution.covariance.columns(columns),
+            "landmark_joint_covariance": joint,
             "landmark_sessions": merged.landmark_sessions,
         },
     )

@@ -76,9 +76,9 @@ class MergedMap:
         """Landmarks and the path of every session; the ellipses show the uncertainty of the *shape* of the map."""
         from graphslam.plots.merged import plot_merged
 
-        columns = self.solution.covariance.layout.columns_of([f"l{i}" for i in self.landmark_ids.tolist()])
         centred = self.landmarks - self.landmarks.mean(axis=0)
-        P = inner_covariance(self.solution.covariance.columns(columns), gauge_directions(np.zeros((0, 3)), centred))
+        joint = self.solution.joint_marginal(f"l{i}" for i in self.landmark_ids.tolist())
+        P = inner_covariance(joint, gauge_directions(np.zeros((0, 3)), centred))
         k = 2 * np.arange(len(centred))[:, None] + np.arange(2)
         blocks = P[k[:, :, None], k[:, None, :]] + 1e-12 * np.eye(2)
         paths = {s.name: s.map.trajectory for s in self.sessions}

@@ -171,7 +171,7 @@ def test_an_opened_run_has_its_graph_and_solution(run: Run) -> None:
     assert opened.solution is not None
     assert run.solution is not None
     np.testing.assert_array_equal(opened.solution.poses, run.solution.poses)
-    np.testing.assert_allclose(opened.solution.marginal(2), run.solution.marginal("x2"), rtol=1e-9)
+    np.testing.assert_allclose(opened.solution.covariance(2), run.solution.covariance("x2"), rtol=1e-9)
     assert opened.graph is not None
     assert len(opened.graph.submaps) == len(run.submaps)
     assert opened.holds("graph")
@@ -180,10 +180,10 @@ def test_an_opened_run_has_its_graph_and_solution(run: Run) -> None:
 
 def test_a_marginal_is_asked_for_by_number_or_name(run: Run) -> None:
     assert run.solution is not None
-    np.testing.assert_array_equal(run.solution.marginal(1), run.solution.marginal("x1"))
-    assert run.solution.marginal(0).tolist() == np.zeros((3, 3)).tolist()
+    np.testing.assert_array_equal(run.solution.covariance(1), run.solution.covariance("x1"))
+    assert run.solution.covariance(0).tolist() == np.zeros((3, 3)).tolist()
     with pytest.raises(SolverError, match="no variable 'x999'"):
-        run.solution.marginal(999)
+        run.solution.covariance(999)
 
 
 def test_a_missing_log_is_still_named() -> None:

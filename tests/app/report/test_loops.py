@@ -177,7 +177,7 @@ def test_nees_of_the_ends_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest
     assert r.truth is not None
     error = pose_error(r.solution.poses[r.solution.exit_nodes], r.truth.exit_poses)
     wanted = [
-        e @ np.linalg.solve(r.solution.marginal(f"x{n}"), e) for e, n in zip(error, r.solution.exit_nodes.tolist())
+        e @ np.linalg.solve(r.solution.covariance(f"x{n}"), e) for e, n in zip(error, r.solution.exit_nodes.tolist())
     ]
     np.testing.assert_allclose(drawn[0].nees[0], wanted, rtol=1e-6)
     assert drawn[0].dof[0, 0] == 6

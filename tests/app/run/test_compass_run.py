@@ -53,7 +53,7 @@ def test_a_recorded_compass_and_beacons_enter_the_graph(recorded: SensorLog, sol
     assert 0.5 < chi2["beacon"].chi2_per_dof < 1.6
     spent = run.ledger if not hasattr(run.ledger, "table") else run.ledger.table()
     assert {"compass", "radio/11", "radio/12", "radio/13"} <= set(spent["stream"])
-    P = run.solution.marginal("compass0")
+    P = run.solution.covariance("compass0")
     assert abs(run.solution.values["compass"][0, 0] - 0.8) < 4 * np.sqrt(P[0, 0]) + 0.02
     again = gs.open_run(tmp_path / "r")
     assert again.report["streams"] == run.report["streams"]

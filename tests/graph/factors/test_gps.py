@@ -89,7 +89,7 @@ def test_datum_heading_is_recovered(rng):
         g.add_submap(s)
         solver.update()
     T = solver.solution().T_gps_world
-    sigma = np.sqrt(np.diag(solver.solution().marginal("datum")))
+    sigma = np.sqrt(np.diag(solver.solution().covariance("datum")))
     assert abs(wrap_angle(T[2] - DATUM[2])) < 4 * sigma[2]
     assert sigma[2] < 0.01
     assert np.linalg.norm(T[:2] - DATUM[:2]) < 0.3

@@ -67,7 +67,7 @@ def test_the_datum_is_found_again(rng):
     solver.update()
     solver.solve_to_optimum()
     solution = solver.solution()
-    T, P = solution.T_gps_world, solution.marginal("datum")
+    T, P = solution.T_gps_world, solution.covariance("datum")
     assert P.shape == (4, 4)
     sigma = np.sqrt(np.diag(P))
     assert abs(wrap_angle(g.values.datum[3] - DATUM[3])) < 4 * sigma[3]

@@ -172,8 +172,8 @@ def test_both_solvers_agree(rng):
     np.testing.assert_allclose(theirs.tilt, mine.tilt, atol=1e-6)
     solution = solver.solution()
     assert solution.converged
-    assert solution.marginal("velocity0").shape == (3, 3)
-    assert solution.marginal("imubias0").shape == (6, 6)
+    assert solution.covariance("velocity0").shape == (3, 3)
+    assert solution.covariance("imubias0").shape == (6, 6)
 
 
 def test_online_is_offline(rng):

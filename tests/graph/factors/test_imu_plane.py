@@ -105,7 +105,7 @@ def test_both_solvers_agree(rng):
     assert g.objective().total == pytest.approx(objective, rel=1e-6)
     for word in ("x", "l", "velocity", "imubias"):
         np.testing.assert_allclose(theirs[word], g.values[word], atol=1e-5)
-    assert solver.solution().marginal("velocity0").shape == (2, 2)
+    assert solver.solution().covariance("velocity0").shape == (2, 2)
 
 
 def test_readings_without_error_have_no_residual(rng, monkeypatch):

@@ -11,9 +11,9 @@ from matplotlib.ticker import MaxNLocator
 from graphslam.core.errors import DataError
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
+from graphslam.core.poses import position_covariances
 from graphslam.core.submap import Submap
 from graphslam.plots import style
-from graphslam.plots.paths import position_covariances
 from graphslam_studies.evaluate.exit_nees import ExitNees
 from graphslam_studies.plots.exit_points import draw_exits
 
