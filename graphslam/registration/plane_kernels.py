@@ -30,6 +30,101 @@ class PlanePairs(NamedTuple):
     j: Index
 
 
+@njit
+def symmetric_eigen(A: Array, w: Array, V: Array) -> None:
+    """Eigenvalues ``w`` (ascending) and eigenvectors (columns of ``V``) of a small symmetric matrix.
+
+    Cyclic Jacobi rotations: for 3 x 3 at least three times as fast as LAPACK, and as accurate. ``A`` is overwritten.
+    """
+    n = len(A)
+    for i in range(n):
+        for j in range(n):
+            V[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        off, on = 0.0, 0.0
+        for i in range(n):
+            on += A[i, i] * A[i, i]
+            for j in range(i):
+                off += A[i, j] * A[i, j]
+        if off <= 1e-34 * on or off == 0.0:  # an error of w of at most 1e-17 of the largest
+            break
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if A[q, p] == 0.0:
+                    continue
+                theta = (A[q, q] - A[p, p]) / (2.0 * A[q, p])
+                t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                A[p, p], A[q, q] = A[p, p] - t * A[q, p], A[q, q] + t * A[q, p]
+                A[q, p] = A[p, q] = 0.0
+                for k in range(n):
+                    if k not in (p, q):
+                        a, b = A[k, p], A[k, q]
+                        A[k, p] = A[p, k] = c * a - s * b
+                        A[k, q] = A[q, k] = s * a + c * b
+                    a, b = V[k, p], V[k, q]
+                    V[k, p], V[k, q] = c * a - s * b, s * a + c * b
+    for i in range(n):
+        w[i] = A[i, i]
+    for i in range(1, n):  # insertion sort
+        j = i
+        while j > 0 and w[j - 1] > w[j]:
+            w[j - 1], w[j] = w[j], w[j - 1]
+            for k in range(n):
+                V[k, j - 1], V[k, j] = V[k, j], V[k, j - 1]
+            j -= 1
+
+
+@njit(fastmath={"contract"})
+def _covariance(points: Array, rows: Index, mean: Array, C: Array) -> int:
+    """Covariance ``C`` of the points in ``rows`` (-1: none), divided by their number, which is returned."""
+    d = points.shape[1]
+    n = 0
+    mean[:] = 0.0
+    C[:] = 0.0
+    for a in rows:
+        if a >= 0:
+            n += 1
+            for u in range(d):
+                mean[u] += points[a, u]
+    if n == 0:
+        return 0
+    for u in range(d):
+        mean[u] /= n
+    for a in rows:
+        if a >= 0:
+            for u in range(d):
+                for v in range(u + 1):
+                    C[u, v] += (points[a, u] - mean[u]) * (points[a, v] - mean[v])
+    for u in range(d):
+        for v in range(u + 1):
+            C[u, v] /= n
+            C[v, u] = C[u, v]
+    return n
+
+
+@njit
+def principal_axes(points: Array, neighbours: Index, out_spread: Array, out_axes: Array) -> None:
+    """Eigenvalues and eigenvectors of the covariance of neighbourhoods.
+
+    Parameters
+    ----------
+    points : (q, d)
+    neighbours : (k, m)
+        Rows of ``points``.
+    out_spread : (k, d)
+        Variances [m²], ascending.
+    out_axes : (k, d, d)
+        Their unit vectors, in columns.
+    """
+    d = points.shape[1]
+    mean, C = np.zeros(d), np.zeros((d, d))
+    for k in range(len(neighbours)):
+        _covariance(points, neighbours[k], mean, C)
+        symmetric_eigen(C, out_spread[k], out_axes[k])
+
+
 @njit(fastmath={"contract"})
 def fit_surfaces(
     points: Array, neighbours: Index, least: int, out_normal: Array, out_flat: Array, out_tilt: Array
@@ -51,29 +146,14 @@ def fit_surfaces(
         points of variance ``σ²`` has the variance ``σ² / (n l)``, where l is their variance along the axis.
     """
     d = points.shape[1]
+    mean, C, w, V = np.zeros(d), np.zeros((d, d)), np.zeros(d), np.zeros((d, d))
     for k in range(len(neighbours)):
-        c = np.zeros(d)
-        n = 0
-        for a in neighbours[k]:
-            if a >= 0:
-                n += 1
-                for u in range(d):
-                    c[u] += points[a, u]
+        n = _covariance(points, neighbours[k], mean, C)
         if n < least:
             out_flat[k] = np.nan
             out_tilt[k] = 0.0
             continue
-        c /= n
-        C = np.zeros((d, d))
-        for a in neighbours[k]:
-            if a >= 0:
-                for u in range(d):
-                    for v in range(u + 1):
-                        C[u, v] += (points[a, u] - c[u]) * (points[a, v] - c[v])
-        for u in range(d):
-            for v in range(u):
-                C[v, u] = C[u, v]
-        w, V = np.linalg.eigh(C / n)
+        symmetric_eigen(C, w, V)
         out_normal[k] = V[:, 0]
         for u in range(1, d):
             sigma = np.sqrt(max(w[0], 0.0) / ((n - d) * max(w[u], 1e-12)))

@@ -14,6 +14,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
 from graphslam.core.log import DropCounter
 from graphslam.core.points import finite_points, voxel_downsample
+from graphslam.registration.plane_kernels import principal_axes
 
 FLATNESS = 1e-3
 """Variance across a surface over that along it, in the covariance of a point (Segal 2009)."""
@@ -106,15 +107,16 @@ class Target:
             spread, axes = self._spread(self.points[new], n)
             normals[new] = axes[:, :, 0]
             turned = np.minimum(spread[:, :1] / (n * spread[:, 1:]), 1.0)
-            noise[new] = np.einsum("mij,mj,mkj->mik", axes[:, :, 1:], turned, axes[:, :, 1:])
+            noise[new] = (axes[:, :, 1:] * turned[:, None]) @ np.swapaxes(axes[:, :, 1:], 1, 2)
         known[new] = True
         return normals[rows], noise[rows]
 
     def _spread(self, points: Array, n: int) -> tuple[Array, Array]:
         """Variances ``(k, dim)`` of the n nearest points around each, ascending, and their axes."""
-        around = self.points[self.tree.query(points, n)[1]]
-        d = around - around.mean(axis=1, keepdims=True)
-        spread, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", d, d) / n)
+        d = self.dim
+        rows = self.tree.query(points, n)[1] if d == 2 else self.cloud[1].batch_knn_search(points, n)[0]
+        spread, axes = np.empty((len(rows), d)), np.empty((len(rows), d, d))
+        principal_axes(self.points, rows.astype(np.int64), spread, axes)
         return np.maximum(spread, 1e-12 * np.maximum(spread[:, -1:], 1e-300)), axes
 
     @cached_property
