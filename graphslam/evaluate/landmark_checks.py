@@ -87,7 +87,7 @@ def _gaps(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
         for g in r.get("gaps", ()):
             text = (
                 f"gap in the odometry: {g['begin']:.1f} to {g['end']:.1f} s ({g['end'] - g['begin']:.1f} s) — bridged "
-                f"with the mean motion of the log, {g['speed']:.2f} ± {g['speed_sigma']:.2g} m/s and "
+                f"with {g['speed']:.2f} ± {g['speed_sigma']:.2g} m/s and "
                 f"{np.rad2deg(g['yaw_rate']):.1f} ± {np.rad2deg(g['yaw_rate_sigma']):.2g} °/s; "
             )
             if not g["unseen"]:

@@ -15,6 +15,7 @@ from graphslam.core.range_scans import RangeScans
 from graphslam.core.records import Gps, LandmarkObservations, LaserScans, Odometry, SteeringControls, VelocityControls
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.clock import CLOCK_SET_BACK
+from graphslam_frontends.odometry.recorded import motion_is_given
 
 STEADY = (Imu, LaserScans, Odometry, PointClouds, RangeScans, SteeringControls, VelocityControls)
 """Streams with regular records; landmarks and fixes can pause."""
@@ -34,7 +35,9 @@ def check_clocks(log: SensorLog) -> list[tuple[str, Finding]]:
     out: list[tuple[str, Finding]] = []
     for name, stream in log.streams.items():
         if isinstance(stream, STEADY) and len(stream.times) > 2:
-            out += [(name, f) for f in (*_unit(name, stream.times), *_jumps(name, stream.times))]
+            found = (*_unit(name, stream.times), *_jumps(name, stream.times, log))
+            said = {f.code for _, f in out} & {"pause-bridged"}  # all streams pause together
+            out += [(name, f) for f in found if f.code not in said]
     return [*out, *_overlap(log), *_order(log.read, log.dropped)]
 
 
@@ -49,12 +52,19 @@ def _unit(name: str, t: np.ndarray) -> list[Finding]:
     return [Finding("bad", "stamps-unit", text)]
 
 
-def _jumps(name: str, t: np.ndarray) -> list[Finding]:
+def _jumps(name: str, t: np.ndarray, log: SensorLog) -> list[Finding]:
     dt = np.diff(t)
     k = np.flatnonzero(dt > max(JUMP, JUMP_TIMES * float(np.median(dt))))
     if not len(k):
         return []
     worst = int(k[np.argmax(dt[k])])
+    odometry = next((s for s in log.streams.values() if isinstance(s, Odometry) and len(s.times) > 2), None)
+    if odometry is not None and all(motion_is_given(odometry, float(t[j]), float(t[j + 1])) for j in k):
+        text = (
+            f"records of {name}: pause of {dt[worst]:.1f} s after record {worst} (at {t[worst]:.3f} s); pauses of "
+            f"{JUMP:g} s or more: {len(k)} — the odometry gives the motion over them. Check the map after the pause."
+        )
+        return [Finding("look", "pause-bridged", text)]
     more = f", and {len(k) - 1} more jumps of {JUMP:g} s or more" if len(k) > 1 else ""
     text = (
         f"stamps of {name}: jump of {dt[worst]:.1f} s after record {worst} (at {t[worst]:.3f} s){more} — a clock was "

@@ -11,7 +11,7 @@ from graphslam.core.errors import DataError
 from graphslam.core.imu import GRAVITY
 from graphslam.core.log import SensorLog
 from graphslam.core.point_clouds import ArrayClouds, PointClouds
-from graphslam.core.records import Odometry, VelocityControls
+from graphslam.core.records import LaserScans, Odometry, VelocityControls
 from graphslam.evaluate.stream_checks import check_streams, refuse_faulty
 from graphslam.evaluate.stream_checks_beams import check_beams
 from graphslam.evaluate.stream_checks_imu import check_imu, compare_turns
@@ -140,3 +140,19 @@ def test_records_that_came_together_say_nothing_of_a_speed() -> None:
     dense = replace(odometry, times=1e-3 * np.arange(400), increments=10 * increments)
     (found,) = check_streams(SensorLog(name="dense", streams={"odometry": dense}))
     assert (found.finding.level, found.finding.code) == ("look", "stamps-dense")  # and a map is made nevertheless
+
+
+@pytest.mark.parametrize(("moved", "code", "level"), [(0.0, "pause-bridged", "look"), (400.0, "clock-jump", "bad")])
+def test_a_pause_of_the_recording_that_odometry_bridges_is_no_error(moved: float, code: str, level: str) -> None:
+    t = 0.2 * np.arange(200)
+    t[100:] += 198.0
+    motion = np.tile([0.1, 0.0, 0.01], (200, 1))
+    motion[97:104] = 0.0
+    motion[100, 0] = moved
+    odometry = Odometry(times=t, increments=motion, covariances=np.tile(1e-4 * np.eye(3), (200, 1, 1)))
+    ranges = np.random.default_rng(0).uniform(1.0, 9.0, (200, 40)).astype(np.float32)
+    laser = LaserScans(times=t, ranges=ranges, bearings=np.linspace(-1.5, 1.5, 40), max_range=10.0)
+    log = SensorLog(name="paused", streams={"laser": laser, "odometry": odometry})
+    found = [f.finding for f in check_streams(log) if "198.2 s" in f.finding.text]
+    assert {(f.code, f.level) for f in found} == {(code, level)}
+    assert len(found) == (1 if moved == 0.0 else 2)

@@ -121,7 +121,7 @@ class SightingConfig:
     """Observations beyond this range are not used [m]."""
     longest_gap: float = 60.0
     """Longest gap in the records of the motion that is bridged [s] (:mod:`graphslam_frontends.odometry.motion_gaps`).
-    """
+    Longer gaps are bridged if recorded odometry gives the motion over them."""
     motion: MotionNoise = field(default_factory=MotionNoise)
     """Noise of the dead-reckoning increments."""
     noise: RangeBearingNoise | None = None

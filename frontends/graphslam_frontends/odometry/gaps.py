@@ -54,7 +54,7 @@ def find_gaps(stamps: Array, begin: float, end: float, limit: float, *, where: s
 
 
 def refuse_long_gaps(
-    stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION
+    stamps: Array, gaps: npt.NDArray[np.int64], limit: float, where: str, option: str = OPTION, got: str = ""
 ) -> None:
     """Raise if a gap, given by the record before it, is longer than ``limit`` seconds; ``option`` sets the limit."""
     spacing = np.diff(stamps)
@@ -63,6 +63,6 @@ def refuse_long_gaps(
         raise DataError(
             f"gap without records: {spacing[worst]:.3f} s after record {worst}",
             where=where,
-            got=f"{stamps[worst]:.3f} to {stamps[worst + 1]:.3f} s",
-            wanted=f"gaps of at most {limit:g} s ({option})",
+            got=f"{stamps[worst]:.3f} to {stamps[worst + 1]:.3f} s{got}",
+            wanted=f"gaps of at most {limit:g} s ({option}), or a log that is cut there",
         )

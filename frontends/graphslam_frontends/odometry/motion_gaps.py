@@ -24,12 +24,14 @@ from graphslam_frontends.odometry.motion import (
     dead_reckoned_increments,
     motion_stream,
 )
-from graphslam_frontends.odometry.recorded import BRIDGED
+from graphslam_frontends.odometry.recorded import BRIDGED, gives_motion, refuse_unbridged, usual_variances
 
 SHORTEST = 1.0
 """An interval longer than this, and than 3 times the median, is a gap [s]: a robot can stop within a second."""
 AROUND = 2.0
 """Time before and after a gap for the mean motion in it [s]."""
+OPTION = "frontend.longest_gap"
+"""Full name of the option that limits gaps."""
 LOST = 0.5
 """A record of odometry over a gap with less than this share of the speed around it has lost motion."""
 
@@ -107,7 +109,7 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
                 "the motion stream holds a single record, so there is no motion",
                 where=where,
                 got=f"one record for {end - begin:.1f} s",
-                wanted=f"records at least every {limit:g} s (frontend.longest_gap)",
+                wanted=f"records at least every {limit:g} s ({OPTION})",
             )
         return []
     if not isinstance(motion, Odometry) and end > stamps[-1]:
@@ -120,7 +122,11 @@ def find_motion_gaps(motion: Motion, begin: float, end: float, limit: float, *, 
         if spacing[i] > 3.0 * usual:
             gaps.append(i)
             out.append(_gap(motion.take(slice(0, known)), float(stamps[i]), float(stamps[i + 1]), usual))
-    refuse_long_gaps(stamps, np.array(gaps, dtype=np.int64), limit, where, option="frontend.longest_gap")
+    long = np.array([i for i in gaps if spacing[i] > limit], dtype=np.int64)
+    if isinstance(motion, Odometry):
+        refuse_unbridged(motion, long, limit, where, option=OPTION)
+    else:
+        refuse_long_gaps(stamps, long, limit, where, option=OPTION)
     return out
 
 
@@ -164,6 +170,8 @@ def _gap(motion: Motion, begin: float, end: float, usual: float) -> MotionGap:
     if over >= 0 and abs(speed[over]) >= LOST * abs(v):  # it has the whole motion, not the velocity within
         v, w = float(speed[over]), float(rate[over])
         return MotionGap(begin, end, v, w, BRIDGED * abs(v), BRIDGED * abs(w), usual)
+    if isinstance(motion, Odometry) and gives_motion(motion, np.array([over]))[0]:  # perhaps it stopped meanwhile
+        return MotionGap(begin, end, float(speed[over]), float(rate[over]), abs(v), abs(w), usual)
     spread_v = float(np.sqrt(np.mean((speed[known] - v) ** 2)))
     spread_w = float(np.sqrt(np.mean((rate[known] - w) ** 2)))
     return MotionGap(begin, end, v, w, spread_v, spread_w, usual)
@@ -175,8 +183,10 @@ def _filled(motion: Motion, gap: MotionGap) -> Motion:
     if isinstance(motion, Odometry):
         increments = motion.increments.copy()
         k = int(np.searchsorted(motion.times, gap.end))
-        increments[k] = se2_exp((gap.end - gap.begin) * np.array([v, 0.0, w]))
-        return replace(motion, increments=increments)
+        T, covariances = gap.end - gap.begin, motion.covariances.copy()
+        increments[k] = se2_exp(T * np.array([v, 0.0, w]))
+        covariances[k] += T * np.diag(usual_variances(motion, np.array([k - 1])))
+        return replace(motion, increments=increments, covariances=covariances)
     k = int(np.searchsorted(motion.times, gap.begin)) + 1
     times = np.insert(motion.times, k, gap.begin + min(gap.usual, SHORTEST))
     if isinstance(motion, VelocityControls):

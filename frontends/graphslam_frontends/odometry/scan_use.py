@@ -133,7 +133,7 @@ def scan_findings(steps: Steps) -> list[Finding]:
         a, b = max(gaps, key=lambda g: g[1] - g[0])
         text = (
             f"gaps in the odometry: {len(gaps)} of {LONG:g} s or more, the longest {b - a:.1f} s from {a:.2f} s — "
-            "bridged with the usual motion of the robot; the covariances are increased accordingly."
+            "bridged with the motion that the odometry gives, or else the usual one; the covariances are increased."
         )
         out.append(Finding("look", "motion-gap", text))
     stretches = unobserved_stretches(steps)

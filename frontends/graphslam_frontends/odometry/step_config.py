@@ -57,7 +57,8 @@ class StepConfig:
     constant error and is subtracted. Heights then drift by a third or less."""
     longest_record: float = 20.0
     """Longest gap in the records of the motion that is bridged [s]. In a gap the motion is extrapolated with an
-    increased covariance; gaps are counted and reported."""
+    increased covariance; gaps are counted and reported. Longer gaps are bridged if recorded odometry gives the motion
+    over them."""
 
     def __post_init__(self) -> None:
         positive = {"period": self.period, "max_range": self.max_range}

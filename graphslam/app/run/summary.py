@@ -96,6 +96,7 @@ ADVICE: dict[str, str] = {
     "particles": "use more particles, or rbpf-ekf",
     "one-particle": "use more than one particle",
     "motion-gap": "check the pose after the gap in the motion",
+    "pause-bridged": "check the map after the pause of the recording",
     "wheels-slipped": "check the wheels at these times",
     "residuals": "check units and signs of odometry and observations, or increase their noise",
     "imu-contradicted": "increase the IMU noise, or leave the IMU out (--set imu.use=none)",

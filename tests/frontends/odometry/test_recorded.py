@@ -24,6 +24,7 @@ from graphslam_frontends.odometry.recorded import (
     add_yaw_bias,
     bridge_gap,
     chain_odometry,
+    motion_is_given,
 )
 from graphslam_frontends.odometry.step_config import StepConfig
 
@@ -169,7 +170,7 @@ def test_bridges_cost_certainty(dim: int) -> None:
     metres = np.linalg.norm(log(gap.increments[30])[x : x + dim])
     assert np.sqrt(sure.covariances[30, x, x]) == pytest.approx(0.2 * metres, rel=0.01)
     with pytest.raises(DataError, match=r"odometry: gap without records: 3\.200 s after record 29"):
-        bridge_gap(gap, 3.0, where="odometry")
+        bridge_gap(o.take(keep), 3.0, where="odometry")
     assert bridge_gap(o, 1.0, where="odometry")[0] is not None
     # records that are lost, not late: the one after tells its own motion only, and the body drove on meanwhile
     lost, _ = bridge_gap(o.take(keep), 5.0, where="odometry")
@@ -236,3 +237,44 @@ def test_several_clouds_in_a_step(data_dir: Path) -> None:
     assert len(steps) == pytest.approx(recorded.duration / 2.0, abs=2)
     assert np.median(per_step) > 3 * np.median(recorded["clouds"].counts)
     assert per_step.sum() <= recorded["clouds"].counts.sum()
+
+
+def paused(dim: int, seconds: float, moved: float, *, still: bool, jump: float = 0.0) -> Odometry:
+    """A drive at 1 m/s with a pause in the recording after record 50: ``moved`` [m] over it."""
+    o = winding(dim)
+    times, xi = o.times.copy(), log(o.increments)
+    x = 0 if dim == 2 else 3
+    times[51:] += seconds
+    if still:
+        xi[45:57] = 0.0
+    xi[51] = 0.0
+    xi[51, x] = moved + jump
+    return Odometry(times=times, increments=exp(xi), covariances=o.covariances)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("seconds", "moved", "still"), [(21.0, 0.6, False), (198.0, 0.0, True), (40.0, 30.0, False)])
+def test_a_long_pause_that_odometry_bridges_is_kept_and_widened(
+    dim: int, seconds: float, moved: float, still: bool
+) -> None:
+    o, drops = paused(dim, seconds, moved, still=still), DropCounter()
+    wide, gaps = bridge_gap(o, 20.0, where="odometry", drops=drops)
+    assert drops.counts == {"odometry: gap bridged": 1}
+    assert gaps.end - gaps.begin == pytest.approx([seconds + 0.2])
+    np.testing.assert_array_equal(wide.increments, o.increments)
+    added = np.diagonal(wide.covariances[51] - o.covariances[51])
+    rate = np.diagonal(o.covariances[1]) / 0.2  # variance per second of the other records
+    assert np.all(added >= 0.99 * rate * seconds)
+    longer, _ = bridge_gap(paused(dim, 2 * seconds, moved, still=still), 20.0, where="odometry")
+    assert np.all(np.diagonal(longer.covariances[51]) > np.diagonal(wide.covariances[51]))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("moved", "jump"), [(0.2, 0.0), (0.6, 300.0)])
+def test_a_clock_that_was_set_and_odometry_that_was_reset_bridge_nothing(dim: int, moved: float, jump: float) -> None:
+    o = paused(dim, 60.0, moved, still=False, jump=jump)
+    with pytest.raises(DataError, match=rf"{moved + jump:.2f} m over it.*at most 20 s \(frontend\.steps\.longest_"):
+        bridge_gap(o, 20.0, where="odometry")
+    assert not motion_is_given(o, float(o.times[50]), float(o.times[51]))
+    assert motion_is_given(o, 0.0, float(o.times[50]))
+    assert not motion_is_given(o, 0.0, float(o.times[-1]) + 1.0)
