@@ -64,7 +64,7 @@ def check_times(times: Any, n: int | None = None, *, where: str | None = None) -
             f"time does not increase at record {k}",
             where=where,
             got=f"{t[k]:.6f} after {t[k - 1]:.6f}",
-            wanted="strictly increasing stamps",
+            wanted="strictly increasing stamps: sort the records, or leave repeated ones out",
         )
     return t
 

@@ -24,6 +24,8 @@ LEAST_BEAMS = 8
 """Least number of beams with a return in a scan that is called constant."""
 NEAREST, FARTHEST = 0.1, 1000.0
 """Plausible limits of the median range [m]."""
+OF_A_MAP = 1e5
+"""Points farther away [m] are in coordinates of a map: no lidar sees 100 m, written in millimetres, on the whole."""
 MOST_CLOUDS = 100
 """Clouds that are decoded for these checks, evenly over the stream: a recording can have 10⁷ points."""
 SOME = 0.01
@@ -129,6 +131,9 @@ def _unit(name: str, middle: Array) -> list[Finding]:
     usual = float(np.median(middle))
     if NEAREST <= usual <= FARTHEST:
         return []
-    unit = "kilometres" if usual < NEAREST else "millimetres"
     text = f"median range of {name}: {usual:.3g} m [{NEAREST:g}, {FARTHEST:g}] — "
-    return [Finding("bad", "scans-unit", text + f"the ranges seem to be in {unit}, wanted metres.")]
+    if not usual < OF_A_MAP:
+        text += "the points seem to be in coordinates of a map (UTM). Give each scan in the frame of its scanner."
+        return [Finding("bad", "scans-of-a-map", text)]
+    unit = "kilometres" if usual < NEAREST else "millimetres"
+    return [Finding("bad", "scans-unit", text + f"the ranges seem to be in {unit}. Convert them to metres.")]

@@ -138,7 +138,9 @@ def _pair(
     """Stamps, reference poses, aligned estimated poses, alignment and scale."""
     if reference.dim != estimate.dim:
         raise DataError(
-            "estimate and reference differ in dimension", got=f"a {estimate.dim}-D path", wanted=f"{reference.dim}-D"
+            "estimate and reference differ in dimension",
+            got=f"estimate in {estimate.dim}-D, reference in {reference.dim}-D",
+            wanted="both in 3-D (read_tum(…, dim=3)) or both in the plane",
         )
     i, j = match_stamps(reference.times, estimate.times, max_diff=max_diff)
     if not len(i):

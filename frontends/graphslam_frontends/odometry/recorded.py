@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, se2_exp, se2_log
@@ -14,6 +15,7 @@ from graphslam.core.records import Odometry
 from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry.gaps import OPTION, Gaps, refuse_long_gaps
 
+Ints = npt.NDArray[np.int64]
 BRIDGED = 0.2
 """σ of the division of a bridged record, relative to its motion."""
 PLAUSIBLE = 2.0
@@ -34,7 +36,7 @@ def record_rates(odometry: Odometry) -> tuple[Array, Array, Array]:
     return metres, radians, np.diff(odometry.times)
 
 
-def gives_motion(odometry: Odometry, records: Array) -> Array:
+def gives_motion(odometry: Odometry, records: Ints) -> npt.NDArray[np.bool_]:
     """Which of the long ``records`` (indices of intervals) give the motion of the body over their interval.
 
     Not one that is faster than the body ever was (the odometry was reset), nor one between moving records with a motion
@@ -69,7 +71,7 @@ def motion_is_given(odometry: Odometry, begin: float, end: float) -> bool:
     return bool(np.all(gives_motion(odometry, k)[(t[k] < end) & (t[k + 1] > begin)]))
 
 
-def usual_variances(odometry: Odometry, records: Array) -> Array:
+def usual_variances(odometry: Odometry, records: Ints) -> Array:
     """Median variance per second ``(d,)`` of the other records: covariances over gaps grow by at least this."""
     seconds = np.diff(odometry.times)
     others = np.setdiff1d(np.arange(len(seconds)), records)
@@ -137,7 +139,7 @@ def bridge_gap(
     return replace(odometry, covariances=covariances), Gaps(odometry.times[k], odometry.times[k + 1])
 
 
-def refuse_unbridged(odometry: Odometry, long: Array, limit: float, where: str, option: str = OPTION) -> None:
+def refuse_unbridged(odometry: Odometry, long: Ints, limit: float, where: str, option: str = OPTION) -> None:
     """Raise for a record longer than ``limit`` seconds that does not give the motion over its interval."""
     odd = long[~gives_motion(odometry, long)]
     metres, _, _ = record_rates(odometry)

@@ -22,7 +22,8 @@ from graphslam.core.reading import finite_mask, read_text
 from graphslam.io.text_records import find_text_file
 from graphslam_studies.evaluate.information import information_matrices
 
-INPUT, TRUTH = "Lecture_Hall_Input.txt", "Lecture_Hall_GT.txt"
+INPUT, TRUTH = "_Input.txt", "_GT.txt"
+"""Ends of the names of the two files of a place, such as Lecture_Hall or Corridor."""
 PLACE_SIGMA = 1.0
 """Stated σ of "the same place" [m]: images are compared about every two metres of the way."""
 HEADING_SIGMA = 0.3
@@ -155,15 +156,21 @@ def read_tuc(folder: str | os.PathLike[str], *, drops: DropCounter | None = None
     Parameters
     ----------
     folder : path
-        Holds ``Lecture_Hall_Input.txt`` and ``Lecture_Hall_GT.txt``, plain or compressed.
+        Holds ``NAME_Input.txt`` and ``NAME_GT.txt`` of one place (Lecture_Hall), plain or compressed.
     drops : DropCounter, optional
         Counts into this one, besides ``TucLog.dropped``.
     """
     root = Path(folder)
     if not root.is_dir():
-        raise MissingDataError("no such folder", where=str(root), wanted="the folder of the lecture hall")
+        raise MissingDataError("no such folder", where=str(root), wanted="a folder of the data set")
     counter = DropCounter()
-    path = find_text_file(root, INPUT)
+    names = sorted({p.name.partition(INPUT)[0] for p in root.iterdir() if INPUT in p.name})
+    if len(names) != 1:
+        raise MissingDataError(
+            "folder does not hold one recording", where=str(root), got=f"recordings: {', '.join(names) or 'none'}",
+            wanted=f"one pair of files NAME{INPUT} and NAME{TRUTH}, plain or compressed",
+        )  # fmt: skip
+    path = find_text_file(root, names[0] + INPUT)
     tables = _tables(path, _INPUT)
     odometry, loops = tables["odom2"], tables["loop"]
     keep = finite_mask(odometry).all(axis=1) & (odometry[:, 4:] > 0.0).all(axis=1)
@@ -187,12 +194,12 @@ def read_tuc(folder: str | os.PathLike[str], *, drops: DropCounter | None = None
     ):
         counter.drop("loops", reason, int((good & wrong).sum()))
         good &= ~wrong
-    truth = _tables(find_text_file(root, TRUTH), _TRUTH)["point2"]
+    truth = _tables(find_text_file(root, names[0] + TRUTH), _TRUTH)["point2"]
     order = np.flatnonzero(np.isfinite(truth[:, :3]).all(axis=1))
     counter.drop("truth", "not finite", len(truth) - len(order))
     truth = truth[order[np.argsort(truth[order, 0], kind="stable")]]
     if not len(truth):
-        raise DataError("holds no true position", where=str(root / TRUTH), wanted="point2 records")
+        raise DataError("holds no true position", where=str(root / (names[0] + TRUTH)), wanted="point2 records")
     if drops is not None:
         drops.counts.update(counter.counts)
     return TucLog(
