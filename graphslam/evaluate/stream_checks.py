@@ -55,11 +55,15 @@ class StreamFinding:
     finding: Finding
 
 
-def check_speeds(wheels: VelocityControls, name: str, log: SensorLog) -> list[Finding]:
-    """Wheels that never turn."""
-    if len(wheels.times) < 2 or wheels.speed.any():
+def check_speeds(wheels: VelocityControls | Odometry, name: str, log: SensorLog) -> list[Finding]:
+    """Wheels that never turn, and odometry that never moves."""
+    moves = group_of(wheels.increments).log(wheels.increments[1:]) if isinstance(wheels, Odometry) else wheels.speed
+    if len(wheels.times) < 2 or np.any(moves):
         return []
-    text = f"speed of {name}: 0 in all {len(wheels.times)} records — the robot never moves. Check that it is connected."
+    what = "motion" if isinstance(wheels, Odometry) else "speed"
+    text = (
+        f"{what} of {name}: 0 in all {len(wheels.times)} records — the robot never moves. Check that it is connected."
+    )
     return [Finding("bad", "wheels-still", text)]
 
 
@@ -122,7 +126,7 @@ STREAM_CHECKS: tuple[tuple[tuple[type, ...], Callable[[Any, str, SensorLog], lis
     ((Gps,), check_gps),
     ((Imu,), check_imu),
     ((Imu,), check_turns),
-    ((VelocityControls,), check_speeds),
+    ((VelocityControls, Odometry), check_speeds),
     ((Odometry, VelocityControls), lambda stream, name, log: check_odometry(stream, name)),
     ((LandmarkObservations,), check_sighted_motion),
     ((Imu,), _gyro),

@@ -260,8 +260,11 @@ def _ply_layout(head: bytes, where: str) -> _Layout:
     at = names.index("vertex")
     _, n, properties = elements[at]
     labels = [p for p, _ in properties]
-    if n < 0 or any(k == "list" for _, k in properties) or len(set(labels)) != len(labels) or not labels:
-        raise FormatError("vertices of this PLY file are not read", where=where, got=labels, wanted="plain numbers")
+    lists = [p for p, k in properties if k == "list"]
+    if n < 0 or lists or len(set(labels)) != len(labels) or not labels:
+        got = f"property {lists[0]!r} is a list" if lists else f"{n} vertices with properties {labels}"
+        wanted = "vertices of plain numbers, each name once: write the file without others"
+        raise FormatError("vertices of this PLY file are not read", where=where, got=got, wanted=wanted)
     if form == "ascii":
         return _Layout(end.end(), n, labels, skip=sum(e[1] for e in elements[:at]))
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(form)
@@ -330,15 +333,16 @@ def _pcd_layout(head: bytes, where: str) -> _Layout:
     codes = {"F": "f", "I": "i", "U": "u"}
     ok = len(fields) == len(sizes) == len(kinds) == len(counts) and n >= 0 and 0 < len(fields) <= 100
     if not ok or any(
-        k not in codes or s not in (1, 2, 4, 8) or (k == "F" and s < 4) or not 1 <= c <= 1000
+        k not in codes or s not in (1, 2, 4, 8) or (k == "F" and s < 4) or not 0 <= c <= 1000
         for k, s, c in zip(kinds, sizes, counts)
     ):
         raise FormatError(
             "PCD header is damaged", where=where, got={k: said.get(k) for k in ("FIELDS", "SIZE", "TYPE", "COUNT")}
         )
-    columns = [  # fields named "_" are padding and may be repeated
+    columns = [  # fields named "_" are padding: they may be repeated, and be of no size
         (f"{f}#{i}" if f == "_" else f, f"<{codes[k]}{s}", c)
         for i, (f, k, s, c) in enumerate(zip(fields, kinds, sizes, counts))
+        if c
     ]
     if len({c[0] for c in columns}) != len(columns):
         raise FormatError("a field is repeated", where=where, got=fields)

@@ -1,4 +1,4 @@
-"""Messages that strangers did not understand: what, where, got, wanted, what to do; or no message, as it is read now."""
+"""Messages that strangers did not understand: what, where, got, wanted, what to do; or none, as it is read now."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graphslam.evaluate.stream_checks import check_streams, refuse_faulty
 from graphslam.evaluate.trajectory_error import ate
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.io.bags import read_bag
-from graphslam.io.catalog import load_recording, locate
+from graphslam.io.catalog import locate
 from graphslam.io.g2o import read_g2o
 from graphslam.io.landmark_tables import read_landmark_tables
 from graphslam.io.network_file import read_network
@@ -143,33 +143,104 @@ def corridor(root: Path) -> Any:
 
 READ = "is read"
 CASES: dict[str, tuple[Case, str | tuple[str, ...]]] = {
-    "GTSAM keys": (text("a.g2o", PAIR.replace(" 1 1 0 0", f" {KEY} 1 0 0", 1).replace("0 1 1", f"0 {KEY} 1"), read_g2o), READ),
-    "an id that is too large": (text("a.g2o", PAIR.replace("SE2 1 ", f"SE2 {2**63} "), read_g2o), ("vertex id", "a.g2o:2", str(2**63), "whole numbers from 0 to 2⁶³")),
-    "EDGE3": (text("a.graph", "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 0 0 0 0 0\nEDGE3 0 1 1 0 0 0 0 0\n", read_network), READ),
-    "no record of a network": (text("a.graph", "NODE 1 2 3\n", read_network), ("not a pose network", "a.graph", "records NODE", "VERTEX2, EDGE2, EDGE3")),
+    "GTSAM keys": (
+        text("a.g2o", PAIR.replace(" 1 1 0 0", f" {KEY} 1 0 0", 1).replace("0 1 1", f"0 {KEY} 1"), read_g2o),
+        READ,
+    ),
+    "an id that is too large": (
+        text("a.g2o", PAIR.replace("SE2 1 ", f"SE2 {2**63} "), read_g2o),
+        ("vertex id", "a.g2o:2", str(2**63), "whole numbers from 0 to 2⁶³"),
+    ),
+    "EDGE3": (
+        text("a.graph", "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 0 0 0 0 0\nEDGE3 0 1 1 0 0 0 0 0\n", read_network),
+        READ,
+    ),
+    "no record of a network": (
+        text("a.graph", "NODE 1 2 3\n", read_network),
+        ("not a pose network", "a.graph", "records NODE", "VERTEX2, EDGE2, EDGE3"),
+    ),
     "byte-order mark": (text("a.g2o", "\ufeff" + PAIR, read_network), READ),
-    "indefinite information": (text("a.g2o", PAIR.replace(I3, "1 0 0 -1 0 1"), read_network), ("indefinite: 0 -> 1", "a.g2o", "smallest eigenvalue -1", "--repair (repair=True)")),
-    "noise columns": (text("a.graph", "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1 2 3 4 5 6\n", read_network), ("meaning of the noise columns", "a.graph:3", "--noise covariance", "(in Python noise=…)")),
-    "a network is no log": (checked(lambda p: Path(text("a.g2o", PAIR, lambda q: q)(p))), ("a.g2o: not a sensor log", "`graphslam solve` checks pose-graph files", "Nothing was checked")),
-    "fixes of another dimension": (flat_fixes, ("GPS positions and map differ in dimension", "gps", "2-D positions", "--set gps.use=none")),
+    "indefinite information": (
+        text("a.g2o", PAIR.replace(I3, "1 0 0 -1 0 1"), read_network),
+        ("indefinite: 0 -> 1", "a.g2o", "smallest eigenvalue -1", "--repair (repair=True)"),
+    ),
+    "noise columns": (
+        text("a.graph", "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1 2 3 4 5 6\n", read_network),
+        ("meaning of the noise columns", "a.graph:3", "--noise covariance", "(in Python noise=…)"),
+    ),
+    "a network is no log": (
+        checked(lambda p: Path(text("a.g2o", PAIR, lambda q: q)(p))),
+        ("a.g2o: not a sensor log", "`graphslam solve` checks pose-graph files", "Nothing was checked"),
+    ),
+    "fixes of another dimension": (
+        flat_fixes,
+        ("GPS positions and map differ in dimension", "gps", "2-D positions", "--set gps.use=none"),
+    ),
     "stamps in nanoseconds": (stamps(1e9), ("stamp interval of controls", "1e+08 s", "nanoseconds", "wanted seconds")),
-    "stamps in microseconds": (stamps(1e6), ("stamp interval of controls", "1e+05 s", "microseconds", "wanted seconds")),
-    "decimal comma": (text("a.tum", pose_rows("1,{}"), read_tum), ("not a number", "a.tum:1", "1,0", "numbers with a decimal point; time in seconds")),
-    "date as a stamp": (table("t,v,w\n" + "".join(f"2024-01-01T00:00:0{k},1,0\n" for k in range(4))), ("4 of 4 values in the column of t", "odometry.csv", "2024-01-01T00:00:00", "times in seconds")),
-    "13 columns": (text("a.tum", pose_rows("{}", " 0 0 0 0 0"), read_tum), ("wrong number of columns", "a.tum:1", "13:", "8: t x y z qx qy qz qw")),
-    "a stamp that is not finite": (lambda p: check_times([1.0, np.nan], where="odometry"), ("stamp of record 1 is not finite", "odometry", "nan", "seconds, with a decimal point")),
-    "time that does not increase": (text("a.tum", pose_rows("1311868229.57{}") + "1311868228 0 0 0 0 0 0 1\n", read_tum), ("stamps do not increase", "a.tum:5", "1311868228.0 after 1311868229.573", "sort the file")),
-    "records out of order": (lambda p: check_times([1.0, 3.0, 2.0], where="odometry"), ("does not increase at record 2", "odometry", "2.000000 after 3.000000", "sort the records")),
-    "plane and space": (paths, ("estimate and reference differ in dimension", "estimate in 2-D, reference in 3-D", "dim=3")),
+    "stamps in microseconds": (
+        stamps(1e6),
+        ("stamp interval of controls", "1e+05 s", "microseconds", "wanted seconds"),
+    ),
+    "decimal comma": (
+        text("a.tum", pose_rows("1,{}"), read_tum),
+        ("not a number", "a.tum:1", "1,0", "numbers with a decimal point; time in seconds"),
+    ),
+    "date as a stamp": (
+        table("t,v,w\n" + "".join(f"2024-01-01T00:00:0{k},1,0\n" for k in range(4))),
+        ("4 of 4 values in the column of t", "odometry.csv", "2024-01-01T00:00:00", "times in seconds"),
+    ),
+    "13 columns": (
+        text("a.tum", pose_rows("{}", " 0 0 0 0 0"), read_tum),
+        ("wrong number of columns", "a.tum:1", "13:", "8: t x y z qx qy qz qw"),
+    ),
+    "a stamp that is not finite": (
+        lambda p: check_times([1.0, np.nan], where="odometry"),
+        ("stamp of record 1 is not finite", "odometry", "nan", "seconds, with a decimal point"),
+    ),
+    "time that does not increase": (
+        text("a.tum", pose_rows("1311868229.57{}") + "1311868228 0 0 0 0 0 0 1\n", read_tum),
+        ("stamps do not increase", "a.tum:5", "1311868228.0 after 1311868229.573", "sort the file"),
+    ),
+    "records out of order": (
+        lambda p: check_times([1.0, 3.0, 2.0], where="odometry"),
+        ("does not increase at record 2", "odometry", "2.000000 after 3.000000", "sort the records"),
+    ),
+    "plane and space": (
+        paths,
+        ("estimate and reference differ in dimension", "estimate in 2-D, reference in 3-D", "dim=3"),
+    ),
     "a bag without its end": (cut_bag(0.05), ("no message is found in this bag", "cut.bag", "bytes", "rosbag reindex")),
     "a bag that ends early": (cut_bag(0.8), READ),
     "messages in zstd": (zstd_bag, READ),
-    "landmarks that move": (checked(feet), ("shift of landmarks of landmarks", "% of their range", "bearings seem to count from the left side", "wanted from ahead")),
-    "scale, or field of view": (lambda p: ADVICE["distance-disagrees"], ("scale of the odometry", "field of view", "maximum range of the scanner")),
-    "LAS in UTM": (checked(of_a_map), ("median range of clouds", "e+06 m", "coordinates of a map (UTM)", "in the frame of its scanner")),
-    "data that are not there": (not_there, ("files of data set 'tuc-slam-lecture-hall' are missing", "tuc", "first LICENSE.txt", "a copy from https://", "(no direct download)")),
+    "landmarks that move": (
+        checked(feet),
+        (
+            "shift of landmarks of landmarks",
+            "% of their range",
+            "bearings seem to count from the left side",
+            "wanted from ahead",
+        ),
+    ),
+    "scale, or field of view": (
+        lambda p: ADVICE["distance-disagrees"],
+        ("scale of the odometry", "field of view", "maximum range of the scanner"),
+    ),
+    "LAS in UTM": (
+        checked(of_a_map),
+        ("median range of clouds", "e+06 m", "coordinates of a map (UTM)", "in the frame of its scanner"),
+    ),
+    "data that are not there": (
+        not_there,
+        (
+            "files of data set 'tuc-slam-lecture-hall' are missing",
+            "tuc",
+            "first LICENSE.txt",
+            "a copy from https://",
+            "(no direct download)",
+        ),
+    ),
     "another place of a data set": (corridor, READ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CASES)
