@@ -2,7 +2,8 @@
 
 Every stranger is right, or its fault is named: in the refusal, or in a line of ``graphslam data check``. A log that is
 wrong without a word is a fault of ours. What is right is measured without a map: the returns of all scans, brought to
-the room by the odometry of the log, must lie on the walls of the room. ``--full`` also runs each log, .
+the room by the odometry of the log, must lie on the walls of the room. ``--full`` prints all
+that ``data check`` says.
 """
 
 from __future__ import annotations
