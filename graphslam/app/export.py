@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
+from graphslam.app.export_bag import write_run_bag
 from graphslam.app.folders.generations import name_inside, new_generation
 from graphslam.app.folders.lock import lock_folder
 from graphslam.app.run.outputs import read_run_folder
@@ -23,6 +24,7 @@ from graphslam.core.plan_view import plan_pose
 from graphslam.core.plugins import load_plugin
 from graphslam.core.se3 import se3_transform
 from graphslam.io.autoware import write_autoware
+from graphslam.io.bag_writer import BagForm
 from graphslam.io.geographic import GeographicMap, write_geojson, write_kml
 from graphslam.io.tum import embed_plane, write_kitti, write_tum
 from graphslam.maps.export import save_maps
@@ -149,6 +151,13 @@ def _tiles(run: Run, path: Path, o: WriteOptions) -> None:
     write_autoware(path, points, datum=o.datum)
 
 
+def _bag(form: BagForm) -> Callable[[Run, Path, WriteOptions], Any]:
+    def written(run: Run, path: Path, o: WriteOptions) -> None:
+        write_run_bag(run, path, form, o.confidence, _dense_map(run, required=False))
+
+    return written
+
+
 WRITERS = {
     "tum": Writer(lambda run, path, _: write_tum(path, run.map.trajectory), "path.tum"),
     "kitti": Writer(lambda run, path, _: write_kitti(path, run.map.trajectory), "path.kitti.txt"),
@@ -156,6 +165,8 @@ WRITERS = {
     "geojson": _globe(write_geojson, "map.geojson"),
     "nav2": Writer(_floor_plans, None),
     "autoware": Writer(_tiles, None),
+    "mcap": Writer(_bag("mcap"), "run.mcap"),
+    "ros2": Writer(_bag("ros2"), None),
 }
 
 
@@ -163,7 +174,7 @@ def export(
     run: Run | str | Path,
     datum: tuple[float, float] | None = None,
     *,
-    format: str = "kml",
+    format: str = "tum",
     heading: float | None = None,
     confidence: float = 0.95,
     out: str | Path | None = None,
@@ -180,14 +191,17 @@ def export(
         One of the following, or the name of a registered :class:`Writer`.
         ``tum`` or ``kitti``: the path at full rate, in the frame of the first base (input of evo). ``kml``,
         ``geojson``: path, landmarks with ellipses, fixes. ``nav2``: floor plans (map_server). ``autoware``: the map's
-        points in tiles, with ``map_projector_info.yaml``.
+        points in tiles, with ``map_projector_info.yaml``. ``mcap`` (a file) and ``ros2`` (a bag folder): messages of
+        ROS 2 in the frames ``map`` (first base) and ``base``, with the stamps of the log: ``/tf``, ``/path``, ``/pose``
+        with covariances, ``/markers`` (ellipses, landmarks, loop closures) and, with a dense map, ``/map`` and
+        ``/points``.
     heading : float, optional
         Of the first base's x axis, degrees clockwise from north; with a datum, for runs without GPS.
     confidence : float
         Of the ellipses.
     out : path, optional
-        Default: ``map.<format>`` or ``path.<format>`` in the run's folder; ``nav2`` and ``autoware`` write a folder,
-        whose name is required.
+        Default: ``map.<format>``, ``path.<format>`` or ``run.mcap`` in the run's folder; ``nav2``, ``autoware`` and
+        ``ros2`` write a folder, whose name is required.
 
     Returns
     -------
@@ -202,6 +216,8 @@ def export(
         A datum or a heading is missing, or must not be given; no output path.
     MissingDataError
         A run without a dense map, for ``nav2`` and ``autoware``.
+    MissingExtraError
+        The extra ``ros`` is not installed, for ``mcap`` and ``ros2``.
     RunFolderError, FormatError
         Not a finished run, or a damaged one.
 
@@ -237,9 +253,18 @@ def export(
     return home / name
 
 
-def _dense_map(run: Run) -> RunMap:
-    made = run.fused if run.folder is None or run.holds("fused") else map_of_folder(run.folder)[1]
-    if made is None:
+@overload
+def _dense_map(run: Run) -> RunMap: ...
+@overload
+def _dense_map(run: Run, *, required: bool) -> RunMap | None: ...
+def _dense_map(run: Run, *, required: bool = True) -> RunMap | None:
+    try:
+        made = run.fused if run.folder is None or run.holds("fused") else map_of_folder(run.folder)[1]
+    except MissingDataError:
+        if required:
+            raise
+        made = None
+    if made is None and required:
         raise MissingDataError("the run has no dense map", where=run.name, wanted="a front end with grids or clouds")
     return made
 

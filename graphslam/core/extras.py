@@ -28,7 +28,7 @@ EXTRAS = {
     ),
     "open3d": Extra("gs.to_open3d(run), Poisson surfaces", ("open3d",), 1020),
     "kiss-icp": Extra("front end kiss-icp: the odometry of KISS-ICP", ("kiss_icp",), 17),
-    "ros": Extra("bags of ROS 1 and ROS 2, MCAP; no ROS needed", ("rosbags", "mcap"), 45),
+    "ros": Extra("read and export bags of ROS 1 and ROS 2, MCAP; no ROS needed", ("rosbags", "mcap"), 45),
     "las": Extra("LAS and LAZ clouds", ("laspy", "lazrs"), 2),
     "live": Extra("run --live: the Rerun viewer during a run", ("rerun",), 670),
     "cluster": Extra("studies, joins and networks on a Dask cluster", ("distributed",), 40),

@@ -9,7 +9,9 @@ import numpy.typing as npt
 
 from graphslam.core.charts import check_chart
 from graphslam.core.errors import DataError
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, rotation2
+from graphslam.core.poses import group_of
 from graphslam.core.se3 import quat_to_matrix
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.consistency import nees, pose_error, vector_pose_error
@@ -113,6 +115,42 @@ def path_consistency(path: Trajectory, truth: Trajectory, *, chart: str) -> Path
         dof=P.shape[-1],
         certain=certain,
     )
+
+
+def path_nees(estimate: Trajectory, reference: Trajectory, *, max_diff: float) -> dict[str, float]:
+    """NEES of an estimated path in the frame of its first pose that the reference has.
+
+    Parameters
+    ----------
+    estimate : Trajectory
+        With covariances relative to its first pose.
+    reference : Trajectory
+        In any frame.
+    max_diff : float
+        Largest difference of associated stamps [s].
+
+    Returns
+    -------
+    dict
+        ``poses``, ``dof``, mean ``nees``, ``nees_per_dof`` (1 if the covariances are right), and ``inside_95``: the
+        share of the poses inside their 95 % region (0.95 if the covariances are right).
+    """
+    if estimate.dim != reference.dim:
+        raise DataError("the paths differ in dimension", got=estimate.dim, wanted=reference.dim)
+    i, j = match_stamps(reference.times, estimate.times, max_diff=max_diff)
+    if len(i) < 2:
+        raise DataError("too few associated poses", got=len(i), wanted="at least 2")
+    group = group_of(estimate.poses)
+    T = group.compose(estimate.poses[j[0]], group.inverse(reference.poses[i[0]]))
+    true = group.compose(np.broadcast_to(T, reference.poses[i].shape), reference.poses[i])
+    found = path_consistency(estimate, Trajectory(estimate.times[j], true), chart="group")
+    if not len(found.nees):
+        raise DataError("every covariance of the path is singular", wanted="poses that are uncertain")
+    mean = float(found.nees.mean())
+    inside = float(np.mean(found.nees <= chi2_quantile(0.95, found.dof)))
+    return {
+        "poses": len(found.nees), "dof": found.dof, "nees": mean, "nees_per_dof": mean / found.dof, "inside_95": inside
+    }  # fmt: skip
 
 
 def _uncertain(P: Array) -> npt.NDArray[np.bool_]:

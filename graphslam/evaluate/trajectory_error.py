@@ -57,6 +57,13 @@ class TrajectoryError:
     pairs: int
     delta: tuple[float, str] | None = None
 
+    def aligned(self, estimate: Trajectory) -> Trajectory:
+        """An estimate after the alignment, with its covariances if the scale is 1."""
+        poses = estimate.poses.copy()
+        poses[:, : estimate.dim] *= self.scale
+        covariances = estimate.covariances if self.scale == 1.0 else None
+        return Trajectory(estimate.times, poses, covariances).transformed(self.T_ref_est)
+
     @property
     def statistics(self) -> ErrorStatistics:
         """Of the translation part [m]."""

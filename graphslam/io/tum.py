@@ -107,6 +107,26 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
     return Trajectory(data[:, 0], np.column_stack([data[:, 1:3], heading]))
 
 
+def read_path(path: str | os.PathLike[str]) -> Trajectory:
+    """Read a TUM file, or a KITTI file (12 numbers per line), whose stamps are the numbers of its lines."""
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    if not rows or any(len(fields) != 12 for fields in rows):
+        return read_tum(path)
+    try:
+        T = np.array(rows, dtype=np.float64).reshape(-1, 3, 4)
+    except ValueError as error:
+        raise FormatError(f"not a number ({error})", where=str(path), wanted="numbers with a decimal point") from None
+    R = T[:, :, :3]
+    good = finite_mask(T).all(axis=(1, 2))
+    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    good &= (off < _NORM_TOLERANCE) & (np.linalg.det(np.where(good[:, None, None], R, 0.0)) > 0.0)
+    if not good.all():
+        k = int(np.flatnonzero(~good)[0])
+        raise FormatError("not a pose", where=f"{path}: pose {k + 1}", got=rows[k], wanted="a rotation and a position")
+    poses = np.column_stack([T[:, :, 3], se3.quat_normalize(se3.matrix_to_quat(R))])
+    return Trajectory(np.arange(len(T), dtype=np.float64), poses)
+
+
 def _without_repeats(data: Array, lines: list[int], where: str) -> tuple[Array, list[int]]:
     """Remove rows with the stamp of the previous row, if these are at most :data:`MAX_DROPPED` of all rows."""
     again = np.r_[False, np.diff(data[:, 0]) == 0][: len(data)]

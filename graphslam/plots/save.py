@@ -21,6 +21,12 @@ def save_figure(ax: Axes, path: Path) -> Path:
     return path
 
 
+def show_figure(ax: Axes) -> None:
+    """Show the figure of ``ax`` in a window and wait until it is closed."""
+    plt.figure(ax.figure.number)  # type: ignore[union-attr]
+    plt.show()
+
+
 def figure_png(ax: Axes) -> bytes:
     """The figure of ``ax`` as the bytes of a PNG, as :func:`save_figure` would write them; closes it."""
     figure = ax.figure

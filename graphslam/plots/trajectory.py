@@ -1,14 +1,18 @@
-"""Plots of the errors of a trajectory against GPS."""
+"""Plots of the errors of a trajectory against GPS, or against a reference."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.gps import GpsResiduals
+from graphslam.evaluate.trajectory_error import TrajectoryError
 from graphslam.plots import style
+from graphslam.plots.paths import plot_paths
 
 # A pause between fixes longer than this starts a new segment: no line is drawn over it [s].
 SEGMENT_GAP = 2.0
@@ -43,3 +47,25 @@ def plot_gps_residuals(
     ax.set_ylim(0.0, top * (1.08 + 0.12 * len(named)))  # room for the legend
     style.legend(ax, outside=False, loc="upper left")
     return ax
+
+
+def plot_trajectory_error(estimate: Trajectory, reference: Trajectory, error: TrajectoryError) -> Axes:
+    """Both paths from above, and the absolute error over time; returns the axes of the paths.
+
+    Parameters
+    ----------
+    estimate : Trajectory
+        Aligned (:meth:`TrajectoryError.aligned`).
+    error : TrajectoryError
+        ATE.
+    """
+    figure, (above, below) = plt.subplots(2, 1, figsize=(7.0, 7.5), height_ratios=(2.5, 1.0))
+    plot_paths(above, {"estimate": estimate}, truth=reference, title=f"alignment: {error.alignment}")
+    s = error.statistics
+    below.plot(error.times, error.translation, color=style.ESTIMATE, lw=1.0)
+    below.axhline(s.rmse, color=style.VERMILION, lw=0.9, ls="--", label=f"RMSE {s.rmse:.3g} m")
+    below.set_xlabel("time [s]")
+    below.set_ylabel("ATE [m]")
+    style.legend(below, outside=False)
+    figure.tight_layout()
+    return above

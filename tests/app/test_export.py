@@ -122,13 +122,13 @@ def test_what_cannot_be_exported_is_refused(run, tmp_path):
     with pytest.raises(UnknownNameError, match="kml"):
         export(run, DATUM, format="kmz")
     with pytest.raises(ConfigError, match="defines the heading"):
-        export(run, DATUM, heading=3.0)
+        export(run, DATUM, format="kml", heading=3.0)
     with pytest.raises(GeometryError, match="latitude"):
-        export(run, (95.0, 0.0))
+        export(run, (95.0, 0.0), format="kml")
     with pytest.raises(ConfigError, match="LAT,LON"):
         parse_datum("151.2")
     with pytest.raises(ConfigError, match="file name"):
-        export(replace(run, folder=None), DATUM)
+        export(replace(run, folder=None), DATUM, format="kml")
 
 
 def test_command_line(run, tmp_path):

@@ -125,7 +125,7 @@ def test_without_rerun_it_says_what_to_install(log: SensorLog, tmp_path: Path, m
 def test_the_command_records(log: SensorLog, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     save_log(log, tmp_path / "log")
-    where = ["--out", str(tmp_path / "run"), "--live-file", str(tmp_path / "run.rrd")]
+    where = ["--out", str(tmp_path / "run"), "--record", str(tmp_path / "run.rrd")]
     done = CliRunner().invoke(
         app, ["run", str(tmp_path / "log"), "--frontend", "ekf", *where, "--set", "calibrate.use=none"]
     )

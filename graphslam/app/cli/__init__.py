@@ -39,6 +39,38 @@ class Interrupted(Exception):
 
 
 COMMANDS = "graphslam.commands"
+GROUPS = {
+    "Map": {
+        "run": "Map a log: submaps, graph, solution, verdict.",
+        "init": "Write a commented file of options for a log.",
+        "calibrate": "Estimate noise, biases and scales of sensors from a log.",
+        "report": "Write one HTML page of a run.",
+        "map": "Make the map of a run again, its terrain or surface.",
+        "export": "Export a run: tum, kml, nav2, mcap, ros2, ...",
+        "demo": "Simulate a garage with two levels and map it.",
+    },
+    "Solve and compare": {
+        "join": "Join submaps into one map with one method.",
+        "compare": "Compare methods on the same submaps.",
+        "loops": "List the loop closures of a run; undo one.",
+        "solve": "Solve a pose-graph file.",
+        "eval": "Compare a path with a reference: ATE, RPE, NEES.",
+    },
+    "Data": {
+        "data": "Data sets and logs: list, download, check.",
+        "simulate": "Simulate a robot and write its log with ground truth.",
+    },
+    "Advanced": {
+        "merge": "Merge runs of several robots or days.",
+        "localise": "Localise a log or submaps in a saved map.",
+        "relax": "Relax a pose graph that is larger than memory.",
+        "options": "List the options of a run or of a front end.",
+        "doctor": "Check the installation.",
+        "study": "Run a Monte-Carlo study.",
+        "terrain-tables": "Learn the tables of the terrain from drives.",
+    },
+}
+"""Commands by group, with their line in ``graphslam --help``; other commands of plug-ins are listed last."""
 
 
 def _volume() -> list[Any]:
@@ -95,6 +127,17 @@ class AllCommands(Commands):
         lone = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
         lone.command(name)(load_plugin(COMMANDS, "command", name))
         return typer.main.get_command(lone)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """See click: the commands by group, one line each."""
+        there = self.list_commands(ctx)
+        others = [n for n in there if not any(n in lines for lines in GROUPS.values())]
+        groups = {**GROUPS, "Plug-ins": {n: self.get_command(ctx, n).get_short_help_str(60) for n in others}}
+        for title, lines in groups.items():
+            rows = [(n, text) for n, text in lines.items() if n in there]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
     def main(self, *args: Any, **options: Any) -> Any:
         log_to_stderr()

@@ -27,7 +27,9 @@ def calibrate_command(
     config: Path | None = typer.Option(None, help="TOML file with options, as for a run."),
     setting: list[str] = typer.Option([], "--set", help="Set one option, as a.b=value. May be repeated."),
     seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
-    out: Path | None = typer.Option(None, help="TOML file for the result; use it with `graphslam run --config FILE`."),
+    out: Path | None = typer.Option(
+        None, "--out", "-o", help="TOML file for the result; use it with `graphslam run --config FILE`."
+    ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:

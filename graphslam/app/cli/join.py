@@ -37,7 +37,7 @@ def join_command(
     workers: int | None = typer.Option(None, help="Number of processes for eif-tree."),
     cluster: str | None = typer.Option(None, help="Address of a Dask scheduler that runs the joins of eif-tree."),
     submap_poses: int | None = SUBMAP_POSES,
-    out: Path | None = typer.Option(None, help="Folder for the results joined.npz and nodes.tum."),
+    out: Path | None = typer.Option(None, "--out", "-o", help="Folder for the results joined.npz and nodes.tum."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:

@@ -57,7 +57,9 @@ def loops_command(
 
 def report_command(
     run: Path = typer.Argument(..., help="Folder of run, demo or merge; the run may be unfinished."),
-    out: Path | None = typer.Option(None, help="HTML file to write. Default: report.html in the folder."),
+    out: Path | None = typer.Option(
+        None, "--out", "-o", help="HTML file to write. Default: report.html in the folder."
+    ),
     show: bool = typer.Option(False, "--open", help="Open the page in the browser."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
@@ -81,9 +83,9 @@ def report_command(
 def export_command(
     run: Path = typer.Argument(..., help="Folder of a finished run."),
     format: str = typer.Option(
-        "kml",
+        "tum",
         help="Path: tum or kitti. Map on the globe: kml, or geojson for GIS programs. Floor plans: nav2. "
-        "Points in tiles: autoware.",
+        "Points in tiles: autoware. For Foxglove: mcap. For ros2 bag play: ros2.",
     ),
     datum: str | None = typer.Option(
         None,
@@ -95,12 +97,15 @@ def export_command(
     ),
     confidence: float = typer.Option(0.95, help="Confidence of the landmark ellipses, between 0 and 1."),
     out: Path | None = typer.Option(
-        None, help="File to write; folder for nav2 and autoware. Default: a file in the folder of the run."
+        None,
+        "--out",
+        "-o",
+        help="File to write; folder for nav2, autoware and ros2. Default: a file in the folder of the run.",
     ),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Export a run for other programs: its path, its map on the globe, its floor plans, its points."""
+    """Export a run for other programs: path, map on the globe, floor plans, points, bag."""
     from graphslam.app.export import export as export_run
     from graphslam.app.export import parse_datum
 

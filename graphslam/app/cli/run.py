@@ -82,7 +82,7 @@ def run_command(
     control: Path | None = typer.Option(None, help="CSV file of control points and distances; they enter the graph."),
     check: Path | None = typer.Option(None, help="CSV file of check points and distances; they test the result."),
     seed: int = typer.Option(0, help="Seed of all random numbers; the same seed gives the same result."),
-    out: Path = typer.Option(..., help="Folder for the results of the run."),
+    out: Path = typer.Option(..., "--out", "-o", help="Folder for the results of the run."),
     resume: bool = typer.Option(False, "--resume", help="Continue an interrupted run after its last finished submap."),
     saved: list[Path] = typer.Option(
         [], "--continue", help="Folder of an earlier run; both become one graph in OUT/continued. May be repeated."
@@ -90,7 +90,7 @@ def run_command(
     live: bool = typer.Option(False, "--live", help="Show the map in the viewer Rerun during the run."),
     live_file: Path | None = typer.Option(
         None,
-        "--live-file",
+        "--record",
         help="Record the viewer data to a file; replay it with `rerun FILE`.",
     ),
     max_size: str | None = MAX_SIZE,
@@ -209,7 +209,9 @@ def join_note(result: Any) -> list[str]:
 
 
 def demo_command(
-    out: Path = typer.Option(Path("demo-run"), help="Folder for the results. An unfinished demo in it is resumed."),
+    out: Path = typer.Option(
+        Path("demo-run"), "--out", "-o", help="Folder for the results. An unfinished demo in it is resumed."
+    ),
     seed: int = typer.Option(0, help="Seed for sensor noise, clutter and the filter."),
     preset: str = typer.Option("garage", help="World of the demo: garage, or quick for a small one."),
     every: bool = EVERY,
@@ -237,7 +239,7 @@ def simulate_command(
         help="Name of the world: mixed, landmark-field, garage or court; of the studies: campus, point-field, mine or "
         "building.",
     ),
-    out: Path = typer.Option(..., help="Folder for the log, with the true path and map."),
+    out: Path = typer.Option(..., "--out", "-o", help="Folder for the log, with the true path and map."),
     seed: int = typer.Option(0, help="Seed for sensor noise and for movable objects in the world."),
     layout: str | None = typer.Option(
         None,

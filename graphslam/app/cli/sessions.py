@@ -35,7 +35,7 @@ def merge_command(
     ),
     voxel: float = typer.Option(0.05, help="With --surface: edge of its voxels [m]."),
     colour: str = typer.Option("session", help="With --surface: session, height, piece, or sigma."),
-    out: Path = typer.Option(..., help="Folder for the merged map."),
+    out: Path = typer.Option(..., "--out", "-o", help="Folder for the merged map."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:

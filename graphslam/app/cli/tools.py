@@ -1,4 +1,4 @@
-"""``graphslam solve``, ``relax``, ``eval``, ``options``, ``doctor``."""
+"""``graphslam solve``, ``relax``, ``eval``, ``options``, ``init``, ``doctor``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any, Literal, cast, get_args
 
 import typer
 
-from graphslam.app.cli.run import JSON, MAX_SIZE
+from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
 from graphslam.app.cli.terminal import print_result, text_table
-from graphslam.core.errors import DataError, GraphSlamError, MissingDataError, UnknownNameError
+from graphslam.core.atomic import atomic_open
+from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError, UnknownNameError
 
 
 def add_tool_commands(app: typer.Typer) -> None:
@@ -18,6 +19,7 @@ def add_tool_commands(app: typer.Typer) -> None:
     app.command("relax")(relax_command)
     app.command("eval")(evaluate_command)
     app.command("options")(options_command)
+    app.command("init")(init_command)
     app.command("doctor")(doctor_command)
 
 
@@ -37,7 +39,7 @@ def solve_command(
     create_missing: bool = typer.Option(
         False, "--create-missing", help="Add vertices that only edges mention instead of refusing the file."
     ),
-    out: Path | None = typer.Option(None, help="g2o file to write the solution to."),
+    out: Path | None = typer.Option(None, "--out", "-o", help="g2o file to write the solution to."),
     starts: str | None = typer.Option(
         None, help="Initial values: all, or names such as chordal,tree. Default: one, and others only in case of doubt."
     ),
@@ -100,20 +102,28 @@ def relax_command(
 
 
 def evaluate_command(
-    estimate: Path = typer.Argument(..., help="Estimated path, a TUM file."),
-    reference: Path = typer.Argument(..., help="Reference path, a TUM file."),
+    estimate: Path = typer.Argument(..., help="Estimated path: a TUM or KITTI file, or the folder of a run."),
+    reference: Path = typer.Argument(..., help="Reference path: a TUM or KITTI file."),
     align: str = typer.Option("se", help="Alignment before the error is measured: none, origin, se or sim."),
     delta: float = typer.Option(10.0, help="Distance [m] or time [s] over which the relative error is measured."),
     delta_unit: str = typer.Option("m", help="Unit of --delta: m or s."),
     max_diff: float = typer.Option(0.01, help="Largest time difference of poses that are compared [s]."),
+    plot: bool = typer.Option(False, "--plot", "-p", help="Show both paths and the error over time."),
+    save_plot: Path | None = typer.Option(None, help="Picture of both paths and the error over time (PNG)."),
     max_size: str | None = MAX_SIZE,
     as_json: bool = JSON,
 ) -> None:
-    """Measure the absolute and the relative trajectory error (ATE, RPE) of a path."""
-    from graphslam.evaluate.trajectory_error import Alignment, ate, rpe
-    from graphslam.io.tum import read_tum
+    """Measure the absolute and the relative trajectory error (ATE, RPE) of a path.
 
-    est, ref = read_tum(estimate), read_tum(reference)
+    NEES: of the path of a run, whose covariances are known, in the frame of the first common pose.
+    """
+    from graphslam.app.run.outputs import read_run_folder
+    from graphslam.evaluate.path_consistency import path_nees
+    from graphslam.evaluate.trajectory_error import Alignment, ate, rpe
+    from graphslam.io.tum import read_path
+
+    est = read_run_folder(estimate).trajectory if estimate.is_dir() else read_path(estimate)
+    ref = read_path(reference)
     known = {"align": (align, get_args(Alignment)), "delta-unit": (delta_unit, ("m", "s"))}
     for option, (given, allowed) in known.items():
         if given not in allowed:
@@ -125,8 +135,21 @@ def evaluate_command(
         value["rpe"] = rpe(est, ref, delta=delta, unit=unit, scale=align == "sim", max_diff=max_diff).as_row()
     except DataError as error:  # a path shorter than delta still has an absolute error
         typer.echo(f"no relative error: {error}; choose another --delta", err=True)
-    rows = [{"error": k, **v} for k, v in value.items() if v]
-    print_result(value, text_table(rows), as_json=as_json)
+    text = text_table([{"error": k, **v} for k, v in value.items() if v])
+    if est.covariances is not None:
+        value["nees"] = path_nees(est, ref, max_diff=max_diff)
+        text += "\n" + text_table([value["nees"]])
+    if plot or save_plot is not None:
+        from graphslam.plots.save import save_figure, show_figure
+        from graphslam.plots.trajectory import plot_trajectory_error
+
+        axes = plot_trajectory_error(absolute.aligned(est), ref, absolute)
+        if save_plot is not None:
+            save_figure(axes, save_plot)
+            text += f"\nwritten to {save_plot}"
+        if plot:
+            show_figure(axes)
+    print_result(value, text, as_json=as_json)
 
 
 def options_command(
@@ -141,6 +164,28 @@ def options_command(
     rows = option_rows(frontend)
     text = "\n".join(f"{r.option} = {r.default}\n    {r.meaning}" for r in rows)
     print_result({"options": [asdict(r) for r in rows]}, text, as_json=as_json)
+
+
+def init_command(
+    source: str = typer.Argument(..., help="A log: a file, a folder, or the name of a data set."),
+    frontend: str | None = typer.Option(None, help="Front end that reads the log. Default: by the streams of the log."),
+    reader: str | None = READER,
+    reader_option: list[str] = READER_OPTION,
+    out: Path = typer.Option(Path("graphslam.toml"), "--out", "-o", help="TOML file to write."),
+    force: bool = typer.Option(False, "--force", "-f", help="Replace an existing file."),
+    max_size: str | None = MAX_SIZE,
+    as_json: bool = JSON,
+) -> None:
+    """Write a commented file of options for a log: meaning and value of each, the values of the preset marked."""
+    from graphslam.app.config_file import config_file
+    from graphslam.app.run.source import load
+
+    if out.exists() and not force:
+        raise ConfigError(f"{out} is there; give another name (-o), or replace it (--force)")
+    text = config_file(load(source, reader=reader, **reader_options(reader_option)), source, frontend)
+    with atomic_open(out, "w") as file:
+        file.write(text)
+    print_result({"file": str(out)}, f"written to {out}: graphslam run {source} --config {out}", as_json=as_json)
 
 
 def doctor_command(
