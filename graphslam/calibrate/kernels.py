@@ -97,6 +97,121 @@ def _leave(at, active, A, C, S, gone):
 
 
 @njit(error_model="numpy", nogil=True)
+def _range_row(x, nuisance, g, data, sensor, p, q, at, row):
+    """Whitened residual of the range of observation ``q`` from pose ``x``; returns its number of border columns."""
+    jp, _, cols, vals = row
+    j, v = data.slots[q]
+    c, s = math.cos(x[2]), math.sin(x[2])
+    ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
+    dx, dy = nuisance[j, 0] - x[0] - ox, nuisance[j, 1] - x[1] - oy
+    r = math.sqrt(dx * dx + dy * dy + 1e-12)
+    base = HEAD + 2 * at[j]
+    grow, w = 1.0 + g[RANGE_SCALE], 1.0 / p[RANGE]
+    # residual: predicted minus measured
+    e = grow * r + g[RANGE_OFFSET] - data.sightings[q, 0]
+    jp[:] = 0.0
+    jp[0], jp[1] = -w * grow * dx / r, -w * grow * dy / r
+    jp[2] = w * grow * (dx * oy - dy * ox) / r
+    cols[1], vals[1] = base, w * grow * dx / r
+    cols[2], vals[2] = base + 1, w * grow * dy / r
+    cols[3], vals[3] = RANGE_SCALE, w * r
+    cols[4], vals[4] = RANGE_OFFSET, w
+    count = 5
+    if v >= 0:
+        e += nuisance[v, 0]
+        cols[5], vals[5] = HEAD + 2 * at[v], w
+        count = 6
+    vals[0] = -w * e
+    return count
+
+
+@njit(error_model="numpy", nogil=True)
+def _bearing_row(x, nuisance, g, data, sensor, p, q, at, row):
+    """Whitened residual of the bearing of observation ``q`` from pose ``x``; returns its number of border columns."""
+    jp, _, cols, vals = row
+    j, v = data.slots[q]
+    c, s = math.cos(x[2]), math.sin(x[2])
+    ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
+    dx, dy = nuisance[j, 0] - x[0] - ox, nuisance[j, 1] - x[1] - oy
+    r2 = dx * dx + dy * dy + 1e-12
+    base = HEAD + 2 * at[j]
+    w = 1.0 / p[BEARING]
+    e = math.atan2(dy, dx) - x[2] - sensor[2] - g[SENSOR_YAW] - data.sightings[q, 1]
+    if v >= 0:
+        e += nuisance[v, 1]
+    e = wrap_residual(e)
+    jp[:] = 0.0
+    jp[0], jp[1] = w * dy / r2, -w * dx / r2
+    jp[2] = w * (-(dx * ox + dy * oy) / r2 - 1.0)
+    cols[1], vals[1] = base, -w * dy / r2
+    cols[2], vals[2] = base + 1, w * dx / r2
+    cols[3], vals[3] = SENSOR_YAW, -w
+    count = 4
+    if v >= 0:
+        cols[4], vals[4] = HEAD + 2 * at[v] + 1, w
+        count = 5
+    vals[0] = -w * e
+    return count
+
+
+@njit(error_model="numpy", nogil=True)
+def _visit_row(value, part, p, at, row):
+    """Whitened prior of the range (``part`` 0) or bearing (1) of a visit."""
+    _, _, cols, vals = row
+    w = 1.0 / (p[VISIT_RANGE] if part == 0 else p[VISIT_BEARING])
+    cols[1], vals[0], vals[1] = HEAD + 2 * at + part, -w * value, w
+
+
+@njit(error_model="numpy", nogil=True)
+def _motion_variances(step, p, out):
+    """Variances of a step: along, lateral, heading."""
+    turn, dt, d = step[2], step[3], step[4]
+    out[0] = p[ALONG_METRE] ** 2 * d + p[ALONG_SECOND] ** 2 * dt + p[FLOOR_POSITION] ** 2
+    out[1] = p[LATERAL_METRE] ** 2 * d + p[FLOOR_POSITION] ** 2
+    out[2] = p[HEADING_METRE] ** 2 * d + p[HEADING_RADIAN] ** 2 * abs(turn) + p[HEADING_SECOND] ** 2 * dt
+    out[2] += p[FLOOR_HEADING] ** 2
+    if step[5] > 0.0:
+        out[0] = step[5]
+    if step[6] > 0.0:
+        out[1], out[2] = step[6], step[7]
+
+
+@njit(error_model="numpy", nogil=True)
+def _motion_row(x, then, g, step, variances, axis, row):
+    """Whitened residual of a step from pose ``x`` to ``then``: along, lateral or heading; 5 border columns."""
+    jp, jn, cols, vals = row
+    ux, uy, turn, dt, d = step[0], step[1], step[2], step[3], step[4]
+    less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn
+    h = 0.5 * turn
+    phi = x[2] + h - 0.5 * less
+    cp, sp = math.cos(phi), math.sin(phi)
+    mx, my = then[0] - x[0], then[1] - x[1]
+    longer = math.exp(g[DISTANCE_SCALE])  # the prediction is scaled, not the measurement with its noise
+    qx, qy = longer * (cp * mx + sp * my), longer * (-sp * mx + cp * my)
+    w = 1.0 / math.sqrt(variances[axis])
+    u = w * longer
+    jp[:] = 0.0
+    jn[:] = 0.0
+    if axis == 0:
+        e, dphi, scale = qx - (math.cos(h) * ux + math.sin(h) * uy), qy, qx
+        jp[0], jp[1], jn[0], jn[1] = -u * cp, -u * sp, u * cp, u * sp
+    elif axis == 1:
+        e, dphi, scale = qy - (-math.sin(h) * ux + math.cos(h) * uy), -qx, qy
+        jp[0], jp[1], jn[0], jn[1] = u * sp, -u * cp, -u * sp, u * cp
+    else:
+        e, dphi, scale = wrap_residual(then[2] - x[2] - turn + less), -1.0, 0.0
+        jn[2] = w
+    jp[2] = w * dphi
+    # a change of the turn by the constants rotates the chord by half of it, the heading by all of it
+    part = -0.5 * dphi if axis < 2 else 1.0
+    cols[1], vals[1] = YAW_BIAS, w * part * dt
+    cols[2], vals[2] = DISTANCE_SCALE, w * scale
+    cols[3], vals[3] = TURN_PER_METRE, w * part * d
+    cols[4], vals[4] = TURN_SCALE, w * part * turn
+    vals[0] = -w * e
+
+
+@njit(error_model="numpy", nogil=True)
 def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     """Linearise a window and marginalise its poses and nuisances, so that the constants remain.
 
@@ -139,7 +254,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     logdet, volume = 0.0, 0.0
     A, An = np.zeros((D, D)), np.zeros((D, D))
     jp, jn, zero = np.zeros(D), np.zeros(D), np.zeros(D)
-    cols, vals = np.zeros(16, np.int64), np.zeros(16)
+    cols, vals, variances = np.zeros(16, np.int64), np.zeros(16), np.zeros(3)
     cols[0] = RHS
     here, onward = _Row(jp, zero, cols, vals), _Row(jp, jn, cols, vals)
     alone = _Row(zero, zero, cols, vals)
@@ -158,9 +273,6 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
         X[k] = 0.0
         An[:] = 0.0
         blocks = _Blocks(A, An, X[k], C[k], C[min(k + 1, n - 1)], S)
-        x, y, th = poses[k, 0], poses[k, 1], poses[k, 2]
-        c, s = math.cos(th), math.sin(th)
-        ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
         for q in range(first[k], first[k + 1]):
             j, v = slots[q, 0], slots[q, 1]
             for new in (j, v):  # first observation: add the prior
@@ -173,104 +285,27 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                 for a in range(2):
                     col = HEAD + 2 * place + a
                     if kinds[new] == 1:
-                        sv = p[VISIT_RANGE] if a == 0 else p[VISIT_BEARING]
-                        volume += math.log(sv)
-                        cols[1], vals[0], vals[1] = col, -nuisance[new, a] / sv, 1.0 / sv
+                        volume += math.log(p[VISIT_RANGE] if a == 0 else p[VISIT_BEARING])
+                        _visit_row(nuisance[new, a], a, p, place, alone)
                         _add(alone, 2, blocks)
                         chi2[5] += vals[0] * vals[0]
                     else:
                         S[col, col] += _FAR
-            dx, dy = nuisance[j, 0] - x - ox, nuisance[j, 1] - y - oy
-            r2 = dx * dx + dy * dy + 1e-12
-            r = math.sqrt(r2)
-            base = HEAD + 2 * at[j]
-            grow = 1.0 + g[RANGE_SCALE]
-            w = 1.0 / p[RANGE]
             volume += math.log(p[RANGE])
-            # residual: predicted minus measured
-            e = grow * r + g[RANGE_OFFSET] - sightings[q, 0]
-            jp[:] = 0.0
-            jp[0], jp[1] = -w * grow * dx / r, -w * grow * dy / r
-            jp[2] = w * grow * (dx * oy - dy * ox) / r
-            cols[1], vals[1] = base, w * grow * dx / r
-            cols[2], vals[2] = base + 1, w * grow * dy / r
-            cols[3], vals[3] = RANGE_SCALE, w * r
-            cols[4], vals[4] = RANGE_OFFSET, w
-            count = 5
-            if v >= 0:
-                e += nuisance[v, 0]
-                cols[5], vals[5] = HEAD + 2 * at[v], w
-                count = 6
-            vals[0] = -w * e
+            count = _range_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
             chi2[3] += vals[0] * vals[0]
             _add(here, count, blocks)
             if sightings[q, 1] == sightings[q, 1]:
-                w = 1.0 / p[BEARING]
                 volume += math.log(p[BEARING])
-                e = math.atan2(dy, dx) - th - sensor[2] - g[SENSOR_YAW] - sightings[q, 1]
-                if v >= 0:
-                    e += nuisance[v, 1]
-                e = wrap_residual(e)
-                jp[:] = 0.0
-                jp[0], jp[1] = w * dy / r2, -w * dx / r2
-                jp[2] = w * (-(dx * ox + dy * oy) / r2 - 1.0)
-                cols[1], vals[1] = base, -w * dy / r2
-                cols[2], vals[2] = base + 1, w * dx / r2
-                cols[3], vals[3] = SENSOR_YAW, -w
-                count = 4
-                if v >= 0:
-                    cols[4], vals[4] = HEAD + 2 * at[v] + 1, w
-                    count = 5
-                vals[0] = -w * e
+                count = _bearing_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
                 chi2[4] += vals[0] * vals[0]
                 _add(here, count, blocks)
         if k + 1 < n:
-            ux, uy, turn, dt, d = steps[k + 1, 0], steps[k + 1, 1], steps[k + 1, 2], steps[k + 1, 3], steps[k + 1, 4]
-            less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn
-            h = 0.5 * turn
-            cx, cyy = math.cos(h) * ux + math.sin(h) * uy, -math.sin(h) * ux + math.cos(h) * uy
-            longer = math.exp(g[DISTANCE_SCALE])  # the prediction is scaled, not the measurement with its noise
-            phi = th + h - 0.5 * less
-            cp, sp = math.cos(phi), math.sin(phi)
-            mx, my = poses[k + 1, 0] - x, poses[k + 1, 1] - y
-            qx, qy = cp * mx + sp * my, -sp * mx + cp * my
-            qx, qy = longer * qx, longer * qy
-            ex, ey = qx - cx, qy - cyy
-            et = wrap_residual(poses[k + 1, 2] - th - turn + less)
-            var_x = p[ALONG_METRE] ** 2 * d + p[ALONG_SECOND] ** 2 * dt + p[FLOOR_POSITION] ** 2
-            var_y = p[LATERAL_METRE] ** 2 * d + p[FLOOR_POSITION] ** 2
-            var_t = p[HEADING_METRE] ** 2 * d + p[HEADING_RADIAN] ** 2 * abs(turn) + p[HEADING_SECOND] ** 2 * dt
-            var_t += p[FLOOR_HEADING] ** 2
-            if steps[k + 1, 5] > 0.0:
-                var_x = steps[k + 1, 5]
-            if steps[k + 1, 6] > 0.0:
-                var_y, var_t = steps[k + 1, 6], steps[k + 1, 7]
-            volume += 0.5 * (math.log(var_x) + math.log(var_y) + math.log(var_t))
-            for row in range(3):
-                jp[:] = 0.0
-                jn[:] = 0.0
-                if row == 0:
-                    w, e, dphi = 1.0 / math.sqrt(var_x), ex, qy
-                    u = w * longer
-                    jp[0], jp[1], jn[0], jn[1] = -u * cp, -u * sp, u * cp, u * sp
-                    scale = qx
-                elif row == 1:
-                    w, e, dphi = 1.0 / math.sqrt(var_y), ey, -qx
-                    u = w * longer
-                    jp[0], jp[1], jn[0], jn[1] = u * sp, -u * cp, -u * sp, u * cp
-                    scale = qy
-                else:
-                    w, e, dphi, scale = 1.0 / math.sqrt(var_t), et, -1.0, 0.0
-                    jn[2] = w
-                jp[2] = w * dphi
-                # a change of the turn by the constants rotates the chord by half of it, the heading by all of it
-                part = -0.5 * dphi if row < 2 else 1.0
-                cols[1], vals[1] = YAW_BIAS, w * part * dt
-                cols[2], vals[2] = DISTANCE_SCALE, w * scale
-                cols[3], vals[3] = TURN_PER_METRE, w * part * d
-                cols[4], vals[4] = TURN_SCALE, w * part * turn
-                vals[0] = -w * e
-                chi2[row] += vals[0] * vals[0]
+            _motion_variances(steps[k + 1], p, variances)
+            for axis in range(3):
+                volume += 0.5 * math.log(variances[axis])
+                _motion_row(poses[k], poses[k + 1], g, steps[k + 1], variances, axis, onward)
+                chi2[axis] += vals[0] * vals[0]
                 _add(onward, 5, blocks)
         if damping > 0.0:
             for a in range(D):
@@ -371,6 +406,123 @@ def substitute_window(work, dg, d_poses, d_nuisance):
                     t += gone[2 * j + a, m + b] * d_poses[k, b]
                 d_nuisance[j, a] = y[HEAD + 2 * at[j] + a] = -t / pivots[2 * j + a]
             last -= 1
+
+
+@njit(error_model="numpy", nogil=True)
+def _enter(M, coefficients, at, pivot, variance):
+    """Second moments ``M`` of z where z[at] becomes -coefficients · z / pivot + noise of a variance."""
+    f, new = len(M), M[at]
+    new[:] = 0.0
+    for i in range(f):
+        w = coefficients[i] / pivot
+        if w != 0.0:
+            for b in range(f):
+                new[b] -= w * M[i, b]
+    new[at] = variance
+    for i in range(f):
+        if i != at:
+            new[at] -= coefficients[i] / pivot * new[i]
+            M[i, at] = new[i]
+
+
+@njit(error_model="numpy", nogil=True)
+def _unexplained(row, n, M, here, then):
+    """1 minus the expected square of a whitened residual: a variance is too small where it is below 0."""
+    jp, jn, cols, vals = row
+    total, D = 0.0, len(jp)
+    for i in range(n):
+        part = 0.0
+        for j in range(n):
+            part += M[cols[i], cols[j]] * vals[j]
+        for b in range(D):
+            part += 2.0 * (M[cols[i], here + b] * jp[b] + M[cols[i], then + b] * jn[b])
+        total += vals[i] * part
+    for a in range(D):
+        for b in range(D):
+            total += jp[a] * M[here + a, here + b] * jp[b] + jn[a] * M[then + a, then + b] * jn[b]
+            total += 2.0 * jp[a] * M[here + a, then + b] * jn[b]
+    return 1.0 - total
+
+
+@njit(error_model="numpy", nogil=True)
+def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
+    """Derivative of a window's negative log-likelihood by ln σ of each standard deviation ``(PARAMETERS,)``.
+
+    A residual of variance v, with whitened Jacobian a and states of covariance P, adds ½ (1 - E[e²]) to the derivative
+    by ln v, where E[e²] = ê² + a P aᵀ and ê is the whitened residual at the optimum. Back-substitution from the last
+    pose to the first gives the second moments of the states that a residual involves.
+
+    moments : (HEAD, HEAD) second moments of the constants, and of -1 in row RHS, at the optimum of all windows.
+    work : Work of :func:`eliminate_window` for the same window, states and ``p``, undamped.
+    """
+    steps, first, sightings, slots, kinds = data
+    L, X, C, _, _, gone, pivots, order, when, at = work
+    n, D = poses.shape
+    m = C.shape[2]
+    out = np.zeros(PARAMETERS)
+    M, z = np.zeros((m + 2 * D, m + 2 * D)), np.zeros(m + 2 * D)
+    M[:HEAD, :HEAD] = moments
+    jp, jn, zero = np.zeros(D), np.zeros(D), np.zeros(D)
+    cols, vals, variances = np.zeros(16, np.int64), np.zeros(16), np.zeros(3)
+    cols[0] = RHS
+    here, onward = _Row(jp, zero, cols, vals), _Row(jp, jn, cols, vals)
+    alone = _Row(zero, zero, cols, vals)
+    begun = np.full(len(nuisance), n, np.int64)
+    for k in range(n - 1, -1, -1):
+        for q in range(first[k], first[k + 1]):
+            for j in slots[q]:
+                if j >= 0:
+                    begun[j] = k
+    last = len(order) - 1
+    while last >= 0 and order[last] < 0:
+        last -= 1
+    for k in range(n - 1, -1, -1):
+        mine, then = m + D * (k % 2), m + D * ((k + 1) % 2)
+        for a in range(D - 1, -1, -1):
+            z[:m] = C[k, a]
+            for b in range(D):
+                z[then + b] = X[k, a, b] if k + 1 < n else 0.0
+                z[mine + b] = L[k, b, a] if b > a else 0.0
+            _enter(M, z, mine + a, L[k, a, a], 1.0 / L[k, a, a] ** 2)
+        z[then : then + D] = 0.0
+        while last >= 0 and when[last] == k:  # nuisances eliminated with pose k, in reverse order
+            j = order[last]
+            for a in range(2):
+                z[:m] = gone[2 * j + a, :m]
+                z[mine : mine + D] = gone[2 * j + a, m:]
+                _enter(M, z, HEAD + 2 * at[j] + a, pivots[2 * j + a], 1.0 / pivots[2 * j + a])
+            last -= 1
+        for q in range(first[k], first[k + 1]):
+            count = _range_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
+            out[RANGE] += _unexplained(here, count, M, mine, then)
+            if sightings[q, 1] == sightings[q, 1]:
+                count = _bearing_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
+                out[BEARING] += _unexplained(here, count, M, mine, then)
+            for j in slots[q]:
+                if j >= 0 and begun[j] == k and kinds[j] == 1:
+                    begun[j] = -1
+                    for a in range(2):
+                        _visit_row(nuisance[j, a], a, p, at[j], alone)
+                        out[VISIT_RANGE if a == 0 else VISIT_BEARING] += _unexplained(alone, 2, M, mine, then)
+        if k + 1 < n:
+            _motion_variances(steps[k + 1], p, variances)
+            turn, dt, d = abs(steps[k + 1, 2]), steps[k + 1, 3], steps[k + 1, 4]
+            for axis in range(3):
+                _motion_row(poses[k], poses[k + 1], g, steps[k + 1], variances, axis, onward)
+                excess = _unexplained(onward, 5, M, mine, then) / variances[axis]
+                if axis == 0 and not steps[k + 1, 5] > 0.0:
+                    out[ALONG_METRE] += excess * p[ALONG_METRE] ** 2 * d
+                    out[ALONG_SECOND] += excess * p[ALONG_SECOND] ** 2 * dt
+                    out[FLOOR_POSITION] += excess * p[FLOOR_POSITION] ** 2
+                elif axis == 1 and not steps[k + 1, 6] > 0.0:
+                    out[LATERAL_METRE] += excess * p[LATERAL_METRE] ** 2 * d
+                    out[FLOOR_POSITION] += excess * p[FLOOR_POSITION] ** 2
+                elif axis == 2 and not steps[k + 1, 6] > 0.0:
+                    out[HEADING_METRE] += excess * p[HEADING_METRE] ** 2 * d
+                    out[HEADING_RADIAN] += excess * p[HEADING_RADIAN] ** 2 * turn
+                    out[HEADING_SECOND] += excess * p[HEADING_SECOND] ** 2 * dt
+                    out[FLOOR_HEADING] += excess * p[FLOOR_HEADING] ** 2
+    return out
 
 
 @njit(error_model="numpy", nogil=True)

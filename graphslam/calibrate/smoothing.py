@@ -172,15 +172,37 @@ class Smoothing:
                 return self.objective()
             finally:
                 self.sigmas = kept
+        return self._likelihood()[0]
+
+    def _likelihood(self) -> tuple[float, Array]:
+        """:meth:`objective`, and the second moments ``(HEAD, HEAD)`` of the constants and of -1 in row RHS."""
         logdet, volume, S, _ = self._eliminated(self._parameters())
         H, h, chi2 = self._with_prior(S)
+        i, moments = self._index, np.zeros((K.HEAD, K.HEAD))
+        moments[K.RHS, K.RHS] = 1.0
         if len(h):
-            chi2 -= float(h @ np.linalg.solve(H, h))
+            step = np.linalg.solve(H, h)
+            chi2 -= float(h @ step)
             logdet += float(np.linalg.slogdet(H)[1])
-        i = self._index
+            moments[np.ix_(i, i)] = np.linalg.inv(H) + np.outer(step, step)
+            moments[i, K.RHS] = moments[K.RHS, i] = -step
         value = 0.5 * chi2 + 0.5 * logdet + volume + float(np.sum(np.log(PRIOR[i])))
         value += sum(0.5 * (np.log(self.sigmas[s] / START[s]) / WIDTH) ** 2 for s in self.fitted)
-        return value if np.isfinite(value) else 1e12
+        return value if np.isfinite(value) else 1e12, moments
+
+    def gradient(self) -> tuple[float, Array]:
+        """:meth:`objective`, and its derivative by ln of each fitted standard deviation [nats]."""
+        value, moments = self._likelihood()
+        out = np.array([np.log(self.sigmas[s] / START[s]) / WIDTH**2 for s in self.fitted])
+        if value == 1e12:  # no elimination to go back from
+            return value, out
+        p, fitted = self._parameters(), [SIGMAS.index(s) for s in self.fitted]
+        for w, work in zip(self.windows, self._memory):
+            data = K.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
+            out += K.differentiate_window(
+                w.poses, w.nuisance, self.constants, data, self.sensor, p, moments, work
+            )[fitted]
+        return value, out
 
     def total(self) -> float:
         """χ² of all residuals and priors at the current states."""
@@ -254,16 +276,18 @@ class Smoothing:
         for _ in range(rounds if names else 0):
             x0, scale = np.log([self.sigmas[s] for s in names]), self._fisher_scale(names)
 
-            def negative(y: Array, x0: Array = x0, scale: Array = scale) -> float:
-                return self.objective(dict(zip(names, np.exp(x0 + y / scale).tolist())))
+            def negative(y: Array, x0: Array = x0, scale: Array = scale) -> tuple[float, Array]:
+                self.sigmas.update(dict(zip(names, np.exp(x0 + y / scale).tolist())))
+                value, gradient = self.gradient()
+                return value, gradient / scale
 
             found = minimize(
                 negative,
                 np.zeros(len(names)),
                 method="L-BFGS-B",
+                jac=True,
                 bounds=[(-3.0 * a, 3.0 * a) for a in scale],
                 options={
-                    "eps": 1e-3 * scale,
                     "ftol": tolerance / max(abs(value), 1.0),
                     # in units of scale the Hessian is about 1: half the squared gradient is the possible decrease
                     "gtol": np.sqrt(2.0 * tolerance / len(names)),

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.smoothing import CONSTANTS, Smoothing, SmoothingWindow, most_open_nuisances, renumber_slots
+from graphslam.calibrate.smoothing import (
+    CONSTANTS,
+    SIGMAS,
+    START,
+    Smoothing,
+    SmoothingWindow,
+    most_open_nuisances,
+    renumber_slots,
+)
 from tests.reference.slow_smoothing import objective_and_step, residuals, states_of
 
 
@@ -79,3 +87,18 @@ def test_settled_states_are_a_minimum_of_the_residuals():
     assert value == pytest.approx(float(np.sum(residuals(s, x)[0] ** 2)), rel=1e-9)
     for _ in range(20):
         assert np.sum(residuals(s, x + 1e-3 * rng.standard_normal(len(x)))[0] ** 2) > value
+
+
+@pytest.mark.parametrize("free", [CONSTANTS, ()])
+def test_gradient_is_that_of_finite_differences(free):
+    """With a step of stated variances, observations without a bearing, and visits that end before others begin."""
+    rng = np.random.default_rng(6)
+    windows = [window(rng, n=12, landmarks=3, visits=4), window(rng, bearings=False)]
+    s = Smoothing(windows, np.array([0.4, -0.1, 0.2]), free, SIGMAS)
+    s.constants[:] = 0.02 * rng.standard_normal(7)
+    s.sigmas.update({name: START[name] * f for name, f in zip(SIGMAS, rng.uniform(0.5, 2.0, len(SIGMAS)))})
+    _, found = s.gradient()
+    for name, slope in zip(SIGMAS, found):
+        up, down = (s.objective({name: s.sigmas[name] * np.exp(h)}) for h in (1e-4, -1e-4))
+        assert slope == pytest.approx((up - down) / 2e-4, rel=1e-4, abs=1e-3), name
+        assert abs(slope) > 0.0 or name.startswith("floor"), name
