@@ -60,9 +60,7 @@ types: $(STAMP)
 	$(BIN)/mypy
 
 bench: $(STAMP)
-	@ls tests/benchmarks/bench_*.py | xargs -P $(WORKERS) -I{} sh -c 'b={}; begin=$$(date +%s); \
-	  out=$$($(BIN)/python -m tests.benchmarks.$$(basename $$b .py) --quick 2>&1); code=$$?; \
-	  printf "== %s (%d s)\n%s\n" "$$b" "$$(($$(date +%s) - begin))" "$$out"; exit $$code'
+	$(BIN)/python -m tests.benchmarks.quick $(WORKERS)
 
 clean:
 	rm -rf $(VENV) build demo-run .pytest_cache .mypy_cache .ruff_cache

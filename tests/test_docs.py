@@ -8,8 +8,10 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+from matplotlib import pyplot
 
 from graphslam.backend.config import BackEndConfig
 from graphslam_frontends.landmarks.config import RbpfEkfConfig
@@ -71,8 +73,14 @@ def test_page_for_users_is_short(name: str) -> None:
     ],
     ids=lambda names: names[0],
 )
-def test_python_of_the_page_runs_from_top_to_bottom(names: list[str], tmp_path: Path) -> None:
-    """Blocks that name a file are that file; the rest of the pages is one script, run in an empty folder."""
+def test_python_of_the_page_runs_from_top_to_bottom(
+    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blocks that name a file are that file; the rest of the pages is one script, run in an empty folder.
+
+    In this process, which has imported the package and loaded its kernels. A package that a page installs needs one of
+    its own.
+    """
     script = []
     for code in [code for name in names for code in BLOCK.findall(page(name))]:
         named = re.match(r"# file: (\S+)\n", code)
@@ -81,8 +89,14 @@ def test_python_of_the_page_runs_from_top_to_bottom(names: list[str], tmp_path: 
         else:
             script.append(code)
     assert script
-    if "own-front-end.md" in names:
-        script.append(own_front_end(tmp_path))
+    if "own-front-end.md" not in names:
+        module = ModuleType("page")
+        monkeypatch.setitem(sys.modules, "page", module)
+        monkeypatch.chdir(tmp_path)
+        exec(compile("\n".join(script), names[0], "exec"), module.__dict__)
+        pyplot.close("all")
+        return
+    script.append(own_front_end(tmp_path))
     environment = {**os.environ, "MPLBACKEND": "Agg", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(script)], cwd=tmp_path, env=environment, capture_output=True, text=True

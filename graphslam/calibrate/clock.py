@@ -37,7 +37,7 @@ def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
         if k not in scores:
             moved = L.shift_motion(s, seen, k * period)
             moved.settle(8)
-            moved.fit(budget=60, rounds=1)
+            moved.fit(rounds=1)
             scores[k] = moved.objective()
         return scores[k]
 

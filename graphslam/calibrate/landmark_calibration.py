@@ -230,7 +230,7 @@ def cross_check_windows(s: Smoothing, value: float, other: Smoothing) -> tuple[l
         alone = x.copy(free=applied)
         for name in set(first.free) - set(applied):
             alone.constants[CONSTANTS.index(name)] = 0.0
-        alone.fit(budget=200, rounds=3)
+        alone.fit(rounds=3)
         left.append(alone)
     again = [e if not e.applied else replace(e, **_values(e.name, *left)) for e in out]
     return again, left[0], left[1]
@@ -304,7 +304,7 @@ def fit_two_level_noise(
         for k in long.fitted:
             s.sigmas[k] = long.sigmas[k]
         s.constants = long.constants.copy()
-        s, value = L.fit_noise(s, trims=(), budget=200)
+        s, value = L.fit_noise(s, trims=())
         values.append(value)
         fits.append(s)
     if not values[0] - values[1] > GAIN:
@@ -321,7 +321,7 @@ def fit_two_level_noise(
         for e in again:
             if not e.applied and e.name in CONSTANTS:
                 s.constants[CONSTANTS.index(e.name)] = 0.0
-        s.fit(budget=200, rounds=2)
+        s.fit(rounds=2)
     out = {}
     for k in ("range", "bearing"):
         for of_fit, of_noise in ((k, f"{k}_sigma"), (f"visit_{k}", f"{k}_visit")):

@@ -43,17 +43,17 @@ def trim_outliers(s: Smoothing, limit: float) -> Smoothing:
     return s if all(g.all() for g in good) else keep_sightings(s, good)
 
 
-def fit_noise(s: Smoothing, *, budget: int = 400, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
+def fit_noise(s: Smoothing, *, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
     """Fit, trim and fit again; the smoothing and its objective."""
     s.settle(8)
     s = trim_outliers(s, 12.0)  # a false association by metres would inflate the noise of all
-    value = s.fit(budget=budget, rounds=2 if trims else 4)
+    value = s.fit(rounds=2 if trims else 4)
     for limit in trims:
         less = trim_outliers(s, limit)
         if less is s:
             continue
         s = less
-        value = s.fit(budget=budget, rounds=2)
+        value = s.fit(rounds=2)
     return s, value
 
 
@@ -61,7 +61,7 @@ def fit_without(s: Smoothing, constant: str) -> tuple[Smoothing, float]:
     """The smoothing with one constant fixed at zero, its noise fitted again, and its objective."""
     alone = s.copy(free=tuple(c for c in s.free if c != constant))
     alone.constants[CONSTANTS.index(constant)] = 0.0
-    return alone, alone.fit(budget=150, rounds=3)
+    return alone, alone.fit(rounds=3)
 
 
 def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Smoothing, Smoothing] | None:
@@ -105,9 +105,9 @@ def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Sm
             one.constants, one.sigmas = g, {**sigmas, "range": max(sigmas["range"], 1.0)}
             tries.append((one.settle(60), one))
         best = min(tries, key=lambda x: x[0])[1]
-        best.fit(budget=120, rounds=2)
+        best.fit(rounds=2)
         best = trim_outliers(best, 5.0)
-        best.fit(budget=120, rounds=2)
+        best.fit(rounds=2)
         constants, sigmas, poses = best.constants, best.sigmas, best.windows[0].poses
         names = _names(whole, best.windows[0])
         places = {int(l): best.windows[0].nuisance[j] for j, l in enumerate(names)}

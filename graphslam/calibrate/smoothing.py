@@ -199,9 +199,9 @@ class Smoothing:
         p, fitted = self._parameters(), [SIGMAS.index(s) for s in self.fitted]
         for w, work in zip(self.windows, self._memory):
             data = K.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
-            out += K.differentiate_window(
-                w.poses, w.nuisance, self.constants, data, self.sensor, p, moments, work
-            )[fitted]
+            out += K.differentiate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, moments, work)[
+                fitted
+            ]
         return value, out
 
     def total(self) -> float:
@@ -264,7 +264,7 @@ class Smoothing:
                 break
         return value
 
-    def fit(self, *, rounds: int = 4, budget: int = 400, tolerance: float = 0.05) -> float:
+    def fit(self, *, rounds: int = 4, tolerance: float = 0.05) -> float:
         """Maximum-likelihood standard deviations, with states and constants; returns the objective.
 
         Each round minimises the objective of the problem linearised at the states, then updates the states with the
@@ -291,7 +291,7 @@ class Smoothing:
                     "ftol": tolerance / max(abs(value), 1.0),
                     # in units of scale the Hessian is about 1: half the squared gradient is the possible decrease
                     "gtol": np.sqrt(2.0 * tolerance / len(names)),
-                    "maxfun": budget,
+                    "maxfun": 100,
                     "maxls": 10,
                 },
             )

@@ -121,7 +121,7 @@ def whole(tmp_path_factory) -> Study:
     return study(SMALL, KILLED, out=tmp_path_factory.mktemp("whole"), worlds=["near"], seed=5, progress=False)
 
 
-@pytest.mark.parametrize(("workers", "kills"), [(None, 3), (2, 2)])
+@pytest.mark.parametrize(("workers", "kills"), [(None, 2), (2, 2)])
 def test_kills_and_a_resume_give_the_bytes_of_an_uninterrupted_study(
     whole: Study, tmp_path: Path, workers: int | None, kills: int
 ) -> None:

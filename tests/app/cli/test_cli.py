@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import gzip
-import io
 import json
 import logging
 import os
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,16 +16,17 @@ import pytest
 import scipy.sparse as sp
 from typer.testing import CliRunner
 
-from graphslam.app.cli import app, main
+from graphslam.app.cli import app
 from graphslam.app.cli.terminal import log_to_stderr
 from graphslam.app.worlds import simulate
 from graphslam.core.progress import Bar
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.log_store import save_log
 from graphslam.io.tum import read_tum, write_tum
+from tests.command_line import graphslam
 
 
-def graphslam(*args: object, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+def in_a_process(*args: object, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own."""
     command = [sys.executable, "-m", "graphslam", *map(str, args)]
     return subprocess.run(
@@ -36,25 +35,9 @@ def graphslam(*args: object, env: dict[str, str] | None = None) -> subprocess.Co
 
 
 def refused(*args: object, saying: str, env: dict[str, str] | None = None) -> None:
-    """Exit 1, nothing on stdout, one line on stderr that says what is wrong; before it, at most bars of progress.
-
-    In this process, but where the environment is another one; what the command does to logging is undone.
-    """
-    if env:
-        found = graphslam(*args, env=env)
-        code, out, err = found.returncode, found.stdout, found.stderr
-    else:
-        root, hidden = logging.getLogger(), Bar.hidden
-        handlers, level = root.handlers[:], root.level
-        command = ["graphslam", *map(str, args)]
-        texts = io.StringIO(), io.StringIO()
-        with redirect_stdout(texts[0]), redirect_stderr(texts[1]), pytest.MonkeyPatch.context() as m:
-            m.setattr(sys, "argv", command)
-            with pytest.raises(SystemExit) as ended:
-                main()
-        root.handlers[:], Bar.hidden = handlers, hidden
-        root.setLevel(level)
-        code, out, err = ended.value.code, *(t.getvalue() for t in texts)
+    """Exit 1, nothing on stdout, one line on stderr that says what is wrong; before it, at most bars of progress."""
+    found = in_a_process(*args, env=env) if env else graphslam(*args)
+    code, out, err = found.returncode, found.stdout, found.stderr
     assert code == 1, (out, err)
     assert out == ""
     bars = "read: ", "front end: ", "compiling "
@@ -71,7 +54,7 @@ def run_folder(tmp_path_factory) -> Path:
     made = graphslam("simulate", "landmark-field", "--preset", "quick", "--seed", 2, "--out", root / "log", "--json")
     assert made.returncode == 0, made.stderr
     assert json.loads(made.stdout)["streams"]["landmarks"] > 100
-    done = graphslam("run", root / "log", "--out", root / "run", "--set", "frontend.particles=20", "--json")
+    done = in_a_process("run", root / "log", "--out", root / "run", "--set", "frontend.particles=20", "--json")
     assert done.returncode == 0, done.stderr
     value = json.loads(done.stdout)
     assert {"metrics", "report", "out"} <= set(value)
@@ -157,7 +140,7 @@ def test_data_list_and_info():
 
 
 def test_doctor_finds_this_machine_in_order():
-    done = graphslam("doctor", "--json")
+    done = in_a_process("doctor", "--json")
     assert done.returncode == 0, done.stderr
     states = {c["check"]: c["state"] for c in json.loads(done.stdout)["checks"]}
     assert states["gtsam"] == "ok"
