@@ -34,7 +34,7 @@ LONGEST = (
     "refine/test_plane.py",
     "app/cli/test_cli.py",
 )
-"""The files with the most CPU time, as CI prints it. They come first, so that no process is left with one at the end."""
+"""The files with the most CPU time, as CI prints it: they come first, so that no process has one left at the end."""
 _cpu_before = [0.0]
 
 

@@ -1,21 +1,23 @@
-"""Peak memory of a join, measured in its own process with the kernel's count of resident pages.
+"""Peak memory of joins, each measured in its own process with the kernel's count of resident pages.
 
 Tracing Python's allocations would not see the memory of SuperLU, LAPACK and gtsam, and would slow down the timed code.
-So each method runs once more in a new interpreter. It loads the submaps and every module, resets the kernel's
-high-water mark, joins, and reports the rise of the mark. Only on Linux; on other systems there is no value.
+So a new interpreter loads the submaps and is forked for each method. The fork loads what the method needs, resets the
+kernel's high-water mark, joins, and reports the rise of the mark. Only on Linux; on other systems there is no value.
 """
 
 from __future__ import annotations
 
 import gc
+import json
 import logging
 import math
+import multiprocessing
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
 
@@ -70,27 +72,24 @@ class MemoryProbe:
     def measure(self, methods: Sequence[str], *, polish: bool) -> list[float | None]:
         """Peak growth of resident memory [MB = 10⁶ bytes] while each method joins; None if unknown.
 
-        The processes share nothing; one process per core runs at the same time.
+        One process per core runs at the same time.
         """
         if self._folder is None:
             return [None] * len(methods)
-        with ThreadPoolExecutor(max(1, os.cpu_count() or 1)) as pool:
-            return list(pool.map(lambda method: self._measure(method, polish), methods))
-
-    def _measure(self, method: str, polish: bool) -> float | None:
-        assert self._folder is not None
-        command = [sys.executable, "-m", "graphslam.app.memory", self._folder.name, method, str(int(polish))]
+        command = [sys.executable, "-m", "graphslam.app.memory", self._folder.name, str(int(polish)), *methods]
         paths = [str(Path(graphslam.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in paths if p)}
         try:
             done = subprocess.run(
                 command, capture_output=True, text=True, check=True, env=environment, timeout=_TIMEOUT_S
             )
-            megabytes = float(done.stdout.strip().splitlines()[-1])
+            found = json.loads(done.stdout.strip().splitlines()[-1])
         except (subprocess.SubprocessError, ValueError, IndexError) as error:
-            logger.warning("peak memory of %s could not be measured: %s", method, error)
-            return None
-        return megabytes if math.isfinite(megabytes) else None
+            found = [str(error)] * len(methods)
+        for method, value in zip(methods, found):
+            if isinstance(value, str):
+                logger.warning("peak memory of %s could not be measured: %s", method, value)
+        return [v if isinstance(v, float) and math.isfinite(v) else None for v in found]
 
 
 def _status(field: str) -> int:
@@ -109,9 +108,8 @@ def _read(folder: Path) -> Material:
     return JoinProblem.load(folder / _GRAPH)
 
 
-def _measure_here(folder: str, method: str, polish: bool) -> float:
-    """Load, compile, free memory, reset the high-water mark, join, read the mark [MB]."""
-    submaps = _read(Path(folder))
+def _measure_here(submaps: Material, method: str, polish: bool) -> float:
+    """Compile, free memory, reset the high-water mark, join, read the mark [MB]."""
     compile_method(submaps, method, polish=polish)  # also loads modules and thread pools
     gc.collect()
     trim_heap()  # otherwise the join would reuse freed memory, which the mark does not count
@@ -126,10 +124,37 @@ def _measure_here(folder: str, method: str, polish: bool) -> float:
     return max(peak - before, 0) / 1e6
 
 
+def _answer(end: Connection, submaps: Material, method: str, polish: bool) -> None:
+    """In a fork: send the value, or why there is none."""
+    try:
+        end.send(_measure_here(submaps, method, polish))
+    except Exception as error:
+        end.send(f"{type(error).__name__}: {error}")
+
+
 def measure_and_print(arguments: Sequence[str]) -> None:
-    """Entry of the measuring process: folder, method, polish (0 or 1); prints the value to standard output."""
-    folder, method, polish = arguments
-    sys.stdout.write(f"{_measure_here(folder, method, polish == '1')}\n")
+    """Entry of the measuring process: folder, polish (0 or 1), methods; prints a JSON list to standard output.
+
+    The process has loaded the submaps, but has not joined anything, so that it has no threads when it is forked.
+    """
+    folder, polish, *methods = arguments
+    submaps, fork, out = _read(Path(folder)), multiprocessing.get_context("fork"), []
+    cores = max(1, os.cpu_count() or 1)
+    for some in (methods[k : k + cores] for k in range(0, len(methods), cores)):
+        started = []
+        for method in some:
+            here, there = fork.Pipe(duplex=False)
+            process = fork.Process(target=_answer, args=(there, submaps, method, polish == "1"))
+            process.start()
+            there.close()
+            started.append((process, here))
+        for process, here in started:
+            try:
+                out.append(here.recv())
+            except EOFError:
+                out.append("its process ended")
+            process.join()
+    sys.stdout.write(json.dumps(out) + "\n")
 
 
 if __name__ == "__main__":

@@ -206,9 +206,12 @@ class Smoothing:
 
     def total(self) -> float:
         """χ² of all residuals and priors at the current states."""
-        _, _, _, chi2 = self._eliminated(self._parameters())
+        return self._total(self._eliminated(self._parameters()))
+
+    def _total(self, eliminated: tuple[float, float, Array, Array]) -> float:
+        """χ² of all residuals and priors where the windows were linearised; NaN if they could not be eliminated."""
         i = self._index
-        return float(chi2.sum() + np.sum((self.constants[i] / PRIOR[i]) ** 2))
+        return float(eliminated[3].sum() + np.sum((self.constants[i] / PRIOR[i]) ** 2) + 0.0 * eliminated[0])
 
     def gain_without_distances(self, count: int, every: int = 1) -> list[Array]:
         """Decrease of χ² without ``count`` distances from each ``every``-th step on; χ²(count) for the true noise."""
@@ -230,18 +233,18 @@ class Smoothing:
 
     def settle(self, iterations: int = 20, tolerance: float = 1e-3) -> float:
         """Gauss-Newton, with Levenberg-Marquardt damping after a failed step; returns χ²."""
-        p, damping = self._parameters(), 0.0
+        p, damping, value = self._parameters(), 0.0, np.inf
         i = self._index
-        value = np.inf
+        current = self._eliminated(p)
         for _ in range(iterations):
-            logdet, _, S, parts = self._eliminated(p, damping)
-            now = float(parts.sum() + np.sum((self.constants[i] / PRIOR[i]) ** 2))
-            if not np.isfinite(logdet) or not np.isfinite(now):
+            now = self._total(current)
+            if not np.isfinite(now):
                 damping = max(10.0 * damping, 1e-4)
                 if damping > 1e6:
                     break
+                current = self._eliminated(p, damping)
                 continue
-            H, h, _ = self._with_prior(S)
+            H, h, _ = self._with_prior(current[2])
             step = np.zeros(K.CONSTANTS)
             step[i] = np.linalg.solve(H, h) if len(i) else 0.0
             kept = [(w.poses, w.nuisance) for w in self.windows], self.constants
@@ -250,7 +253,9 @@ class Smoothing:
                 K.substitute_window(work, step, dp, dn)
                 w.poses, w.nuisance = w.poses + dp, w.nuisance + dn
             self.constants = self.constants + step
-            value = self.total()
+            less = 0.1 * damping if damping > 1e-6 else 0.0
+            current = self._eliminated(p, less)  # χ² of this step, and the start of the next one
+            value = self._total(current)
             if not value <= now + 1e-9 * now + 1e-9:
                 for w, (poses, nuisance) in zip(self.windows, kept[0]):
                     w.poses, w.nuisance = poses, nuisance
@@ -258,8 +263,9 @@ class Smoothing:
                 damping, value = max(10.0 * damping, 1e-4), now
                 if damping > 1e6:
                     break
+                current = self._eliminated(p, damping)
                 continue
-            damping = 0.1 * damping if damping > 1e-6 else 0.0
+            damping = less
             if now - value < tolerance * max(1.0, 1e-3 * now):
                 break
         return value

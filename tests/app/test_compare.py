@@ -156,8 +156,11 @@ def test_peak_memory_grows_with_what_is_joined(rng: np.random.Generator) -> None
     states = join_by_method(submaps, "eif-tree").states
     assert states > 1400
     with MemoryProbe(submaps) as probe:
-        (dense,) = probe.measure(["ekf"], polish=False)
+        dense, sparse, unknown = probe.measure(["ekf", "isam2", "magic"], polish=False)
     assert dense is not None
+    assert sparse is not None
+    assert sparse < dense
+    assert unknown is None
     assert 8e-6 * states**2 < dense < 12 * 8e-6 * states**2
     with MemoryProbe(None) as probe:
         assert probe.measure(["ekf"], polish=False) == [None]
