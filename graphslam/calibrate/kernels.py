@@ -7,40 +7,38 @@ from collections import namedtuple
 
 import numpy as np
 
-from graphslam.core.jit import njit
-
-YAW_BIAS, DISTANCE_SCALE, TURN_PER_METRE, TURN_SCALE, RANGE_SCALE, RANGE_OFFSET, SENSOR_YAW = range(7)
-CONSTANTS = 7
-RHS = CONSTANTS
-HEAD = CONSTANTS + 1
-(
+from graphslam.calibrate.residual_kernels import (
     ALONG_METRE,
     ALONG_SECOND,
-    LATERAL_METRE,
+    BEARING,
+    CONSTANTS,
+    FLOOR_HEADING,
+    FLOOR_POSITION,
+    HEAD,
     HEADING_METRE,
     HEADING_RADIAN,
     HEADING_SECOND,
+    LATERAL_METRE,
+    PARAMETERS,
     RANGE,
-    BEARING,
-    VISIT_RANGE,
+    RHS,
     VISIT_BEARING,
-    FLOOR_POSITION,
-    FLOOR_HEADING,
-) = range(12)
-PARAMETERS = 12
-Data = namedtuple("Data", ["steps", "first", "sightings", "slots", "kinds"])
-"""Measurements of a window."""
+    VISIT_RANGE,
+    Model,
+    Row,
+    bearing_row,
+    motion_row,
+    motion_variances,
+    range_row,
+    visit_row,
+    wrap_residual,
+)
+from graphslam.core.jit import njit
+
 Work = namedtuple("Work", ["L", "X", "C", "S", "chi2", "gone", "pivots", "order", "when", "at"])
 """Output of :func:`eliminate_window`."""
-_Row = namedtuple("_Row", ["jp", "jn", "cols", "vals"])
 _Blocks = namedtuple("_Blocks", ["A", "An", "B", "C", "Cn", "S"])
 _FAR = 1e-8  # prior information of a landmark position [1/m²]
-
-
-@njit(error_model="numpy", nogil=True)
-def wrap_residual(a):
-    """Angle in (-π, π]."""
-    return math.pi - (math.pi - a) % (2.0 * math.pi)
 
 
 @njit(error_model="numpy", nogil=True)
@@ -97,121 +95,6 @@ def _leave(at, active, A, C, S, gone):
 
 
 @njit(error_model="numpy", nogil=True)
-def _range_row(x, nuisance, g, data, sensor, p, q, at, row):
-    """Whitened residual of the range of observation ``q`` from pose ``x``; returns its number of border columns."""
-    jp, _, cols, vals = row
-    j, v = data.slots[q]
-    c, s = math.cos(x[2]), math.sin(x[2])
-    ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
-    dx, dy = nuisance[j, 0] - x[0] - ox, nuisance[j, 1] - x[1] - oy
-    r = math.sqrt(dx * dx + dy * dy + 1e-12)
-    base = HEAD + 2 * at[j]
-    grow, w = 1.0 + g[RANGE_SCALE], 1.0 / p[RANGE]
-    # residual: predicted minus measured
-    e = grow * r + g[RANGE_OFFSET] - data.sightings[q, 0]
-    jp[:] = 0.0
-    jp[0], jp[1] = -w * grow * dx / r, -w * grow * dy / r
-    jp[2] = w * grow * (dx * oy - dy * ox) / r
-    cols[1], vals[1] = base, w * grow * dx / r
-    cols[2], vals[2] = base + 1, w * grow * dy / r
-    cols[3], vals[3] = RANGE_SCALE, w * r
-    cols[4], vals[4] = RANGE_OFFSET, w
-    count = 5
-    if v >= 0:
-        e += nuisance[v, 0]
-        cols[5], vals[5] = HEAD + 2 * at[v], w
-        count = 6
-    vals[0] = -w * e
-    return count
-
-
-@njit(error_model="numpy", nogil=True)
-def _bearing_row(x, nuisance, g, data, sensor, p, q, at, row):
-    """Whitened residual of the bearing of observation ``q`` from pose ``x``; returns its number of border columns."""
-    jp, _, cols, vals = row
-    j, v = data.slots[q]
-    c, s = math.cos(x[2]), math.sin(x[2])
-    ox, oy = c * sensor[0] - s * sensor[1], s * sensor[0] + c * sensor[1]
-    dx, dy = nuisance[j, 0] - x[0] - ox, nuisance[j, 1] - x[1] - oy
-    r2 = dx * dx + dy * dy + 1e-12
-    base = HEAD + 2 * at[j]
-    w = 1.0 / p[BEARING]
-    e = math.atan2(dy, dx) - x[2] - sensor[2] - g[SENSOR_YAW] - data.sightings[q, 1]
-    if v >= 0:
-        e += nuisance[v, 1]
-    e = wrap_residual(e)
-    jp[:] = 0.0
-    jp[0], jp[1] = w * dy / r2, -w * dx / r2
-    jp[2] = w * (-(dx * ox + dy * oy) / r2 - 1.0)
-    cols[1], vals[1] = base, -w * dy / r2
-    cols[2], vals[2] = base + 1, w * dx / r2
-    cols[3], vals[3] = SENSOR_YAW, -w
-    count = 4
-    if v >= 0:
-        cols[4], vals[4] = HEAD + 2 * at[v] + 1, w
-        count = 5
-    vals[0] = -w * e
-    return count
-
-
-@njit(error_model="numpy", nogil=True)
-def _visit_row(value, part, p, at, row):
-    """Whitened prior of the range (``part`` 0) or bearing (1) of a visit."""
-    _, _, cols, vals = row
-    w = 1.0 / (p[VISIT_RANGE] if part == 0 else p[VISIT_BEARING])
-    cols[1], vals[0], vals[1] = HEAD + 2 * at + part, -w * value, w
-
-
-@njit(error_model="numpy", nogil=True)
-def _motion_variances(step, p, out):
-    """Variances of a step: along, lateral, heading."""
-    turn, dt, d = step[2], step[3], step[4]
-    out[0] = p[ALONG_METRE] ** 2 * d + p[ALONG_SECOND] ** 2 * dt + p[FLOOR_POSITION] ** 2
-    out[1] = p[LATERAL_METRE] ** 2 * d + p[FLOOR_POSITION] ** 2
-    out[2] = p[HEADING_METRE] ** 2 * d + p[HEADING_RADIAN] ** 2 * abs(turn) + p[HEADING_SECOND] ** 2 * dt
-    out[2] += p[FLOOR_HEADING] ** 2
-    if step[5] > 0.0:
-        out[0] = step[5]
-    if step[6] > 0.0:
-        out[1], out[2] = step[6], step[7]
-
-
-@njit(error_model="numpy", nogil=True)
-def _motion_row(x, then, g, step, variances, axis, row):
-    """Whitened residual of a step from pose ``x`` to ``then``: along, lateral or heading; 5 border columns."""
-    jp, jn, cols, vals = row
-    ux, uy, turn, dt, d = step[0], step[1], step[2], step[3], step[4]
-    less = g[YAW_BIAS] * dt + g[TURN_PER_METRE] * d + g[TURN_SCALE] * turn
-    h = 0.5 * turn
-    phi = x[2] + h - 0.5 * less
-    cp, sp = math.cos(phi), math.sin(phi)
-    mx, my = then[0] - x[0], then[1] - x[1]
-    longer = math.exp(g[DISTANCE_SCALE])  # the prediction is scaled, not the measurement with its noise
-    qx, qy = longer * (cp * mx + sp * my), longer * (-sp * mx + cp * my)
-    w = 1.0 / math.sqrt(variances[axis])
-    u = w * longer
-    jp[:] = 0.0
-    jn[:] = 0.0
-    if axis == 0:
-        e, dphi, scale = qx - (math.cos(h) * ux + math.sin(h) * uy), qy, qx
-        jp[0], jp[1], jn[0], jn[1] = -u * cp, -u * sp, u * cp, u * sp
-    elif axis == 1:
-        e, dphi, scale = qy - (-math.sin(h) * ux + math.cos(h) * uy), -qx, qy
-        jp[0], jp[1], jn[0], jn[1] = u * sp, -u * cp, -u * sp, u * cp
-    else:
-        e, dphi, scale = wrap_residual(then[2] - x[2] - turn + less), -1.0, 0.0
-        jn[2] = w
-    jp[2] = w * dphi
-    # a change of the turn by the constants rotates the chord by half of it, the heading by all of it
-    part = -0.5 * dphi if axis < 2 else 1.0
-    cols[1], vals[1] = YAW_BIAS, w * part * dt
-    cols[2], vals[2] = DISTANCE_SCALE, w * scale
-    cols[3], vals[3] = TURN_PER_METRE, w * part * d
-    cols[4], vals[4] = TURN_SCALE, w * part * turn
-    vals[0] = -w * e
-
-
-@njit(error_model="numpy", nogil=True)
 def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     """Linearise a window and marginalise its poses and nuisances, so that the constants remain.
 
@@ -256,8 +139,8 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     jp, jn, zero = np.zeros(D), np.zeros(D), np.zeros(D)
     cols, vals, variances = np.zeros(16, np.int64), np.zeros(16), np.zeros(3)
     cols[0] = RHS
-    here, onward = _Row(jp, zero, cols, vals), _Row(jp, jn, cols, vals)
-    alone = _Row(zero, zero, cols, vals)
+    model, here, onward = Model(g, sensor, p), Row(jp, zero, cols, vals), Row(jp, jn, cols, vals)
+    alone = Row(zero, zero, cols, vals)
     for a in range(3):
         A[a, a] = 1e12
     last = np.zeros(M, np.int64)
@@ -286,25 +169,25 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                     col = HEAD + 2 * place + a
                     if kinds[new] == 1:
                         volume += math.log(p[VISIT_RANGE] if a == 0 else p[VISIT_BEARING])
-                        _visit_row(nuisance[new, a], a, p, place, alone)
+                        visit_row(nuisance[new, a], a, p, place, alone)
                         _add(alone, 2, blocks)
                         chi2[5] += vals[0] * vals[0]
                     else:
                         S[col, col] += _FAR
             volume += math.log(p[RANGE])
-            count = _range_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
+            count = range_row(poses[k], nuisance, model, data, q, at, here)
             chi2[3] += vals[0] * vals[0]
             _add(here, count, blocks)
             if sightings[q, 1] == sightings[q, 1]:
                 volume += math.log(p[BEARING])
-                count = _bearing_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
+                count = bearing_row(poses[k], nuisance, model, data, q, at, here)
                 chi2[4] += vals[0] * vals[0]
                 _add(here, count, blocks)
         if k + 1 < n:
-            _motion_variances(steps[k + 1], p, variances)
+            motion_variances(steps[k + 1], p, variances)
             for axis in range(3):
                 volume += 0.5 * math.log(variances[axis])
-                _motion_row(poses[k], poses[k + 1], g, steps[k + 1], variances, axis, onward)
+                motion_row(poses[k], poses[k + 1], g, steps[k + 1], variances, axis, onward)
                 chi2[axis] += vals[0] * vals[0]
                 _add(onward, 5, blocks)
         if damping > 0.0:
@@ -445,6 +328,24 @@ def _unexplained(row, n, M, here, then):
 
 
 @njit(error_model="numpy", nogil=True)
+def _spread(step, p, axis, slope, out):
+    """Add twice a derivative by the variance of a step along an axis to those of the standard deviations in it."""
+    turn, dt, d = abs(step[2]), step[3], step[4]
+    if axis == 0 and not step[5] > 0.0:
+        out[ALONG_METRE] += slope * p[ALONG_METRE] ** 2 * d
+        out[ALONG_SECOND] += slope * p[ALONG_SECOND] ** 2 * dt
+        out[FLOOR_POSITION] += slope * p[FLOOR_POSITION] ** 2
+    elif axis == 1 and not step[6] > 0.0:
+        out[LATERAL_METRE] += slope * p[LATERAL_METRE] ** 2 * d
+        out[FLOOR_POSITION] += slope * p[FLOOR_POSITION] ** 2
+    elif axis == 2 and not step[6] > 0.0:
+        out[HEADING_METRE] += slope * p[HEADING_METRE] ** 2 * d
+        out[HEADING_RADIAN] += slope * p[HEADING_RADIAN] ** 2 * turn
+        out[HEADING_SECOND] += slope * p[HEADING_SECOND] ** 2 * dt
+        out[FLOOR_HEADING] += slope * p[FLOOR_HEADING] ** 2
+
+
+@njit(error_model="numpy", nogil=True)
 def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
     """Derivative of a window's negative log-likelihood by ln σ of each standard deviation ``(PARAMETERS,)``.
 
@@ -465,8 +366,8 @@ def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
     jp, jn, zero = np.zeros(D), np.zeros(D), np.zeros(D)
     cols, vals, variances = np.zeros(16, np.int64), np.zeros(16), np.zeros(3)
     cols[0] = RHS
-    here, onward = _Row(jp, zero, cols, vals), _Row(jp, jn, cols, vals)
-    alone = _Row(zero, zero, cols, vals)
+    model, here, onward = Model(g, sensor, p), Row(jp, zero, cols, vals), Row(jp, jn, cols, vals)
+    alone = Row(zero, zero, cols, vals)
     begun = np.full(len(nuisance), n, np.int64)
     for k in range(n - 1, -1, -1):
         for q in range(first[k], first[k + 1]):
@@ -493,35 +394,22 @@ def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
                 _enter(M, z, HEAD + 2 * at[j] + a, pivots[2 * j + a], 1.0 / pivots[2 * j + a])
             last -= 1
         for q in range(first[k], first[k + 1]):
-            count = _range_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
+            count = range_row(poses[k], nuisance, model, data, q, at, here)
             out[RANGE] += _unexplained(here, count, M, mine, then)
             if sightings[q, 1] == sightings[q, 1]:
-                count = _bearing_row(poses[k], nuisance, g, data, sensor, p, q, at, here)
+                count = bearing_row(poses[k], nuisance, model, data, q, at, here)
                 out[BEARING] += _unexplained(here, count, M, mine, then)
             for j in slots[q]:
                 if j >= 0 and begun[j] == k and kinds[j] == 1:
                     begun[j] = -1
                     for a in range(2):
-                        _visit_row(nuisance[j, a], a, p, at[j], alone)
+                        visit_row(nuisance[j, a], a, p, at[j], alone)
                         out[VISIT_RANGE if a == 0 else VISIT_BEARING] += _unexplained(alone, 2, M, mine, then)
         if k + 1 < n:
-            _motion_variances(steps[k + 1], p, variances)
-            turn, dt, d = abs(steps[k + 1, 2]), steps[k + 1, 3], steps[k + 1, 4]
+            motion_variances(steps[k + 1], p, variances)
             for axis in range(3):
-                _motion_row(poses[k], poses[k + 1], g, steps[k + 1], variances, axis, onward)
-                excess = _unexplained(onward, 5, M, mine, then) / variances[axis]
-                if axis == 0 and not steps[k + 1, 5] > 0.0:
-                    out[ALONG_METRE] += excess * p[ALONG_METRE] ** 2 * d
-                    out[ALONG_SECOND] += excess * p[ALONG_SECOND] ** 2 * dt
-                    out[FLOOR_POSITION] += excess * p[FLOOR_POSITION] ** 2
-                elif axis == 1 and not steps[k + 1, 6] > 0.0:
-                    out[LATERAL_METRE] += excess * p[LATERAL_METRE] ** 2 * d
-                    out[FLOOR_POSITION] += excess * p[FLOOR_POSITION] ** 2
-                elif axis == 2 and not steps[k + 1, 6] > 0.0:
-                    out[HEADING_METRE] += excess * p[HEADING_METRE] ** 2 * d
-                    out[HEADING_RADIAN] += excess * p[HEADING_RADIAN] ** 2 * turn
-                    out[HEADING_SECOND] += excess * p[HEADING_SECOND] ** 2 * dt
-                    out[FLOOR_HEADING] += excess * p[FLOOR_HEADING] ** 2
+                motion_row(poses[k], poses[k + 1], g, steps[k + 1], variances, axis, onward)
+                _spread(steps[k + 1], p, axis, _unexplained(onward, 5, M, mine, then) / variances[axis], out)
     return out
 
 

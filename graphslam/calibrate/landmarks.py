@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphslam.calibrate import kernels as K
+from graphslam.calibrate import residual_kernels as R
 from graphslam.calibrate.smoothing import CONSTANTS, START, Smoothing, SmoothingWindow, keep_sightings, renumber_slots
 from graphslam.calibrate.windows import SightingLog, cut_windows
 from graphslam.core.geometry import Array
@@ -98,7 +99,7 @@ def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Sm
         for trial in range(1 if len(poses) else 16):
             g = constants.copy()
             if not len(poses):
-                g[K.YAW_BIAS] = rng.normal(0.0, 0.005) if trial else 0.0
+                g[R.YAW_BIAS] = rng.normal(0.0, 0.005) if trial else 0.0
             path = _extended(whole, poses, n, g)
             w = _part(whole, path, places, rng)
             one = smoothing_of([w], s.T_base_sensor, free)
@@ -127,7 +128,7 @@ def _names(whole: SmoothingWindow, w: SmoothingWindow) -> Array:
 def _extended(whole: SmoothingWindow, poses: Array, n: int, g: Array) -> Array:
     """Path of ``n`` poses: the given ones, extended by dead reckoning corrected for the yaw bias."""
     u = whole.steps[:n].copy()
-    u[:, 2] -= g[K.YAW_BIAS] * u[:, 3]
+    u[:, 2] -= g[R.YAW_BIAS] * u[:, 3]
     out = np.zeros((n, 3))
     known = min(len(poses), n)
     out[:known] = poses[:known]

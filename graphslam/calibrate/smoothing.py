@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from graphslam.calibrate import kernels as K
+from graphslam.calibrate import residual_kernels as R
 from graphslam.core.geometry import Array
 
 Ints = npt.NDArray[np.int64]
@@ -150,7 +151,7 @@ class Smoothing:
         """ln det, Σ ln σ, information of the constants ``(HEAD, HEAD)``, and χ² by class."""
         logdet, volume, S, chi2 = 0.0, 0.0, np.zeros((K.HEAD, K.HEAD)), np.zeros(6)
         for w, work in zip(self.windows, self._buffers()):
-            data = K.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
+            data = R.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
             a, b = K.eliminate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, damping, work)
             logdet, volume = logdet + a, volume + b
             S += work.S[: K.HEAD, : K.HEAD]
@@ -198,7 +199,7 @@ class Smoothing:
             return value, out
         p, fitted = self._parameters(), [SIGMAS.index(s) for s in self.fitted]
         for w, work in zip(self.windows, self._memory):
-            data = K.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
+            data = R.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
             out += K.differentiate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, moments, work)[
                 fitted
             ]
@@ -219,7 +220,7 @@ class Smoothing:
         for w, work in zip(self.windows, self._buffers()):
 
             def chi2(steps: Array, w: SmoothingWindow = w, work: K.Work = work) -> float:
-                data = K.Data(steps, w.first, w.sightings, w.slots, w.kinds)
+                data = R.Data(steps, w.first, w.sightings, w.slots, w.kinds)
                 K.eliminate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, 0.0, work)
                 return float(work.S[K.RHS, K.RHS])
 
@@ -333,8 +334,8 @@ class Smoothing:
             o = np.column_stack([c * self.sensor[0] - si * self.sensor[1], si * self.sensor[0] + c * self.sensor[1]])
             d = w.nuisance[w.slots[:, 0]] - x[:, :2] - o
             visit = np.where(w.slots[:, 1:] >= 0, w.nuisance[w.slots[:, 1]], 0.0)
-            r = (1 + g[K.RANGE_SCALE]) * np.hypot(d[:, 0], d[:, 1]) + g[K.RANGE_OFFSET] + visit[:, 0]
-            b = np.arctan2(d[:, 1], d[:, 0]) - x[:, 2] - self.sensor[2] - g[K.SENSOR_YAW] + visit[:, 1]
+            r = (1 + g[R.RANGE_SCALE]) * np.hypot(d[:, 0], d[:, 1]) + g[R.RANGE_OFFSET] + visit[:, 0]
+            b = np.arctan2(d[:, 1], d[:, 0]) - x[:, 2] - self.sensor[2] - g[R.SENSOR_YAW] + visit[:, 1]
             b = np.pi - np.mod(np.pi - (b - w.sightings[:, 1]), 2 * np.pi)
             seen.append(np.column_stack([(r - w.sightings[:, 0]) / s["range"], b / s["bearing"]]))
         return seen

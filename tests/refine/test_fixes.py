@@ -35,7 +35,7 @@ def fixes_along(truth, times, rng, sigma=0.05, lever=(0.2, -0.1, 0.5), **more):
 @pytest.fixture(scope="module")
 def plain():
     """The drive of seed 3 refined without fixes."""
-    scans, reckoned, _ = court_scans(3)
+    scans, reckoned, _ = court_scans(3, beams=31)
     return refine_by_scans(scans, reckoned)
 
 
@@ -73,7 +73,7 @@ def test_jacobians(rng, dim, lasting):
 
 def test_fixes_hold_what_scans_and_motion_do_not(rng, plain):
     """The frame of the fixes is found, and the path in it is nearer the truth and surer."""
-    scans, reckoned, truth = court_scans(3)
+    scans, reckoned, truth = court_scans(3, beams=31)
     gps = fixes_along(truth[::3], scans.times[::3], rng, sigma=0.02)
     with_fixes = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
     assert with_fixes.fixes is not None
@@ -133,7 +133,7 @@ def test_errors_that_last_are_no_news_fix_after_fix(rng):
 
 
 def test_fixes_that_do_not_say_where_north_is_hold_nothing(rng, plain):
-    scans, reckoned, truth = court_scans(3)
+    scans, reckoned, truth = court_scans(3, beams=31)
     gps = fixes_along(truth[:4], scans.times[:4], rng)
     found = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=20.0)))
     assert found.fixes is None
@@ -141,7 +141,7 @@ def test_fixes_that_do_not_say_where_north_is_hold_nothing(rng, plain):
 
 
 def test_fixes_outside_the_path_are_left_out_and_counted(rng):
-    scans, reckoned, truth = court_scans(3)
+    scans, reckoned, truth = court_scans(3, beams=31)
     gps = fixes_along(truth[::3], scans.times[::3], rng)
     late = replace(gps, times=gps.times + 0.5 * (scans.times[-1] - scans.times[0]))
     found = refine_by_scans(scans, reckoned, gps=(late, GpsConfig(baseline=1.0)))

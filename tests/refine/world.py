@@ -20,7 +20,7 @@ from graphslam_studies.segslam_trial import QUICK
 @lru_cache(maxsize=32)
 def court_scans(seed: int, **changes: float) -> tuple[Scans, Array, Array]:
     """Scans of a drive through the court, its dead reckoning and the truth in the level frame of its first pose."""
-    robot = crawler_preset("light", **{"beams": 31, "drift": 0.08, "max_range": 8.0, **changes})
+    robot = crawler_preset("light", **{"drift": 0.08, "max_range": 8.0, **changes})
     log = simulate_crawler(ring_hall(seed=seed), seed, robot)
     steps = make_steps(log, QUICK.steps)
     assert steps.truth is not None

@@ -140,7 +140,7 @@ def test_data_list_and_info():
 
 
 def test_doctor_finds_this_machine_in_order():
-    done = in_a_process("doctor", "--json")
+    done = graphslam("doctor", "--json")
     assert done.returncode == 0, done.stderr
     states = {c["check"]: c["state"] for c in json.loads(done.stdout)["checks"]}
     assert states["gtsam"] == "ok"
