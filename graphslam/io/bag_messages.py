@@ -215,7 +215,7 @@ def collect_messages(
                 r.values.append(_TAKE[kind](message))
             r.stamps.append(stamp)
             r.bag_stamps.append(bag_stamp)
-            r.frame = r.frame or frame.lstrip("/")
+            r.frames.append(frame.lstrip("/"))
             if kind == "odometry":
                 r.child = r.child or str(message.child_frame_id).lstrip("/")
         except (ValueError, AttributeError, TypeError, OverflowError, FormatError) as error:
@@ -227,6 +227,7 @@ def collect_messages(
     for reason, n in lost.items():
         counter.drop("clouds", reason, n)
     for kind, r in list(rows.items()):
+        r.frame = next((f for f, _ in Counter(r.frames).most_common() if f), "")
         counter.drop(kind, f"message cannot be decoded ({r.why})", r.damaged)
         if not r.values:
             del rows[kind]

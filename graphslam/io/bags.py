@@ -226,9 +226,15 @@ class _BagLog:
         return found
 
     def _kept(self, kind: str, bad: dict[str, Any]) -> tuple[Array, Any]:
-        """Stamps of the kept records, and their mask. Half may be dropped: ROS repeats and delays some messages."""
-        times = self._stamps(kind)
-        keep = usable_records(times, bad, stream=kind, where=f"{self.where}, {kind}", drops=self.counter, limit=0.5)
+        """Stamps of the kept records, and their mask. Half may be dropped: ROS repeats and delays some messages.
+
+        Several sensors, or layers of one, may share a topic: the records of one frame are kept.
+        """
+        times, r = self._stamps(kind), self.rows[kind]
+        others = np.array([bool(f) and f != r.frame for f in r.frames] or [False] * len(times))
+        bad = {f"of another frame than {r.frame!r}": others, **bad}
+        limit = 0.5 + 0.5 * float(others.mean())
+        keep = usable_records(times, bad, stream=kind, where=f"{self.where}, {kind}", drops=self.counter, limit=limit)
         return times[keep], keep
 
     def clouds(self, spool: CloudSpool, mount: tuple[float, ...] | None, timed: bool) -> PointClouds:

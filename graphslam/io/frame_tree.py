@@ -24,12 +24,13 @@ joints is smaller."""
 
 @dataclass
 class TopicRows:
-    """Values of the messages of one topic, with stamps and frames."""
+    """Values of the messages of one topic, with stamps and frames; ``frame`` is that of most of them."""
 
     stamps: list[float] = field(default_factory=list)
     bag_stamps: list[float] = field(default_factory=list)
     values: list[Any] = field(default_factory=list)
     frame: str = ""
+    frames: list[str] = field(default_factory=list)
     child: str = ""
     damaged: int = 0
     why: str = ""

@@ -191,7 +191,11 @@ class Records:
                 whole.extend(map(int, tokens[1 : 1 + integers]))
                 real.extend(map(float, tokens[1 + integers :]))
             except ValueError as error:
-                raise FormatError(f"{tokens[0]} record holds no number ({error})", where=self.where(number)) from None
+                raise FormatError(
+                    f"{tokens[0]} record holds no number ({error})",
+                    where=self.where(number),
+                    wanted="numbers with a decimal point",
+                ) from None
             except OverflowError:
                 self._impossible(number, next(t for t in tokens[1:] if not 0 <= int(t) < 2**63))
             if each:

@@ -68,12 +68,16 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
     text = read_text(path)
     rows: list[list[float]] = []
     lines: list[int] = []
+    marks = 0
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
-        if len(fields) == 9 and fields[8].isdigit():
-            fields.pop()  # RTAB-Map: pose number
+        if len(fields) == 9 and fields[8].lstrip("-").isdigit():  # RTAB-Map: number of the pose, negative: a landmark
+            number_of = int(fields.pop())
+            marks += number_of < 0
+            if number_of < 0:
+                continue
         if len(fields) != 8:
             raise FormatError(
                 "wrong number of columns",
@@ -87,6 +91,8 @@ def read_tum(path: str | os.PathLike[str], *, dim: int | None = None) -> Traject
             wanted = "numbers with a decimal point; time in seconds"
             raise FormatError(f"not a number ({error})", where=f"{where}:{number}", wanted=wanted) from None
         lines.append(number)
+    if marks:
+        log.warning("%s: %d rows of landmarks (negative numbers at their end) are not read", where, marks)
     data = np.array(rows).reshape(-1, 8)
     _refuse(~np.all(finite_mask(data), axis=1), "not finite", where, lines, rows)
     norm = np.linalg.norm(data[:, 4:], axis=1)

@@ -43,6 +43,7 @@ ROOM = np.array([6.0, 4.0, 1.5])
 """Half the size of the room [m]."""
 MOUNT = np.array([0.2, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0])
 """``T_base_scanner``."""
+REAR = np.array([-0.3, 0.1, 0.2, 0.0, 0.0, 1.0, 0.0])
 AT_BASE = np.array([0.0, 0, 0, 0, 0, 0, 1])
 SCAN, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 
@@ -74,10 +75,10 @@ def cloud(t: float, n: int = 300, lasts: float = 0.1, mount: Array = MOUNT) -> t
     return d * rays(t + after, d, mount)[:, None], after
 
 
-def scan(t: float, beams: Array) -> Array:
+def scan(t: float, beams: Array, mount: Array = MOUNT) -> Array:
     """Ranges ``(n,)`` of a planar laser."""
     d = np.column_stack([np.cos(beams), np.sin(beams), np.zeros(len(beams))])
-    return rays(np.full(len(beams), t), d)
+    return rays(np.full(len(beams), t), d, mount)
 
 
 def off_the_walls(log: SensorLog) -> float:
@@ -129,7 +130,7 @@ def bag(
 
     def make(root: Path) -> Path:
         m = Messages(ros1=ros1)
-        pairs = [("base_link", f, static) for f in ("laser", "lidar", "imu")]
+        pairs = [("base_link", f, static) for f in ("laser", "lidar", "imu")] + [("base_link", "rear", REAR)]
         rows: Rows = [("/tf_static", "tf2_msgs/msg/TFMessage", T0 - 0.05, m.transforms(T0, pairs))]
         for t in (0.05 * np.arange(-2, 2 * n + 3)).tolist():
             rows.append(("/odom", "nav_msgs/msg/Odometry", T0 + t, m.odometry(T0 + t, pose(t)[0])))
@@ -157,6 +158,20 @@ def laser(
         return "/scan", SCAN, message
 
     return make
+
+
+def two_lasers(m: Messages, t: float) -> tuple[str, str, Any]:
+    """A laser ahead and one behind, by turns on one topic."""
+    rear = round(10 * t) % 2 == 1
+    r = scan(t, BEAMS, REAR if rear else MOUNT)
+    return "/scan", SCAN, m.scan(T0 + t, r, float(BEAMS[0]), float(BEAMS[1] - BEAMS[0]), "rear" if rear else "laser")
+
+
+def two_lidars(m: Messages, t: float) -> tuple[str, str, Any]:
+    """The same with clouds."""
+    rear = round(10 * t) % 3 == 1
+    xyz, after = cloud(t, mount=REAR if rear else MOUNT)
+    return "/points", CLOUD, m.cloud(T0 + t, xyz, times=after.astype(np.float32), frame="rear" if rear else "lidar")
 
 
 def lidar(
@@ -399,6 +414,35 @@ def off_the_graph(source: Path) -> float:
     return max(far, float(np.abs(network.poses[:, :3] - pose(0.4 * np.arange(5))[:, :3]).max()))
 
 
+# ---- landmarks -------------------------------------------------------------------------------------------------------
+
+
+def tables(change: Callable[[Array, Array], Array]) -> Callable[[Path], Path]:
+    """Two tables; ``change`` the rows (stamp, id, range, bearing), given the headings at their stamps."""
+
+    def make(root: Path) -> Path:
+        small.tables(root / "csv", poses=True)
+        t, _, _, path = small.drive()
+        rows = small.sightings(t, path)
+        rows = change(rows, np.interp(rows[:, 0], t, path[:, 2]))
+        form = ("%.6f", "%d", "%.9g", "%.9g")
+        np.savetxt(root / "csv" / "sightings.csv", rows, form, ",", header="t,id,range,bearing", comments="")
+        return root / "csv"
+
+    return make
+
+
+def off_the_landmarks(source: Path) -> tuple[float, str]:
+    """Distance of 90 % of the observations, on the true path, from the landmark of their id [m]; and what is said."""
+    log = load_recording(source)
+    z, (t, _, _, path) = log["landmarks"], small.drive()
+    at = np.repeat(z.times, np.diff(z.offsets))
+    x, y, heading = (np.interp(at, t, c) for c in path.T)
+    xy = np.column_stack([x + z.ranges * np.cos(heading + z.bearings), y + z.ranges * np.sin(heading + z.bearings)])
+    far = np.linalg.norm(xy - small.LANDMARKS[np.clip(z.ids, 0, len(small.LANDMARKS) - 1)], axis=1)
+    return float(np.quantile(far, 0.9)), said_of(log)
+
+
 # ---- the strangers ---------------------------------------------------------------------------------------------------
 
 
@@ -417,7 +461,7 @@ class Stranger:
     says : str
         Pattern of the cause; with ``right`` it must be said as well.
     error : callable or None
-        Error of what was read, from the path [m]; None: :func:`off_the_walls` of the log.
+        Error of what was read, from the path [m], perhaps with what is said; None: :func:`off_the_walls` of the log.
     tolerance : float
     """
 
@@ -426,7 +470,7 @@ class Stranger:
     make: Callable[[Path], Path]
     outcome: str = "right"
     says: str = ""
-    error: Callable[[Path], float] | None = None
+    error: Callable[[Path], float | tuple[float, str]] | None = None
     tolerance: float = 0.02
 
 
@@ -442,7 +486,8 @@ def try_stranger(s: Stranger, root: Path) -> tuple[str, str]:
     source = s.make(root)
     try:
         if s.error is not None:
-            error, words = s.error(source), ""
+            found = s.error(source)
+            error, words = found if isinstance(found, tuple) else (found, "")
         else:
             log = load_recording(source)
             error, words = off_the_walls(log), said_of(log)
@@ -525,6 +570,17 @@ STRANGERS = [
         r"sort the file",
         off_the_path,
     ),
+    Stranger(
+        "rtabmap-landmarks",
+        GH + "introlab/rtabmap/issues/1199",
+        path_file(
+            lambda r: joined(
+                [["0.000000", *x[1:], str(-17 + k)] for k, x in enumerate(r[:3])]
+                + [[*x, str(k + 1)] for k, x in enumerate(r)]
+            )
+        ),
+        error=off_the_path,
+    ),
     # pose graphs
     Stranger(
         "space-in-tag",
@@ -571,6 +627,14 @@ STRANGERS = [
         r"VERTEX_TRACKXYZ",
         off_the_graph,
     ),
+    Stranger(
+        "decimal-comma",
+        GH + "introlab/rtabmap/pull/319",
+        graph_file(lambda r: [x.replace(".", ",") for x in r]),
+        "refused",
+        r"decimal point",
+        off_the_graph,
+    ),
     # planar lasers
     Stranger(
         "other-beams-at-start",
@@ -613,6 +677,9 @@ STRANGERS = [
         GH + "cartographer-project/cartographer/issues/1026",
         bag(laser(stamp=lambda t: T0 + t - (1.3227 if 1.45 < t < 1.55 else 0.0))),
         says=r"out of order|repeated",
+    ),
+    Stranger(
+        "two-lasers", GH + "SICKAG/sick_scan_xd/issues/342", bag(two_lasers), says="of another frame than 'laser'"
     ),
     # clouds with times of their points
     Stranger(
@@ -657,6 +724,12 @@ STRANGERS = [
         GH + "TixiaoShan/LIO-SAM/issues/112",
         bag(lidar(lambda t, a: (1e3 * a).astype(np.float32), "time")),
     ),
+    Stranger(
+        "two-lidars",
+        GH + "SteveMacenski/slam_toolbox/issues/462",
+        bag(two_lidars),
+        says="of another frame than 'lidar'",
+    ),
     # files of clouds
     Stranger("pcd-padding", GH + "PDAL/PDAL/issues/3254", folder(padded_pcd)),
     Stranger(
@@ -690,6 +763,26 @@ STRANGERS = [
         "las-adjusted-time",
         GH + "ASPRSorg/LAS/issues/40",
         folder(lambda p, x, a, t: las(p, x, a, T0 + t - 315_964_782.0 - 1e9), "{:.6f}.las"),
+    ),
+    # landmarks
+    Stranger("landmarks", GH + "MRPT/mrpt/issues/909", tables(lambda z, h: z), error=off_the_landmarks, tolerance=0.15),
+    Stranger(
+        "bearing-of-a-map",
+        GH + "AtsushiSakai/PythonRobotics/issues/116",
+        tables(lambda z, h: np.column_stack([z[:, :3], np.arctan2(np.sin(z[:, 3] + h), np.cos(z[:, 3] + h))])),
+        "named",
+        r"bearings are counted from the heading",
+        off_the_landmarks,
+        0.15,
+    ),
+    Stranger(
+        "one-id-for-all",
+        GH + "ros-perception/ar_track_alvar/issues/93",
+        tables(lambda z, h: z * [1, 0, 1, 1]),
+        "named",
+        r"check ids",
+        off_the_landmarks,
+        0.15,
     ),
     # IMU, GPS, transforms, bags
     Stranger("kitti-with-gaps", GH + "tomas789/kitti2bag/issues/4", kitti_with_gaps, error=off_the_stamps),
