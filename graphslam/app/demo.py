@@ -11,11 +11,11 @@ from graphslam.app.run.run import Run
 from graphslam.app.run.run_bar import RunBar
 from graphslam.app.worlds import simulate
 from graphslam.backend.back_end import Observer
-from graphslam.core.atomic import part_path
+from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import UnknownNameError
 from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
-from graphslam.plots.save import save_figure
+from graphslam.plots.save import figure_png
 from graphslam.plots.segments import plot_segments
 from graphslam_frontends.segslam.progress import SegSlamProgress
 
@@ -88,6 +88,5 @@ class DemoProgress(Observer):
             truth = truth.transformed(group_of(truth.poses).inverse(remove_roll_pitch(truth.poses[0])))
         title = f"SegSLAM after {at.length:.0f} m: {len(paths)} segments, no loop closure yet"
         ax = plot_segments(None, paths, truth=truth, title=title)
-        part = part_path(self.picture, ".png")
-        save_figure(ax, part)
-        part.replace(self.picture)
+        with atomic_open(self.picture) as stream:
+            stream.write(figure_png(ax))

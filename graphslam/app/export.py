@@ -11,18 +11,21 @@ import numpy as np
 
 from graphslam.app.export_bag import write_run_bag
 from graphslam.app.folders.generations import name_inside, new_generation
-from graphslam.app.folders.lock import lock_folder
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.remake_map import map_of_folder
 from graphslam.app.run.run import Run
+from graphslam.core.atomic import check_file_target
 from graphslam.core.errors import ConfigError, MissingDataError
 from graphslam.core.extras import import_extra
 from graphslam.core.gaussian import ellipse_rings, largest_sigmas
 from graphslam.core.geodesy import check_geodetic, enu_to_geodetic
 from graphslam.core.geometry import Array, se2_transform
+from graphslam.core.lock import lock_folder
+from graphslam.core.output_folder import check_folder_target, output_folder
 from graphslam.core.plan_view import plan_pose
 from graphslam.core.plugins import load_plugin
 from graphslam.core.se3 import se3_transform
+from graphslam.io.autoware import KIND as AUTOWARE
 from graphslam.io.autoware import write_autoware
 from graphslam.io.bag_writer import BagForm
 from graphslam.io.geographic import GeographicMap, write_geojson, write_kml
@@ -31,6 +34,7 @@ from graphslam.maps.export import save_maps
 from graphslam.maps.run_map import RunMap
 
 _RING = 36  # corners of the polygon of an ellipse
+_FLOOR_PLANS = "set of floor plans"
 
 
 def map_to_enu(run: Run, heading: float | None) -> Array:
@@ -121,11 +125,15 @@ class Writer:
     file : str or None
         Default name in the folder of the run; None: it writes a folder, whose name is required.
     needs_datum : bool
+    folder : str
+        Kind of the folder (:func:`~graphslam.core.output_folder.check_folder_target`), which is then checked before
+        the work.
     """
 
     write: Callable[[Run, Path, WriteOptions], Any]
     file: str | None
     needs_datum: bool = False
+    folder: str = ""
 
 
 def _globe(write: Callable[[Path, GeographicMap], Any], file: str) -> Writer:
@@ -138,7 +146,8 @@ def _globe(write: Callable[[Path, GeographicMap], Any], file: str) -> Writer:
 
 def _floor_plans(run: Run, path: Path, _: WriteOptions) -> None:
     made = _dense_map(run)
-    save_maps(made.fused.grid, path, bands=made.bands)
+    with output_folder(path, _FLOOR_PLANS, last=("*.yaml",)) as folder:
+        save_maps(made.fused.grid, folder, bands=made.bands)
 
 
 def _tiles(run: Run, path: Path, o: WriteOptions) -> None:
@@ -163,8 +172,8 @@ WRITERS = {
     "kitti": Writer(lambda run, path, _: write_kitti(path, run.map.trajectory), "path.kitti.txt"),
     "kml": _globe(write_kml, "map.kml"),
     "geojson": _globe(write_geojson, "map.geojson"),
-    "nav2": Writer(_floor_plans, None),
-    "autoware": Writer(_tiles, None),
+    "nav2": Writer(_floor_plans, None, folder=_FLOOR_PLANS),
+    "autoware": Writer(_tiles, None, folder=AUTOWARE),
     "mcap": Writer(_bag("mcap"), "run.mcap"),
     "ros2": Writer(_bag("ros2"), None),
 }
@@ -220,6 +229,8 @@ def export(
         The extra ``ros`` is not installed, for ``mcap`` and ``ros2``.
     RunFolderError, FormatError
         Not a finished run, or a damaged one.
+    OutputError
+        There is no place for the output.
 
     Examples
     --------
@@ -233,6 +244,10 @@ def export(
         raise ConfigError(
             f"{format} needs a datum: latitude and longitude of the GPS frame's origin, or of the first base"
         )
+    if out is not None and writer.file is not None:
+        check_file_target(out)
+    elif out is not None and writer.folder:
+        check_folder_target(out, writer.folder)
     options = WriteOptions(datum, heading, confidence)
     opened = run if isinstance(run, Run) else read_run_folder(run)
     home = opened.folder

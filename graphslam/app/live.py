@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.backend.back_end import Observer
+from graphslam.core.atomic import check_file_target
 from graphslam.core.extras import import_extra
 from graphslam.core.geometry import Array
 from graphslam.core.poses import group_of
@@ -46,8 +47,7 @@ class LiveView(Observer):
         if file is None:
             self.stream.spawn()
         else:
-            Path(file).parent.mkdir(parents=True, exist_ok=True)
-            self.stream.save(str(file))
+            self.stream.save(str(check_file_target(file)))
         self.stream.log("map", self.rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def submap_added(self, submap: Submap, graph: FactorGraph) -> None:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from graphslam.core.atomic import check_file_target
 from graphslam.core.network import PoseNetwork
 from graphslam.io.g2o import write_g2o
 from graphslam.io.isam_graph import Noise
@@ -26,6 +27,7 @@ def solve_network_file(
     create_missing: bool = False,
     starts: str | Sequence[str] | None = None,
     certificate: bool = False,
+    unwritten: list[OSError] | None = None,
     **options: Any,
 ) -> dict[str, Any]:
     """Solve a g2o, TORO or iSAM file.
@@ -50,6 +52,8 @@ def solve_network_file(
     certificate : bool
         Test whether the solution is certified as the global optimum (text in ``"certificate"``, values in
         ``"certificate_numbers"``).
+    unwritten : list, optional
+        An error of writing ``out`` is appended to it instead of raised, so that the result is not lost.
     **options
         Of :func:`graphslam.solve.network.solve.solve_network`.
 
@@ -59,13 +63,20 @@ def solve_network_file(
         JSON-serialisable. ``objective`` is ``Σ rᵀ Ω r`` without ½ and with GTSAM's residual; ``objective_g2o`` is that
         of the same solution with g2o's residual.
     """
+    if out is not None:
+        check_file_target(out)
     network = read_network(path, noise=noise, repair=repair, create_missing=create_missing)
     solution = solve_network(network, solver, starts=starts, certificate=certificate, **options)
-    if out is not None:
-        write_g2o(out, solution.to_network())
     report = solution_json(solution)
     if out is not None:
         report["out"] = str(out)
+        try:
+            write_g2o(out, solution.to_network())
+        except OSError as error:
+            if unwritten is None:
+                raise
+            unwritten.append(error)
+            report["out"] = None
     return report
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import re
@@ -14,13 +15,13 @@ from typing import IO, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from graphslam.core.errors import FormatError
+from graphslam.core.errors import FormatError, OutputError
 from graphslam.core.interrupt import defer_interrupts
 from graphslam.core.json_file import check_json, parse_json
 from graphslam.core.npz import Field, check_arrays, read_arrays
 from graphslam.core.reading import read_text
 
-_PART = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.part(\.[a-z]+)?")
+_PART = re.compile(r"\.(?P<target>.+)\.(?P<process>\d+)-[0-9a-f]{8}\.part(\.[a-z]+)?")
 
 
 def part_path(target: Path, ending: str = "") -> Path:
@@ -56,13 +57,55 @@ def sync_to_disk(path: str | os.PathLike[str]) -> None:
         os.close(handle)
 
 
+def check_file_target(path: str | os.PathLike[str]) -> Path:
+    """Check that a file can be written, before the work for it; temporary files of killed writers of it are removed.
+
+    Raises
+    ------
+    OutputError
+        The path names no file, or a folder, pipe, socket or device, or a file in a folder that is missing or read-only.
+    """
+    target = _file_target(path)
+    if not os.access(target.parent, os.W_OK | os.X_OK):
+        raise OutputError(f"{target}: the folder {target.parent} cannot be written; name a file in another folder")
+    for stray in target.parent.glob(f".{glob.escape(target.name)}.*.part*"):
+        said = _PART.fullmatch(stray.name)
+        if said is not None and said["target"] == target.name and not _runs(int(said["process"])):
+            stray.unlink(missing_ok=True)
+    return target
+
+
+def _file_target(path: str | os.PathLike[str]) -> Path:
+    target = Path(path)
+    if target.name in ("", ".."):
+        raise OutputError(f"{os.fspath(path)!r} names no file; wanted the name of a file")
+    if target.is_dir():
+        raise OutputError(f"{target}: is a folder; wanted the name of a file")
+    if target.exists() and not target.is_file():
+        raise OutputError(f"{target}: is a pipe, socket or device; wanted a regular file")
+    if not target.parent.is_dir():
+        raise OutputError(f"{target}: there is no folder {target.parent}; make it first, or name another file")
+    return target
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # of another user
+        pass
+    return True
+
+
 @contextmanager
 def atomic_open(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -> Iterator[IO[Any]]:
     """Write to a temporary name in the same folder; rename on success, remove on failure.
 
-    A reader sees the old file or the new one, never a partial one, even if the process is killed.
+    A reader sees the old file or the new one, never a partial one, even if the process is killed. Only regular files
+    are replaced. Errors of the system name the file, not the temporary one.
     """
-    target = Path(path)
+    target = _file_target(path)
     temporary = part_path(target)
     text = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
     try:
@@ -71,6 +114,11 @@ def atomic_open(path: str | os.PathLike[str], mode: Literal["wb", "w"] = "wb") -
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(target)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        if error.errno is not None and error.filename in (None, str(temporary)):
+            raise OSError(error.errno, error.strerror, str(target)) from None
+        raise
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -9,8 +10,16 @@ from typing import TYPE_CHECKING, Any
 from graphslam.core.errors import ConfigError, GraphSlamError
 from graphslam.core.extras import import_extra
 
+_ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx|inproc)://)?(\[[0-9a-fA-F:.%]+\]|[\w.-]+):\d{1,5}|inproc://[\w./-]+")
+
 if TYPE_CHECKING:
     from distributed import Client
+
+
+def check_address(address: str) -> None:
+    """Refuse what cannot be the address of a scheduler; Dask itself waits for half a minute."""
+    if not _ADDRESS.fullmatch(address):
+        raise ConfigError(f"{address!r} is no address of a Dask scheduler; wanted host:port, as 10.0.0.1:8786")
 
 
 def connect_cluster(address: str, *, timeout: float = 10.0) -> Client:
@@ -29,6 +38,7 @@ def connect_cluster(address: str, *, timeout: float = 10.0) -> Client:
         Not the process-wide default client; a context manager that the caller closes.
     """
     distributed = import_extra("distributed", "a Dask cluster")
+    check_address(address)
     try:
         client: Client = distributed.Client(address, timeout=timeout, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:

@@ -97,6 +97,10 @@ class RunFolderError(GraphSlamError):
     """A run folder cannot be written, read or resumed."""
 
 
+class OutputError(GraphSlamError):
+    """An output cannot be written where it was asked for."""
+
+
 class GridError(DataError):
     """An impossible request to an evidence grid (voxel size, shape, a place outside its cube)."""
 

@@ -14,22 +14,22 @@ from types import FrameType
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Defer Ctrl-C to the end of this block; for short blocks that must be atomic.
+    """Defer Ctrl-C, and SIGTERM if the command line handles it, to the end of this block; for short atomic blocks.
 
     Does nothing outside the main thread, which no signal interrupts.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.getsignal(signal.SIGINT)
-    if not callable(before):  # ignored, the default of the system, or not set by Python
-        yield
-        return
+    # not one that is ignored, has the default of the system, or was not set by Python
+    before = {n: h for n in (signal.SIGINT, signal.SIGTERM) if callable(h := signal.getsignal(n))}
     pending: list[tuple[int, FrameType | None]] = []
-    signal.signal(signal.SIGINT, lambda number, frame: pending.append((number, frame)))
+    for number in before:
+        signal.signal(number, lambda number, frame: pending.append((number, frame)))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         if pending:
-            before(*pending[0])
+            before[signal.Signals(pending[0][0])](*pending[0])

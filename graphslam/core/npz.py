@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.core.errors import FormatError, MissingDataError
-from graphslam.core.reading import LARGEST, check_size, finite_mask
+from graphslam.core.reading import LARGEST, check_regular, check_size, finite_mask
 
 MOST_HEADER = 1 << 16
 """Most bytes of an array header."""
@@ -72,6 +72,7 @@ def texts(*shape: int | str, optional: bool = False) -> Field:
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
     """All arrays of an npz archive. Nothing is unpickled, and at most the size limit is read."""
     where = str(path)
+    check_regular(path)
     if not Path(path).is_file():
         raise MissingDataError("no such file", where=where)
     try:
@@ -94,6 +95,8 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
                 with archive.open(m) as stream:
                     arrays[m.filename.removesuffix(".npy")] = read_npy(stream, m.file_size, m.filename)
             return arrays
+    except PermissionError as error:
+        raise MissingDataError(f"cannot be read ({error.strerror})", where=where) from None
     except (zipfile.BadZipFile, zlib.error, struct.error, NotImplementedError, RuntimeError) as error:
         raise FormatError(f"archive is truncated or corrupt ({error})", where=where) from None
     except (ValueError, EOFError, OSError, OverflowError, LookupError) as error:

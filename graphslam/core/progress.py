@@ -15,8 +15,8 @@ COMPILING = "compiling (first run only, ~1 min)"
 
 
 def printable(text: str) -> str:
-    """Text of a file or log for a terminal: control characters are replaced, line breaks are kept."""
-    return "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
+    """Text of a file or log for a terminal: control characters become escapes (``\\x1b``), line breaks are kept."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
 class Bar(tqdm):

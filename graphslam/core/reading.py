@@ -72,6 +72,12 @@ def check_size(size: int, where: str) -> None:
         )
 
 
+def check_regular(path: str | os.PathLike[str]) -> None:
+    """Refuse a pipe, socket or device, on which reading may wait for ever."""
+    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
+        raise FormatError("is a pipe, socket or device", where=str(path), wanted="a regular file")
+
+
 def read_bytes(path: str | os.PathLike[str], *, first: int | None = None) -> bytes:
     """Bytes of a file, decompressed if it starts like xz, gzip or bzip2; at most the limit is kept in memory.
 
@@ -81,6 +87,7 @@ def read_bytes(path: str | os.PathLike[str], *, first: int | None = None) -> byt
         Approximate number of bytes to read.
     """
     where = str(path)
+    check_regular(path)
     try:
         with open(path, "rb") as stream:
             head = stream.read(6)

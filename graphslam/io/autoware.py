@@ -15,9 +15,13 @@ import numpy as np
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array
+from graphslam.core.output_folder import output_folder
 
 TILE = 20.0
 """Side of a tile [m]."""
+KIND = "map in tiles"
+"""See :func:`~graphslam.core.output_folder.check_folder_target`."""
+_TILES, _PROJECTOR = "pointcloud_map_metadata.yaml", "map_projector_info.yaml"
 
 
 def write_pcd(path: str | os.PathLike[str], points: Array) -> None:
@@ -40,7 +44,7 @@ def write_autoware(
     Parameters
     ----------
     folder : path
-        Created if missing; tiles of an earlier map in it are removed.
+        New, empty, or of an earlier map, which is replaced; other files in it stay.
     points : (n, 3)
         [m]; with a datum: east, north, up relative to it; otherwise in the frame of the map.
     datum : (latitude, longitude), optional
@@ -53,11 +57,14 @@ def write_autoware(
         raise DataError("a map without a point cannot be written", where=str(folder))
     if not (tile >= 1 and tile == int(tile)):
         raise DataError("impossible side of a tile", got=tile, wanted="a whole number of metres")
-    root = Path(folder)
+    with output_folder(folder, KIND, last=(_TILES, _PROJECTOR)) as root:
+        _write_map(root, p, datum, tile)
+    return Path(folder)
+
+
+def _write_map(root: Path, p: Array, datum: tuple[float, float] | None, tile: float) -> None:
     tiles = root / "pointcloud_map.pcd"
-    tiles.mkdir(parents=True, exist_ok=True)
-    for old in tiles.glob("*.pcd"):
-        old.unlink()
+    tiles.mkdir()
     corners = np.floor(p[:, :2] / tile).astype(np.int64)
     found, which = np.unique(corners, axis=0, return_inverse=True)
     lines = [f"x_resolution: {float(tile)}", f"y_resolution: {float(tile)}"]
@@ -65,14 +72,12 @@ def write_autoware(
         x, y = (int(c * tile) for c in corner)
         write_pcd(tiles / f"{x}_{y}.pcd", p[which.ravel() == k])
         lines.append(f"{x}_{y}.pcd: [{x}, {y}]")
-    _write(root / "pointcloud_map_metadata.yaml", lines)
+    _write(root / _TILES, lines)
     if datum is None:
-        _write(root / "map_projector_info.yaml", ["projector_type: Local"])
+        _write(root / _PROJECTOR, ["projector_type: Local"])
     else:
         origin = [f"  latitude: {datum[0]!r}", f"  longitude: {datum[1]!r}", "  altitude: 0.0"]
-        projector = ["projector_type: LocalCartesian", "vertical_datum: WGS84", "map_origin:", *origin]
-        _write(root / "map_projector_info.yaml", projector)
-    return root
+        _write(root / _PROJECTOR, ["projector_type: LocalCartesian", "vertical_datum: WGS84", "map_origin:", *origin])
 
 
 def _write(path: Path, lines: list[str]) -> None:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import GeometryError
 from graphslam.core.geometry import Array
+from graphslam.core.markup import plain_text
 
 KML_NAMESPACE = "http://www.opengis.net/kml/2.2"
 _DIGITS = 9  # decimals of a degree: 0.1 mm
@@ -117,7 +118,7 @@ def _tag(name: str) -> str:
 
 def _child(parent: ET.Element, name: str, text: str | None = None, **attributes: str) -> ET.Element:
     element = ET.SubElement(parent, _tag(name), attributes)
-    element.text = text
+    element.text = None if text is None else plain_text(text)  # XML has no control characters
     return element
 
 

@@ -8,7 +8,6 @@ poses and, if bases are levelled, two rotations of the up direction. The first b
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from graphslam.core.atomic import write_npz
+from graphslam.core.output_folder import output_folder
 from graphslam.core.trajectory import Trajectory
 from graphslam.io.tum import write_tum
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from graphslam.join.submap_solver import SubmapEstimate
 
 JOINED_FORMAT = "graphslam.joined/2"
+KIND = "joined map"
+"""See :func:`~graphslam.core.output_folder.check_folder_target`."""
 
 
 def write_joined(
@@ -44,8 +46,6 @@ def write_joined(
     state : {"vector", "tangent"}
         Coordinates of the uncertainty.
     """
-    root = Path(folder)
-    root.mkdir(parents=True, exist_ok=True)
     stamps = np.asarray(times, dtype=np.float64)
     arrays = {
         "format": JOINED_FORMAT,
@@ -65,5 +65,6 @@ def write_joined(
         arrays |= {f"information_{part}": getattr(A, part) for part in ("data", "indices", "indptr")}
     elif covariance is not None:
         arrays["covariance"] = covariance
-    write_npz(root / "joined.npz", arrays)
-    write_tum(root / "nodes.tum", Trajectory(stamps, estimate.poses))
+    with output_folder(folder, KIND, last=("joined.npz",)) as new:
+        write_npz(new / "joined.npz", arrays)
+        write_tum(new / "nodes.tum", Trajectory(stamps, estimate.poses))

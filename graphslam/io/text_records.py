@@ -13,6 +13,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import NoReturn
@@ -20,11 +21,16 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
+from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import FormatError, MissingDataError
 from graphslam.core.geometry import Array
 from graphslam.core.reading import LARGEST, finite_mask, read_text
 
-_WRITERS: dict[str, Callable[[bytes], bytes]] = {".xz": lzma.compress, ".gz": gzip.compress, ".bz2": bz2.compress}
+_WRITERS: dict[str, Callable[[bytes], bytes]] = {
+    ".xz": lzma.compress,
+    ".gz": partial(gzip.compress, mtime=0),
+    ".bz2": bz2.compress,
+}
 
 
 def find_text_file(folder: str | os.PathLike[str], name: str) -> Path:
@@ -96,9 +102,8 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     data = text.encode("utf-8")
     if p.suffix in _WRITERS:
         data = _WRITERS[p.suffix](data)
-    temporary = p.with_name(p.name + ".tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, p)
+    with atomic_open(p) as stream:
+        stream.write(data)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from graphslam.core.atomic import atomic_open, read_json, sweep_parts, write_json
 from graphslam.core.errors import DataError, FormatError, MissingDataError
 from graphslam.core.npz import read_arrays
+from graphslam.core.reading import check_regular
 
 FORMAT = "graphslam.tiles/1"
 _INDEX = "tiles.json"
@@ -192,6 +193,7 @@ def stored_arrays(folder: Path, name: str) -> dict[str, npt.NDArray[Any]]:
         raise FormatError("name of a file of arrays", where=str(folder), got=name, wanted="<digest>.arrays")
     if not path.is_file():
         raise MissingDataError("file of arrays is missing", where=str(path))
+    check_regular(path)
     if _digest(path.read_bytes()) != path.stem:
         raise FormatError("file was changed: its digest is not its name", where=str(path))
     return read_arrays(path)

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from graphslam.app.folders.generations import new_generation
-from graphslam.app.folders.lock import lock_folder
 from graphslam.app.report.report import make_report
 from graphslam.app.run.folder import RunFolder
 from graphslam.app.run.loops import loops_of_run
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.submap_sources import submap_source
 from graphslam.core.errors import FormatError, GraphSlamError, RunFolderError, UnknownNameError
+from graphslam.core.lock import lock_folder
 from graphslam.io.log_store import load_log
 from graphslam.io.submap_store import read_submaps
 from graphslam_studies.montecarlo.study import open_study

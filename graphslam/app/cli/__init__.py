@@ -1,6 +1,7 @@
 """The command line: commands, exit codes, and conversion of errors to one line of text.
 
-Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage; 130 interrupted, with the command to resume.
+Exit codes: 0 done; 1 a known error, one line on stderr; 2 wrong usage; 130 interrupted (143 by SIGTERM), with the
+command to resume.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 import errno
 import os
 import shlex
+import signal
 import sys
+import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -28,14 +31,17 @@ from graphslam.app.cli import results as cli_results
 from graphslam.app.cli import run as cli_run
 from graphslam.app.cli import sessions as cli_sessions
 from graphslam.app.cli import tools as cli_tools
-from graphslam.app.cli.terminal import be_quiet, be_verbose, log_to_stderr, outlive_stderr
+from graphslam.app.cli.terminal import be_quiet, be_verbose, log_to_stderr, outlive_streams
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.plugins import IN_STUDIES, load_plugin, plugins
 from graphslam.core.progress import printable, shown_bars
 
 
 class Interrupted(Exception):
-    """Ctrl-C. Typer handles ``KeyboardInterrupt`` itself and would exit without a message."""
+    """Ctrl-C or SIGTERM. Typer handles ``KeyboardInterrupt`` itself and would exit without a message."""
+
+
+_HOW = {int(signal.SIGINT): "interrupted", int(signal.SIGTERM): "terminated"}
 
 
 COMMANDS = "graphslam.commands"
@@ -147,7 +153,7 @@ class AllCommands(Commands):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            raise Interrupted from None
+            raise Interrupted("interrupted") from None
 
 
 app = typer.Typer(
@@ -185,38 +191,109 @@ app.add_typer(cli_data.app, name="data", cls=Commands)
 
 
 def main() -> None:
-    """Entry point ``graphslam``."""
-    outlive_stderr()
+    """The command line, from its arguments to its exit code; see :mod:`graphslam.__main__` for the entry point."""
+    outlive_streams()
+    heard: list[int] = []
+    _hear_signals(heard)
     try:
         app()
     except BrokenPipeError:  # `graphslam … | head`
         sys.stderr.close()
         sys.exit(1)
-    except (GraphSlamError, OSError, MemoryError, RecursionError, KeyboardInterrupt, Interrupted) as error:
-        for bar in shown_bars():
-            bar.close()
-        typer.echo(f"graphslam: {error_line(error)}", err=True)
-        _drop_output()
-        sys.exit(130 if isinstance(error, (KeyboardInterrupt, Interrupted)) else 1)
+    except (Exception, KeyboardInterrupt) as error:
+        if heard:  # also if a library made another error of it, as at its import
+            _fail(Interrupted(_HOW[heard[-1]]), 128 + heard[-1])
+        if isinstance(error, (KeyboardInterrupt, Interrupted)):
+            _fail(error, 130)
+        if not isinstance(error, (GraphSlamError, OSError, MemoryError, RecursionError)) and not lacks_memory(error):
+            raise
+        _fail(error, 1)
+    finally:
+        _forget_signals()
+
+
+def _fail(error: BaseException, code: int) -> NoReturn:
+    _forget_signals()  # a second Ctrl-C ends the process at once
+    for bar in shown_bars():
+        bar.close()
+    typer.echo(f"graphslam: {error_line(error)}", err=True)
+    _drop_output()
+    sys.exit(code)
+
+
+def _forget_signals() -> None:
+    if threading.current_thread() is threading.main_thread():
+        for number in _HOW:
+            if callable(signal.getsignal(number)):
+                signal.signal(number, signal.SIG_DFL)
+
+
+def _hear_signals(heard: list[int]) -> None:
+    """SIGTERM ends a command as Ctrl-C does, so that no temporary file is left; ``heard`` gets the numbers.
+
+    A signal that falls into a callback, where Python prints a traceback and goes on, is raised again.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+
+    def interrupt(number: int, _: Any) -> NoReturn:
+        heard.append(number)
+        raise KeyboardInterrupt
+
+    for number in _HOW:
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, interrupt)
+    known = sys.unraisablehook
+
+    def unraisable(what: Any) -> None:
+        if isinstance(what.exc_value, KeyboardInterrupt):
+            signal.raise_signal(heard[-1] if heard else signal.SIGINT)
+        elif not isinstance(what.exc_value, MemoryError):
+            known(what)
+
+    sys.unraisablehook = unraisable
+
+
+_NO_MEMORY = ("cannot allocate memory", "can't start new thread", "bad_alloc", "bad allocation", "out of memory")
+
+
+def lacks_memory(error: BaseException | None) -> bool:
+    """Whether the system refused memory: an import, a thread or a library says so in its own words."""
+    while error is not None:
+        said = str(error).lower()
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+            return True
+        if any(words in said for words in _NO_MEMORY):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def error_line(error: BaseException) -> str:
     """Message of an error: our own unchanged, system errors with advice."""
     if isinstance(error, (KeyboardInterrupt, Interrupted)):
-        return f"interrupted; {_go_on(sys.argv[1:])}"
-    if isinstance(error, MemoryError):  # NumPy's message has the requested size
-        return f"not enough memory; use a smaller part of the data, or a machine with more memory. {error}".strip()
+        return f"{str(error) or 'interrupted'}; {_go_on(sys.argv[1:])}"
+    said = printable(" ".join(str(error).split()))
+    if isinstance(error, GraphSlamError):
+        return said
+    if lacks_memory(error):  # NumPy's message has the requested size
+        return f"not enough memory; use a smaller part of the data, or a machine with more memory. {said}".strip()
     if isinstance(error, RecursionError):
         return "an input file is nested too deeply; check the input files for a damaged one"
     if isinstance(error, OSError):
         files = [str(f) for f in (error.filename, error.filename2) if f is not None]
-        advice = _ADVICE.get(error.errno or 0, "")
-        return printable(f"{': '.join([*files, error.strerror or str(error)])}{advice}")
-    return printable(" ".join(str(error).split()))
+        return printable(f"{': '.join([*files, error.strerror or str(error)])}{_advice(error.errno)}")
+    return said
+
+
+def _advice(number: int | None) -> str:
+    if number in (errno.ENOSPC, errno.EDQUOT):
+        return f"; free disk space; {_go_on(sys.argv[1:])}"
+    return _ADVICE.get(number or 0, "")
 
 
 def _go_on(arguments: list[str]) -> str:
-    """How to resume an interrupted command."""
+    """How to resume a command that did not end."""
     command = shlex.join(["graphslam", *arguments])
     verb = next((a for a in arguments if not a.startswith("-")), "")
     if verb == "run":
@@ -236,8 +313,6 @@ def _drop_output() -> None:
 
 
 _ADVICE = {
-    errno.ENOSPC: "; free disk space and run the same command again: finished parts are saved",
-    errno.EDQUOT: "; free disk space and run the same command again: finished parts are saved",
     errno.EFBIG: "; increase the file size limit (ulimit -f)",
     errno.EMFILE: "; increase the limit of open files (ulimit -n)",
 }

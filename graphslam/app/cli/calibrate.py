@@ -7,8 +7,8 @@ from pathlib import Path
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, PRESET, READER, READER_OPTION, reader_options, run_options
-from graphslam.app.cli.terminal import print_result
-from graphslam.core.atomic import atomic_open
+from graphslam.app.cli.terminal import write_and_print
+from graphslam.core.atomic import atomic_open, check_file_target
 from graphslam.core.config import dump_toml
 
 
@@ -36,6 +36,8 @@ def calibrate_command(
     """Estimate sensor noise, biases and scale factors from a log (no ground truth needed)."""
     from graphslam.app.run.calibration import calibrate_log
 
+    if out is not None:
+        check_file_target(out)
     options = run_options(config, setting)
     given = reader_options(reader_option)
     found = calibrate_log(
@@ -49,8 +51,12 @@ def calibrate_command(
         preset=preset,
     )
     lines = [f"{f.level or '-':4}  {f.text}" for f in found.findings()]
-    if out is not None:
-        with atomic_open(out, "w") as file:
-            file.write(dump_toml({"calibrate": found.config()}))
-        lines.append(f"written to {out}: graphslam run {source} --config {out}")
-    print_result(found.as_dict() | {"out": None if out is None else str(out)}, "\n".join(lines), as_json=as_json)
+    value, text = found.as_dict() | {"out": None if out is None else str(out)}, "\n".join(lines)
+
+    def write() -> None:
+        if out is not None:
+            with atomic_open(out, "w") as file:
+                file.write(dump_toml({"calibrate": found.config()}))
+
+    said = "" if out is None else f"written to {out}: graphslam run {source} --config {out}"
+    write_and_print(write, value, text, said, as_json=as_json)

@@ -9,7 +9,8 @@ from typing import Any
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE
-from graphslam.app.cli.terminal import print_result, text_table, verdict_text
+from graphslam.app.cli.terminal import print_result, text_table, verdict_text, write_and_print
+from graphslam.core.atomic import atomic_open, check_file_target
 
 SUBMAP_POSES = typer.Option(
     None, "--submap-poses", help="Cut a pose-graph file into submaps with this number of poses."
@@ -47,11 +48,17 @@ def join_command(
     from graphslam.app.compare import JSON_COLUMNS, join_json, submap_keys
     from graphslam.app.join_verdict import join_headline, join_verdict
     from graphslam.app.submap_sources import submap_source
+    from graphslam.core.cluster import check_address
+    from graphslam.core.output_folder import check_folder_target
     from graphslam.core.trajectory import Trajectory
-    from graphslam.io.joined_map import write_joined
+    from graphslam.io.joined_map import KIND, write_joined
     from graphslam.join.registry import compile_method, methods_for, prepare_submaps
     from graphslam.join.registry import join_by_method as join_by
 
+    if out is not None:
+        check_folder_target(out, KIND)
+    if cluster is not None:
+        check_address(cluster)
     s = submap_source(source, submap_poses=submap_poses)
     factor = s.covariance_scale if scale is None else scale
     material = prepare_submaps(s.material, associate=associate, covariance_scale=factor)
@@ -73,14 +80,18 @@ def join_command(
     truth = s.truth if associate == "given" else None
     value: dict[str, Any] = join_json(material, method, estimate, truth=truth, own=own if polish and filters else None)
     plain = isinstance(material, Sequence)
-    if out is not None:
-        write_joined(out, s.times, estimate, "vector" if plain else "tangent")
     found = join_verdict(value["methods"][0], estimate)
     length = Trajectory(np.arange(len(estimate.poses), dtype=np.float64), estimate.poses).length()
     said = join_headline(value["methods"][0], found, submaps=len(submap_keys(material)), length=length)
     value |= {"headline": said.text, "verdict": [f.as_row() for f in found]}
     text = "\n".join([text_table(value["methods"], JSON_COLUMNS), *verdict_text(said, found)])
-    print_result(value, text, as_json=as_json)
+    if out is None:
+        return print_result(value, text, as_json=as_json)
+
+    def write() -> None:
+        write_joined(out, s.times, estimate, "vector" if plain else "tangent")
+
+    write_and_print(write, {**value, "out": str(out)}, text, f"written to {out}", as_json=as_json)
 
 
 def compare_command(
@@ -110,6 +121,8 @@ def compare_command(
     from graphslam.app.verdict.figures import CONFIDENCE
     from graphslam.evaluate.residual_consistency import two_sided_bounds
 
+    if figure is not None:
+        check_file_target(figure)
     s = submap_source(source, submap_poses=submap_poses)
     options: dict[str, Any] = {"covariance_scale": s.covariance_scale if scale is None else scale}
     names = tuple(m.strip() for m in methods.split(",")) if methods else comparing.default_methods(s.material)
@@ -124,11 +137,6 @@ def compare_command(
         **options,
     )
     value: dict[str, Any] = comparing.methods_json(found)
-    if figure is not None:
-        from graphslam.plots.comparison import comparison_figure
-        from graphslam.plots.save import save_figure
-
-        save_figure(comparison_figure(found), figure)
     said = compare_verdict(value["methods"])
     value["verdict"] = [f.as_row() for f in said]
     text = [text_table(comparing.comparison_rows(value["methods"])), *(f.text for f in said)]
@@ -137,4 +145,14 @@ def compare_command(
     elif n := found["nees_dof"].iloc[0]:
         low, high, _ = two_sided_bounds(1.0, float(n), CONFIDENCE)
         text.append(f"NEES/n of a consistent map: [{low:.3g}, {high:.3g}] in 95 % of the runs (n = {n}).")
-    print_result(value, "\n".join(text), as_json=as_json)
+    if figure is None:
+        return print_result(value, "\n".join(text), as_json=as_json)
+    from graphslam.plots.comparison import comparison_figure
+    from graphslam.plots.save import figure_png
+
+    def write() -> None:
+        with atomic_open(figure) as stream:
+            stream.write(figure_png(comparison_figure(found)))
+
+    value["figure"] = str(figure)
+    write_and_print(write, value, "\n".join(text), f"plot: {figure}", as_json=as_json, key="figure")

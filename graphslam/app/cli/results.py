@@ -66,6 +66,7 @@ def report_command(
 ) -> None:
     """Write one self-contained HTML page of a run: verdict, plots, metrics, graph, loop closures, ledger, events."""
     from graphslam.app.report.report import report_and_file
+    from graphslam.core.errors import FormatError
 
     made, file = report_and_file(run, out)
     size = file.stat().st_size
@@ -78,6 +79,8 @@ def report_command(
             lines.append("no browser found; open the file by hand")
     value = {"run": str(run), "page": str(file), "kind": made.kind, "bytes": size, "missing": made.problems}
     print_result(value, "\n".join(lines), as_json=as_json)
+    if made.damage:
+        raise FormatError(f"the result is damaged: {made.damage}", where=str(run))
 
 
 def export_command(

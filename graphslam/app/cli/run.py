@@ -10,6 +10,7 @@ from typing import Any
 import typer
 
 from graphslam.app.cli.terminal import print_result, text_table, verdict_text
+from graphslam.core.atomic import check_file_target
 from graphslam.core.config import merge_options, parse_setting, read_toml
 from graphslam.core.reading import set_size_limit
 
@@ -102,6 +103,8 @@ def run_command(
     from graphslam.app.run.run_bar import RunBar
     from graphslam.app.run.source import load
 
+    if live_file is not None:
+        check_file_target(live_file)
     options = run_options(config, setting)
     if preset is not None:
         options["preset"] = preset
@@ -261,9 +264,10 @@ def simulate_command(
     """Simulate a robot in a world and write its log, with ground truth and all noise parameters."""
     from graphslam.app.worlds import simulate as make
     from graphslam.app.worlds import write_simulated
-    from graphslam.io.log_folder import check_log_folder
+    from graphslam.core.output_folder import check_folder_target
+    from graphslam.io.log_folder import KIND
 
-    check_log_folder(out)
+    check_folder_target(out, KIND)
     changes: dict[str, Any] = {}
     for text in setting:
         changes |= parse_setting(text)

@@ -7,11 +7,12 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import typer
 
+from graphslam.core.errors import GraphSlamError
 from graphslam.core.findings import Finding, Findings
 from graphslam.core.json_file import json_values
 from graphslam.core.progress import Bar, printable
@@ -20,6 +21,32 @@ from graphslam.core.progress import Bar, printable
 def print_result(value: Mapping[str, Any], text: str, *, as_json: bool) -> None:
     """Print ``value`` as one JSON object, or ``text``."""
     typer.echo(json.dumps(json_values(value), allow_nan=False) if as_json else printable(text))
+
+
+def write_and_print(
+    write: Callable[[], Any], value: Mapping[str, Any], text: str, written: str, *, as_json: bool, key: str = "out"
+) -> None:
+    """Write the file of a result, and print the result, also if the file could not be written.
+
+    Parameters
+    ----------
+    written : str
+        Last line of the text if the file was written.
+    key : str
+        Of the file in ``value``; None there if it was not written.
+    """
+    failed: Exception | None = None
+    try:
+        write()
+    except (GraphSlamError, OSError, MemoryError) as error:
+        failed = error
+    print_result(
+        {**value, key: None} if failed else value,
+        text if failed or not written else f"{text}\n{written}",
+        as_json=as_json,
+    )
+    if failed is not None:
+        raise failed
 
 
 def text_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
@@ -83,8 +110,15 @@ class _Lost(io.FileIO):
             return len(data)
 
 
-def outlive_stderr() -> None:
-    """Continue if stderr is closed, full, or a broken pipe: messages are lost, the result is not."""
+def outlive_streams() -> None:
+    """Continue if stderr is closed, full, or a broken pipe: messages are lost, the result is not. A closed stdout is
+    the wish of the caller: the result is then in the files only."""
+    if sys.stdout is None:  # otherwise the next opened file would get descriptor 1
+        try:
+            os.fstat(1)
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if sys.stderr is None:
         try:
             os.fstat(2)

@@ -62,6 +62,7 @@ def solve_command(
             )
         path = found
     names = None if starts is None else "all" if starts == "all" else starts.split(",")
+    unwritten: list[OSError] = []
     value = solve_network_file(
         path,
         solver,
@@ -71,8 +72,11 @@ def solve_command(
         out=out,
         starts=names,
         certificate=certify,
+        unwritten=unwritten,
     )
     print_result(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
+    if unwritten:
+        raise unwritten[0]
 
 
 def relax_command(
@@ -82,9 +86,13 @@ def relax_command(
     as_json: bool = JSON,
 ) -> None:
     """Relax a pose graph that is larger than memory: a chain with loops, in tiles on disk."""
+    from graphslam.core.lock import lock_folder
     from graphslam.skeleton.chain_tiles import relax_tiles
 
-    found = relax_tiles(folder, workers=workers, cluster=cluster)
+    if not folder.is_dir():
+        raise MissingDataError("no such folder", where=str(folder))
+    with lock_folder(folder):
+        found = relax_tiles(folder, workers=workers, cluster=cluster)
     value = {
         "folder": str(folder),
         "tiles": len(found.names),

@@ -30,10 +30,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from graphslam.app.folders.lock import LOCK, is_lock, lock_folder
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.core.atomic import is_part, part_path, sweep_parts, sync_to_disk
 from graphslam.core.errors import FormatError, GraphSlamError
+from graphslam.core.lock import LOCK, is_lock, lock_folder
 
 GENERATIONS, CURRENT = "generations", "current"
 OWNED = (

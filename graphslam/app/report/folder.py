@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,15 +10,27 @@ from typing import Any, Literal, TypeVar
 
 import pandas as pd
 
-from graphslam.app.run.files import read_events, read_ledger, read_merge_report, read_metrics, read_options, read_report
+from graphslam.app.run.files import (
+    read_events,
+    read_ledger,
+    read_map,
+    read_merge_report,
+    read_metrics,
+    read_options,
+    read_report,
+)
 from graphslam.core.atomic import read_json
-from graphslam.core.errors import GraphSlamError, MissingDataError, RunFolderError
+from graphslam.core.errors import FormatError, GraphSlamError, MissingDataError, RunFolderError
+from graphslam.core.npz import read_arrays
+from graphslam.core.reading import check_regular
 from graphslam.io.submap_store import SubmapStore
 from graphslam.loops.ledger import LoopLedger, ledger_of_events
 
 Kind = Literal["run", "interrupted", "merged"]
 T = TypeVar("T")
 _PNG_HEAD, _PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+RESULT = ("run.json", "merge.json", "metrics.json", "map.npz", "merged.npz", "submaps/index.json", "submaps")
+"""Parts without which a finished run is damaged."""
 MOST_BYTES = 8_000_000
 """A larger picture is not included in the page [bytes]."""
 
@@ -56,6 +69,10 @@ class ReportFolder:
     problems: dict[str, str] = field(default_factory=dict)
     """Part of the folder → why it is not in the report."""
 
+    def damage(self) -> str:
+        """What is wrong with the result of a finished run; empty if nothing is."""
+        return "; ".join(f"{n} {self.problems[n]}" for n in RESULT if n in self.problems and self.kind != "interrupted")
+
     @property
     def name(self) -> str:
         """Source of the run, or names of the merged sessions."""
@@ -92,9 +109,11 @@ class ReportFolder:
             if file.name.startswith("."):
                 continue
             try:
+                check_regular(file)
                 data = file.read_bytes()
-            except OSError as error:
-                self.problems[f"figures/{file.name}"] = f"cannot be read ({error.strerror})"
+            except (OSError, FormatError) as error:
+                why = error.what if isinstance(error, FormatError) else f"cannot be read ({error.strerror})"
+                self.problems[f"figures/{file.name}"] = why
                 continue
             if not (data.startswith(_PNG_HEAD) and data.endswith(_PNG_TAIL)):
                 self.problems[f"figures/{file.name}"] = "is no whole PNG file"
@@ -139,6 +158,9 @@ def read_folder(path: str | Path, root: Path) -> ReportFolder:
         for name in ("run.json", "metrics.json", "events.jsonl", "ledger.csv"):
             out.problems[name] = "is missing; it is written when a run is finished"
         return out
+    attempt("map.npz" if kind == "run" else "merged.npz", lambda: _result(root, kind), None)
+    if kind == "run":
+        attempt("submaps", lambda: _submap_files(home, out.submaps), None)
     out.metrics = attempt("metrics.json", lambda: _metrics(root, "metrics.json"), [])
     out.metrics += attempt("timings.json", lambda: _metrics(root, "timings.json"), [])
     out.events = attempt("events.jsonl", lambda: read_events(root), None)
@@ -158,6 +180,22 @@ def _options(root: Path) -> dict[str, Any]:
     if not (root / "config.toml").exists():
         raise MissingDataError("no such file", where="config.toml")
     return read_options(root)
+
+
+def _result(root: Path, kind: Kind) -> None:
+    if kind == "run":
+        read_map(root)
+    else:
+        read_arrays(root / "merged.npz")
+
+
+def _submap_files(home: Path, entries: list[dict[str, Any]]) -> None:
+    """Refuse a store of which a file is missing or cut; what is in them is not read."""
+    for entry in entries:
+        file = home / "submaps" / str(entry.get("file"))
+        check_regular(file)
+        if not zipfile.is_zipfile(file):
+            raise FormatError("is missing or cut", where=f"submaps/{file.name}")
 
 
 def _metrics(root: Path, name: str) -> list[dict[str, Any]]:

@@ -25,7 +25,7 @@ from graphslam.app.report.sections import (
     verdict_lines,
     what_was_run,
 )
-from graphslam.core.atomic import atomic_open
+from graphslam.core.atomic import atomic_open, check_file_target
 from graphslam.core.errors import GraphSlamError, RunFolderError
 from graphslam.core.markup import html_element, plain_text
 
@@ -60,11 +60,14 @@ class Report:
         Of the folder.
     problems : dict of str to str
         Part of the folder → why it is not in the page.
+    damage : str
+        What is wrong with the result itself; empty if nothing is.
     """
 
     html: str
     kind: Kind
     problems: dict[str, str]
+    damage: str = ""
 
     def _repr_html_(self) -> str:
         """The page in a notebook, isolated from the notebook's own style and scripts."""
@@ -90,7 +93,7 @@ def _page(home: Path, root: Path) -> Report:
         scene=shown,
         parts={name: made for name, part in _PARTS.items() if (made := part(found))},
     )
-    return Report(html, found.kind, dict(found.problems))
+    return Report(html, found.kind, dict(found.problems), found.damage())
 
 
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
@@ -106,6 +109,8 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
 
 def report_and_file(folder: str | Path, out: str | Path | None = None) -> tuple[Report, Path]:
     """Write the page of a folder; returns the page and its file. See :func:`write_report`."""
+    if out is not None:
+        check_file_target(out)
     home, report = Path(folder), make_report(folder)
     name = PAGE if out is None else name_inside(home, out)
     if name is None:

@@ -337,6 +337,8 @@ def verdict_lines(folder: ReportFolder) -> tuple[Finding, list[Finding]]:
         found = interruption_lines(folder)
         return headline(found, [stopping_line(folder)]), found
     found = run_findings(metrics_of_folder(folder))
+    if damage := folder.damage():
+        found.insert(0, Finding("bad", "folder-damaged", f"files of the result are missing or damaged: {damage}."))
     return summarise_run(metrics_of_folder(folder), found), found
 
 

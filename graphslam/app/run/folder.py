@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from graphslam.app.folders.generations import check_links, current_outputs, is_empty, remove_stale_files
-from graphslam.app.folders.lock import lock_folder, make_folder
 from graphslam.app.run.files import removed_loops_of_run
 from graphslam.core.atomic import atomic_open, read_json, write_json
 from graphslam.core.config import dump_toml, read_toml
 from graphslam.core.errors import ConfigError, RunFolderError
+from graphslam.core.lock import lock_folder, make_folder
 from graphslam.core.reading import resolve_inside
 from graphslam.io.submap_store import GridLoader, SubmapStore
 from graphslam.loops.ledger import LoopDecision
@@ -69,24 +69,42 @@ class RunFolder:
         if path is None:
             yield None
             return
+        cls.check(path, resume=resume)
         folder = cls(path)
         make_folder(folder.path)
-        if not (folder.path / CONFIG).is_file() and not is_empty(folder.path):  # before a lock file is created
-            raise RunFolderError(f"{folder.path}: not empty and not a run folder; choose another --out")
         with lock_folder(folder.path):
             check_links(folder.path)
             old = folder.path / CONFIG
             if folder._begun():
-                if not resume:
-                    raise RunFolderError(
-                        f"{folder.path}: holds a run already; resume it with --resume, or choose another --out"
-                    )
+                folder._refuse_second(resume)
                 folder._check_same(old, config)
             else:
                 folder.describe(config)
             folder._undo_settling()
             remove_stale_files(folder.path)
             yield folder
+
+    @classmethod
+    def check(cls, path: str | os.PathLike[str] | None, *, resume: bool) -> None:
+        """Check that a run can be written into a folder, before the work for it."""
+        if path is None:
+            return
+        folder = cls(path)
+        place = next(p for p in (folder.path, *folder.path.absolute().parents) if os.path.lexists(p))
+        if not place.is_dir():
+            raise RunFolderError(f"{folder.path}: cannot be made: {place} is no folder; choose another --out")
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise RunFolderError(f"{folder.path}: {place} cannot be written; choose another --out")
+        if not folder.path.is_dir():
+            return
+        if not (folder.path / CONFIG).is_file() and not is_empty(folder.path):  # before a lock file is created
+            raise RunFolderError(f"{folder.path}: not empty and not a run folder; choose another --out")
+        if folder._begun():
+            folder._refuse_second(resume)
+
+    def _refuse_second(self, resume: bool) -> None:
+        if not resume:
+            raise RunFolderError(f"{self.path}: holds a run already; resume it with --resume, or choose another --out")
 
     def describe(self, config: Mapping[str, Any]) -> None:
         """Write the configuration again, with the digest of the complete log."""

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from graphslam.app.folders.generations import current_outputs, new_generation
-from graphslam.app.folders.lock import lock_folder
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.app.report.report import add_report
 from graphslam.app.run.outputs import read_run_folder
 from graphslam.app.run.run import Run
+from graphslam.core.lock import lock_folder
 from graphslam.core.log import SensorLog
 
 

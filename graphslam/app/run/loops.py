@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from graphslam.app.folders.lock import lock_folder
 from graphslam.app.run.files import loops_of_run, removed_loops_of_run
 from graphslam.app.run.reopened import rerun_without_loops
 from graphslam.core.errors import DataError
+from graphslam.core.lock import lock_folder
 from graphslam.loops.candidates import FRONT_END
 from graphslam.loops.ledger import LoopDecision, LoopLedger
 from graphslam.loops.overlap_constraints import overlap_entries

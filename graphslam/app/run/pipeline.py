@@ -79,6 +79,7 @@ def run(
     1.0
     """
     check_names(None if isinstance(source, SensorLog) else frontend, solver)
+    RunFolder.check(out, resume=resume)
     bar, watch = bar_among(progress)
     with one_blas_thread(), bar:
         clock = RunClock()

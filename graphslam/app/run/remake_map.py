@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphslam.app.folders.generations import current_outputs, new_generation
-from graphslam.app.folders.lock import lock_folder
 from graphslam.app.hypotheses import (
     MinimumEntropyMap,
     minimum_entropy_loops,
@@ -20,6 +19,7 @@ from graphslam.app.run.outputs import read_run_folder, refined_submaps_of
 from graphslam.app.run.run import Run
 from graphslam.core.config import build_config, merge_options
 from graphslam.core.errors import ConfigError, MissingDataError
+from graphslam.core.lock import lock_folder
 from graphslam.core.log import SensorLog
 from graphslam.evidence.spilled_grid import load_spilled
 from graphslam.io.submap_store import read_submaps

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from graphslam.app.folders.generations import read_consistently
-from graphslam.app.folders.lock import lock_folder
 from graphslam.app.machine import one_blas_thread
 from graphslam.app.run.attempts import best_map
 from graphslam.app.run.files import read_report, removed_loops_of_run
@@ -18,6 +17,7 @@ from graphslam.app.run.run_bar import RunBar
 from graphslam.app.run.run_inputs import read_inputs
 from graphslam.app.run.stages import RunClock
 from graphslam.app.run.submap_slam import SubmapSlam
+from graphslam.core.lock import lock_folder
 from graphslam.core.record_source import RecordSource
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.loops.ledger import LoopDecision

@@ -33,6 +33,7 @@ CONSISTENCY_CODES = frozenset(
 bad, it is wrong."""
 
 ADVICE: dict[str, str] = {
+    "folder-damaged": "copy the whole folder again, or repeat the run with --resume",
     # errors in the log come first: everything else may follow from them
     "unreadable": "give a log that can be read",
     "refused": "correct the log as the error says",

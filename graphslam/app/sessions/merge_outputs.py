@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.app.folders.generations import FolderTransaction, current_outputs, is_empty, new_generation
-from graphslam.app.folders.lock import lock_folder, make_folder
 from graphslam.app.report.report import add_report
 from graphslam.app.run.files import MERGED_DENSE_FORMAT, MERGED_FORMAT
 from graphslam.app.run.outputs import graph_metrics, landmarks_csv
@@ -18,6 +17,7 @@ from graphslam.app.sessions.merge_dense import MergedSubmaps
 from graphslam.app.sessions.merged_map import MergedMap
 from graphslam.core.atomic import write_npz
 from graphslam.core.errors import RunFolderError
+from graphslam.core.lock import lock_folder, make_folder
 from graphslam.evaluate.residual_consistency import class_consistency
 from graphslam.io.tum import write_tum
 from graphslam.plots.save import save_figure

@@ -55,7 +55,7 @@ def in_the_data() -> None:
         (too_much, "graphslam: not enough memory; .* Unable to allocate 7.28 PiB .*"),
         (
             no_room,
-            "graphslam: run/map.npz: No space left on device; free disk space and run the same .*",
+            "graphslam: run/map.npz: No space left on device; free disk space; .*",
         ),
         (
             no_files_left,
@@ -96,8 +96,7 @@ def test_a_full_file_system_behind_the_output_is_one_line() -> None:
         code, err = verb("data", "list", stdout=full.fileno())
     assert (code, err) == (
         1,
-        "graphslam: No space left on device; free disk space and run the same command again: "
-        "finished parts are saved\n",
+        "graphslam: No space left on device; free disk space; existing files are unchanged\n",
     )
 
 

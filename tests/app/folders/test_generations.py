@@ -13,9 +13,9 @@ import pytest
 
 from graphslam.app.folders import generations
 from graphslam.app.folders.generations import check_same, current_outputs, is_empty, new_generation, read_consistently
-from graphslam.app.folders.lock import LOCK, lock_folder
 from graphslam.core.atomic import part_path
 from graphslam.core.errors import FormatError, RunFolderError
+from graphslam.core.lock import LOCK, lock_folder
 from graphslam_studies.montecarlo.study import study
 from tests.app.cli.test_cli import graphslam
 
@@ -115,7 +115,7 @@ def test_ids_of_two_states_are_told(tmp_path: Path) -> None:
 
 def test_one_writer_at_a_time(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom graphslam.app.folders.lock import lock_folder\n"
+        "import sys, time\nfrom graphslam.core.lock import lock_folder\n"
         "with lock_folder(sys.argv[1]):\n    print('held', flush=True)\n    time.sleep(100)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:

@@ -21,9 +21,9 @@ import numpy as np
 import pandas as pd
 
 from graphslam.app.folders.generations import check_links, is_empty, remove_stale_files
-from graphslam.app.folders.lock import lock_folder, make_folder
 from graphslam.core.atomic import read_json, read_npz, sweep_parts, write_json, write_npz
 from graphslam.core.errors import FormatError, MissingDataError, RunFolderError
+from graphslam.core.lock import lock_folder, make_folder
 from graphslam.core.npz import flags, floats, ints, texts
 from graphslam_studies.montecarlo.trials import Measurement
 

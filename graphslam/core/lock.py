@@ -22,6 +22,8 @@ LOCK = ".lock"
 _HEAD = "graphslam: this folder is written by process"
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 """The lock file is written to, so it must not be a link to another file."""
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
+"""A named pipe in its place must not stop the reader."""
 _guard = threading.Lock()
 _held: dict[str, int] = {}
 
@@ -85,6 +87,6 @@ def _take(home: Path) -> Any:
 
 def is_lock(file: Path) -> bool:
     """Is it a lock file of :func:`lock_folder`?"""
-    with contextlib.suppress(OSError), open(file, "rb") as stream:
+    with contextlib.suppress(OSError), open(os.open(file, os.O_RDONLY | _NO_WAIT), "rb") as stream:
         return stream.read(len(_HEAD)) == _HEAD.encode()
     return False
