@@ -16,7 +16,7 @@ def _leave(*_: Any) -> None:
     os._exit(130)
 
 
-def main() -> None:
+def start() -> None:
     """Entry point ``graphslam``."""
     python = signal.getsignal(signal.SIGINT)
     if python is signal.default_int_handler:  # not if it is ignored, as in the background of a shell
@@ -33,4 +33,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start()

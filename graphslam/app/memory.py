@@ -84,7 +84,7 @@ class MemoryProbe:
                 command, capture_output=True, text=True, check=True, env=environment, timeout=_TIMEOUT_S
             )
             found = json.loads(done.stdout.strip().splitlines()[-1])
-        except (subprocess.SubprocessError, ValueError, IndexError) as error:
+        except (subprocess.SubprocessError, OSError, ValueError, IndexError) as error:
             found = [str(error)] * len(methods)
         for method, value in zip(methods, found):
             if isinstance(value, str):

@@ -27,7 +27,6 @@ def solve_network_file(
     create_missing: bool = False,
     starts: str | Sequence[str] | None = None,
     certificate: bool = False,
-    unwritten: list[OSError] | None = None,
     **options: Any,
 ) -> dict[str, Any]:
     """Solve a g2o, TORO or iSAM file.
@@ -52,8 +51,6 @@ def solve_network_file(
     certificate : bool
         Test whether the solution is certified as the global optimum (text in ``"certificate"``, values in
         ``"certificate_numbers"``).
-    unwritten : list, optional
-        An error of writing ``out`` is appended to it instead of raised, so that the result is not lost.
     **options
         Of :func:`graphslam.solve.network.solve.solve_network`.
 
@@ -69,14 +66,8 @@ def solve_network_file(
     solution = solve_network(network, solver, starts=starts, certificate=certificate, **options)
     report = solution_json(solution)
     if out is not None:
+        write_g2o(out, solution.to_network())
         report["out"] = str(out)
-        try:
-            write_g2o(out, solution.to_network())
-        except OSError as error:
-            if unwritten is None:
-                raise
-            unwritten.append(error)
-            report["out"] = None
     return report
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from graphslam.core.atomic import is_part, read_json, write_json
+from graphslam.core.atomic import check_file_target, is_part, read_json, write_json
 from graphslam.core.errors import FormatError, OutputError
 from graphslam.core.interrupt import defer_interrupts
 from graphslam.core.lock import LOCK, is_lock, lock_folder
@@ -91,6 +91,7 @@ def output_folder(path: str | os.PathLike[str], kind: str, *, last: Sequence[str
     try:
         with lock_folder(home):
             before = _listed(home, kind)
+            check_file_target(home / LISTED)  # removes what a killed writer left beside it
             staged = home / STAGED
             shutil.rmtree(staged, ignore_errors=True)
             staged.mkdir()

@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from graphslam.core.cluster import connect_cluster, task_runner
+from graphslam.core.cluster import check_address, connect_cluster, task_runner
 from graphslam.core.errors import ConfigError
 
 
@@ -15,6 +15,14 @@ from graphslam.core.errors import ConfigError
 def test_nobody_there_is_an_error_that_names_the_address(address: str) -> None:
     with pytest.raises(ConfigError, match=address):
         connect_cluster(address, timeout=1.0)
+
+
+@pytest.mark.parametrize("address", ["", "x y z", "host", "host:port", "tcp://", "10.0.0.1:8786; x"])
+def test_what_is_no_address_is_refused_at_once(address: str) -> None:
+    with pytest.raises(ConfigError, match="is no address of a Dask scheduler; wanted host:port"):
+        check_address(address)
+    for known in ("10.0.0.1:8786", "tcp://node-1.local:8786", "tls://[::1]:8786"):
+        check_address(known)
 
 
 def test_a_cluster_is_found_and_not_made_the_default() -> None:

@@ -200,7 +200,9 @@ def main() -> None:
     except BrokenPipeError:  # `graphslam … | head`
         sys.stderr.close()
         sys.exit(1)
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt, SystemExit) as error:
+        if isinstance(error, SystemExit) and not (heard and error.code):  # Typer exits before a command begins
+            raise
         if heard:  # also if a library made another error of it, as at its import
             _fail(Interrupted(_HOW[heard[-1]]), 128 + heard[-1])
         if isinstance(error, (KeyboardInterrupt, Interrupted)):
@@ -246,9 +248,10 @@ def _hear_signals(heard: list[int]) -> None:
     known = sys.unraisablehook
 
     def unraisable(what: Any) -> None:
-        if isinstance(what.exc_value, KeyboardInterrupt):
-            signal.raise_signal(heard[-1] if heard else signal.SIGINT)
-        elif not isinstance(what.exc_value, MemoryError):
+        if issubclass(what.exc_type, KeyboardInterrupt):  # later: here it would be lost once more
+            number = heard[-1] if heard else signal.SIGINT
+            threading.Timer(0.02, os.kill, (os.getpid(), number)).start()
+        elif not issubclass(what.exc_type, MemoryError):
             known(what)
 
     sys.unraisablehook = unraisable

@@ -8,7 +8,7 @@ from typing import Any, Literal, cast, get_args
 import typer
 
 from graphslam.app.cli.run import JSON, MAX_SIZE, READER, READER_OPTION, reader_options
-from graphslam.app.cli.terminal import print_result, text_table
+from graphslam.app.cli.terminal import print_result, text_table, write_and_print
 from graphslam.core.atomic import atomic_open
 from graphslam.core.errors import ConfigError, DataError, GraphSlamError, MissingDataError, UnknownNameError
 
@@ -50,9 +50,15 @@ def solve_command(
     as_json: bool = JSON,
 ) -> None:
     """Solve a pose-graph file, and check whether the solution is at its optimum."""
-    from graphslam.app.solve_file import solve_network_file
+    from graphslam.app.solve_file import solution_json
+    from graphslam.core.atomic import check_file_target
     from graphslam.io.catalog import load_recording
+    from graphslam.io.g2o import write_g2o
+    from graphslam.io.network_file import read_network
+    from graphslam.solve.network.solve import solve_network
 
+    if out is not None:
+        check_file_target(out)
     path = Path(file)
     if not path.is_file():
         found = load_recording(file)
@@ -62,21 +68,17 @@ def solve_command(
             )
         path = found
     names = None if starts is None else "all" if starts == "all" else starts.split(",")
-    unwritten: list[OSError] = []
-    value = solve_network_file(
-        path,
-        solver,
-        noise=cast(Any, noise),
-        repair=repair,
-        create_missing=create_missing,
-        out=out,
-        starts=names,
-        certificate=certify,
-        unwritten=unwritten,
-    )
-    print_result(value, "\n".join(f"{k:20} {v}" for k, v in value.items()), as_json=as_json)
-    if unwritten:
-        raise unwritten[0]
+    network = read_network(path, noise=cast(Any, noise), repair=repair, create_missing=create_missing)
+    solution = solve_network(network, solver, starts=names, certificate=certify)
+    value = solution_json(solution)
+    text = "\n".join(f"{k:20} {v}" for k, v in value.items())
+    if out is None:
+        return print_result(value, text, as_json=as_json)
+
+    def write() -> None:
+        write_g2o(out, solution.to_network())
+
+    write_and_print(write, {**value, "out": str(out)}, text, f"{'out':20} {out}", as_json=as_json)
 
 
 def relax_command(

@@ -33,6 +33,7 @@ from typing import Any, TypeVar
 from graphslam.app.folders.output_files import OutputFiles
 from graphslam.core.atomic import is_part, part_path, sweep_parts, sync_to_disk
 from graphslam.core.errors import FormatError, GraphSlamError
+from graphslam.core.interrupt import defer_interrupts
 from graphslam.core.lock import LOCK, is_lock, lock_folder
 
 GENERATIONS, CURRENT = "generations", "current"
@@ -196,7 +197,8 @@ def new_generation(folder: str | os.PathLike[str]) -> Iterator[FolderTransaction
             sync_to_disk(staged / name)
         for part in (*{(staged / n).parent for n in names}, staged, staged.parent):
             sync_to_disk(part)
-        (_commit if linked else _replace_plainly)(home, staged, names)
+        with defer_interrupts():
+            (_commit if linked else _replace_plainly)(home, staged, names)
 
 
 def _commit(home: Path, staged: Path, names: list[str]) -> None:

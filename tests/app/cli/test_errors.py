@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from graphslam.app import cli
+from graphslam.app.cli.terminal import write_and_print
 from graphslam.core.errors import FormatError
 
 
@@ -121,3 +122,88 @@ def test_a_file_that_cannot_grow_is_one_line_and_no_half_file(tmp_path: Path) ->
     assert "File too large" in err
     assert not list(out.glob(".*"))  # no temporary file is left
     assert not (out / "log.json").exists()
+
+
+def run_code(code: str, **options: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload,no-any-return]
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "said"), [("SIGINT", 130, "interrupted; existing"), ("SIGTERM", 143, "terminated; existing")]
+)
+@pytest.mark.parametrize("how", ["raised", "hidden", "lost"])
+def test_a_signal_is_one_line_also_if_a_library_hides_it(number: str, code: int, said: str, how: str) -> None:
+    """Raised at once; made an ImportError of, as by an extension module; or lost in a finaliser."""
+    strike = f"os.kill(os.getpid(), signal.{number}); time.sleep(0.01)"
+    if how == "hidden":
+        body = f"    try:\n        {strike}\n    except KeyboardInterrupt:\n        raise ImportError('failed')\n"
+    elif how == "lost":
+        body = f"    class F:\n        def __del__(self): {strike}\n    F()\n    time.sleep(5)\n"
+    else:
+        body = f"    {strike}\n"
+    done = run_code(
+        "import os, signal, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"from graphslam.app import cli\ndef app():\n{body}cli.app = app\ncli.main()"
+    )
+    assert (done.returncode, done.stderr) == (code, f"graphslam: {said} files are unchanged\n")
+
+
+def test_an_interrupt_during_the_imports_is_one_line() -> None:
+    done = run_code(
+        "import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "class Finder:\n    def find_spec(self, name, *_):\n"
+        "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Finder())\nfrom graphslam.__main__ import start\nstart()"
+    )
+    assert (done.returncode, done.stderr) == (130, "graphslam: interrupted; existing files are unchanged\n")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("can't start new thread"),
+        ImportError("libx.so: failed to map segment from shared object: Cannot allocate memory"),
+        OSError(12, "Cannot allocate memory"),
+        RuntimeError("std::bad_alloc"),
+    ],
+)
+def test_a_lack_of_memory_is_called_so_whoever_says_it(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "app", fail)
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert capfd.readouterr().err.startswith("graphslam: not enough memory; ")
+    assert not cli.lacks_memory(ValueError("no such submap"))
+
+
+def test_a_program_that_cannot_be_loaded_is_one_line() -> None:
+    done = run_code(
+        "import sys\nclass Finder:\n    def find_spec(self, name, *_):\n"
+        "        if name == 'typer': raise ImportError('failed to map segment from shared object')\n"
+        "sys.meta_path.insert(0, Finder())\nfrom graphslam.__main__ import start\nstart()"
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "graphslam: cannot be loaded: not enough memory, or a damaged installation. "
+        "failed to map segment from shared object\n"
+    )
+
+
+def test_a_result_is_printed_where_its_file_cannot_be_written(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(OSError, match="No space"):
+        write_and_print(no_room, {"out": "a", "x": 1}, "the result", "written to a", as_json=False)
+    assert capsys.readouterr().out == "the result\n"
+    with pytest.raises(OSError, match="No space"):
+        write_and_print(no_room, {"out": "a", "x": 1}, "the result", "written to a", as_json=True)
+    assert capsys.readouterr().out == '{"out": null, "x": 1}\n'
+
+
+def test_a_closed_stdout_is_no_descriptor_of_a_file(tmp_path: Path) -> None:
+    command = f'"$0" -m graphslam simulate landmark-field --preset quick --out "{tmp_path / "log"}" >&-'
+    done = subprocess.run(["bash", "-c", command, sys.executable], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "log" / "log.json").is_file()

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import graphslam as gs
 from graphslam.app.cli import app
 from graphslam.app.report.report import PAGE, make_report, write_report
-from graphslam.core.errors import RunFolderError
+from graphslam.core.errors import OutputError, RunFolderError
 from graphslam.core.log import SensorLog
 from tests.app.report.test_markup import HOSTILE
 from tests.reference.page import Page
@@ -255,6 +255,20 @@ def test_what_is_gone_or_damaged_is_named(copy: Path, whole: Page, name: str, pa
     assert all(page.sections[k] == whole.sections[k] for k in others)
 
 
+@pytest.mark.parametrize("name", ["map.npz", "metrics.json", "submaps/000001.npz"])
+def test_a_damaged_result_is_the_headline(copy: Path, name: str) -> None:
+    """The page of a run whose map or submaps are lost does not say that the result can be used."""
+    if name == "submaps/000001.npz":
+        (copy / name).unlink()
+    else:
+        (copy / name).write_bytes(b"PK")
+    assert read(copy).headline.startswith("Wrong: do not rely on this")
+    assert "copy the whole folder again" in read(copy).headline
+    done = CliRunner().invoke(app, ["report", str(copy), "--out", str(copy.parent / "page.html")])
+    assert done.exit_code == 1
+    assert "the result is damaged" in str(done.exception)
+
+
 def test_values_of_a_wrong_kind_are_no_crash(copy: Path) -> None:
     with (copy / "events.jsonl").open("a") as stream:
         stream.write('{"event": "loop", "loop": 1, "verdict": "accepted", "why": "", "i": 0, "j": 1, "chi2": "x"}\n')
@@ -319,7 +333,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path, copy: Path) -> None:
         make_report(tmp_path / "nothing")
     with pytest.raises(RunFolderError, match="not a run folder"):
         make_report(copy / "submaps")
-    with pytest.raises(RunFolderError, match="cannot be written"):
+    with pytest.raises(OutputError, match="there is no folder"):
         write_report(copy, tmp_path / "no" / "such" / "folder.html")
 
 
