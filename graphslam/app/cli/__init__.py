@@ -257,7 +257,14 @@ def _hear_signals(heard: list[int]) -> None:
     sys.unraisablehook = unraisable
 
 
-_NO_MEMORY = ("cannot allocate memory", "can't start new thread", "bad_alloc", "bad allocation", "out of memory")
+_NO_MEMORY = (
+    "failed to map segment",
+    "cannot allocate memory",
+    "can't start new thread",
+    "bad_alloc",
+    "bad allocation",
+    "out of memory",
+)
 
 
 def lacks_memory(error: BaseException | None) -> bool:
