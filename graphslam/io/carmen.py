@@ -13,6 +13,8 @@ Scans with an unusual beam layout are resampled to the most frequent one.
 
 Stamps of such logs may decrease if the computer was busy, while the order of the lines is right. They are not dropped,
 but corrected to the nearest increasing stamps (isotonic regression), if no stamp moves by more than ``most_mended``.
+Corrected logs often have one stamp for all scans, or rounded ones: stamps that the motion excludes are replaced by
+those of a robot of usual speed (:func:`usual_stamps`).
 """
 
 from __future__ import annotations
@@ -45,6 +47,11 @@ _LASER_PARAM = re.compile(r"PARAM (?:robot|laser)_(front|rear)_?laser_(fov|max|m
 USUAL_BEAMS = (180, 181, 360, 361)
 """Numbers of beams of 180° scanners with steps of 1° and 0.5°."""
 _SPACING = 1e-3  # minimal time between corrected stamps [s]
+USUAL_MOTION = (0.5, 0.5, 0.1)
+"""Speed [m/s], yaw rate [rad/s] and least interval [s] of stamps that replace those without information."""
+IMPOSSIBLE, TOGETHER = (10.0, 10.0), 20
+"""Speed [m/s] and yaw rate [rad/s] that no robot with such a log has. If half of the motions over so many scans are
+faster, the stamps contain no information; single motions are also faster where delayed scans have stamps in bunches."""
 _POSED = {"FLASER": 9, "RLASER": 9, "ROBOTLASER": 14, "RAWLASER": 3}  # words after ranges (and remissions)
 
 
@@ -113,6 +120,16 @@ def read_carmen(
         counter.drop("log", "line ODOM not used: scans have their own odometry", len(scans.odom))
     T_base_sensor = np.zeros(3)
     streams: dict[str, Stream] = {}
+    assumed = list(scans.assumed)
+    if poses is not None and (instead := usual_stamps(times, poses[:, 3:])) is not None:
+        times, seconds = instead, float(np.ptp(times))
+        counter.counts.pop("laser: stamp corrected (kept)", None)
+        counter.drop("laser", "stamp replaced (kept)", len(times))
+        text = (
+            f"stamps of the scans: {seconds:.6g} s for all of the path, which is impossible. They were replaced by "
+            f"those of a robot with {USUAL_MOTION[0]:g} m/s and {USUAL_MOTION[1]:g} rad/s."
+        )
+        assumed.append(("look", text))
     if poses is not None:
         T_base_sensor = np.median(se2_between(poses[:, 3:], poses[:, :3]), axis=0)
         streams["odometry"] = noise.odometry(times, poses[:, 3:])
@@ -134,7 +151,7 @@ def read_carmen(
         meta={
             "source": raw.name,
             "reference": says,
-            "assumed": scans.assumed,
+            "assumed": assumed,
             "odometry_sigmas": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(noise).items()},
         },
     )
@@ -165,6 +182,27 @@ def mend_stamps(stamps: Array, most: float, *, where: str) -> tuple[Array, int]:
             wanted=f"at most {most:g} s",
         )
     return times, int(np.sum(moved > 0.5 * _SPACING))
+
+
+def usual_stamps(times: Array, poses: Array) -> Array | None:
+    """Stamps of a robot of usual speed, from the first stamp on; None if the robot can have moved as the stamps say.
+
+    Parameters
+    ----------
+    times : (n,)
+        Increasing [s].
+    poses : (n, 3)
+        Of the odometry [m, rad].
+    """
+    step = se2_between(poses[:-1], poses[1:])
+    metres, radians, seconds = np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]), np.diff(times)
+    n = min(TOGETHER, len(seconds))
+    way, turn, time = (np.convolve(v, np.ones(n), "valid") if n else v for v in (metres, radians, seconds))
+    if not n or np.mean((way > IMPOSSIBLE[0] * time) | (turn > IMPOSSIBLE[1] * time)) < 0.5:
+        return None
+    spent = np.maximum(np.maximum(metres / USUAL_MOTION[0], radians / USUAL_MOTION[1]), USUAL_MOTION[2])
+    spent = np.minimum(spent, 3.0 * np.median(spent))  # a large step between two scans is no gap in the records
+    return np.asarray(times[0] + np.concatenate([[0.0], np.cumsum(spent)]))
 
 
 def _files(path: Path) -> tuple[Path, Path | None]:

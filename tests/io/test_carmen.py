@@ -11,7 +11,7 @@ import pytest
 from graphslam.core.errors import ConfigError, DataError, FormatError, MissingDataError
 from graphslam.core.geometry import se2_between, se2_compose
 from graphslam.core.log import DropCounter
-from graphslam.io.carmen import beam_bearings, mend_stamps, read_carmen
+from graphslam.io.carmen import beam_bearings, mend_stamps, read_carmen, usual_stamps
 from graphslam.io.catalog import load_recording
 from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.step_config import StepConfig
@@ -86,6 +86,25 @@ def test_stamps_are_mended_the_least(rng: np.random.Generator) -> None:
     t[200:] -= 100.0
     with pytest.raises(DataError, match=r"s out of order"):
         mend_stamps(t, 3.0, where="log")
+
+
+def test_stamps_that_the_motion_excludes_are_replaced(tmp_path: Path) -> None:
+    scans = [" ".join([*s.split()[:-3], "0", "host", "0"]) for s in lines() if s.startswith("FLASER")]
+    log = read_carmen(write(tmp_path, scans, "one-stamp.log"))
+    t, step = log["laser"].times, se2_between(poses(40)[:-1], poses(40)[1:])
+    np.testing.assert_array_equal(t, log["odometry"].times)
+    # 0.2 m and 0.06 rad: 0.4 s at the usual speed
+    np.testing.assert_allclose(np.diff(t), np.hypot(step[:, 0], step[:, 1]) / 0.5, rtol=1e-6)
+    assert log.dropped == {"laser: stamp replaced (kept)": 40}
+    assert log.meta["assumed"][-1] == (
+        "look",
+        "stamps of the scans: 0.039 s for all of the path, which is impossible. They were replaced by those of a robot "
+        "with 0.5 m/s and 0.5 rad/s.",
+    )
+    # bunches of delayed scans, each with one stamp: the stamps stay
+    bunches = mend_stamps(np.floor(np.arange(40) / 8) * 1.6, 3.0, where="log")[0]
+    assert usual_stamps(bunches, poses(40)) is None
+    assert usual_stamps(bunches[:1], poses(1)) is None
 
 
 def test_corrected_scans_are_found_by_their_ranges(tmp_path: Path) -> None:

@@ -106,8 +106,8 @@ def bridge_gap(
 
     A record gives the motion over its interval, but not the velocity within it, so pieces of it are less certain.
     Records longer than 3 times the median (and than 1 s) are counted and get an additional σ of 20 % of their motion on
-    every axis. If the body moved before and after, and the record has less than half of that speed, records may be
-    missing: σ is then that speed (and the RMS yaw rate) times the interval.
+    every axis. If the body moved before and after (:data:`MOVING`), and the record has less than half of that speed,
+    records may be missing: σ is then that speed (and the RMS yaw rate) times the interval.
 
     Records longer than ``limit`` [s] must give the motion over their interval (:func:`gives_motion`); others are
     refused. Their covariance also grows by the usual variance per second.
@@ -123,7 +123,8 @@ def bridge_gap(
     g = group_of(odometry.increments)
     metres, radians, _ = record_rates(odometry)
     sound = np.setdiff1d(np.arange(len(spacing)), k)
-    turns = float(np.sqrt(np.mean((radians[sound] / spacing[sound]) ** 2))) if len(sound) else 0.0
+    # weighted by the squared intervals: corrected stamps are 1 ms apart, and their rates mean nothing
+    turns = float(np.sqrt(np.sum(radians[sound] ** 2) / np.sum(spacing[sound] ** 2))) if len(sound) else 0.0
     covariances = odometry.covariances.copy()
     for i in k:
         near = [j for j in (i - 1, i + 1) if 0 <= j < len(spacing) and j not in k]
@@ -131,7 +132,7 @@ def bridge_gap(
         speed = min(float(metres[j] / spacing[j]) for j in near) if len(near) == 2 else 0.0
         sigma = np.full(g.dof, BRIDGED * radians[i])
         sigma[g.position] = BRIDGED * metres[i]
-        if metres[i] < 0.5 * speed * spacing[i]:
+        if speed > MOVING[0] and metres[i] < 0.5 * speed * spacing[i]:
             sigma[g.heading] = max(sigma[g.heading], turns * spacing[i])
             sigma[g.position] = speed * spacing[i]
         covariances[i + 1] += np.diag(np.square(sigma))

@@ -184,6 +184,21 @@ def test_bridges_cost_certainty(dim: int) -> None:
     np.testing.assert_array_equal(still.covariances, stood.covariances)
 
 
+def test_a_pause_while_turning_on_the_spot_is_no_loss_of_records() -> None:
+    times = np.r_[np.arange(10) * 0.2, 1.8 + 3.0 + np.arange(10) * 0.2]
+    increments = np.zeros((20, 3))
+    increments[1:, 0], increments[1:, 2] = 1e-3, 0.1  # 5 mm/s
+    increments[10] = [2e-3, 0.0, -0.38]
+    o = Odometry(times=times, increments=increments, covariances=np.tile(1e-4 * np.eye(3), (20, 1, 1)))
+    sure, _ = bridge_gap(o, 20.0, where="odometry")
+    assert np.sqrt(sure.covariances[10, 2, 2]) == pytest.approx(np.hypot(0.01, 0.2 * 0.38), rel=0.02)
+    # the yaw rate of the other records does not come from two stamps that are 1 ms apart
+    moving = replace(o, increments=increments * [100.0, 1.0, 1.0])
+    lost = bridge_gap(moving, 20.0, where="odometry")[0].covariances[10, 2, 2]
+    bunched = replace(moving, times=times - np.where(np.arange(20) == 5, 0.199, 0.0))
+    assert np.sqrt(bridge_gap(bunched, 20.0, where="odometry")[0].covariances[10, 2, 2]) < 1.1 * np.sqrt(lost)
+
+
 def test_intervals_that_are_not_there() -> None:
     errors = prior(winding(3))
     for start, end in ((-1, 3), (5, 4), (0, 101)):
