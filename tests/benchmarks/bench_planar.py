@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 import graphslam as gs
+from graphslam.core.errors import MissingDataError
 from graphslam.core.log import SensorLog
 from graphslam.core.trajectory import Trajectory
 from graphslam.evaluate.trajectory_error import ate
@@ -113,6 +114,11 @@ def main() -> None:
     scans = QUICK_SCANS if a.quick else a.scans
     print(HEAD, flush=True)
     for name in a.names or (QUICK if a.quick else LOGS):
+        try:
+            locate(LOGS[name][0])
+        except MissingDataError:
+            print(f"{name} left out: no recording (set GRAPHSLAM_DATA)")
+            continue
         rows = []
         for seed in range(a.first, a.first + (1 if a.quick else a.seeds)):
             command = [sys.executable, "-m", "tests.benchmarks.bench_planar", name, "--one", "--first", str(seed)]
