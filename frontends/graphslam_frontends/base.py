@@ -33,7 +33,7 @@ class FrontEnd(Protocol):
     draws: ClassVar[bool] = False
     """Do its submaps depend on random numbers, that is on the seed?"""
     calibrates: ClassVar[str] = ""
-    """Data for the calibration besides the motion: ``sightings`` of landmarks, ``scans``, or none (no calibration)."""
+    """Data for the calibration besides the motion: ``observations`` of landmarks, ``scans``, or none."""
     config: Any
 
     def submaps(
@@ -111,6 +111,6 @@ class FrontEnd(Protocol):
     def observations(self, log: SensorLog) -> tuple[str, LandmarkObservations] | None:
         """Name of its stream of landmarks, and the observations in it; None if it uses none.
 
-        ``sightings`` of its submaps are indices of these, so that data associations can be checked.
+        ``detections`` of its submaps are indices of these, so that data associations can be checked.
         """
         return None

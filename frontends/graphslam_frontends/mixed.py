@@ -82,7 +82,7 @@ class MixedFrontEnd(FrontEnd):
     @property
     def calibrated_part(self) -> FrontEnd:
         """The front end for the calibration: the motion is common to both, and landmarks show its errors better."""
-        return min(self.parts, key=lambda p: p.calibrates != "sightings")
+        return min(self.parts, key=lambda p: p.calibrates != "observations")
 
     def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
         """See :class:`~graphslam_frontends.base.FrontEnd`; for each front end."""
@@ -299,8 +299,8 @@ def _idle(intervals: list[Interval], seen: FrontEnd, scans: FrontEnd) -> list[di
 def _renumbered(submap: Submap, first: int, offset: int) -> Submap:
     """A submap with its key in the whole run, and its observation indices in the whole log."""
     landmarks = submap.landmarks
-    if landmarks is not None and landmarks.sightings is not None:
-        landmarks = replace(landmarks, sightings=landmarks.sightings + np.array([offset, 0]))
+    if landmarks is not None and landmarks.detections is not None:
+        landmarks = replace(landmarks, detections=landmarks.detections + np.array([offset, 0]))
     matches = tuple(replace(m, target=m.target + first) for m in submap.matches)
     report = dict(submap.report)
     if "holds" in report:

@@ -48,7 +48,7 @@ def identity_statistics(graph: FactorGraphState, record: SubmapRecord) -> Array:
     """
     ids = record.landmark_ids
     n = len(ids)
-    lonely = np.array([len(graph.sightings(int(i))) < 2 for i in ids])
+    lonely = np.array([len(graph.detections(int(i))) < 2 for i in ids])
     if n == 0 or bool(lonely.all()):
         return np.full(n, np.nan)
     ends = graph.values.poses[record.start], graph.values.poses[record.start + 1]

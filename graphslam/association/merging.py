@@ -68,13 +68,13 @@ def mahalanobis_merges(graph: FactorGraph, gate: float = 11.8, *, distance: floa
 
 def _share(graph: FactorGraph, i: int, j: int) -> bool:
     """Whether one submap contains both."""
-    return bool(graph.sightings(i) & graph.sightings(j))
+    return bool(graph.detections(i) & graph.detections(j))
 
 
 def _resolve(graph: FactorGraph, pairs: Array, *, within_submap: bool, limit: float) -> list[tuple[int, int]]:
     """Turn pairs of rows into merges, each landmark dropped at most once and never kept after."""
     ids, points = graph.values.landmark_ids, graph.values.landmarks
-    seen = {int(i): set(graph.sightings(int(i))) for i in ids[np.unique(pairs)]}
+    seen = {int(i): set(graph.detections(int(i))) for i in ids[np.unique(pairs)]}
     home: dict[int, int] = {}
     row = {int(i): r for r, i in enumerate(ids)}
     members: dict[int, list[int]] = {i: [i] for i in seen}

@@ -344,7 +344,7 @@ class BackEnd:
             if s.landmarks is None:
                 continue
             ids = self.graph.landmark_ids_of(s.key)
-            rows = s.landmarks.sightings
+            rows = s.landmarks.detections
             counts = np.ones(len(ids), dtype=int) if rows is None else np.bincount(rows[:, 1], minlength=len(ids))
             for i, n in zip(ids.tolist(), counts.tolist()):
                 hits[i] = hits.get(i, 0) + n
@@ -354,9 +354,9 @@ class BackEnd:
         """(observation index in the log, landmark id) of every observation, for audits of the association."""
         rows: list[Any] = [np.zeros((0, 2), dtype=np.int64)]
         for s in submaps:
-            if s.landmarks is not None and s.landmarks.sightings is not None:
+            if s.landmarks is not None and s.landmarks.detections is not None:
                 ids = self.graph.landmark_ids_of(s.key)
-                q = s.landmarks.sightings
+                q = s.landmarks.detections
                 rows.append(np.column_stack([q[:, 0], ids[q[:, 1]]]))
         table = np.concatenate(rows)
         return table[:, 0], table[:, 1]

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from graphslam.calibrate.estimate import Calibration
-from graphslam.calibrate.landmark_calibration import CalibrationBudget, calibrate_sightings
+from graphslam.calibrate.landmark_calibration import CalibrationBudget, calibrate_observations
 from graphslam.calibrate.scans import POINTS, calibrate_scans
-from graphslam.calibrate.windows import SightingLog
+from graphslam.calibrate.windows import ObservationLog
 from graphslam.core.errors import DataError
 from graphslam.core.log import SensorLog
 from graphslam.core.records import LaserScans
@@ -18,9 +18,9 @@ from graphslam_frontends.odometry.make_steps import make_steps
 from graphslam_frontends.odometry.motion_prior import MotionPrior, OdometryBiases
 
 
-def _of_sightings(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int) -> Calibration:
-    seen = SightingLog.of(log, *landmark_stream(log, config.detector))
-    return calibrate_sightings(seen, effort, seed=seed, noise=getattr(config, "motion", None))
+def _of_observations(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int) -> Calibration:
+    seen = ObservationLog.of(log, *landmark_stream(log, config.detector))
+    return calibrate_observations(seen, effort, seed=seed, noise=getattr(config, "motion", None))
 
 
 def _of_scans(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int) -> Calibration:
@@ -34,7 +34,7 @@ def _of_scans(log: SensorLog, config: Any, effort: CalibrationBudget, seed: int)
 
 
 CALIBRATIONS: dict[str, Callable[[SensorLog, Any, CalibrationBudget, int], Calibration]] = {
-    "sightings": _of_sightings,
+    "observations": _of_observations,
     "scans": _of_scans,
 }
 """Calibration methods by the data that they use in addition to the motion; none needs ground truth.

@@ -1,4 +1,4 @@
-"""Offset of the motion's clock against that of the sightings."""
+"""Offset of the motion's clock against that of the detections."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from graphslam.calibrate import landmarks as L
 from graphslam.calibrate.estimate import Estimate
 from graphslam.calibrate.smoothing import Smoothing
-from graphslam.calibrate.windows import SightingLog
+from graphslam.calibrate.windows import ObservationLog
 
 MOST_PERIODS = 20
 """Largest offset that is looked for, in periods of the motion's records."""
 
 
-def profile_clock(s: Smoothing, seen: SightingLog) -> Estimate:
+def profile_clock(s: Smoothing, seen: ObservationLog) -> Estimate:
     """Offset of the motion's clock, by smoothing with the motion cut at shifted stamps.
 
     Only shifts by whole periods of the motion's records are compared: a shift by half a period averages two records,

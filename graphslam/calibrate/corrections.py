@@ -78,7 +78,7 @@ class Corrections:
     """σ of a range error that is common to all observations of one visit of a landmark [m]."""
     bearing_visit: float = 0.0
     """The same for bearings [rad]."""
-    visit_sightings: float = 1.0
+    visit_observations: float = 1.0
     """Typical number of observations per visit, for logs without landmark identities."""
     slips: tuple[tuple[float, float], ...] = ()
     """Intervals of wheel slip, in the clock of the observations [s]: σ of the distance is the whole distance."""
@@ -149,7 +149,7 @@ def apply_corrections(log: SensorLog, c: Corrections) -> SensorLog:
     }  # first: with two odometry streams, the first one is used
     for other, stream in log.streams.items():
         if other != name:
-            streams[other] = corrected_sightings(stream, c) if isinstance(stream, LandmarkObservations) else stream
+            streams[other] = corrected_observations(stream, c) if isinstance(stream, LandmarkObservations) else stream
     return replace(log, streams=streams)
 
 
@@ -179,14 +179,14 @@ def moved_end(log: SensorLog, corrected: SensorLog, noise: MotionNoise) -> tuple
     return d, CERTAIN * float(np.sqrt(along @ covariance @ along))
 
 
-def corrected_sightings(s: LandmarkObservations, c: Corrections) -> LandmarkObservations:
+def corrected_observations(s: LandmarkObservations, c: Corrections) -> LandmarkObservations:
     """Observations with corrected ranges, mounting and σ."""
     if (c.range_scale, c.range_offset, c.sensor_yaw) == (1.0, 0.0, 0.0) and c.range_sigma is c.bearing_sigma is None:
         return s
     ranges = (s.ranges - c.range_offset) / c.range_scale
     sigmas = s.sigmas.copy()
     # mean of n observations with common error σ_v: variance σ² / n + σ_v², as with white noise of σ² + n σ_v²
-    n = visit_counts(s) if s.ids is not None else np.full(len(ranges), c.visit_sightings)
+    n = visit_counts(s) if s.ids is not None else np.full(len(ranges), c.visit_observations)
     if c.range_sigma is not None:
         sigmas[:, 0] = np.sqrt(c.range_sigma**2 + n * c.range_visit**2) / c.range_scale
     if c.bearing_sigma is not None:

@@ -131,7 +131,7 @@ class Calibration:
     Parameters
     ----------
     kind : str
-        Data used: ``sightings``, ``ranges``, ``scans`` or ``clouds``.
+        Data used: ``observations``, ``ranges``, ``scans`` or ``clouds``.
     corrections : Corrections
         Corrections to apply.
     noise : mapping of str to float

@@ -108,7 +108,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
         steps (n, 8): dx, dy, turn, seconds, metres from pose k - 1 to k; then variances: column 5 (along) if > 0, and
             columns 6 and 7 (lateral, heading) if column 6 > 0, replace those of the noise model; row 0 is not read.
         first : (n + 1,) observations of pose k are ``first[k]:first[k + 1]``.
-        ``sightings`` : (q, 2) range and bearing; NaN: no bearing.
+        ``detections`` : (q, 2) range and bearing; NaN: no bearing.
         slots : (q, 2) nuisance of the landmark, and of the visit or -1.
         kinds (M,): 0 landmark, 1 visit.
     sensor : (3,) pose of the sensor in the base frame.
@@ -126,7 +126,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
     (float, float)
         ln det of the eliminated blocks, and the sum of ln σ of all residuals.
     """
-    steps, first, sightings, slots, kinds = data
+    steps, first, detections, slots, kinds = data
     L, X, C, S, chi2, gone, pivots, order, when, at = work
     n, D = poses.shape
     M = len(nuisance)
@@ -178,7 +178,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
             count = range_row(poses[k], nuisance, model, data, q, at, here)
             chi2[3] += vals[0] * vals[0]
             _add(here, count, blocks)
-            if sightings[q, 1] == sightings[q, 1]:
+            if detections[q, 1] == detections[q, 1]:
                 volume += math.log(p[BEARING])
                 count = bearing_row(poses[k], nuisance, model, data, q, at, here)
                 chi2[4] += vals[0] * vals[0]
@@ -356,7 +356,7 @@ def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
     moments : (HEAD, HEAD) second moments of the constants, and of -1 in row RHS, at the optimum of all windows.
     work : Work of :func:`eliminate_window` for the same window, states and ``p``, undamped.
     """
-    steps, first, sightings, slots, kinds = data
+    steps, first, detections, slots, kinds = data
     L, X, C, _, _, gone, pivots, order, when, at = work
     n, D = poses.shape
     m = C.shape[2]
@@ -396,7 +396,7 @@ def differentiate_window(poses, nuisance, g, data, sensor, p, moments, work):
         for q in range(first[k], first[k + 1]):
             count = range_row(poses[k], nuisance, model, data, q, at, here)
             out[RANGE] += _unexplained(here, count, M, mine, then)
-            if sightings[q, 1] == sightings[q, 1]:
+            if detections[q, 1] == detections[q, 1]:
                 count = bearing_row(poses[k], nuisance, model, data, q, at, here)
                 out[BEARING] += _unexplained(here, count, M, mine, then)
             for j in slots[q]:

@@ -14,10 +14,10 @@ from graphslam.calibrate import landmarks as L
 from graphslam.calibrate.clock import profile_clock
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import ALIKE, GAIN, LASTS, SURE, Calibration, Estimate, round_digits
-from graphslam.calibrate.prediction_check import predict_withheld_sightings
+from graphslam.calibrate.prediction_check import predict_withheld_observations
 from graphslam.calibrate.slips import ROUNDS, find_slips, slip_finding, with_untested
 from graphslam.calibrate.smoothing import CONSTANTS, PRIOR, Ints, Smoothing, SmoothingWindow, rebuild_window
-from graphslam.calibrate.windows import SightingLog, window_scans
+from graphslam.calibrate.windows import ObservationLog, window_scans
 from graphslam.core.errors import DataError
 from graphslam.core.findings import Finding
 from graphslam.core.geometry import Array
@@ -56,8 +56,8 @@ QUICK = CalibrationBudget()
 FULL = CalibrationBudget(windows=60, poses=6000, again=True)
 
 
-def calibrate_sightings(
-    seen: SightingLog, effort: CalibrationBudget = QUICK, *, seed: int = 0, noise: MotionNoise | None = None
+def calibrate_observations(
+    seen: ObservationLog, effort: CalibrationBudget = QUICK, *, seed: int = 0, noise: MotionNoise | None = None
 ) -> Calibration:
     """Estimate noise and systematic errors of motion and observations; parts that fail the cross-validation are unused.
 
@@ -67,25 +67,25 @@ def calibrate_sightings(
         Noise of controls without a calibration, for comparison.
     """
     held, noise = seen.holding(), noise or MotionNoise()
-    blind = not np.any(seen.sightings.has_bearing)
+    blind = not np.any(seen.detections.has_bearing)
     if blind:
         found, whole = _ranges_alone(held, effort, seed)
         scans = [window_scans(seen, 1e9)[0][: len(whole.windows[0].poses)]]
         foretell = partial(
-            predict_withheld_sightings, held, found, scans, noise, partial(_along, whole, seen.sightings.ids)
+            predict_withheld_observations, held, found, scans, noise, partial(_along, whole, seen.detections.ids)
         )
     else:
         found = _range_and_bearing(held, effort)
-        foretell = partial(predict_withheld_sightings, held, found, _tested(held, effort), noise)
+        foretell = partial(predict_withheld_observations, held, found, _tested(held, effort), noise)
     prediction = None if found.contradictions() else foretell()
     if blind or effort.again:  # after the test, the withheld data are used, too
         found = _ranges_alone(seen, effort, seed)[0] if blind else _range_and_bearing(seen, effort)
     return found if prediction is None or found.contradictions() else found.validated(prediction)
 
 
-def _tested(held: SightingLog, effort: CalibrationBudget) -> list[Ints]:
+def _tested(held: ObservationLog, effort: CalibrationBudget) -> list[Ints]:
     """Scans of long windows with withheld observations, spread over the log."""
-    s = held.sightings
+    s = held.detections
     assert held.withheld is not None
     hidden = np.concatenate([[0], np.cumsum(held.withheld)])[s.offsets]
     there = [k for k in window_scans(held, LONG) if np.any(hidden[k + 1] > hidden[k])]
@@ -108,12 +108,12 @@ def _along(whole: Smoothing, ids: Ints | None, w: SmoothingWindow) -> SmoothingW
     return w if len(w.rows) else None
 
 
-def _rate(seen: SightingLog) -> float:
+def _rate(seen: ObservationLog) -> float:
     """Mean rate of the scans [Hz]."""
-    return len(seen.sightings.times) / max(seen.span[1] - seen.span[0], 1e-9)
+    return len(seen.detections.times) / max(seen.span[1] - seen.span[0], 1e-9)
 
 
-def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple[str, ...] = ()) -> Calibration:
+def _range_and_bearing(seen: ObservationLog, effort: CalibrationBudget, held: tuple[str, ...] = ()) -> Calibration:
     """Calibrate a log with bearings; ``held`` are constants that diverged before and are fixed at zero."""
     steers = isinstance(motion_stream(seen.log)[1], SteeringControls)
     named = ("turn_per_metre" if steers else "yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
@@ -123,10 +123,10 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
     wild = tuple(c for c in free if abs(short.constants[CONSTANTS.index(c)]) > RAN_AWAY * PRIOR[CONSTANTS.index(c)])
     if wild:
         held, free = (*held, *wild), tuple(c for c in free if c not in wild)
-        short, short_value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
+        short, short_value = L.fit_noise(L.smooth_observations(seen, SHORT, count, free))
     _enough(short, seen)
     start = dict(short.sigmas), short.constants.copy()
-    long = L.smooth_sightings(seen, LONG, None if count is None else max(count // 4, 3), free)
+    long = L.smooth_observations(seen, LONG, None if count is None else max(count // 4, 3), free)
     long.sigmas, long.constants = dict(start[0]), start[1].copy()
     clock = None
     long, _ = L.fit_noise(long, trims=L.TRIMS[1:])
@@ -144,7 +144,7 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
         estimates.append(clock)
     noise, lasts = combine_noise(short, long)
     alike = residual_autocorrelation(long)
-    few = len(np.unique(seen.sightings.ids)) <= FEW if seen.sightings.ids is not None else False
+    few = len(np.unique(seen.detections.ids)) <= FEW if seen.detections.ids is not None else False
     if lasts or alike > PERHAPS or few:
         two, estimates = fit_two_level_noise(seen, long, effort, estimates)
         noise |= two
@@ -152,23 +152,25 @@ def _range_and_bearing(seen: SightingLog, effort: CalibrationBudget, held: tuple
             notes.append(_lasting_note(short, long, alike))
     if seen.slips:
         notes.append(slip_finding(seen.slips, short, seen.span))
-    made = calibration_of("sightings", estimates, noise, notes, _data(short))
+    made = calibration_of("observations", estimates, noise, notes, _data(short))
     slips = () if made.contradictions() else with_untested(seen.slips, seen)
     return replace(made, corrections=replace(made.corrections, slips=slips))
 
 
-def _without_slips(seen: SightingLog, count: int | None, free: tuple[str, ...]) -> tuple[SightingLog, Smoothing, float]:
+def _without_slips(
+    seen: ObservationLog, count: int | None, free: tuple[str, ...]
+) -> tuple[ObservationLog, Smoothing, float]:
     """The log with its intervals of wheel slip, and a fit of short windows that does not use distances there."""
     for _ in range(ROUNDS):
-        short, value = L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
+        short, value = L.fit_noise(L.smooth_observations(seen, SHORT, count, free))
         slips = find_slips(short, seen.spacing, seen.slips)
         if not slips:
             return seen, short, value
         seen = replace(seen, slips=tuple(sorted((*seen.slips, *slips))))
-    return seen, *L.fit_noise(L.smooth_sightings(seen, SHORT, count, free))
+    return seen, *L.fit_noise(L.smooth_observations(seen, SHORT, count, free))
 
 
-def _again(seen: SightingLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:
+def _again(seen: ObservationLog, clock: Estimate, effort: CalibrationBudget, held: tuple[str, ...]) -> Calibration:
     """The calibration repeated with the corrected clock of the motion."""
     found = _range_and_bearing(
         seen.mended(Corrections(clock=round_digits(clock.value))), replace(effort, clock=False), held
@@ -179,7 +181,7 @@ def _again(seen: SightingLog, clock: Estimate, effort: CalibrationBudget, held: 
     return replace(found, corrections=corrections, estimates=(*found.estimates, clock))
 
 
-def _ranges_alone(seen: SightingLog, effort: CalibrationBudget, seed: int) -> tuple[Calibration, Smoothing]:
+def _ranges_alone(seen: ObservationLog, effort: CalibrationBudget, seed: int) -> tuple[Calibration, Smoothing]:
     begin, end = seen.span
     until = end - begin if effort.windows is None else min(effort.poses / max(_rate(seen), 1e-9), end - begin)
     found = L.smooth_ranges(seen, until, seed=seed)
@@ -290,7 +292,7 @@ def residual_autocorrelation(s: Smoothing) -> float:
 
 
 def fit_two_level_noise(
-    seen: SightingLog, long: Smoothing, effort: CalibrationBudget, estimates: list[Estimate]
+    seen: ObservationLog, long: Smoothing, effort: CalibrationBudget, estimates: list[Estimate]
 ) -> tuple[dict[str, float], list[Estimate]]:
     """Observation noise with an additional error per visit of a landmark; empty unless it gains :data:`GAIN` nats.
 
@@ -300,7 +302,7 @@ def fit_two_level_noise(
     count = max(int(effort.poses / max(_rate(seen) * VISITS, 1.0)), 1)
     values, fits = [], []
     for visits in (False, True):
-        s = L.smooth_sightings(seen, VISITS, count, long.free, visits=visits)
+        s = L.smooth_observations(seen, VISITS, count, long.free, visits=visits)
         for k in long.fitted:
             s.sigmas[k] = long.sigmas[k]
         s.constants = long.constants.copy()
@@ -328,7 +330,7 @@ def fit_two_level_noise(
             if of_fit in s.fitted:
                 out[of_noise] = s.sigmas[of_fit]
     there = 1.0 if seen.withheld is None else 1.0 - float(seen.withheld.mean())
-    return out | {"visit_sightings": sightings_of_a_visit(s.windows) / there} | motion_noise(s), again
+    return out | {"visit_observations": observations_of_a_visit(s.windows) / there} | motion_noise(s), again
 
 
 def motion_noise(s: Smoothing) -> dict[str, float]:
@@ -336,21 +338,21 @@ def motion_noise(s: Smoothing) -> dict[str, float]:
     return {k: s.sigmas[k] for k in L.WHEELS}
 
 
-def sightings_of_a_visit(windows: Sequence[SmoothingWindow]) -> float:
+def observations_of_a_visit(windows: Sequence[SmoothingWindow]) -> float:
     """Expected number of observations in the visit of a randomly chosen observation: Σn² / Σn."""
     n = np.concatenate([np.bincount(w.slots[w.slots[:, 1] >= 0, 1]) for w in windows])
     n = n[n > 0]
     return float((n**2).sum() / max(n.sum(), 1))
 
 
-def _count(seen: SightingLog, seconds: float, effort: CalibrationBudget) -> int | None:
+def _count(seen: ObservationLog, seconds: float, effort: CalibrationBudget) -> int | None:
     """Number of windows that keeps the number of poses within the budget; None: all."""
     if effort.windows is None:
         return None
     return int(np.clip(effort.poses / max(_rate(seen) * seconds, 1.0), 6, effort.windows))
 
 
-def _enough(s: Smoothing, seen: SightingLog) -> None:
+def _enough(s: Smoothing, seen: ObservationLog) -> None:
     n = sum(len(w.rows) for w in s.windows)
     if n < 50:
         raise DataError(

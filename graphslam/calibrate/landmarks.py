@@ -9,8 +9,15 @@ import numpy as np
 
 from graphslam.calibrate import kernels as K
 from graphslam.calibrate import residual_kernels as R
-from graphslam.calibrate.smoothing import CONSTANTS, START, Smoothing, SmoothingWindow, keep_sightings, renumber_slots
-from graphslam.calibrate.windows import SightingLog, cut_windows
+from graphslam.calibrate.smoothing import (
+    CONSTANTS,
+    START,
+    Smoothing,
+    SmoothingWindow,
+    keep_observations,
+    renumber_slots,
+)
+from graphslam.calibrate.windows import ObservationLog, cut_windows
 from graphslam.core.geometry import Array
 from graphslam.core.random import SeedTree
 
@@ -23,25 +30,25 @@ def smoothing_of(
     windows: Sequence[SmoothingWindow], sensor: Array, free: Sequence[str], *, visits: bool = False
 ) -> Smoothing:
     """Smoothing of windows that estimates the noise of the motion and of the measured quantities."""
-    bearings = any(np.isfinite(w.sightings[:, 1]).any() for w in windows)
+    bearings = any(np.isfinite(w.detections[:, 1]).any() for w in windows)
     fitted = [*WHEELS, "range"] + ["bearing"] * bearings
     fitted += (["visit_range"] + ["visit_bearing"] * bearings) if visits else []
     return Smoothing(list(windows), np.asarray(sensor, dtype=np.float64), tuple(free), tuple(fitted))
 
 
-def smooth_sightings(
-    seen: SightingLog, seconds: float, count: int | None, free: Sequence[str], *, visits: bool = False
+def smooth_observations(
+    seen: ObservationLog, seconds: float, count: int | None, free: Sequence[str], *, visits: bool = False
 ) -> Smoothing:
     """Smoothing of windows of range and bearing, initialised by odometry."""
     windows = cut_windows(seen, seconds, count, visits=visits)
-    return smoothing_of(windows, seen.sightings.T_base_sensor, free, visits=visits)
+    return smoothing_of(windows, seen.detections.T_base_sensor, free, visits=visits)
 
 
 def trim_outliers(s: Smoothing, limit: float) -> Smoothing:
     """The smoothing without observations whose residual is above ``limit`` standard deviations."""
     seen = s.residuals()
     good = [np.nan_to_num(np.abs(r), nan=0.0).max(axis=1, initial=0.0) < limit for r in seen]
-    return s if all(g.all() for g in good) else keep_sightings(s, good)
+    return s if all(g.all() for g in good) else keep_observations(s, good)
 
 
 def fit_noise(s: Smoothing, *, trims: Sequence[float] = TRIMS) -> tuple[Smoothing, float]:
@@ -65,7 +72,7 @@ def fit_without(s: Smoothing, constant: str) -> tuple[Smoothing, float]:
     return alone, alone.fit(rounds=3)
 
 
-def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Smoothing, Smoothing] | None:
+def smooth_ranges(seen: ObservationLog, until: float, *, seed: int = 0) -> tuple[Smoothing, Smoothing] | None:
     """Smooth one range-only window without an initial guess: best of 16 random beacon layouts, then longer windows.
 
     Parameters
@@ -80,7 +87,7 @@ def smooth_ranges(seen: SightingLog, until: float, *, seed: int = 0) -> tuple[Sm
     """
     free = ("yaw_bias", "range_scale", "range_offset")
     rng = SeedTree(seed).child("calibrate", "ranges").generator()
-    s, (begin, _) = seen.sightings, seen.span
+    s, (begin, _) = seen.detections, seen.span
     (whole,) = cut_windows(seen, 1e9)[:1] or (None,)
     if whole is None:
         return None
@@ -149,13 +156,13 @@ def _part(whole: SmoothingWindow, path: Array, places: dict[int, Array], rng: np
             nuisance[j] = places[l]
             continue
         mine = np.flatnonzero(slots[:, 0] == j)
-        at, r = path[k[mine], :2], whole.sightings[mine, 0]
+        at, r = path[k[mine], :2], whole.detections[mine, 0]
         nuisance[j] = _anywhere(at, r, rng)
     return SmoothingWindow(
         times=whole.times[:n],
         steps=whole.steps[:n],
         first=whole.first[: n + 1],
-        sightings=whole.sightings[:q],
+        detections=whole.detections[:q],
         slots=slots,
         kinds=np.zeros(len(order), dtype=np.int64),
         rows=whole.rows[:q],
@@ -183,7 +190,7 @@ def _anywhere(at: Array, r: Array, rng: np.random.Generator) -> Array:
     return best if rng.random() < 0.7 else other
 
 
-def shift_motion(s: Smoothing, seen: SightingLog, shift: float) -> Smoothing:
+def shift_motion(s: Smoothing, seen: ObservationLog, shift: float) -> Smoothing:
     """The smoothing with its motion evaluated at stamps that are later by ``shift`` [s]."""
     windows = [replace(w, steps=seen.steps(w.times, shift)) for w in s.windows]
     return s.copy(windows=windows)

@@ -15,8 +15,8 @@ import numpy as np
 from graphslam.calibrate.corrections import Corrections
 from graphslam.calibrate.estimate import GAIN, Calibration, Prediction
 from graphslam.calibrate.landmarks import smoothing_of, trim_outliers
-from graphslam.calibrate.smoothing import Ints, Smoothing, SmoothingWindow, keep_sightings
-from graphslam.calibrate.windows import SightingLog, make_window
+from graphslam.calibrate.smoothing import Ints, Smoothing, SmoothingWindow, keep_observations
+from graphslam.calibrate.windows import ObservationLog, make_window
 from graphslam_frontends.odometry.motion import MotionNoise
 
 TRIM = 4.0
@@ -24,8 +24,8 @@ TRIM = 4.0
 SETTLE = 12
 
 
-def predict_withheld_sightings(
-    seen: SightingLog,
+def predict_withheld_observations(
+    seen: ObservationLog,
     found: Calibration,
     scans: list[Ints],
     noise: MotionNoise,
@@ -35,7 +35,7 @@ def predict_withheld_sightings(
 
     Parameters
     ----------
-    seen : SightingLog
+    seen : ObservationLog
         The uncorrected log, with its withheld observations marked.
     found : Calibration
         Estimated without the withheld observations.
@@ -68,10 +68,10 @@ def predict_withheld_sightings(
             s = trim_outliers(s, TRIM)
             kept = np.concatenate([w.rows for w in s.windows]) if s.windows else np.zeros(0, dtype=np.int64)
         else:
-            s = keep_sightings(s, [np.isin(w.rows, kept) for w in s.windows])
+            s = keep_observations(s, [np.isin(w.rows, kept) for w in s.windows])
         s.sigmas |= {k: v for k, v in own.items() if v > 0.0}
         s.settle(SETTLE)
-        rest = keep_sightings(s, [~hidden[w.rows] for w in s.windows])
+        rest = keep_observations(s, [~hidden[w.rows] for w in s.windows])
         rest.settle(SETTLE)
         n = sum(int(hidden[w.rows].sum()) for w in s.windows)
         return s.objective() - rest.objective() + n * math.log(c.range_scale), n
@@ -95,9 +95,9 @@ LEAST = 20
 """Minimal number of withheld observations for a test."""
 
 
-def _stated(seen: SightingLog) -> dict[str, float]:
+def _stated(seen: ObservationLog) -> dict[str, float]:
     """Median σ of the observations in the log."""
-    s = seen.sightings
+    s = seen.detections
     out = {"range": float(np.median(s.sigmas[:, 0])), "visit_range": 0.0, "visit_bearing": 0.0}
     blind = not np.any(s.has_bearing)
     return out | {"bearing": 1.0 if blind else float(np.median(s.sigmas[s.has_bearing, 1]))}
@@ -110,12 +110,12 @@ def _sigmas(c: Corrections, stated: dict[str, float]) -> dict[str, float]:
 
 
 def _smoothing(
-    seen: SightingLog, scans: list[Ints], start: Callable[[SmoothingWindow], SmoothingWindow | None], *, visits: bool
+    seen: ObservationLog, scans: list[Ints], start: Callable[[SmoothingWindow], SmoothingWindow | None], *, visits: bool
 ) -> Smoothing:
     """Smoothing of windows with all their observations; only the states are estimated."""
     begin, end = seen.span
-    t = seen.sightings.times
+    t = seen.detections.times
     inside = [k for k in scans if t[k[0]] >= begin and t[k[-1]] <= end]
     made = (make_window(seen, k, visits=visits) for k in inside)
     windows = [x for w in made if w is not None and (x := start(w)) is not None]
-    return smoothing_of(windows, seen.sightings.T_base_sensor, (), visits=visits).copy(fitted=())
+    return smoothing_of(windows, seen.detections.T_base_sensor, (), visits=visits).copy(fitted=())

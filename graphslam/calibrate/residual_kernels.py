@@ -26,7 +26,7 @@ HEAD = CONSTANTS + 1
     FLOOR_HEADING,
 ) = range(12)
 PARAMETERS = 12
-Data = namedtuple("Data", ["steps", "first", "sightings", "slots", "kinds"])
+Data = namedtuple("Data", ["steps", "first", "detections", "slots", "kinds"])
 """Measurements of a window."""
 Model = namedtuple("Model", ["g", "sensor", "p"])
 """Constants (CONSTANTS,), pose of the sensor in the base frame (3,), standard deviations (PARAMETERS,)."""
@@ -53,7 +53,7 @@ def range_row(x, nuisance, model, data, q, at, row):
     base = HEAD + 2 * at[j]
     grow, w = 1.0 + g[RANGE_SCALE], 1.0 / p[RANGE]
     # residual: predicted minus measured
-    e = grow * r + g[RANGE_OFFSET] - data.sightings[q, 0]
+    e = grow * r + g[RANGE_OFFSET] - data.detections[q, 0]
     jp[:] = 0.0
     jp[0], jp[1] = -w * grow * dx / r, -w * grow * dy / r
     jp[2] = w * grow * (dx * oy - dy * ox) / r
@@ -82,7 +82,7 @@ def bearing_row(x, nuisance, model, data, q, at, row):
     r2 = dx * dx + dy * dy + 1e-12
     base = HEAD + 2 * at[j]
     w = 1.0 / p[BEARING]
-    e = math.atan2(dy, dx) - x[2] - sensor[2] - g[SENSOR_YAW] - data.sightings[q, 1]
+    e = math.atan2(dy, dx) - x[2] - sensor[2] - g[SENSOR_YAW] - data.detections[q, 1]
     if v >= 0:
         e += nuisance[v, 1]
     e = wrap_residual(e)

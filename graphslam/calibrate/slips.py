@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from graphslam.calibrate.smoothing import Smoothing
-from graphslam.calibrate.windows import SightingLog
+from graphslam.calibrate.windows import ObservationLog
 from graphslam.core.findings import Finding
 
 Stretches = tuple[tuple[float, float], ...]
@@ -54,11 +54,11 @@ def find_slips(s: Smoothing, spacing: float, known: Stretches = ()) -> Stretches
     return tuple(sorted((a, b) for a, b in set(out) if all(b <= c or d <= a for c, d in known)))
 
 
-def with_untested(slips: Stretches, seen: SightingLog) -> Stretches:
+def with_untested(slips: Stretches, seen: ObservationLog) -> Stretches:
     """If there are slips, add intervals before the first and after the last observation: slip there is unobservable."""
     if not slips:
         return ()
-    out, s = list(slips), seen.sightings
+    out, s = list(slips), seen.detections
     times = s.times[np.diff(s.offsets) > 0]
     for a, b in ((seen.span[0], times[0]), (times[-1], seen.span[1])):
         if b > a:

@@ -73,7 +73,7 @@ class SmoothingWindow:
         those of the noise model if they are above 0.
     first : (n + 1,) int64
         Observations of pose k are rows ``first[k]:first[k + 1]``.
-    sightings : (q, 2)
+    detections : (q, 2)
         Range [m] and bearing [rad]; NaN where there is no bearing.
     slots : (q, 2) int64
         Landmark, and visit or -1, as row indices of ``nuisance``.
@@ -88,7 +88,7 @@ class SmoothingWindow:
     times: Array
     steps: Array
     first: Ints
-    sightings: Array
+    detections: Array
     slots: Ints
     kinds: Ints
     rows: Ints
@@ -151,7 +151,7 @@ class Smoothing:
         """ln det, Σ ln σ, information of the constants ``(HEAD, HEAD)``, and χ² by class."""
         logdet, volume, S, chi2 = 0.0, 0.0, np.zeros((K.HEAD, K.HEAD)), np.zeros(6)
         for w, work in zip(self.windows, self._buffers()):
-            data = R.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
+            data = R.Data(w.steps, w.first, w.detections, w.slots, w.kinds)
             a, b = K.eliminate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, damping, work)
             logdet, volume = logdet + a, volume + b
             S += work.S[: K.HEAD, : K.HEAD]
@@ -199,7 +199,7 @@ class Smoothing:
             return value, out
         p, fitted = self._parameters(), [SIGMAS.index(s) for s in self.fitted]
         for w, work in zip(self.windows, self._memory):
-            data = R.Data(w.steps, w.first, w.sightings, w.slots, w.kinds)
+            data = R.Data(w.steps, w.first, w.detections, w.slots, w.kinds)
             out += K.differentiate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, moments, work)[
                 fitted
             ]
@@ -220,7 +220,7 @@ class Smoothing:
         for w, work in zip(self.windows, self._buffers()):
 
             def chi2(steps: Array, w: SmoothingWindow = w, work: K.Work = work) -> float:
-                data = R.Data(steps, w.first, w.sightings, w.slots, w.kinds)
+                data = R.Data(steps, w.first, w.detections, w.slots, w.kinds)
                 K.eliminate_window(w.poses, w.nuisance, self.constants, data, self.sensor, p, 0.0, work)
                 return float(work.S[K.RHS, K.RHS])
 
@@ -336,8 +336,8 @@ class Smoothing:
             visit = np.where(w.slots[:, 1:] >= 0, w.nuisance[w.slots[:, 1]], 0.0)
             r = (1 + g[R.RANGE_SCALE]) * np.hypot(d[:, 0], d[:, 1]) + g[R.RANGE_OFFSET] + visit[:, 0]
             b = np.arctan2(d[:, 1], d[:, 0]) - x[:, 2] - self.sensor[2] - g[R.SENSOR_YAW] + visit[:, 1]
-            b = np.pi - np.mod(np.pi - (b - w.sightings[:, 1]), 2 * np.pi)
-            seen.append(np.column_stack([(r - w.sightings[:, 0]) / s["range"], b / s["bearing"]]))
+            b = np.pi - np.mod(np.pi - (b - w.detections[:, 1]), 2 * np.pi)
+            seen.append(np.column_stack([(r - w.detections[:, 0]) / s["range"], b / s["bearing"]]))
         return seen
 
 
@@ -353,19 +353,19 @@ def most_open_nuisances(w: SmoothingWindow) -> int:
     return int(np.cumsum(change).max(initial=0))
 
 
-def keep_sightings(smoothing: Smoothing, keep: Sequence[npt.NDArray[np.bool_]]) -> Smoothing:
+def keep_observations(smoothing: Smoothing, keep: Sequence[npt.NDArray[np.bool_]]) -> Smoothing:
     """The smoothing with a subset of its observations; windows with at most 3 observations are dropped."""
     windows = []
     for w, good in zip(smoothing.windows, keep):
         windows.append(rebuild_window(w, good))
-    return smoothing.copy(windows=[w for w in windows if len(w.sightings) > 3])
+    return smoothing.copy(windows=[w for w in windows if len(w.detections) > 3])
 
 
 def rebuild_window(w: SmoothingWindow, good: npt.NDArray[np.bool_]) -> SmoothingWindow:
     """A window with a subset of its observations; drops landmarks with fewer than 2 (4 in range-only windows)."""
     good = good.copy()
     landmark = w.slots[:, 0]
-    least = 2 if np.isfinite(w.sightings[:, 1]).any() else 4
+    least = 2 if np.isfinite(w.detections[:, 1]).any() else 4
     counts = np.bincount(landmark[good], minlength=len(w.nuisance))
     good &= counts[landmark] >= least
     k = np.repeat(np.arange(len(w.poses)), np.diff(w.first))[good]
@@ -374,7 +374,7 @@ def rebuild_window(w: SmoothingWindow, good: npt.NDArray[np.bool_]) -> Smoothing
         times=w.times,
         steps=w.steps,
         first=np.searchsorted(k, np.arange(len(w.poses) + 1)).astype(np.int64),
-        sightings=np.ascontiguousarray(w.sightings[good]),
+        detections=np.ascontiguousarray(w.detections[good]),
         slots=slots,
         kinds=np.ascontiguousarray(w.kinds[order]),
         rows=w.rows[good],

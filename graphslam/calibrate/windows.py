@@ -8,7 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from graphslam.calibrate import kernels as K
-from graphslam.calibrate.corrections import Corrections, apply_corrections, corrected_sightings, slip_noise, visits_of
+from graphslam.calibrate.corrections import (
+    Corrections,
+    apply_corrections,
+    corrected_observations,
+    slip_noise,
+    visits_of,
+)
 from graphslam.calibrate.smoothing import Ints, SmoothingWindow, rebuild_window, renumber_slots
 from graphslam.core.errors import DataError
 from graphslam.core.geometry import Array, se2_compose, se2_transform
@@ -25,7 +31,7 @@ gap that ends a visit."""
 
 
 @dataclass(frozen=True, slots=True)
-class SightingLog:
+class ObservationLog:
     """Motion and observations of a log, to be cut into windows.
 
     Parameters
@@ -44,26 +50,26 @@ class SightingLog:
 
     log: SensorLog
     name: str
-    sightings: LandmarkObservations
+    detections: LandmarkObservations
     clock: Array
     withheld: npt.NDArray[np.bool_] | None = None
     stated: MotionNoise | None = None
     slips: tuple[tuple[float, float], ...] = ()
 
     @classmethod
-    def of(cls, log: SensorLog, name: str, sightings: LandmarkObservations) -> SightingLog:
+    def of(cls, log: SensorLog, name: str, detections: LandmarkObservations) -> ObservationLog:
         """From a log whose observations are in the stream ``name``, or were detected in it."""
         _, motion = motion_stream(log)
-        return cls(log, name, sightings, cumulative_motion(motion))
+        return cls(log, name, detections, cumulative_motion(motion))
 
-    def mended(self, c: Corrections) -> SightingLog:
+    def mended(self, c: Corrections) -> ObservationLog:
         """Copy with corrections applied; the same observations are withheld."""
-        made = SightingLog.of(apply_corrections(self.log, c), self.name, corrected_sightings(self.sightings, c))
+        made = ObservationLog.of(apply_corrections(self.log, c), self.name, corrected_observations(self.detections, c))
         return replace(made, withheld=self.withheld, stated=self.stated)
 
-    def holding(self) -> SightingLog:
+    def holding(self) -> ObservationLog:
         """Copy with some observations withheld: the last :data:`HELD` of every :data:`EVERY` seconds."""
-        s = self.sightings
+        s = self.detections
         times = np.repeat(s.times, np.diff(s.offsets))
         return replace(self, withheld=np.mod(times - self.span[0], EVERY) > EVERY - HELD)
 
@@ -80,7 +86,7 @@ class SightingLog:
     @property
     def spacing(self) -> float:
         """Median time between scans with observations [s]; infinite with fewer than two."""
-        times = np.unique(self.sightings.times[np.diff(self.sightings.offsets) > 0])
+        times = np.unique(self.detections.times[np.diff(self.detections.offsets) > 0])
         return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
 
     def steps(self, stamps: Array, shift: float = 0.0) -> Array:
@@ -131,7 +137,7 @@ def cumulative_motion(motion: Motion) -> Array:
 
 
 def cut_windows(
-    seen: SightingLog, seconds: float, count: int | None = None, *, visits: bool = False
+    seen: ObservationLog, seconds: float, count: int | None = None, *, visits: bool = False
 ) -> list[SmoothingWindow]:
     """Cut a log into windows of ``seconds``.
 
@@ -146,9 +152,9 @@ def cut_windows(
     return [w for w in made if w is not None]
 
 
-def window_scans(seen: SightingLog, seconds: float, count: int | None = None) -> list[Ints]:
+def window_scans(seen: ObservationLog, seconds: float, count: int | None = None) -> list[Ints]:
     """Indices of the scans in each window of :func:`cut_windows`."""
-    s, (begin, end) = seen.sightings, seen.span
+    s, (begin, end) = seen.detections, seen.span
     used = np.flatnonzero((np.diff(s.offsets) > 0) & (s.times >= begin - _HOLD) & (s.times <= end + _HOLD))
     if len(used) < 5:
         return []
@@ -172,9 +178,9 @@ def window_scans(seen: SightingLog, seconds: float, count: int | None = None) ->
     return [used[a:b] for a, b in starts]
 
 
-def make_window(seen: SightingLog, scans: Ints, *, visits: bool) -> SmoothingWindow | None:
+def make_window(seen: ObservationLog, scans: Ints, *, visits: bool) -> SmoothingWindow | None:
     """Window of these scans with landmarks initialised by odometry; None with fewer than 4 usable observations."""
-    s = seen.sightings
+    s = seen.detections
     steps = seen.steps(s.times[scans])
     poses = np.zeros((len(scans), 3))
     K.compose_steps(steps, np.zeros(3), poses)
@@ -182,7 +188,7 @@ def make_window(seen: SightingLog, scans: Ints, *, visits: bool) -> SmoothingWin
     k = np.repeat(np.arange(len(scans)), np.diff(s.offsets)[scans])
     bearing = s.has_bearing[rows]
     z = np.column_stack([s.ranges[rows], np.where(bearing, s.bearings[rows], np.nan)])
-    points = sighting_points(z, se2_compose(poses, np.broadcast_to(s.T_base_sensor, poses.shape))[k])
+    points = observation_points(z, se2_compose(poses, np.broadcast_to(s.T_base_sensor, poses.shape))[k])
     if s.ids is not None and np.any(s.ids[rows] >= 0):
         track = s.ids[rows].astype(np.int64)
     else:
@@ -203,7 +209,7 @@ def make_window(seen: SightingLog, scans: Ints, *, visits: bool) -> SmoothingWin
         times=s.times[scans],
         steps=steps,
         first=np.searchsorted(k, np.arange(len(scans) + 1)).astype(np.int64),
-        sightings=z,
+        detections=z,
         slots=slots,
         kinds=kinds,
         rows=rows,
@@ -211,10 +217,10 @@ def make_window(seen: SightingLog, scans: Ints, *, visits: bool) -> SmoothingWin
         nuisance=nuisance,
     )
     w = rebuild_window(w, np.ones(len(rows), dtype=np.bool_))
-    return w if len(w.sightings) > 3 else None
+    return w if len(w.detections) > 3 else None
 
 
-def sighting_points(z: Array, sensor: Array) -> Array:
+def observation_points(z: Array, sensor: Array) -> Array:
     """Points ``(q, 2)`` of observations (range, bearing) from sensor poses ``(q, 3)``; NaN without a bearing."""
     local = np.column_stack([z[:, 0] * np.cos(z[:, 1]), z[:, 0] * np.sin(z[:, 1])])
     return np.asarray(se2_transform(sensor, local))

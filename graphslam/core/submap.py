@@ -59,7 +59,7 @@ class LandmarkMap:
     covariance : (d + n·dim, …) or None
     information : sparse, same shape, or None
         Exactly one of the two is given.
-    sightings : (q, 2) int64 or None
+    detections : (q, 2) int64 or None
         Pairs (index in the log's observation stream, landmark of this map), for evaluating the association; not used by
         solvers.
     chart : "cartesian" or "group"
@@ -75,7 +75,7 @@ class LandmarkMap:
     positions: Array
     covariance: Array | None = None
     information: sp.csc_matrix | None = None
-    sightings: npt.NDArray[np.int64] | None = None
+    detections: npt.NDArray[np.int64] | None = None
     chart: str = "cartesian"
     path: PathPoints | None = None
     lasting: SensorBiases | None = None
@@ -113,11 +113,11 @@ class LandmarkMap:
             raise GeometryError(
                 "systematic errors do not fit the map", got=self.lasting.response.shape, wanted=f"({n}, 6)"
             )
-        if self.sightings is not None:
-            rows = np.ascontiguousarray(self.sightings, dtype=np.int64).reshape(-1, 2)
+        if self.detections is not None:
+            rows = np.ascontiguousarray(self.detections, dtype=np.int64).reshape(-1, 2)
             if len(rows) and (rows[:, 1].min() < 0 or rows[:, 1].max() >= len(ids)):
                 raise GeometryError("observations of a landmark that is not in the map", got=rows[:, 1].max())
-            object.__setattr__(self, "sightings", rows)
+            object.__setattr__(self, "detections", rows)
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "exit_pose", pose)
         object.__setattr__(self, "positions", positions)
@@ -186,7 +186,7 @@ class LandmarkMap:
         exit_pose[2] = wrap_angle(exit_pose[2])
         return LandmarkMap(
             ids=self.ids, exit_pose=exit_pose, positions=self.positions + off[3:].reshape(-1, 2),
-            covariance=self.dense_covariance() + S @ covariance @ S.T, sightings=self.sightings, chart=self.chart,
+            covariance=self.dense_covariance() + S @ covariance @ S.T, detections=self.detections, chart=self.chart,
         )  # fmt: skip
 
     def difference(self, x: Array) -> Array:

@@ -18,7 +18,7 @@ LEAST_ANCESTORS = 10
 below 0.46 or above 1.88 in one case of ten)."""
 
 
-def sighting_findings(
+def observation_findings(
     log: SensorLog, reports: Sequence[Mapping[str, Any]], dropped: Mapping[str, int]
 ) -> list[Finding]:
     """Findings on observations offered and used, on particles and on gaps.
@@ -47,16 +47,16 @@ def sighting_findings(
     if trimmed:
         reasons.append(f"{trimmed} trimmed as outliers")
     why = ", ".join(reasons)
-    out = [Finding("", "sightings", f"observations used: {used} of {offered}{' — ' + why if why else ''}.")]
+    out = [Finding("", "observations", f"observations used: {used} of {offered}{' — ' + why if why else ''}.")]
     if offered == 0 or used == 0:
         text = f"observations used: 0 of {offered}{', ' + why if why else ''} — the path is that of the odometry."
-        out.append(Finding("bad", "sightings-not-used", text))
+        out.append(Finding("bad", "observations-not-used", text))
     elif used < HALF * offered:
         text = (
             f"observations used: {used} of {offered} ({why}) — odometry and observations disagree on where landmarks "
             "are. Check units, signs and ids of the observations, and the speeds."
         )
-        out.append(Finding("bad", "sightings-not-used", text))
+        out.append(Finding("bad", "observations-not-used", text))
     return out + _particles(reports) + _gaps(reports)
 
 

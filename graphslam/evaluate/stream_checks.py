@@ -32,7 +32,7 @@ from graphslam.evaluate.stream_checks_clock import ORDER, check_clocks
 from graphslam.evaluate.stream_checks_gps import check_gps
 from graphslam.evaluate.stream_checks_imu import check_imu, check_turns, compare_turns
 from graphslam.evaluate.stream_checks_motion import check_odometry, check_sighted_motion
-from graphslam.evaluate.stream_checks_sightings import check_sightings, check_steering
+from graphslam.evaluate.stream_checks_observations import check_observations, check_steering
 from graphslam.io.clock import CLOCK_SET_BACK
 
 GYRO = 40.0
@@ -121,7 +121,7 @@ _UNPLACED = (
 
 STREAM_CHECKS: tuple[tuple[tuple[type, ...], Callable[[Any, str, SensorLog], list[Finding]]], ...] = (
     ((LaserScans, RangeScans, PointClouds), check_beams),
-    ((LandmarkObservations,), check_sightings),
+    ((LandmarkObservations,), check_observations),
     ((SteeringControls,), check_steering),
     ((Gps,), check_gps),
     ((Imu,), check_imu),

@@ -168,7 +168,7 @@ def check_sighted_motion(z: LandmarkObservations, name: str, log: SensorLog) -> 
         text += "from the heading of the robot."
     else:
         text += f"only {100 * least:.0f} % after one change — {HYPOTHESES[k].text}."
-    return [Finding("bad", "sightings-and-motion", text)]
+    return [Finding("bad", "observations-and-motion", text)]
 
 
 def _sighted_twice(z: LandmarkObservations) -> tuple[Ints, Ints] | None:

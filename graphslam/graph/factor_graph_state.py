@@ -376,7 +376,7 @@ class FactorGraphState:
         """World position of a landmark."""
         return self.values.landmarks[self._row[landmark_id]]
 
-    def sightings(self, landmark_id: int) -> frozenset[int]:
+    def detections(self, landmark_id: int) -> frozenset[int]:
         """Ids of the factors that observe a landmark."""
         return frozenset(self._seen_in[landmark_id])
 

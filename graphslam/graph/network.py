@@ -13,7 +13,7 @@ from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import FactorBatch
 from graphslam.graph.factors.between import BetweenBatch, BetweenRecord
 from graphslam.graph.factors.landmark_submap import SubmapRecord
-from graphslam.graph.factors.sighting import SightingBatch
+from graphslam.graph.factors.observation import ObservationBatch
 from graphslam.graph.factors.space_submap import SpaceSubmapRecord
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import KINDS, Values, VariableLayout
@@ -62,7 +62,7 @@ def problem_of_network(network: PoseNetwork, used: Mask | None = None, *, ordere
     if len(seen):
         polar = network.observation_kind == "bearing-range"
         W = whiteners(network.observation_information[o])
-        batches.append(SightingBatch.of_arrays(seen, network.observation_values[o], polar, W, layout))
+        batches.append(ObservationBatch.of_arrays(seen, network.observation_values[o], polar, W, layout))
     return FactorArrays((), layout, batches)
 
 

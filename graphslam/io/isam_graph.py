@@ -32,7 +32,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.network import Ids, Labels, PoseNetwork
 from graphslam.core.se3 import quat_multiply
 from graphslam.io.g2o import SWAP
-from graphslam.io.network_builder import NetworkBuilder, edge_labels, sighting_labels, upper_triangle
+from graphslam.io.network_builder import NetworkBuilder, edge_labels, observation_labels, upper_triangle
 from graphslam.io.text_records import Records
 
 Noise = Literal["auto", "covariance", "information", "sqrt-information", "toro"]
@@ -164,7 +164,7 @@ def _information(columns: Array, noise: Noise, build: NetworkBuilder, labels: La
 
 def _landmarks(records: Records, build: NetworkBuilder, noise: Noise) -> None:
     rows = records.rows["LANDMARK"]
-    pairs, lines, labels = rows.whole, rows.lines, sighting_labels(rows.whole)
+    pairs, lines, labels = rows.whole, rows.lines, observation_labels(rows.whole)
     xy, c = rows.real[:, :2], rows.real[:, 2:]
     covariance = upper_triangle(c, 2)
     if noise in ("information", "sqrt-information"):

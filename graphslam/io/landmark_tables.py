@@ -1,4 +1,4 @@
-"""Reader of odometry and landmark observations in two tables with headers: ``odometry.csv`` and ``sightings.csv``.
+"""Reader of odometry and landmark observations in two tables with headers: ``odometry.csv`` and ``observations.csv``.
 
 Columns are identified by their names, in any order and case; units in brackets after a name are converted.
 
@@ -51,7 +51,7 @@ UNITS = {
 _UNIT_OF = {"t": "t", "v": "v", "w": "w", "x": "length", "y": "length", "range": "length", "theta": "angle"}
 _UNIT_OF["bearing"] = "angle"
 ODOMETRY_HEADER = "t, v, w or t, x, y, theta"
-SIGHTINGS_HEADER = "t, range, and bearing or id or both"
+OBSERVATIONS_HEADER = "t, range, and bearing or id or both"
 RANGE_SIGMA, BEARING_SIGMA = 0.3, float(np.deg2rad(3.0))
 """Assumed σ of a range [m] and of a bearing [rad]; the tables contain none."""
 NOISE = OdometryNoise((0.01, 0.005), (0.05, 0.02), 0.05)
@@ -90,7 +90,7 @@ class Header:
         return "pose" if {"t", "x", "y", "theta"} <= self.columns.keys() else ""
 
     @property
-    def sightings(self) -> bool:
+    def detections(self) -> bool:
         """Is it a header of landmark observations?"""
         return {"t", "range"} <= self.columns.keys() and bool({"bearing", "id"} & self.columns.keys())
 
@@ -127,7 +127,7 @@ def _header_in(lines: list[str]) -> Header | None:
     """Header of a table: the first known one, also in comments before the first row."""
     for number, line in enumerate(lines[:20], start=1):
         found = header_of(line, number)
-        if found.odometry or found.sightings:
+        if found.odometry or found.detections:
             return found
         if line.strip() and not line.lstrip().startswith(("#", "%")):
             return None
@@ -137,25 +137,25 @@ def _header_in(lines: list[str]) -> Header | None:
 def claim_tables(look: SourceProbe) -> ReaderMatch | None:
     """See :mod:`graphslam.io.recognise`."""
     motion, seen = _tables(look)
-    guess = [p for p in look.files if re.match(r"(odom|sighting|landmark_obs|observation)", p.name.lower())]
+    guess = [p for p in look.files if re.match(r"(odom|landmark_obs|observation)", p.name.lower())]
     guess = [p for p in guess if p.suffix.lower() in TABLE_ENDINGS and look.lines(p, 1)]
     if motion and seen:
         return ReaderMatch(
             f"odometry ({look.relative(motion[0])}) and landmark observations ({look.relative(seen[0])})"
         )
     if motion or seen:
-        have, lack = (motion[0], "sightings") if motion else (seen[0], "odometry")
-        header = SIGHTINGS_HEADER if motion else ODOMETRY_HEADER
+        have, lack = (motion[0], "observations") if motion else (seen[0], "odometry")
+        header = OBSERVATIONS_HEADER if motion else ODOMETRY_HEADER
         bad = [p for p in guess if p != have]
         there = f"; the first line of {look.relative(bad[0])} is {look.lines(bad[0], 1)[0][:80]!r}" if bad else ""
         return ReaderMatch(
-            f"a table of {'odometry' if motion else 'sightings'}, {look.relative(have)}{there}",
+            f"a table of {'odometry' if motion else 'observations'}, {look.relative(have)}{there}",
             f"{lack}.csv beside it, with the header {header}",
         )
-    if len(guess) >= 2 and {g.name.lower()[0] for g in guess} >= {"o", "s"}:
+    if len({g.name.lower().startswith("odom") for g in guess}) == 2:
         heads = "; ".join(f"{look.relative(p)} begins {look.lines(p, 1)[0][:60]!r}" for p in guess[:2])
         return ReaderMatch(
-            heads, f"a first line with names: odometry.csv {ODOMETRY_HEADER}; sightings.csv {SIGHTINGS_HEADER}"
+            heads, f"a first line with names: odometry.csv {ODOMETRY_HEADER}; observations.csv {OBSERVATIONS_HEADER}"
         )
     return None
 
@@ -168,9 +168,9 @@ def _tables(look: SourceProbe) -> tuple[list[Path], list[Path]]:
         for p in [q for q in look.by_ending.get(e, []) if q in look.texts]:
             header = _header_in(look.lines(p, 20))
             if header is not None:
-                (seen if header.sightings else motion).append(p)
+                (seen if header.detections else motion).append(p)
     motion.sort(key=lambda p: ("odom" not in p.name.lower(), len(p.parts), p))
-    seen.sort(key=lambda p: ("sight" not in p.name.lower(), len(p.parts), p))
+    seen.sort(key=lambda p: ("observation" not in p.name.lower(), len(p.parts), p))
     return motion, seen
 
 
@@ -197,7 +197,7 @@ def read_landmark_tables(
     """
     root = Path(path)
     if not root.exists():
-        raise MissingDataError("no such folder", where=str(root), wanted="a folder with odometry.csv and sightings.csv")
+        raise MissingDataError("no such folder", where=str(root), wanted="odometry.csv and observations.csv in it")
     numbers = [range_sigma, bearing_sigma, 1.0 if max_range is None else max_range]
     if not all(np.isfinite(v) and v > 0 for v in numbers):
         raise ConfigError(f"landmark tables: σ and range {numbers}; wanted positive numbers")
@@ -209,11 +209,11 @@ def read_landmark_tables(
             "no odometry table in addition to the observation table",
             where=str(root),
             got=claim.found if claim else str(look),
-            wanted=f"odometry.csv with the header {ODOMETRY_HEADER}, sightings.csv with {SIGHTINGS_HEADER}",
+            wanted=f"odometry.csv with the header {ODOMETRY_HEADER}, observations.csv with {OBSERVATIONS_HEADER}",
         )
     counter = DropCounter()
     controls, n_controls = _motion(motion[0], noise, counter)
-    landmarks, n_seen = _sightings(
+    landmarks, n_seen = _observations(
         seen[0], (float(controls.times[0]), float(controls.times[-1])), range_sigma, bearing_sigma, max_range, counter
     )
     stream = "controls" if isinstance(controls, VelocityControls) else "odometry"
@@ -314,7 +314,7 @@ def _motion(path: Path, noise: OdometryNoise, counter: DropCounter) -> tuple[Vel
     return noise.odometry(t, np.column_stack([a[k][keep] for k in names])), n
 
 
-def _sightings(
+def _observations(
     path: Path,
     span: tuple[float, float],
     range_sigma: float,

@@ -69,9 +69,9 @@ class NetworkBuilder:
     marks: tuple[Ids, Array] = field(default_factory=lambda: (_no_ids(0), _none(0, 2)))
     fixed: tuple[Ids, Ids] = field(default_factory=lambda: (_no_ids(0), _no_ids(0)))
     edges: tuple[Ids, Array, Array] | None = None
-    sightings: tuple[Ids, Array, Array] | None = None
+    detections: tuple[Ids, Array, Array] | None = None
     edge_lines: Ids = field(default_factory=lambda: _no_ids(0))
-    sighting_lines: Ids = field(default_factory=lambda: _no_ids(0))
+    observation_lines: Ids = field(default_factory=lambda: _no_ids(0))
     kind: ObservationKind = "cartesian"
     noise: str = "information"
     repaired: int = 0
@@ -120,8 +120,8 @@ class NetworkBuilder:
 
     def add_observations(self, pairs: Ids, values: Array, information: Array, lines: Ids) -> None:
         """Landmark observations; ``pairs`` ``(k, 2)`` = (vertex id, landmark id)."""
-        information = self.sound(information, sighting_labels(pairs), "landmark information matrices")
-        self.sightings, self.sighting_lines = (pairs, values, information), lines
+        information = self.sound(information, observation_labels(pairs), "landmark information matrices")
+        self.detections, self.observation_lines = (pairs, values, information), lines
 
     def sound(self, matrices: Array, labels: Labels, what: str) -> Array:
         """Check matrices; with ``repair``, indefinite ones are projected and counted, otherwise an error is raised."""
@@ -151,7 +151,7 @@ class NetworkBuilder:
         """The network, with vertices sorted by id."""
         width, d = (3, 3) if self.dim == 2 else (7, 6)
         pairs, measurements, information = self.edges or (_no_ids(0, 2), _none(0, width), _none(0, d, d))
-        seen, values, seen_information = self.sightings or (_no_ids(0, 2), _none(0, 2), _none(0, 2, 2))
+        seen, values, seen_information = self.detections or (_no_ids(0, 2), _none(0, 2), _none(0, 2, 2))
         given, poses_given = self.vertices
         self._check_named(pairs, seen)
         ids = np.unique(np.concatenate([given, pairs.ravel(), seen[:, 0]]))
@@ -200,7 +200,7 @@ class NetworkBuilder:
         if len(self.vertices[0]) == 0 or self.create_missing:
             return
         named = np.concatenate([pairs.ravel(), seen[:, 0]])
-        lines = np.concatenate([np.repeat(self.edge_lines, 2), self.sighting_lines])
+        lines = np.concatenate([np.repeat(self.edge_lines, 2), self.observation_lines])
         lost = np.flatnonzero(~np.isin(named, self.vertices[0]))
         if len(lost):
             others = len(np.unique(named[lost])) - 1
@@ -231,6 +231,6 @@ def edge_labels(pairs: Ids) -> Labels:
     return Labels(lambda k: f"{pairs[k, 0]} -> {pairs[k, 1]}")
 
 
-def sighting_labels(pairs: Ids) -> Labels:
+def observation_labels(pairs: Ids) -> Labels:
     """Names of landmark observations for error messages, created on demand."""
     return Labels(lambda k: f"{pairs[k, 0]} sees {pairs[k, 1]}")

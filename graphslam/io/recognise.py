@@ -264,7 +264,7 @@ BUILT_IN: dict[str, Reader] = {
     ),
     "carmen": Reader("CARMEN log: FLASER, ROBOTLASER1 or RAWLASER1, with ODOM", f"{_IO}.carmen:read_carmen", _carmen),
     "landmark-tables": Reader(
-        "CSV: odometry.csv (t, v, w or t, x, y, theta) and sightings.csv (t, id, range, bearing)",
+        "CSV: odometry.csv (t, v, w or t, x, y, theta) and observations.csv (t, id, range, bearing)",
         f"{_IO}.landmark_tables:read_landmark_tables",
         _tables,
     ),

@@ -54,8 +54,8 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
         else:
             for part in ("data", "indices", "indptr"):
                 arrays[f"information_{part}"] = getattr(landmarks.information, part)
-        if landmarks.sightings is not None:
-            arrays["sightings"] = landmarks.sightings
+        if landmarks.detections is not None:
+            arrays["detections"] = landmarks.detections
         if landmarks.path is not None:
             for part in ("times", "lever", "positions", "covariance", "cross"):
                 arrays[f"path_{part}"] = getattr(landmarks.path, part)
@@ -138,7 +138,7 @@ _FIELDS = {
     "information_data": floats("z", optional=True),
     "information_indices": ints("z", optional=True),
     "information_indptr": ints("v+1", optional=True),
-    "sightings": ints("q", 2, optional=True),
+    "detections": ints("q", 2, optional=True),
     "path_times": floats("f", optional=True),
     "path_lever": floats("c", optional=True),
     "path_positions": floats("f", "c", optional=True),
@@ -196,7 +196,7 @@ def _landmark_map(a: Arrays, dim: int, where: str) -> LandmarkMap:
         positions=positions,
         covariance=a.get("covariance"),
         information=information,
-        sightings=a.get("sightings"),
+        detections=a.get("detections"),
         chart=_chart(a, where),
         path=_path(a, where),
         lasting=_lasting(a, where),

@@ -154,10 +154,10 @@ class SubmapProblem:
         weights = 1.0 / _check_scale(1.0 if scale is None else scale, m)
         all_ids = np.concatenate([a.ids for a in maps] if ids is None else list(ids))
         unique, first, inverse = np.unique(all_ids, return_index=True, return_inverse=True)
-        by_sighting = np.argsort(first, kind="stable")
+        by_observation = np.argsort(first, kind="stable")
         rank = np.empty(len(unique), dtype=np.int64)
-        rank[by_sighting] = np.arange(len(unique))
-        self.ids = unique[by_sighting]
+        rank[by_observation] = np.arange(len(unique))
+        self.ids = unique[by_observation]
         self.size = 3 * m + 2 * len(self.ids)
 
         # Entries: the end of every submap, then its landmarks. Nodes: pose k is node k, landmark j node m + j.
@@ -180,11 +180,11 @@ class SubmapProblem:
         for k, (submap, landmarks) in enumerate(zip(submaps, maps)):
             W = dense_information(landmarks, what=f"submap {submap.key}") if information is None else information[k]
             self._omega[self._omega_ptr[k] : self._omega_ptr[k + 1]] = (weights[k] * W).ravel()
-        sighting = first[by_sighting]  # among the landmark entries of all submaps
-        self._first_owner = owner[is_landmark][sighting]
+        observation = first[by_observation]  # among the landmark entries of all submaps
+        self._first_owner = owner[is_landmark][observation]
         self._first_row = self._row_ptr[self._first_owner] + 3
         self.chart = "group" if bool(np.all(self._group)) else "cartesian"
-        self._first_row += 2 * (np.flatnonzero(is_landmark)[sighting] - self._entry_ptr[self._first_owner] - 1)
+        self._first_row += 2 * (np.flatnonzero(is_landmark)[observation] - self._entry_ptr[self._first_owner] - 1)
 
     @property
     def anchors(self) -> Index:

@@ -52,7 +52,7 @@ def make_pending(landmarks):
 
 
 @njit(nogil=True, error_model="numpy")
-def _sum_interval(sightings, poses, interval, slot, ids, sums):
+def _sum_interval(detections, poses, interval, slot, ids, sums):
     """Sums over the poses of one interval, one row per observed landmark; ``slot`` is initially zero.
 
     A row: Σ h₀ W, Σ h₁ W, Σ h₀ h₀ W, Σ h₀ h₁ W, Σ h₁ h₁ W (six values each), number of observations.
@@ -74,12 +74,12 @@ def _sum_interval(sightings, poses, interval, slot, ids, sums):
         h0 = 1.0 - h1
         h00, h01, h11 = h0 * h0, h0 * h1, h1 * h1
         R = _nine(poses.rotation, i)
-        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
-            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+        for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
+            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
             sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
             )
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             e = slot[j]
             if e == 0:
                 ids[n] = j
@@ -172,7 +172,7 @@ def _add_lever(qx, qy, qz, X, sign, B):
 
 
 @njit(nogil=True)
-def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
+def keyframe_diagonal(detections, poses, landmarks, k, begin, end, out):
     """Add the measurements' diagonal blocks of ``Pᵀ S P`` of the keyframes ``begin … end - 1`` to ``out (K, 6, 6)``.
 
     Parameters
@@ -184,7 +184,7 @@ def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
     l, Di = landmarks
     N, K = len(poses.position), len(out)
     first = max(0, begin - 1)
-    most = _most(sightings.first, k, N, first, min(end, K - 1))
+    most = _most(detections.first, k, N, first, min(end, K - 1))
     slot0, slot1 = np.zeros(len(l), np.int32), np.zeros(len(l), np.int32)
     ids0, ids1 = np.empty(most, np.int32), np.empty(most, np.int32)
     sums0, sums1 = np.empty((most, 31)), np.empty((most, 31))
@@ -194,7 +194,7 @@ def keyframe_diagonal(sightings, poses, landmarks, k, begin, end, out):
     for c in range(first, end):
         n1 = 0
         if c < K - 1:
-            n1 = _sum_interval(sightings, poses, _interval(c, k, N), slot1, ids1, sums1)
+            n1 = _sum_interval(detections, poses, _interval(c, k, N), slot1, ids1, sums1)
         if c >= begin:
             at = min(c * k, N - 1)
             px, py, pz = poses.position[at, 0], poses.position[at, 1], poses.position[at, 2]
@@ -266,7 +266,7 @@ def _subtract_pairs(chain, landmark, waiting, position, size, room, table):
 
 
 @njit(nogil=True)
-def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table):
+def keyframe_network(detections, poses, landmarks, k, span, count, waiting, table):
     """Add the blocks of ``Pᵀ S P`` from measurements to ``table``, interval by interval.
 
     Returns the pending landmarks and the table, as both may have grown.
@@ -285,7 +285,7 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
     l, Di = landmarks
     N = len(poses.position)
     K = (N - 2) // k + 2
-    most = _most(sightings.first, k, N, span[0], span[1])
+    most = _most(detections.first, k, N, span[0], span[1])
     slot, head, frame, after, kept, ends = waiting
     ids, sums = np.empty(most, np.int32), np.empty((most, 31))
     room, used, free = len(frame), ends[0], ends[1]
@@ -295,7 +295,7 @@ def keyframe_network(sightings, poses, landmarks, k, span, count, waiting, table
     B00, B01, B11 = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     T = np.empty((3, 6))
     for c in range(span[0], span[1]):
-        n = _sum_interval(sightings, poses, _interval(c, k, N), slot, ids, sums)
+        n = _sum_interval(detections, poses, _interval(c, k, N), slot, ids, sums)
         if used + 2 * n > room:  # all may be new
             room = 2 * (used + 2 * n)
             frame, after, kept = _longer(frame, after, kept, room)

@@ -85,7 +85,7 @@ class Collapse:
         return self._parent
 
 
-def number_by_first_sighting(landmark: npt.ArrayLike) -> tuple[Labels, int]:
+def number_by_first_observation(landmark: npt.ArrayLike) -> tuple[Labels, int]:
     """Number landmarks of measurements in pose order ``(M,)`` by first observation; any integer labels ≥ 0."""
     label = np.array(landmark, dtype=np.int32)
     table = np.full(int(label.max(initial=-1)) + 1, -1, dtype=np.int32)

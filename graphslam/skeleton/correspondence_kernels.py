@@ -32,7 +32,7 @@ def worst_in_view(landmark, first, ratio, out):
 
 
 @njit(nogil=True, error_model="numpy")
-def split_labels(sightings, poses, wrong, rules, landmark, n):
+def split_labels(detections, poses, wrong, rules, landmark, n):
     """Give every track of a false landmark a new number, from ``n`` on. Returns the number of labels.
 
     A track is a sequence of observations in one traversal at one place: each is compared with the last one of the
@@ -52,20 +52,20 @@ def split_labels(sightings, poses, wrong, rules, landmark, n):
     place = np.empty((room, 3))
     used = 0
     head = np.full(len(wrong), -1, np.int32)
-    for i in range(len(sightings.first) - 1):
+    for i in range(len(detections.first) - 1):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
-        for m in range(sightings.first[i], sightings.first[i + 1]):
+        for m in range(detections.first[i], detections.first[i + 1]):
             j = landmark[m]
             if not wrong[j]:
                 continue
             sx, sy, sz, al, be = _seen(
                 R,
-                np.float64(sightings.points[m, 0]),
-                np.float64(sightings.points[m, 1]),
-                np.float64(sightings.points[m, 2]),
-                sightings.along,
-                sightings.across,
+                np.float64(detections.points[m, 0]),
+                np.float64(detections.points[m, 1]),
+                np.float64(detections.points[m, 2]),
+                detections.along,
+                detections.across,
             )
             best, least = -1, 2.0 * gate
             at = head[j]

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from graphslam.core.geometry import Array
 from graphslam.skeleton import correspondence_kernels, landmark_kernels
-from graphslam.skeleton.collapse import number_by_first_sighting
+from graphslam.skeleton.collapse import number_by_first_observation
 from graphslam.skeleton.schur import Network
 
 Labels = npt.NDArray[np.int32]
@@ -25,7 +25,7 @@ def landmark_chi2(network: Network) -> Array:
     counts = [np.zeros(r, np.int32) for r in layout.reach]
     layout.workers.over(
         lambda k: landmark_kernels.landmark_chi2_kernel(
-            layout.problem.sightings, network.poses, network.landmarks, *layout.ranges[k], parts[k], counts[k]
+            layout.problem.detections, network.poses, network.landmarks, *layout.ranges[k], parts[k], counts[k]
         ),
         [(k,) for k in range(len(parts))],
     )
@@ -74,5 +74,5 @@ def split_false_correspondences(network: Network) -> tuple[Labels, int]:
     bad = np.zeros(L, np.bool_)
     bad[wrong] = True
     landmark = problem.landmark.copy()
-    correspondence_kernels.split_labels(problem.sightings, network.poses, bad, (GAP, 16.27), landmark, L)
-    return number_by_first_sighting(landmark)[0], len(wrong)
+    correspondence_kernels.split_labels(problem.detections, network.poses, bad, (GAP, 16.27), landmark, L)
+    return number_by_first_observation(landmark)[0], len(wrong)

@@ -22,7 +22,7 @@ from graphslam.core.jit import njit
 Array = npt.NDArray[np.float64]
 
 
-class Sightings(NamedTuple):
+class Detections(NamedTuple):
     """Measurements in pose order."""
 
     points: npt.NDArray[np.float32]
@@ -69,24 +69,24 @@ def _nine(R, i):
 
 
 @njit(nogil=True)
-def count_sightings(landmark, out):
+def count_observations(landmark, out):
     """Add the number of observations to ``out (L,)``."""
     for m in range(len(landmark)):
         out[landmark[m]] += 1
 
 
 @njit(nogil=True, error_model="numpy")
-def sum_landmarks(sightings, poses, begin, end, D, b):
+def sum_landmarks(detections, poses, begin, end, D, b):
     """Add ``Σ W`` (xx, xy, xz, yy, yz, zz) to ``D (L, 6)`` and ``Σ W (p + s)`` to ``b (L, 3)``."""
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
-        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
-            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+        for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
+            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
             sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
             )
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             D[j, 0] += al + be * sx * sx
             D[j, 1] += be * sx * sy
             D[j, 2] += be * sx * sz
@@ -117,18 +117,18 @@ def solve_landmarks(D, b, begin, end):
 
 
 @njit(nogil=True, error_model="numpy")
-def pose_gradients(sightings, poses, l, begin, end, g, objective):
+def pose_gradients(detections, poses, l, begin, end, g, objective):
     """Write half the objective's gradient of each pose to ``g (N, 6)`` and ``Σ eᵀ W e`` to ``objective (N,)``."""
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         J = wx = wy = wz = ux = uy = uz = 0.0
-        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
-            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+        for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
+            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
             sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
             )
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
             ex, ey, ez = qx - sx, qy - sy, qz - sz
             d = be * (sx * ex + sy * ey + sz * ez)
@@ -145,17 +145,17 @@ def pose_gradients(sightings, poses, l, begin, end, g, objective):
 
 
 @njit(nogil=True, error_model="numpy")
-def landmark_chi2_kernel(sightings, poses, l, begin, end, out, count):
+def landmark_chi2_kernel(detections, poses, l, begin, end, out, count):
     """Add ``eᵀ W e`` of each measurement to its landmark in ``out (L,)``, and one to ``count (L,)``."""
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
-        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
-            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+        for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
+            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
             sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
             )
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             ex, ey, ez = l[j, 0] - px - sx, l[j, 1] - py - sy, l[j, 2] - pz - sz
             d = sx * ex + sy * ey + sz * ez
             out[j] += al * (ex * ex + ey * ey + ez * ez) + be * d * d
@@ -163,7 +163,7 @@ def landmark_chi2_kernel(sightings, poses, l, begin, end, out, count):
 
 
 @njit(nogil=True, error_model="numpy")
-def schur_diagonal(sightings, poses, landmarks, begin, end, blocks):
+def schur_diagonal(detections, poses, landmarks, begin, end, blocks):
     """Add the measurements' diagonal blocks of the Schur complement to ``blocks (N, 6, 6)``.
 
     Exact if a pose observes each landmark once; otherwise the block is too small by their common part.
@@ -178,12 +178,12 @@ def schur_diagonal(sightings, poses, landmarks, begin, end, blocks):
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
-        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
-            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+        for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
+            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
             sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
             )
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             # C = W - W D⁻¹ W, with W a = α a + β s (s·a); t = D⁻¹ s
             a, c, d, e, f, g = Di[j, 0], Di[j, 1], Di[j, 2], Di[j, 3], Di[j, 4], Di[j, 5]
             tx, ty, tz = a * sx + c * sy + d * sz, c * sx + e * sy + f * sz, d * sx + f * sy + g * sz
@@ -216,18 +216,18 @@ def schur_diagonal(sightings, poses, landmarks, begin, end, blocks):
 
 
 @njit(nogil=True, error_model="numpy")
-def gather_landmarks(sightings, poses, l, v, begin, end, t):
+def gather_landmarks(detections, poses, l, v, begin, end, t):
     """First pass of the product: add ``Σ W (q × w - u)`` to ``t (L, 3)``."""
     for i in range(begin, end):
         R = _nine(poses.rotation, i)
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
-        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
-            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+        for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
+            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
             sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
             )
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
             ax = qy * wz - qz * wy - ux
             ay = qz * wx - qx * wz - uy
@@ -249,7 +249,7 @@ def solve_landmark_sums(Di, t, begin, end):
 
 
 @njit(nogil=True, error_model="numpy")
-def scatter_to_poses(sightings, poses, landmarks, v, begin, end, out):
+def scatter_to_poses(detections, poses, landmarks, v, begin, end, out):
     """Second pass: add ``f × q`` and ``-f``, f = W (q × w - u - t), to ``out (N, 6)``.
 
     Parameters
@@ -262,12 +262,12 @@ def scatter_to_poses(sightings, poses, landmarks, v, begin, end, out):
         px, py, pz = poses.position[i, 0], poses.position[i, 1], poses.position[i, 2]
         wx, wy, wz, ux, uy, uz = v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
         yx = yy = yz = zx = zy = zz = 0.0
-        for m in range(sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base):
-            x, y, z = sightings.points[m, 0], sightings.points[m, 1], sightings.points[m, 2]
+        for m in range(detections.first[i] - detections.base, detections.first[i + 1] - detections.base):
+            x, y, z = detections.points[m, 0], detections.points[m, 1], detections.points[m, 2]
             sx, sy, sz, al, be = _seen(
-                R, np.float64(x), np.float64(y), np.float64(z), sightings.along, sightings.across
+                R, np.float64(x), np.float64(y), np.float64(z), detections.along, detections.across
             )
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             qx, qy, qz = l[j, 0] - px, l[j, 1] - py, l[j, 2] - pz
             ax = qy * wz - qz * wy - ux - t[j, 0]
             ay = qz * wx - qx * wz - uy - t[j, 1]

@@ -85,7 +85,7 @@ class KeyframeNetwork:
         table = make_block_table(max(1024, 4 * self.frames if pattern is None else len(pattern.keys) + 3))
         landmarks, waiting = (network.landmarks, network.inverse), kernels.make_pending(problem.landmarks)
         for a, b in _interval_chunks(network, k, 0, self.frames - 1):
-            sight = problem.sightings_of(*_poses_of(problem.poses, k, a, b))
+            sight = problem.observations_of(*_poses_of(problem.poses, k, a, b))
             waiting, table = kernels.keyframe_network(sight, poses, landmarks, k, (a, b), count, waiting, table)
         keys = sorted_block_keys(table)
         self.blocks = table.block[: len(keys)]
@@ -172,7 +172,7 @@ class Preconditioner:
             def fill(first: int, last: int) -> None:
                 for a, b in _interval_chunks(network, k, first, last):
                     # a keyframe also belongs to the interval before it
-                    sight = network.layout.problem.sightings_of(*_poses_of(len(self.position), k, max(0, a - 1), b))
+                    sight = network.layout.problem.observations_of(*_poses_of(len(self.position), k, max(0, a - 1), b))
                     kernels.keyframe_diagonal(sight, network.poses, landmarks, k, a, b, blocks)
 
             workers.over(fill, ranges)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from graphslam.core.errors import CovarianceError, DataError
 from graphslam.core.geometry import Array
 from graphslam.skeleton.chain_kernels import ChainArrays, compose_odometry
-from graphslam.skeleton.landmark_kernels import Poses, Sightings
+from graphslam.skeleton.landmark_kernels import Detections, Poses
 from graphslam.skeleton.tile_store import Tiles
 
 
@@ -142,7 +142,7 @@ class SkeletonProblem:
             label = self.landmark[k : k + block]
             peak = np.maximum.accumulate(np.concatenate([[high], label]))
             if label.min() < 0 or (label > peak[:-1] + 1).any():
-                raise DataError("landmarks are not numbered by first observation", wanted="number_by_first_sighting")
+                raise DataError("landmarks are not numbered by first observation", wanted="number_by_first_observation")
             high = int(peak[-1])
         object.__setattr__(self, "_landmarks", high + 1)
 
@@ -182,17 +182,17 @@ class SkeletonProblem:
         return inverse_covariance(self.start_covariance, "start_covariance")
 
     @property
-    def sightings(self) -> Sightings:
+    def detections(self) -> Detections:
         """The measurements as input of the kernels."""
-        return self.sightings_of(0, self.poses)
+        return self.observations_of(0, self.poses)
 
-    def sightings_of(self, begin: int, end: int) -> Sightings:
+    def observations_of(self, begin: int, end: int) -> Detections:
         """At least the measurements of the poses ``begin … end - 1``, as input of the kernels."""
         along, across = self.range_sigma**-2, self.bearing_sigma**-2
         if self.tiles is None:
-            return Sightings(self.points, self.landmark, self.first, along, across, 0)
+            return Detections(self.points, self.landmark, self.first, along, across, 0)
         points, landmark = self.tiles.read(begin, end)
-        return Sightings(points, landmark, self.first, along, across, int(self.first[begin]))
+        return Detections(points, landmark, self.first, along, across, int(self.first[begin]))
 
     def chunks(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
         """Ranges of poses to process at once: all if in memory, tile by tile if on disk."""

@@ -53,7 +53,7 @@ class ReducedNetwork:
             )
         table = block_table_kernels.make_block_table(int(1.3 * N * (per_pose + 2)) + 64)
         kernels.eliminate_landmarks(
-            problem.sightings, network.poses, (network.landmarks, network.inverse), order, table
+            problem.detections, network.poses, (network.landmarks, network.inverse), order, table
         )
         keys = block_table_kernels.sorted_block_keys(table)
         blocks = table.block[: len(keys)]

@@ -40,7 +40,7 @@ def count_blocks(landmark, first, ptr, pose, step, mark):
 
 
 @njit(nogil=True, error_model="numpy")
-def eliminate_landmarks(sightings, poses, landmarks, order, table):
+def eliminate_landmarks(detections, poses, landmarks, order, table):
     """Marginalise all landmarks: ``Σ Jᵀ W J`` on the diagonal, minus the pairs of observations, into ``table``.
 
     Parameters
@@ -62,11 +62,11 @@ def eliminate_landmarks(sightings, poses, landmarks, order, table):
             i, m = pose[a + e], measurement[a + e]
             sx, sy, sz, al, be = _seen(
                 _nine(poses.rotation, i),
-                np.float64(sightings.points[m, 0]),
-                np.float64(sightings.points[m, 1]),
-                np.float64(sightings.points[m, 2]),
-                sightings.along,
-                sightings.across,
+                np.float64(detections.points[m, 0]),
+                np.float64(detections.points[m, 1]),
+                np.float64(detections.points[m, 2]),
+                detections.along,
+                detections.across,
             )
             W[0], W[1], W[2] = al + be * sx * sx, be * sx * sy, be * sx * sz
             W[3], W[4], W[5] = al + be * sy * sy, be * sy * sz, al + be * sz * sz

@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.se3 import matrix_to_quat, so3_left_jacobian_inverse, so3_log
 from graphslam.skeleton import chain_kernels as chains
 from graphslam.skeleton import landmark_kernels as kernels
-from graphslam.skeleton.landmark_kernels import Poses, Sightings
+from graphslam.skeleton.landmark_kernels import Detections, Poses
 from graphslam.skeleton.problem import SkeletonProblem
 
 PARTS = 2
@@ -57,10 +57,10 @@ class WorkRanges:
         for a, b in self.ranges:
             high = self.reach[-1] if self.reach else 0
             for c, e in problem.chunks(a, b):
-                sight = problem.sightings_of(c, e)
+                sight = problem.observations_of(c, e)
                 label = sight.landmark[problem.first[c] - sight.base : problem.first[e] - sight.base]
                 high = max(high, int(label.max(initial=-1)) + 1)
-                kernels.count_sightings(label, self.counts)
+                kernels.count_observations(label, self.counts)
             self.reach.append(high)
 
     def over_landmarks(self, work: Callable[[int, int], None]) -> None:
@@ -72,11 +72,11 @@ class WorkRanges:
         return self.workers.over(work, (c for r in self.ranges for c in self.problem.chunks(*r)))
 
     def over(self, work: Callable[..., None]) -> None:
-        """``work(k, sightings, begin, end)`` for the chunks of each range k of poses, in order within a range."""
+        """``work(k, detections, begin, end)`` for the chunks of each range k of poses, in order within a range."""
 
         def walk(k: int) -> None:
             for a, b in self.problem.chunks(*self.ranges[k]):
-                work(k, self.problem.sightings_of(a, b), a, b)
+                work(k, self.problem.observations_of(a, b), a, b)
 
         self.workers.over(walk, [(k,) for k in range(len(self.ranges))])
 
@@ -155,7 +155,7 @@ class Network:
         chain, blocks = self.chain_blocks()[0], layout.problem.room((layout.problem.poses, 6, 6))
         landmarks = (self.landmarks, self.inverse)
 
-        def fill(_: int, sight: Sightings, a: int, e: int) -> None:
+        def fill(_: int, sight: Detections, a: int, e: int) -> None:
             blocks[a:e] = chain[a:e]
             kernels.schur_diagonal(sight, self.poses, landmarks, a, e, blocks)
 
@@ -174,7 +174,7 @@ class Network:
         diagonal, upper = self.chain_blocks()
         out = np.empty_like(v)
 
-        def spread(_: int, sight: Sightings, a: int, e: int) -> None:
+        def spread(_: int, sight: Detections, a: int, e: int) -> None:
             chains.chain_product(diagonal, upper, v, a, e, out)
             kernels.scatter_to_poses(sight, self.poses, (self.landmarks, t), v, a, e, out)
 

@@ -98,6 +98,6 @@ def forward_pass(
     rules = (int(ago), TURN_SIGMA**-2, WAY_SIGMA**-2, GATE)
     tied = refused = 0
     for span in problem.chunks(0, N):
-        t, r = forward_pass_kernel(problem.sightings_of(*span), chain, span, rules, seen, D, b, out)
+        t, r = forward_pass_kernel(problem.observations_of(*span), chain, span, rules, seen, D, b, out)
         tied, refused = tied + int(t), refused + int(r)
     return ForwardPass(out, tied, refused)

@@ -9,7 +9,7 @@ from graphslam.skeleton.chain_kernels import _cholesky, _log, _solve, write_se3_
 
 
 @njit(nogil=True)
-def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, out):
+def forward_pass_kernel(detections, chain_poses, span, rules, start_seen, D, b, out):
     """Process the poses in order: each is aligned with older landmarks, then its observations are added.
 
     Parameters
@@ -34,7 +34,7 @@ def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, o
         Number of poses aligned with old landmarks; number of rejected observations of old landmarks.
     """
     ago, turn, way, gate = rules
-    rotation, position, points = chain_poses.rotation, chain_poses.position, sightings.points
+    rotation, position, points = chain_poses.rotation, chain_poses.position, detections.points
     A = np.empty((6, 6))
     x = np.empty(6)
     w = np.empty(3)
@@ -44,7 +44,7 @@ def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, o
     pp = np.empty(3)
     most = 0
     for i in range(span[0], span[1]):
-        most = max(most, sightings.first[i + 1] - sightings.first[i])
+        most = max(most, detections.first[i + 1] - detections.first[i])
     seen = np.empty((most, 8))
     misfit = np.empty(most)
     which = np.empty(most, np.int64)
@@ -66,11 +66,11 @@ def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, o
                 for k in range(3):
                     R[r, k] = T[r, 0] * c[0, k] + T[r, 1] * c[1, k] + T[r, 2] * c[2, k]
                     p[r] += T[r, k] * (position[i, k] - position[i - 1, k])
-        lo, hi = sightings.first[i] - sightings.base, sightings.first[i + 1] - sightings.base
+        lo, hi = detections.first[i] - detections.base, detections.first[i + 1] - detections.base
         believed[: hi - lo] = True
         n = 0
         for m in range(lo, hi):
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             if start_seen[j] < 0 or i - start_seen[j] <= ago:
                 continue
             # the running mean D⁻¹ b
@@ -84,8 +84,8 @@ def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, o
             z0, z1, z2 = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
             seen[n, 3], seen[n, 4], seen[n, 5] = z0, z1, z2
             r2 = z0 * z0 + z1 * z1 + z2 * z2
-            seen[n, 6] = sightings.across / r2
-            seen[n, 7] = (sightings.along - seen[n, 6]) / r2
+            seen[n, 6] = detections.across / r2
+            seen[n, 7] = (detections.along - seen[n, 6]) / r2
             which[n] = m - lo
             n += 1
         if n >= 3:
@@ -158,11 +158,11 @@ def forward_pass_kernel(sightings, chain_poses, span, rules, start_seen, D, b, o
         for m in range(lo, hi):
             if not believed[m - lo]:
                 continue
-            j = sightings.landmark[m]
+            j = detections.landmark[m]
             z0, z1, z2 = np.float64(points[m, 0]), np.float64(points[m, 1]), np.float64(points[m, 2])
             r2 = z0 * z0 + z1 * z1 + z2 * z2
-            al = sightings.across / r2
-            be = (sightings.along - al) / r2
+            al = detections.across / r2
+            be = (detections.along - al) / r2
             sx = R[0, 0] * z0 + R[0, 1] * z1 + R[0, 2] * z2
             sy = R[1, 0] * z0 + R[1, 1] * z1 + R[1, 2] * z2
             sz = R[2, 0] * z0 + R[2, 1] * z1 + R[2, 2] * z2

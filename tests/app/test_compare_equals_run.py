@@ -60,7 +60,10 @@ def test_on_a_plain_table_of_landmarks_that_was_calibrated(tmp_path: Path) -> No
     rows = np.repeat(np.arange(len(seen.times)), np.diff(seen.offsets))
     tables = {
         "odometry": ("t,x,y,theta", np.column_stack([wheels.times, path])),
-        "sightings": ("t,range,bearing,id", np.column_stack([seen.times[rows], seen.ranges, seen.bearings, seen.ids])),
+        "observations": (
+            "t,range,bearing,id",
+            np.column_stack([seen.times[rows], seen.ranges, seen.bearings, seen.ids]),
+        ),
     }
     for name, (header, table) in tables.items():
         np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=header, comments="", fmt="%.9g")

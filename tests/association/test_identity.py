@@ -26,7 +26,7 @@ def solved(submaps):
 
 
 def misread(submaps, submap, entry, metres):
-    """The same submaps, one sighting displaced."""
+    """The same submaps, one observation displaced."""
     s = submaps[submap]
     positions = s.landmarks.positions.copy()
     positions[entry] += [metres, 0.0]
@@ -46,7 +46,7 @@ def test_the_statistic_is_what_the_objective_falls_by(rng, submap):
     assert new in g.landmark_ids_of(submap)
 
 
-def test_honest_sightings_are_chi_square(rng):
+def test_honest_observations_are_chi_square(rng):
     values = []
     for _ in range(12):
         g = solved(make_chain(rng, m=8, landmarks=20).submaps)
@@ -61,7 +61,7 @@ def test_honest_sightings_are_chi_square(rng):
 
 def test_landmarks_of_one_submap_cannot_be_judged(rng):
     g = solved(make_chain(rng, m=2, landmarks=20).submaps)
-    seen_once = {i for i in g.values.landmark_ids.tolist() if len(g.sightings(i)) == 1}
+    seen_once = {i for i in g.values.landmark_ids.tolist() if len(g.detections(i)) == 1}
     assert seen_once
     for r in g.records.values():
         T = identity_statistics(g, r)
@@ -88,7 +88,7 @@ def test_the_back_end_splits_the_culprit_and_nothing_else(rng, solver):
 def test_impossible_splits_are_refused(rng):
     g = solved(make_chain(rng, m=2, landmarks=20).submaps)
     record = next(iter(g.records.values()))
-    lone = next(k for k, i in enumerate(record.landmark_ids) if len(g.sightings(int(i))) == 1)
+    lone = next(k for k, i in enumerate(record.landmark_ids) if len(g.detections(int(i))) == 1)
     with pytest.raises(DataError, match="nowhere else"):
         g.split_landmark(record.factor_id, lone)
     with pytest.raises(DataError, match="no such observation"):

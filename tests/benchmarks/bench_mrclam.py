@@ -111,7 +111,7 @@ def together(runs: Sequence[Run], by: Any, out: Path | None) -> None:
     shared = int(np.sum(m.landmark_sessions > 1))
     print(
         f"merged by {by}: {len(m.sessions)} robots, {int(m.metric('submaps'))} maps, {shared} shared landmarks, "
-        f"join χ²/dof {m.metric('join_chi2_per_dof'):.2f}, {m.report['sightings_split']} sightings split off, "
+        f"join χ²/dof {m.metric('join_chi2_per_dof'):.2f}, {m.report['observations_split']} detections split off, "
         f"{m.report['seconds']:.1f} s"
     )
     if by == "identity":

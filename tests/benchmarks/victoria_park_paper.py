@@ -48,7 +48,7 @@ from graphslam_studies.plots.study_time import plot_cumulative_time
 from tests.reference.gps_maps import plot_gps_maps
 
 Ints = npt.NDArray[np.int64]
-CONFIRMED = 6  # sightings over all submaps, as in the preset
+CONFIRMED = 6  # detections over all submaps, as in the preset
 EVERYWHERE = 1e6  # m: an EKF that works on all landmarks in every scan, as the textbook has it
 
 
@@ -71,12 +71,12 @@ class Judge:
         return out
 
     def labels(self, submaps: Sequence[Submap], ids: Sequence[npt.ArrayLike]) -> Ints:
-        """Landmark of every observation of the log, -1 where none, from the sightings of submaps."""
+        """Landmark of every observation of the log, -1 where none, from the detections of submaps."""
         out = np.full(len(self.reference), -1, dtype=np.int64)
         for s, i in zip(submaps, ids, strict=True):
             assert s.landmarks is not None
-            assert s.landmarks.sightings is not None
-            q = s.landmarks.sightings
+            assert s.landmarks.detections is not None
+            q = s.landmarks.detections
             out[q[:, 0]] = np.asarray(i)[q[:, 1]]
         return out
 

@@ -11,10 +11,10 @@ from scipy import special
 from graphslam.calibrate.clock import profile_clock
 from graphslam.calibrate.corrections import Corrections, corrected_motion, slip_noise
 from graphslam.calibrate.estimate import Calibration, Estimate, Prediction
-from graphslam.calibrate.landmark_calibration import QUICK, SHORT, calibrate_sightings
-from graphslam.calibrate.landmarks import fit_noise, smooth_sightings
+from graphslam.calibrate.landmark_calibration import QUICK, SHORT, calibrate_observations
+from graphslam.calibrate.landmarks import fit_noise, smooth_observations
 from graphslam.calibrate.slips import find_slips
-from graphslam.calibrate.windows import SightingLog
+from graphslam.calibrate.windows import ObservationLog
 from graphslam.core.random import SeedTree
 from graphslam_studies.calibration_robot import draw_robot, drive
 from graphslam_studies.trust_faults import odometry
@@ -23,8 +23,8 @@ from graphslam_studies.trust_worlds import draw_world, world_log
 FREE = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
 
 
-def seen_in(log) -> SightingLog:
-    return SightingLog.of(log, "landmarks", log["landmarks"])
+def seen_in(log) -> ObservationLog:
+    return ObservationLog.of(log, "landmarks", log["landmarks"])
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def log():
 
 @pytest.fixture(scope="module")
 def clean(log):
-    return fit_noise(smooth_sightings(seen_in(log), SHORT, 20, FREE))[0]
+    return fit_noise(smooth_observations(seen_in(log), SHORT, 20, FREE))[0]
 
 
 def test_statistic_of_noise_that_is_fitted_has_the_distribution_it_is_compared_with(log, clean) -> None:
@@ -59,7 +59,7 @@ def test_distances_left_out_take_away_what_they_cost(clean) -> None:
 
 def test_slipping_wheels_are_named_and_leave_the_noise_as_it_is(log, clean) -> None:
     slipped = odometry(slip=1.5)(log)
-    found = calibrate_sightings(seen_in(slipped), QUICK)
+    found = calibrate_observations(seen_in(slipped), QUICK)
     at = np.array(found.corrections.slips)
     for begin in (10.0, 20.0, 30.0, 40.0, 50.0):
         assert np.any((at[:, 0] < begin + 0.5) & (at[:, 1] > begin + 0.5))
@@ -69,7 +69,7 @@ def test_slipping_wheels_are_named_and_leave_the_noise_as_it_is(log, clean) -> N
     step = np.array([1.0, 1.0 / draw_robot(7).speed])
     variance = [x["along_metre"] ** 2 * step[0] + x["along_second"] ** 2 * step[1] for x in (found.noise, clean.sigmas)]
     assert 0.5 < variance[0] / variance[1] < 2.0  # without the search nine times as large
-    assert all(f.code != "wheels-slipped" for f in calibrate_sightings(seen_in(log), QUICK).findings())
+    assert all(f.code != "wheels-slipped" for f in calibrate_observations(seen_in(log), QUICK).findings())
 
 
 def test_wheels_that_report_nothing_while_the_robot_moves_are_found_once(log) -> None:
@@ -77,11 +77,11 @@ def test_wheels_that_report_nothing_while_the_robot_moves_are_found_once(log) ->
     xi = o.increments.copy()
     xi[(o.times > 20.0) & (o.times < 23.0)] = 0.0  # their σ in slip is zero, too: they stay in contradiction
     stuck = seen_in(replace(log, streams={**log.streams, "odometry": replace(o, increments=xi)}))
-    s = fit_noise(smooth_sightings(stuck, SHORT, 20, FREE))[0]
+    s = fit_noise(smooth_observations(stuck, SHORT, 20, FREE))[0]
     found = find_slips(s, stuck.spacing)
     assert any(a < 22.0 and b > 21.0 for a, b in found)
     assert find_slips(s, stuck.spacing, found) == ()
-    at = np.array(calibrate_sightings(stuck, QUICK).corrections.slips)
+    at = np.array(calibrate_observations(stuck, QUICK).corrections.slips)
     assert len(at) < 12
     assert np.all(at[1:, 0] >= at[:-1, 1])
 
@@ -105,7 +105,7 @@ def test_wheels_that_are_half_a_second_late_are_found_beyond_minima_of_chance() 
     o = drawn["odometry"]
     late = replace(drawn, streams={**drawn.streams, "odometry": replace(o, times=o.times + 0.5)})
     seen = seen_in(late).holding()
-    clock = profile_clock(fit_noise(smooth_sightings(seen, SHORT, 5, FREE))[0], seen)
+    clock = profile_clock(fit_noise(smooth_observations(seen, SHORT, 5, FREE))[0], seen)
     assert clock.applied
     assert clock.sigma < 0.1
     assert abs(clock.value - 0.5) < 3.0 * clock.sigma  # in steps of one record: 0.32 ± 0.02 s
@@ -114,7 +114,7 @@ def test_wheels_that_are_half_a_second_late_are_found_beyond_minima_of_chance() 
 @pytest.mark.parametrize(("timed", "kept"), [(Corrections(clock=0.5), 0.5), (Corrections(), 0.0)])
 def test_clock_is_refused_where_it_predicts_worse_and_not_where_nothing_depends_on_it(timed, kept) -> None:
     estimate = Estimate(name="clock", value=0.5, sigma=0.02, gain=100.0, other=0.5, other_sigma=0.02).gated()
-    found = Calibration(kind="sightings", corrections=Corrections(clock=0.5, along_metre=0.1), estimates=(estimate,))
+    found = Calibration(kind="observations", corrections=Corrections(clock=0.5, along_metre=0.1), estimates=(estimate,))
     tested = found.validated(Prediction(what="observations", count=400, gains={"all": -1.0}, timed=timed))
     assert tested.corrections == Corrections(clock=kept)
     assert tested.estimates[0].applied == bool(kept)

@@ -56,7 +56,7 @@ def test_errors_inside_a_map_equal_a_count_one_by_one(data):
         identity[j] = min(set(held), key=lambda y: (-held.count(y), y))
     got = association_errors(a, b, min_hits=min_hits)
     real = [i for i in identity.values() if i >= 0]
-    assert got.sightings == sum(x >= 0 for x in a)
+    assert got.detections == sum(x >= 0 for x in a)
     assert got.wrong == sum(x >= 0 and y != identity[x] for x, y in zip(a, b))
     assert got.landmarks == len(identity)
     assert got.spurious == sum(i < 0 for i in identity.values())
@@ -69,7 +69,7 @@ def test_errors_inside_a_map_equal_a_count_one_by_one(data):
 def test_hand_case_of_errors_inside_a_map():
     # four of 7 (one is of 8, one clutter); two of clutter and one of 9; a duplicate of 7; 8 twice, unused
     got = association_errors([0, 0, 0, 0, 1, 1, 1, 2, -1, -1], [7, 7, 8, -1, -1, -1, 9, 7, 8, 8], min_hits=3)
-    assert got == AssociationErrors(sightings=8, wrong=3, landmarks=3, spurious=1, duplicated=1, missed=1)
+    assert got == AssociationErrors(detections=8, wrong=3, landmarks=3, spurious=1, duplicated=1, missed=1)
     assert got.wrong_share == pytest.approx(3 / 8)
     assert (got + got).wrong == 6
     assert np.isnan(association_errors([-1], [3]).wrong_share)

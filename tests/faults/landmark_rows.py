@@ -67,7 +67,7 @@ class Row:
         return self.sensor, self.fault, self.name, f"{self.dim}-D", self.outcome, shows if self.shows else "—"
 
 
-def _no_sighting(z: LandmarkObservations, _: Any) -> LandmarkObservations:
+def _no_observation(z: LandmarkObservations, _: Any) -> LandmarkObservations:
     keep = np.zeros(len(z.ranges), dtype=bool)
     return replace(
         z,
@@ -103,7 +103,7 @@ WHEELS: list[tuple[str, inject.Inject]] = [
     ("steering to the other side", inject.steering(-1.0)),
     ("steering in degrees", inject.steering(180.0 / np.pi)),
 ]
-SIGHTINGS: list[tuple[str, inject.Inject]] = [
+OBSERVATIONS: list[tuple[str, inject.Inject]] = [
     ("bearings mirrored", inject.mirrored()),
     ("bearings off by 10°", inject.bearing_offset(np.deg2rad(10.0))),
     ("bearings in degrees", inject.bearings_in_degrees()),
@@ -171,15 +171,15 @@ GPS: list[tuple[str, inject.Inject, Outcome, str]] = [
     ),
     ("no fix at all", inject.gps(lambda g, _: g.take(slice(0, 0))), "reported", "gps-empty"),
 ]
-FIT = "calibration|residuals|sightings-not-used"
+FIT = "calibration|residuals|observations-not-used"
 
 
 def _rows() -> list[Row]:
     rows: list[Row] = []
     for frontend in ("rbpf-ekf", "ekf-slam", "rbpf-slam"):
         rows += [Row("wheels", f, i, "reported", "calibration|residuals", frontend) for f, i in WHEELS]
-        rows += [Row("landmarks", f, i, "reported", "calibration|residuals", frontend) for f, i in SIGHTINGS]
-        rows.append(Row("landmarks", *MILLIMETRES, "reported", "sightings-not-used", frontend))
+        rows += [Row("landmarks", f, i, "reported", "calibration|residuals", frontend) for f, i in OBSERVATIONS]
+        rows.append(Row("landmarks", *MILLIMETRES, "reported", "observations-not-used", frontend))
         rows.append(Row("landmarks", *KILOMETRES, "refused", HARDLY, frontend))
         ids = inject.wrong_identities(0.1)
         rows += [Row("landmarks", "10 % wrong identities", ids, "reported", "residuals", frontend)]
@@ -187,9 +187,9 @@ def _rows() -> list[Row]:
             Row(
                 "landmarks",
                 "none in any scan",
-                inject.sightings(_no_sighting),
+                inject.detections(_no_observation),
                 "reported",
-                "sightings-not-used",
+                "observations-not-used",
                 frontend,
             )
         ]
@@ -205,11 +205,12 @@ def _rows() -> list[Row]:
         rows.append(replace(beyond, config=short))
     for frontend, config in (("rbpf-ekf", LIKELIHOOD), ("ekf-slam", NEAREST)):
         rows += [Row("wheels", f, i, "reported", FIT, frontend, config=config) for f, i in WHEELS]
-        rows += [Row("landmarks", f, i, "reported", FIT, frontend, config=config) for f, i in [*SIGHTINGS, MILLIMETRES]]
+        faults = [*OBSERVATIONS, MILLIMETRES]
+        rows += [Row("landmarks", f, i, "reported", FIT, frontend, config=config) for f, i in faults]
     # by ranges alone, wheels that turn the other way give the mirror image of everything: a limit, not a row
     blind = [
         *(x for x in WHEELS if "other side" not in x[0]),
-        *(x for x in [*SIGHTINGS, MILLIMETRES] if x[0].startswith("ranges")),
+        *(x for x in [*OBSERVATIONS, MILLIMETRES] if x[0].startswith("ranges")),
     ]
     rows += [Row("beacons", f, i, "reported", FIT, log="beacons") for f, i in blind]
     rows.append(Row("beacons", *KILOMETRES, "refused", HARDLY, log="beacons"))
@@ -241,8 +242,8 @@ def _rows() -> list[Row]:
     rows += [
         Row("landmarks", "every scan ten times", inject.repeated(10), "reported", FIT),
         Row("landmarks", "every scan ten times", inject.repeated(10), "reported", FIT, "ekf-slam"),
-        Row("landmarks", "all ranges NaN", inject.sightings(_nan), "refused", "is not finite"),
-        Row("landmarks", "stamps that repeat", inject.sightings(_twice), "refused", "time does not increase"),
+        Row("landmarks", "all ranges NaN", inject.detections(_nan), "refused", "is not finite"),
+        Row("landmarks", "stamps that repeat", inject.detections(_twice), "refused", "time does not increase"),
         Row("landmarks", "log without a record", _records(0, "landmarks"), "refused", "no scan to work on"),
         Row("landmarks", "log of one scan", _records(1, "landmarks"), "handled", ""),
         Row("wheels", "log without a record", _records(0, "controls"), "refused", "motion stream is empty"),

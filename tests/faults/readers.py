@@ -194,9 +194,9 @@ def some_submaps() -> list[Submap]:
             out.append(Submap(key=key, exit_pose=pose, exit_covariance=0.01 * np.eye(3), **common))
             continue
         whole = {"covariance": P} if key == 0 else {"information": sp.csc_matrix(np.linalg.inv(P))}
-        sightings = np.array([[0, 0], [1, 1], [2, 2]])
+        detections = np.array([[0, 0], [1, 1], [2, 2]])
         marks = LandmarkMap(
-            ids=np.arange(n), exit_pose=pose, positions=r.normal(size=(n, 2)), sightings=sightings, **whole
+            ids=np.arange(n), exit_pose=pose, positions=r.normal(size=(n, 2)), detections=detections, **whole
         )
         out.append(Submap.from_landmarks(key, marks, **common))
     return out

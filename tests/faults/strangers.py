@@ -423,10 +423,10 @@ def tables(change: Callable[[Array, Array], Array]) -> Callable[[Path], Path]:
     def make(root: Path) -> Path:
         small.tables(root / "csv", poses=True)
         t, _, _, path = small.drive()
-        rows = small.sightings(t, path)
+        rows = small.detections(t, path)
         rows = change(rows, np.interp(rows[:, 0], t, path[:, 2]))
         form = ("%.6f", "%d", "%.9g", "%.9g")
-        np.savetxt(root / "csv" / "sightings.csv", rows, form, ",", header="t,id,range,bearing", comments="")
+        np.savetxt(root / "csv" / "observations.csv", rows, form, ",", header="t,id,range,bearing", comments="")
         return root / "csv"
 
     return make

@@ -36,7 +36,8 @@ def rich_graph(rng) -> FactorGraph:
     g.add_between(0, 4, rel + [0.3, 0, 0], C, evidence="shared-scan", robust=RobustKernel("huber", 1.0))
     g.add_between(5, 0, se2_between(chain.poses[5], chain.poses[0]), C, evidence=EvidenceUse(["wheel"], (0, 50)))
     g.add_between(2, 5, se2_between(chain.poses[2], chain.poses[5]), C, evidence="shared-scan")
-    shared = [i for i in g.values.landmark_ids if len(g.sightings(int(i)) & g.sightings(int(g.values.landmark_ids[0])))]
+    first = g.detections(int(g.values.landmark_ids[0]))
+    shared = [i for i in g.values.landmark_ids if len(g.detections(int(i)) & first)]
     g.merge_landmarks(int(shared[0]), int(shared[1]))  # the id now stands twice in a submap
     step = 0.02 * rng.standard_normal(g.flat().layout.size)
     g.set_values(g.values.retract(step))

@@ -69,7 +69,7 @@ def test_new_landmarks_get_fresh_ids_and_start_where_they_were_seen(chain):
     g.add_submap(anonymous(chain.submaps[1]), landmark_ids=ids)
     assert g.landmark_ids_of(1)[0] == 2
     assert g.landmark_ids_of(1)[1:].tolist() == list(range(n, n + len(ids) - 1))
-    assert len(g.sightings(2)) == 2
+    assert len(g.detections(2)) == 2
 
 
 @pytest.mark.parametrize("what", ["twice", "shape", "id", "covariance", "ledger", "scale"])

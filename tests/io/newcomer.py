@@ -106,7 +106,7 @@ def tables(out: Path) -> None:
     )
     rows = np.column_stack([np.repeat(z.times, np.diff(z.offsets)), z.ids, z.ranges, np.rad2deg(z.bearings)])
     np.savetxt(
-        folder / "sightings.csv",
+        folder / "observations.csv",
         rows,
         delimiter=";",
         fmt=("%.6f", "%d", "%.9g", "%.9g"),

@@ -200,7 +200,7 @@ def drive(seconds: float = 40.0, rate: float = 10.0) -> tuple[np.ndarray, np.nda
     return t, v, w, pose
 
 
-def sightings(t: np.ndarray, pose: np.ndarray, every: int = 4) -> np.ndarray:
+def detections(t: np.ndarray, pose: np.ndarray, every: int = 4) -> np.ndarray:
     """Rows of stamp, number, range and bearing of what is in front and near."""
     rng, rows = np.random.default_rng(3), []
     for k in range(0, len(t), every):
@@ -213,7 +213,7 @@ def sightings(t: np.ndarray, pose: np.ndarray, every: int = 4) -> np.ndarray:
 
 
 def tables(root: Path, *, seconds: float = 40.0, poses: bool = False, factor: dict[str, float] | None = None) -> Path:
-    """``odometry.csv`` and ``sightings.csv``; columns of ``factor`` are multiplied, which is a fault."""
+    """``odometry.csv`` and ``observations.csv``; columns of ``factor`` are multiplied, which is a fault."""
     root.mkdir(parents=True, exist_ok=True)
     t, v, w, pose = drive(seconds)
     f = {"t": 1.0, "v": 1.0, "w": 1.0, "range": 1.0, "bearing": 1.0, **(factor or {})}
@@ -222,12 +222,12 @@ def tables(root: Path, *, seconds: float = 40.0, poses: bool = False, factor: di
     else:
         rows = np.column_stack([f["t"] * t, f["v"] * v, f["w"] * w])
         np.savetxt(root / "odometry.csv", rows, delimiter=",", header="t [s],v [m/s],w [rad/s]", comments="")
-    rows = sightings(t, pose)
+    rows = detections(t, pose)
     rows[:, 0] *= f["t"]
     rows[:, 2] *= f["range"]
     rows[:, 3] *= f["bearing"]
     form = ("%.6f", "%d", "%.9g", "%.9g")
-    np.savetxt(root / "sightings.csv", rows, delimiter=",", fmt=form, header="t,id,range,bearing", comments="")
+    np.savetxt(root / "observations.csv", rows, delimiter=",", fmt=form, header="t,id,range,bearing", comments="")
     return root
 
 

@@ -102,7 +102,7 @@ def flat_fixes(root: Path) -> Any:
 def table(odometry: str, seen: str = "t,id,range,bearing\n1,1,2,0\n2,1,2,0\n") -> Case:
     def do(root: Path) -> Any:
         (root / "odometry.csv").write_text(odometry)
-        (root / "sightings.csv").write_text(seen)
+        (root / "observations.csv").write_text(seen)
         return read_landmark_tables(root)
 
     return do
@@ -111,7 +111,7 @@ def table(odometry: str, seen: str = "t,id,range,bearing\n1,1,2,0\n2,1,2,0\n") -
 def feet(root: Path) -> Path:
     """Bearings from the left side of the robot."""
     small.tables(root / "csv")
-    path = root / "csv" / "sightings.csv"
+    path = root / "csv" / "observations.csv"
     head, *rows = path.read_text().splitlines()
     turned = [f"{r.rpartition(',')[0]},{float(r.rpartition(',')[2]) - np.pi / 2}" for r in rows]
     path.write_text("\n".join([head, *turned]) + "\n")

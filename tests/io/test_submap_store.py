@@ -31,7 +31,7 @@ def rich(rng: np.random.Generator, s: Submap) -> Submap:
     return replace(
         s,
         interval=(s.key + 0.1, s.key + 0.9 + 1e-9),
-        landmarks=replace(s.landmarks, sightings=np.array([[3, 0], [4, 1], [9, 0]])),
+        landmarks=replace(s.landmarks, detections=np.array([[3, 0], [4, 1], [9, 0]])),
         trajectory=Trajectory(np.arange(n) + s.key, rng.normal(size=(n, 3)), np.tile(np.diag([1.0, 2, 3]), (n, 1, 1))),
         cloud=CloudMap(
             points=rng.normal(size=(7, 2)), origins=np.eye(2), scan=np.array([0, 1, 1, 0, 1, 0, 0]), cell=0.3
@@ -60,8 +60,8 @@ def assert_same(a: Submap, b: Submap) -> None:
             assert b.landmarks.covariance is None
         else:
             np.testing.assert_array_equal(a.landmarks.covariance, b.landmarks.covariance)
-        if a.landmarks.sightings is not None:
-            np.testing.assert_array_equal(a.landmarks.sightings, b.landmarks.sightings)
+        if a.landmarks.detections is not None:
+            np.testing.assert_array_equal(a.landmarks.detections, b.landmarks.detections)
     if a.trajectory is not None:
         for name in ("times", "poses", "covariances"):
             np.testing.assert_array_equal(getattr(a.trajectory, name), getattr(b.trajectory, name))

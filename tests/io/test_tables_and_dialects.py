@@ -1,4 +1,4 @@
-"""CSV of odometry and sightings, dialects of CARMEN, TUM and EuRoC: recognised by content, read as written."""
+"""CSV of odometry and detections, dialects of CARMEN, TUM and EuRoC: recognised by content, read as written."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from graphslam.io.readers import recognise
 from tests.io import small_sources as small
 
 
-def test_speeds_and_sightings(tmp_path: Path) -> None:
+def test_speeds_and_observations(tmp_path: Path) -> None:
     log = load_recording(small.tables(tmp_path / "robot"))
     t, _, w, pose = small.drive()
     np.testing.assert_allclose(log["controls"].times, t, atol=1e-9)
     np.testing.assert_allclose(log["controls"].yaw_rate, w)
-    rows = small.sightings(t, pose)
+    rows = small.detections(t, pose)
     z = log["landmarks"]
     np.testing.assert_allclose(z.ranges, rows[:, 2], rtol=1e-8)
     np.testing.assert_allclose(z.bearings, rows[:, 3], rtol=1e-7, atol=1e-12)
@@ -35,7 +35,7 @@ def test_poses_units_separators_comments_and_columns_in_any_order(tmp_path: Path
     rows = np.column_stack([np.rad2deg(pose[:, 2]), 100.0 * pose[:, :2], 1e3 * t, np.zeros(len(t))])
     head = "# made by hand\nYaw [deg]; X (cm) ;y_cm; Time [ms]; battery"
     np.savetxt(folder / "wheels.csv", rows, delimiter=";", header=head, comments="")
-    seen = small.sightings(t, pose)
+    seen = small.detections(t, pose)
     np.savetxt(
         folder / "tags.txt",
         np.column_stack([np.rad2deg(seen[:, 3]), seen[:, 2], seen[:, 0]]),
@@ -52,8 +52,8 @@ def test_poses_units_separators_comments_and_columns_in_any_order(tmp_path: Path
 
 def test_ranges_alone_have_no_bearing(tmp_path: Path) -> None:
     folder = small.tables(tmp_path / "robot")
-    rows = np.loadtxt(folder / "sightings.csv", delimiter=",", skiprows=1)[:, :3]
-    np.savetxt(folder / "sightings.csv", rows, delimiter=",", header="t,id,range", comments="")
+    rows = np.loadtxt(folder / "observations.csv", delimiter=",", skiprows=1)[:, :3]
+    np.savetxt(folder / "observations.csv", rows, delimiter=",", header="t,id,range", comments="")
     assert not load_recording(folder)["landmarks"].has_bearing.any()
 
 
@@ -68,12 +68,12 @@ def test_records_left_out_are_counted_under_the_stream_they_were_of(tmp_path: Pa
 
 def test_tables_that_lack_something_say_what(tmp_path: Path) -> None:
     folder = small.tables(tmp_path / "robot")
-    (folder / "sightings.csv").unlink()
-    with pytest.raises(MissingDataError, match="sightings"):
+    (folder / "observations.csv").unlink()
+    with pytest.raises(MissingDataError, match="observations"):
         recognise(folder)
     small.tables(folder)
-    lines = (folder / "sightings.csv").read_text().splitlines()
-    (folder / "sightings.csv").write_text("\n".join([lines[0], *(f"9{s}" for s in lines[1:])]))
+    lines = (folder / "observations.csv").read_text().splitlines()
+    (folder / "observations.csv").write_text("\n".join([lines[0], *(f"9{s}" for s in lines[1:])]))
     with pytest.raises(DataError, match="one clock"):
         load_recording(folder)
     small.tables(folder)
@@ -133,12 +133,12 @@ def test_a_named_reader_is_taken_before_what_is_recognised(tmp_path: Path) -> No
 def test_names_of_landmarks_are_numbered(tmp_path: Path) -> None:
     folder = small.tables(tmp_path / "robot")
     plain = load_recording(folder)["landmarks"].ids
-    rows = (folder / "sightings.csv").read_text().splitlines()
+    rows = (folder / "observations.csv").read_text().splitlines()
     k = rows[0].replace(" ", "").lstrip("#").split(",").index("id")
     named = [r.split(",") for r in rows]
     for words in named[1:]:
         words[k] = f"tag_{float(words[k]):04.0f}"
-    (folder / "sightings.csv").write_text("\n".join(",".join(w) for w in named) + "\n")
+    (folder / "observations.csv").write_text("\n".join(",".join(w) for w in named) + "\n")
     ids = load_recording(folder)["landmarks"].ids
     np.testing.assert_array_equal(ids, np.unique(plain, return_inverse=True)[1])
 
@@ -148,7 +148,7 @@ def test_dates_and_decimal_commas_are_refused_with_the_column_and_what_is_wanted
     t, _, _, pose = small.drive(8.0)
     rows = [";".join([stamp.format(a).replace(".", ","), *(f"{v:.3f}" for v in p)]) for a, p in zip(t, pose)]
     (tmp_path / "odometry.csv").write_text("t;x;y;theta\n" + "\n".join(rows) + "\n")
-    (tmp_path / "sightings.csv").write_text("t,id,range,bearing\n0.1,1,2.0,0.1\n")
+    (tmp_path / "observations.csv").write_text("t,id,range,bearing\n0.1,1,2.0,0.1\n")
     with pytest.raises(
         FormatError, match=r"values in the column of t are no numbers; got '.*,.*'; wanted numbers with a"
     ):

@@ -13,7 +13,7 @@ from graphslam.core.submap import LandmarkMap, Submap
 from graphslam.join.submap_blocks import SubmapProblem, fuse_repeated, relabel, scale_covariances
 from graphslam.join.submap_solver import minimise_submaps, solve_submaps
 from graphslam.linear.symmetric_factor import SymmetricFactor
-from tests.reference.dense_join import dense_normal_equations, first_sighting
+from tests.reference.dense_join import dense_normal_equations, first_observation
 from tests.reference.submap_chain import submap_chain
 from tests.reference.submap_model import submap_residual
 
@@ -49,7 +49,7 @@ def test_normal_equations_match_the_dense_twin(chain: list[Submap], rng: np.rand
     np.testing.assert_allclose(g, g_twin, rtol=0, atol=1e-9 * np.abs(g_twin).max())
     np.testing.assert_allclose(H, H_twin, rtol=0, atol=1e-9 * np.abs(H_twin).max())
     np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-13 * np.abs(H).max())
-    assert list(problem.ids) == first_sighting(chain)
+    assert list(problem.ids) == first_observation(chain)
     assert problem.objective_per_submap(x).sum() == pytest.approx(f, rel=1e-12)
 
 

@@ -12,7 +12,7 @@ from graphslam.core.submap import Submap
 from tests.reference.submap_model import predict_submap, submap_jacobians, submap_residual
 
 
-def first_sighting(submaps: Sequence[Submap]) -> list[int]:
+def first_observation(submaps: Sequence[Submap]) -> list[int]:
     ids: list[int] = []
     for s in submaps:
         for j in s.landmarks.ids if s.landmarks is not None else ():
@@ -22,8 +22,8 @@ def first_sighting(submaps: Sequence[Submap]) -> list[int]:
 
 
 def dense_normal_equations(submaps: Sequence[Submap], x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Objective, ``JᵀΩr`` and ``JᵀΩJ`` at ``x = [poses, landmarks by first sighting]``, one factor at a time."""
-    ids, m = first_sighting(submaps), len(submaps)
+    """Objective, ``JᵀΩr`` and ``JᵀΩJ`` at ``x = [poses, landmarks by first observation]``, one factor at a time."""
+    ids, m = first_observation(submaps), len(submaps)
     place = {j: 3 * m + 2 * i for i, j in enumerate(ids)}
     f, g, H = 0.0, np.zeros(len(x)), np.zeros((len(x), len(x)))
     for k, s in enumerate(submaps):
@@ -49,11 +49,11 @@ def dense_normal_equations(submaps: Sequence[Submap], x: np.ndarray) -> tuple[fl
 
 
 def dense_information_join(submaps: Sequence[Submap]) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Eq. 13–16 to the letter, dense: returns X, I and the ids, state ``[poses, landmarks by first sighting]``.
+    """Eq. 13–16 to the letter, dense: returns X, I and the ids, state ``[poses, landmarks by first observation]``.
 
     ``i`` itself is accumulated; the only liberty is that the predicted heading is unwrapped towards the measured one.
     """
-    ids, m = first_sighting(submaps), len(submaps)
+    ids, m = first_observation(submaps), len(submaps)
     n = 3 * m + 2 * len(ids)
     place = {j: 3 * m + 2 * i for i, j in enumerate(ids)}
     X, i, I = np.zeros(n), np.zeros(n), np.zeros((n, n))

@@ -44,10 +44,10 @@ def residuals(s: Smoothing, states: np.ndarray) -> tuple[np.ndarray, float]:
                 dx, dy = nuisance[w.slots[q, 0]] - here
                 more = nuisance[w.slots[q, 1]] if w.slots[q, 1] >= 0 else np.zeros(2)
                 r = (1 + g["range_scale"]) * np.hypot(dx, dy) + g["range_offset"] + more[0]
-                add(r - w.sightings[q, 0], p["range"])
-                if np.isfinite(w.sightings[q, 1]):
+                add(r - w.detections[q, 0], p["range"])
+                if np.isfinite(w.detections[q, 1]):
                     b = np.arctan2(dy, dx) - th - s.sensor[2] - g["sensor_yaw"] + more[1]
-                    add(_wrap(b - w.sightings[q, 1]), p["bearing"])
+                    add(_wrap(b - w.detections[q, 1]), p["bearing"])
             if k + 1 == n:
                 continue
             ux, uy, turn, dt, d, *given = w.steps[k + 1]

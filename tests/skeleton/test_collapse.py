@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graphslam.core.errors import DataError
-from graphslam.skeleton.collapse import Collapse, number_by_first_sighting
+from graphslam.skeleton.collapse import Collapse, number_by_first_observation
 from graphslam_studies.sim.laps import Laps
 
 
@@ -54,8 +54,8 @@ def test_landmarks_of_the_world_are_its_own(laps: Laps) -> None:
     assert count == len(names)
 
 
-def test_labels_of_any_kind_are_numbered_by_first_sighting() -> None:
-    landmark, n = number_by_first_sighting(np.array([7, 3, 7, 0, 3, 9]))
+def test_labels_of_any_kind_are_numbered_by_first_observation() -> None:
+    landmark, n = number_by_first_observation(np.array([7, 3, 7, 0, 3, 9]))
     assert landmark.tolist() == [0, 1, 0, 2, 1, 3]
     assert n == 4
 

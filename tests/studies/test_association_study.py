@@ -98,7 +98,7 @@ def test_figures_equal_counts_one_by_one():
     entries = []  # (submap, landmark, identity by majority)
     for s in submaps:
         seen: dict[int, list[int]] = {}
-        for o, j in s.landmarks.sightings.tolist():
+        for o, j in s.landmarks.detections.tolist():
             seen.setdefault(j, []).append(int(truth[o]))
         for j in range(len(s.landmarks)):
             what = min(set(seen[j]), key=lambda t, held=seen[j]: (-held.count(t), t))

@@ -138,9 +138,9 @@ def test_front_end_gives_one_submap_that_knows_how_sure_it_is_not(log):
     assert np.sqrt(np.mean(np.sum((path.poses - truth)[:, :2] ** 2, axis=1))) < 10.0
 
 
-def test_sightings_of_an_unknown_association_name_the_observations(log):
+def test_observations_of_an_unknown_association_name_the_observations(log):
     (submap,) = RbpfSlam(RbpfSlamConfig(particles=10, min_hits=3)).submaps(log, seed=SeedTree(0))
-    observation, landmark = submap.landmarks.sightings.T
+    observation, landmark = submap.landmarks.detections.T
     assert len(np.unique(observation)) == len(observation)  # an observation is of one landmark
     assert np.bincount(landmark, minlength=len(submap.landmarks)).min() >= 3
     true_id = log["landmarks"].ids[observation]

@@ -74,7 +74,7 @@ def test_report_and_figures(table: pd.DataFrame, tmp_path: Path) -> None:
     assert [p.name for p in STUDY.figures(table, table.iloc[:0], tmp_path)] == ["to_optimum.png", "to_truth.png"]
 
 
-def test_averaged_passes_are_the_means_of_their_sightings() -> None:
+def test_averaged_passes_are_the_means_of_their_observations() -> None:
     problem = draw_laps(LapsConfig(poses=60, laps=2, begin=2, reach=5), seed=2).problem()
     averaged = averaged_passes(problem)
     passes, n = pass_labels(problem.landmark, problem.first, 20)

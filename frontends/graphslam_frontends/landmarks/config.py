@@ -103,7 +103,7 @@ GATE_NEW = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SightingConfig:
+class ObservationConfig:
     """Common options of all filters with a map of landmarks."""
 
     gate: float = 11.8
@@ -141,7 +141,7 @@ class SightingConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FilterConfig(SightingConfig):
+class FilterConfig(ObservationConfig):
     """Options of a particle filter over one map."""
 
     particles: int = 40
@@ -154,7 +154,7 @@ class FilterConfig(SightingConfig):
     """Systematic resampling if N_eff < ess_fraction · N. Do not switch it off."""
 
     def __post_init__(self) -> None:
-        SightingConfig.__post_init__(self)
+        ObservationConfig.__post_init__(self)
         if self.particles < 1:
             raise ConfigError(f"particles = {self.particles}; wanted ≥ 1")
         if self.proposal not in ("1.0", "2.0"):

@@ -77,7 +77,7 @@ class EkfRun:
         by_founding = {founding: identity[key] for key, founding in self.map.keys.items()}
         return np.array([by_founding.get(int(f), -1) for f in self.map.founded[slots]], dtype=np.int64)
 
-    def sightings(self, slots: Ints) -> tuple[Ints, Ints]:
+    def detections(self, slots: Ints) -> tuple[Ints, Ints]:
         """Observations (index in the prepared log) of the landmarks ``slots``, and the index of each one's landmark."""
         a = self.map.association()
         rank = np.full(self.map.foundings + 1, -1, dtype=np.int64)
@@ -136,7 +136,7 @@ class EkfRun:
         """The Gaussian of the filter as a submap; points of its path at fixes are from a smoothing."""
         slots = self.map.landmarks(self.config.min_hits)
         mean, P = self.map.joint(slots)
-        rows, landmark = self.sightings(slots)
+        rows, landmark = self.detections(slots)
         path = np.array(self.poses)
         places = mean[3:].reshape(-1, 2)
         report |= {"systematic": bias_score_test(self.data, self.first, self.next, rows, landmark, path, places)}
@@ -161,7 +161,7 @@ class EkfRun:
         obs, c = self.data.observations, self.config
         slots = self.map.landmarks(c.min_hits)
         mean, _ = self.map.joint(slots)
-        rows, landmark = self.sightings(slots)
+        rows, landmark = self.detections(slots)
         s = self._smoothed(mean[3:].reshape(-1, 2), rows, landmark, trim)
         data, span = self.data, slice(self.first, self.next)
         index = (np.cumsum(s.landmark_kept) - 1)[landmark[s.kept]]
@@ -185,7 +185,7 @@ class EkfRun:
         key: int,
         g: Gaussian,
         ids: Ints,
-        sightings: Ints,
+        detections: Ints,
         path: Trajectory,
         report: dict[str, Any],
         points: PathPoints | None = None,
@@ -195,7 +195,7 @@ class EkfRun:
             exit_pose=g.mean[:3],
             positions=g.mean[3:].reshape(-1, 2),
             covariance=g.covariance,
-            sightings=sightings,
+            detections=detections,
             chart="group",
             path=points,
         )
@@ -219,7 +219,7 @@ class Ekf(FrontEnd):
 
     config: EkfConfig = field(default_factory=EkfConfig)
     name: ClassVar[str] = "ekf"
-    calibrates: ClassVar[str] = "sightings"
+    calibrates: ClassVar[str] = "observations"
 
     def follow(
         self,

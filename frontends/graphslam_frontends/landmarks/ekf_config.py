@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 
 from graphslam.core.errors import ConfigError
-from graphslam_frontends.landmarks.config import RangeBearingNoise, SightingConfig, StoppingConfig
+from graphslam_frontends.landmarks.config import ObservationConfig, RangeBearingNoise, StoppingConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EkfFilterConfig(SightingConfig):
+class EkfFilterConfig(ObservationConfig):
     """Options of an EKF over one map."""
 
     association: Literal["known", "nearest", "jcbb"] = "nearest"
@@ -21,7 +21,7 @@ class EkfFilterConfig(SightingConfig):
     """Joint compatibility: most hypotheses tested per scan; then the best one so far is used, and counted."""
 
     def __post_init__(self) -> None:
-        SightingConfig.__post_init__(self)
+        ObservationConfig.__post_init__(self)
         if self.association not in ("known", "nearest", "jcbb"):
             raise ConfigError(f"association = {self.association!r}; known: known, nearest, jcbb")
         for name in ("max_nodes", "confirm_hits", "drop_misses", "drop_scans", "min_hits"):

@@ -51,7 +51,7 @@ class RbpfEkf(FrontEnd):
 
     config: RbpfEkfConfig = field(default_factory=RbpfEkfConfig)
     name: ClassVar[str] = "rbpf-ekf"
-    calibrates: ClassVar[str] = "sightings"
+    calibrates: ClassVar[str] = "observations"
 
     def with_calibration(self, log: SensorLog, asked: Mapping[str, Any], *, corrected: bool, drift: bool) -> FrontEnd:
         """See :class:`~graphslam_frontends.base.FrontEnd`.
@@ -192,7 +192,7 @@ class RbpfEkf(FrontEnd):
             exit_pose=handed.mean[:3],
             positions=handed.mean[3:].reshape(-1, 2),
             covariance=handed.covariance,
-            sightings=np.column_stack([data.original[used], lm_index]),
+            detections=np.column_stack([data.original[used], lm_index]),
             chart="group" if whole else "cartesian",  # particles: as in the paper
             path=None if way is None else fix_points(smoothed, way),
             lasting=lasting,

@@ -15,8 +15,8 @@ from graphslam.app.run.source import load
 from graphslam.calibrate.calibrate import CALIBRATIONS
 from graphslam.calibrate.corrections import CalibrateConfig, Corrections, apply_corrections, moved_end
 from graphslam.calibrate.estimate import NAMES, SURE, Calibration, estimate_text
-from graphslam.calibrate.landmark_calibration import FULL, QUICK, CalibrationBudget, calibrate_sightings
-from graphslam.calibrate.windows import SightingLog
+from graphslam.calibrate.landmark_calibration import FULL, QUICK, CalibrationBudget, calibrate_observations
+from graphslam.calibrate.windows import ObservationLog
 from graphslam.core.config import merge_options
 from graphslam.core.errors import DataError, GraphSlamError
 from graphslam.core.findings import Finding
@@ -185,7 +185,7 @@ def explain_disagreement(
     if not chi2_per_dof > max(two_sided_bounds(chi2_per_dof, dof, CERTAIN)[1], DISAGREE):
         return []
     try:
-        found = calibrate_sightings(SightingLog.of(log, name, log[name]), QUICK)
+        found = calibrate_observations(ObservationLog.of(log, name, log[name]), QUICK)
     except GraphSlamError:
         return []
     own = ("range_scale", "range_offset") if ranges_corrected else ()

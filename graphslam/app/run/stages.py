@@ -41,7 +41,7 @@ from graphslam.evaluate.check_points import CheckPoints, check_points
 from graphslam.evaluate.covariance_assessment import consistency_tests_as_json, pooled_nonlinearity
 from graphslam.evaluate.dead_reckoning_baseline import dead_reckoned_path
 from graphslam.evaluate.gps import GpsResiduals
-from graphslam.evaluate.landmark_checks import sighting_findings
+from graphslam.evaluate.landmark_checks import observation_findings
 from graphslam.evaluate.metrics import (
     Metrics,
     dead_reckoning_metrics,
@@ -403,7 +403,7 @@ def _verdict(made: SolvedMap, report: dict[str, Any]) -> None:
         *findings_from_run(streams, made.inputs.noticed, submaps, graph.events),
         *explain_disagreement(log, settings.calibrate, *join, ranges_corrected=corrected),
         *bias_findings(report.get("lasting", [])),
-        *sighting_findings(log, reports, dropped),
+        *observation_findings(log, reports, dropped),
         *bias_test_findings(reports),
         *made.findings,
         *control_findings(report),

@@ -68,7 +68,7 @@ ADVICE: dict[str, str] = {
     "turns-disagree": "correct the unit or the mounting of the gyro",
     "odometry-leaps": "give the raw odometry, without corrections by another map",
     "heading-not-ahead": "check unit, zero and sign of the headings of the odometry",
-    "sightings-and-motion": "correct what the finding on the motion names",
+    "observations-and-motion": "correct what the finding on the motion names",
     "scans-and-motion": "correct what the finding on the motion names",
     "distance-disagrees": "check the scale of the odometry, and unit, field of view and maximum range of the scanner",
     "turn-disagrees": "correct the turns of the odometry or the order of the beams",
@@ -79,7 +79,7 @@ ADVICE: dict[str, str] = {
     "calibration": "correct the calibration error that is named below",
     "lasting": "check unit, sign and mounting of the sensor whose error is named below",
     # then what the run did with the log
-    "sightings-not-used": "check units, signs and ids of the observations",
+    "observations-not-used": "check units, signs and ids of the observations",
     "*-not-used": "correct the cause for which a stream was not used",
     "no-effect": "leave the option out, or give a log that has its sensor",
     "front-end-idle": "leave the front end out, or check the stream that it needs",

@@ -192,7 +192,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
         split += 1
     solution = solver.solution()
     sessions = _sessions(runs, names, keys, first, alignments, graph, solution)
-    hits, seen_by = _sightings(sessions, graph, solution)
+    hits, seen_by = _observations(sessions, graph, solution)
     confirmed = max(_confirmed(r) for r in runs)
     keep: npt.NDArray[np.bool_] = np.asarray(hits >= confirmed)
     P = solution.landmark_covariances()
@@ -216,7 +216,7 @@ def _merge(runs: list[Run], by: By, solver_name: str, gate: float, tolerance: fl
             for s in sessions
         ],
         "landmarks_fused": fused,
-        "sightings_split": split,
+        "observations_split": split,
         "seconds": time.perf_counter() - start,
     }
     metrics = merge_metrics(sessions, solution, keep, seen_by, split, identities=by == "identity")
@@ -266,7 +266,7 @@ def _sessions(
     return out
 
 
-def _sightings(sessions: list[Session], graph: FactorGraph, solution: Solution) -> tuple[Ints, Ints]:
+def _observations(sessions: list[Session], graph: FactorGraph, solution: Solution) -> tuple[Ints, Ints]:
     """Number of observations, and of sessions, of every landmark of the solution."""
     row = {int(i): k for k, i in enumerate(solution.landmark_ids)}
     hits = np.zeros(len(row), dtype=np.int64)
@@ -276,8 +276,8 @@ def _sightings(sessions: list[Session], graph: FactorGraph, solution: Solution) 
             if submap.landmarks is None:
                 continue
             rows = np.array([row[int(i)] for i in graph.landmark_ids_of(key)], dtype=np.intp)
-            sightings = submap.landmarks.sightings
-            counts = np.ones(len(rows)) if sightings is None else np.bincount(sightings[:, 1], minlength=len(rows))
+            detections = submap.landmarks.detections
+            counts = np.ones(len(rows)) if detections is None else np.bincount(detections[:, 1], minlength=len(rows))
             np.add.at(hits, rows, counts.astype(np.int64))
             seen[n, rows] = True
     return hits, seen.sum(axis=0).astype(np.int64)

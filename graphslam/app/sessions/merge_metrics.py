@@ -41,7 +41,7 @@ def merge_metrics(
     out.add("submaps", sum(len(s.keys) for s in sessions))
     out.add("landmarks", int(keep.sum()))
     out.add("landmarks_shared", int(np.sum(seen_by[keep] > 1)))
-    out.add("sightings_split", split)
+    out.add("observations_split", split)
     score = solution.score["submap"]
     out.add("join_chi2", score.chi2)
     out.add("join_dof", score.dof)

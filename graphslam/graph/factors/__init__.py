@@ -13,16 +13,16 @@ from graphslam.graph.factors.compass import CompassBatch, DeclinationBatch, Devi
 from graphslam.graph.factors.gps import BiasPriorBatch, GpsBatch
 from graphslam.graph.factors.imu.batch import ForceBatch, GyroBatch, ImuBatch, ImuBiasBatch
 from graphslam.graph.factors.landmark_submap import PathBatch, SubmapBatch
+from graphslam.graph.factors.observation import ObservationBatch
 from graphslam.graph.factors.range import BeaconRangeBatch, RangeBatch
 from graphslam.graph.factors.sensor_biases import SensorBiasBatch
-from graphslam.graph.factors.sighting import SightingBatch
 from graphslam.graph.factors.space_submap import SpaceSubmapBatch
 
 for _batch in (
     *(SubmapBatch, SpaceSubmapBatch, PathBatch, SensorBiasBatch, BetweenBatch, GpsBatch, BiasPriorBatch, AttitudeBatch),
     *(ImuBatch, GyroBatch, ImuBiasBatch, ForceBatch),
     *(CompassBatch, DeclinationBatch, DeviationPriorBatch),
-    *(RangeBatch, BeaconRangeBatch, SightingBatch),
+    *(RangeBatch, BeaconRangeBatch, ObservationBatch),
 ):
     register_factor(_batch)
 

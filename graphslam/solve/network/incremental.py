@@ -20,7 +20,7 @@ from graphslam.core.poses import group_of
 from graphslam.core.progress import Bar
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.factors.between import BetweenRecord
-from graphslam.graph.factors.sighting import SightingRecord
+from graphslam.graph.factors.observation import ObservationRecord
 from graphslam.graph.network import network_values
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import Values
@@ -111,7 +111,7 @@ def _grow(network: PoseNetwork, factorization: str, batch: int, progress: bool) 
         for k in seen_from[v]:
             mark = network.observations[k, 1:]
             graph.start_landmarks(mark, se2_transform(graph.structure.poses[count], local[k])[None])
-            record = SightingRecord(
+            record = ObservationRecord(
                 graph.next_factor(), count, int(mark[0]), network.observation_values[k], polar, W_seen[k]
             )
             graph.insert(record)

@@ -147,8 +147,8 @@ class Trial:
         """Landmark index in the submap for every observation of the log ``(q,)``, -1 = none."""
         out = np.full(len(self.observations.ranges), -1, dtype=np.int64)
         assert submap.landmarks is not None
-        assert submap.landmarks.sightings is not None
-        rows = submap.landmarks.sightings
+        assert submap.landmarks.detections is not None
+        rows = submap.landmarks.detections
         out[rows[:, 0]] = rows[:, 1]
         return out
 
@@ -234,7 +234,7 @@ class Trial:
     def _association(self, name: str, e: AssociationErrors, submaps: int) -> Iterator[Measurement]:
         yield Measurement(name, "wrong_share", e.wrong_share)
         real = int(np.sum(self.truth_ids >= 0))
-        yield Measurement(name, "used_share", (e.sightings - e.wrong) / max(real, 1))
+        yield Measurement(name, "used_share", (e.detections - e.wrong) / max(real, 1))
         for quantity in ("landmarks", "spurious", "duplicated", "missed"):
             yield Measurement(name, f"local_{quantity}", getattr(e, quantity) / submaps)
 

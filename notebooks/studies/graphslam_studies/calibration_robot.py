@@ -87,10 +87,10 @@ def drive(robot: DrawnRobot, seed: int, seconds: float = 120.0, *, rate: float =
     marks = rng.uniform(low, high, (int(np.clip(np.prod(high - low) / size**2 * 5.0, 40, 4000)), 2))
     stamps = np.arange(0.0, seconds - 1e-9, 1.0 / rate)
     odometry = _odometry(robot, truth, stamps, rng)
-    sightings = _sightings(robot, truth, marks, size, np.arange(0.5, seconds - 0.5, 1.0 / scans), rng)
+    detections = _observations(robot, truth, marks, size, np.arange(0.5, seconds - 0.5, 1.0 / scans), rng)
     return SensorLog(
         name=f"drawn-robot-{seed}",
-        streams={"odometry": odometry, "landmarks": sightings},
+        streams={"odometry": odometry, "landmarks": detections},
         truth=Truth(trajectory=truth, landmark_ids=np.arange(len(marks), dtype=np.int64), landmarks=marks),
         meta={"source": "simulation", "world": "drawn-robot", "seed": int(seed)},
     )
@@ -150,7 +150,7 @@ def _gauss_markov(sigma: float, memory: float, dt: Array, rng: np.random.Generat
     return out
 
 
-def _sightings(
+def _observations(
     robot: DrawnRobot, truth: Trajectory, marks: Array, reach: float, stamps: Array, rng: np.random.Generator
 ) -> LandmarkObservations:
     at = truth.interpolate(stamps)

@@ -126,7 +126,7 @@ def draw_log(c: ChartConfig, seed: SeedTree) -> SensorLog:
     s = np.array([c.sensor[0], np.deg2rad(c.sensor[1])])
     noise = rng.standard_normal((*r.shape, 2)) * s
     which = np.nonzero(visible)
-    sightings = LandmarkObservations(
+    detections = LandmarkObservations(
         times=times[at],
         offsets=np.concatenate([[0], np.cumsum(visible.sum(axis=1))]),
         ranges=np.maximum((r + noise[..., 0])[which], 0.05),
@@ -138,7 +138,7 @@ def draw_log(c: ChartConfig, seed: SeedTree) -> SensorLog:
     truth = Truth(Trajectory(times, poses), landmark_ids=np.arange(len(points)), landmarks=points)
     streams: dict[str, Stream] = {
         "odometry": Odometry(times=times, increments=increments, covariances=covariances),
-        "landmarks": sightings,
+        "landmarks": detections,
     }
     return SensorLog(name="charts", streams=streams, truth=truth)
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.core.network import PoseNetwork
 from graphslam.core.se3 import matrix_to_quat, quat_to_matrix
-from graphslam.skeleton.collapse import Collapse, number_by_first_sighting
+from graphslam.skeleton.collapse import Collapse, number_by_first_observation
 from graphslam.skeleton.landmark_kernels import Poses
 from graphslam.skeleton.preconditioner import PreconditionerLevels
 from graphslam.skeleton.problem import SkeletonProblem
@@ -138,14 +138,14 @@ def _labels(
         other = several[(np.searchsorted(several, chosen) + 1) % len(several)]
         table = np.arange(int(landmark.max()) + 1, dtype=np.int32)
         table[chosen] = other
-        labels, _ = number_by_first_sighting(table[merged])
+        labels, _ = number_by_first_observation(table[merged])
         yield f"{share:.2%} wrong unions", labels, False
         yield f"{share:.2%} wrong unions, split", labels, True
     for share in config.kept:
         falls = np.zeros(int(landmark.max()) + 1, dtype=bool)
         falls[several] = rng.random(len(several)) >= share
         labels = np.where(falls[landmark], int(landmark.max()) + 1 + passes, landmark)
-        yield f"{share:.1%} of the links kept", number_by_first_sighting(labels)[0], True
+        yield f"{share:.1%} of the links kept", number_by_first_observation(labels)[0], True
 
 
 def pass_labels(landmark: Labels, first: npt.NDArray[np.int64], gap: int = 20) -> tuple[Labels, int]:
@@ -186,7 +186,7 @@ def averaged_passes(problem: SkeletonProblem) -> SkeletonProblem:
     return replace(
         problem,
         points=mean[order].astype(np.float32),
-        landmark=number_by_first_sighting(landmark[order])[0],
+        landmark=number_by_first_observation(landmark[order])[0],
         first=first.astype(np.int64),
         range_sigma=problem.range_sigma / fewer,
         bearing_sigma=problem.bearing_sigma / fewer,

@@ -58,7 +58,7 @@ ODOMETRY: Mapping[str, a.Inject] = {
     "odometry: late by 0.5 s": b.late("odometry", 0.5),
     "log: 10 s of all lost": a.gap_of_all(10.0, at=40.0),
 }
-SIGHTINGS: Mapping[str, a.Inject] = {
+OBSERVATIONS: Mapping[str, a.Inject] = {
     "landmarks: ranges × 1.05": a.ranges(1.05),
     "landmarks: ranges × 2": a.ranges(2.0),
     "landmarks: ranges in mm": a.ranges(1000.0),
@@ -119,7 +119,7 @@ class FaultWorld:
         return replace(FAULTS[self.wrong](log), truth=log.truth)
 
 
-FAULTS: Mapping[str, a.Inject] = {**ODOMETRY, **SIGHTINGS, **GPS}
+FAULTS: Mapping[str, a.Inject] = {**ODOMETRY, **OBSERVATIONS, **GPS}
 
 
 def fault_worlds() -> dict[str, FaultWorld]:

@@ -158,8 +158,8 @@ def world_log(w: TrustWorld, seed: SeedTree) -> SensorLog:
     streams: dict[str, Stream] = {
         "odometry": replace(odometry, increments=u, covariances=np.tile(np.diag(stated**2), (len(u), 1, 1)))
     }
-    sightings: LandmarkObservations = log["landmarks"]
-    r, b = sightings.ranges.copy(), sightings.bearings.copy()
+    detections: LandmarkObservations = log["landmarks"]
+    r, b = detections.ranges.copy(), detections.bearings.copy()
     told = np.array([c.sensor[0], np.deg2rad(c.sensor[1])])
     if w.tails:
         wild = rng.random(len(r)) < w.tails
@@ -167,7 +167,7 @@ def world_log(w: TrustWorld, seed: SeedTree) -> SensorLog:
         r = np.maximum(np.where(wild, r + more[:, 0], r), 0.05)
         b = np.where(wild, wrap_angle(b + more[:, 1]), b)
     streams["landmarks"] = replace(
-        sightings, ranges=r, bearings=b, sigmas=np.broadcast_to(told, sightings.sigmas.shape).copy()
+        detections, ranges=r, bearings=b, sigmas=np.broadcast_to(told, detections.sigmas.shape).copy()
     )
     if w.gps != "none":
         streams["gps"] = fixes_of(w, path.times, path.poses, seed.child("gps").generator())

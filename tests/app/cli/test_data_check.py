@@ -122,15 +122,15 @@ def test_a_planted_fault_is_named(
 # ---- tables ----------------------------------------------------------------------------------------------------------
 
 IN_TABLES: list[tuple[str, dict[str, float], str, str]] = [
-    ("bearings in degrees", {"bearing": 180.0 / np.pi}, "sightings-and-motion", "bearings seem to be in degrees"),
-    ("bearings to the right", {"bearing": -1.0}, "sightings-and-motion", "opposite signs"),
-    ("ranges in millimetres", {"range": 1000.0}, "sightings-and-motion", "millimetres"),
-    ("speeds in km/h", {"v": 3.6}, "sightings-and-motion", "km/h"),
-    ("speeds in mm/s", {"v": 1000.0}, "sightings-and-motion", "millimetres"),
+    ("bearings in degrees", {"bearing": 180.0 / np.pi}, "observations-and-motion", "bearings seem to be in degrees"),
+    ("bearings to the right", {"bearing": -1.0}, "observations-and-motion", "opposite signs"),
+    ("ranges in millimetres", {"range": 1000.0}, "observations-and-motion", "millimetres"),
+    ("speeds in km/h", {"v": 3.6}, "observations-and-motion", "km/h"),
+    ("speeds in mm/s", {"v": 1000.0}, "observations-and-motion", "millimetres"),
     (
         "yaw rates in degrees",
         {"w": 180.0 / np.pi},
-        "sightings-and-motion",
+        "observations-and-motion",
         "yaw rates or headings seem to be in degrees",
     ),
     ("stamps in milliseconds", {"t": 1000.0}, "stamps-unit", "milliseconds"),

@@ -166,7 +166,7 @@ def test_options_of_the_factors_are_options_of_a_run(monkeypatch):
 
 @pytest.mark.parametrize("gravity", [False, True], ids=["planar", "three axes"])
 def test_wheels_and_an_imu_in_the_plane(gravity):
-    """Landmark submaps from wheels and sightings, and an IMU in their graph: consistent, and nearer to the truth."""
+    """Landmark submaps from wheels and detections, and an IMU in their graph: consistent, and nearer to the truth."""
     log = simulate("landmark-field", seed=4).slice(0.0, 250.0)
     path, rng = log.truth.trajectory, np.random.default_rng(1)
     t = np.arange(path.times[0], path.times[-1], 0.01)

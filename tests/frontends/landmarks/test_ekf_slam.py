@@ -70,7 +70,7 @@ def test_local_maps_with_the_stated_sensor_pay_for_linearisation_and_smoothing_r
 
 
 def test_where_ranges_are_sure_and_bearings_are_not_the_filter_believes_itself_too_much_and_the_default_does_not():
-    """6 cm / 3.5°: a sighting at 20 m is an arc of 2 m, of which one linearisation makes a straight line."""
+    """6 cm / 3.5°: a observation at 20 m is an arc of 2 m, of which one linearisation makes a straight line."""
     maps = StoppingConfig(num_features=10**6, time_max=1e6, max_scans=10**6, max_distance=35.0)
     per_dof = {}
     for name, options in (("default", {}), ("filter", {"handover": "filter"})):
@@ -106,7 +106,7 @@ def test_front_end_resumes_at_any_submap_with_the_same_numbers(world, handover):
         for a, b in zip(rest, whole[k + 1 :]):
             assert a.interval == b.interval
             np.testing.assert_array_equal(a.landmarks.covariance, b.landmarks.covariance)
-            np.testing.assert_array_equal(a.landmarks.sightings, b.landmarks.sightings)
+            np.testing.assert_array_equal(a.landmarks.detections, b.landmarks.detections)
             np.testing.assert_array_equal(a.trajectory.poses, b.trajectory.poses)
 
 
@@ -122,12 +122,12 @@ def test_path_ends_where_the_gaussian_says(world, handover):
 def test_every_usable_observation_is_in_exactly_one_submap_under_its_own_identity(world):
     drops = DropCounter()
     submaps = list(local().submaps(world, seed=SEED, drops=drops))
-    seen = np.concatenate([s.landmarks.sightings[:, 0] for s in submaps])
+    seen = np.concatenate([s.landmarks.detections[:, 0] for s in submaps])
     assert len(np.unique(seen)) == len(seen)
     assert len(seen) + sum(drops.counts.values()) == len(world["landmarks"].ranges)
     ids = world["landmarks"].ids
     for s in submaps:
-        rows = s.landmarks.sightings
+        rows = s.landmarks.detections
         np.testing.assert_array_equal(ids[rows[:, 0]], s.landmarks.ids[rows[:, 1]])
         assert s.report["used"] == len(rows)
         assert s.report["used"] + s.report["not_associated"] == s.report["observations"]
@@ -139,7 +139,7 @@ def test_smoothed_hand_over_counts_what_it_leaves_out(world):
     for s in kept:
         r = s.report
         assert r["used"] + r["trimmed"] + r["not_associated"] == r["observations"]
-        assert np.bincount(s.landmarks.sightings[:, 1]).min() >= 3
+        assert np.bincount(s.landmarks.detections[:, 1]).min() >= 3
 
 
 def test_single_map_is_one_submap_with_the_whole_path(world, single):
@@ -191,7 +191,7 @@ def clear_world():
 def test_unknown_association_finds_the_identities_over_a_loop_closure(clear_world, association):
     options = recommended_options(clear_world, "ekf-slam")["frontend"]
     s = next(make_front_end("ekf-slam", {**options, "association": association}).submaps(clear_world, seed=SEED))
-    rows = s.landmarks.sightings
+    rows = s.landmarks.detections
     found = pair_agreement(rows[:, 1], clear_world["landmarks"].ids[rows[:, 0]])
     assert found.precision > 0.995
     assert found.recall > 0.995

@@ -1,4 +1,4 @@
-"""The front end of identified points in space: honest local maps, wrong sightings left out, and what is refused."""
+"""The front end of identified points in space: honest local maps, wrong detections left out, and what is refused."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_mounting_of_the_sensor_is_taken_into_account() -> None:
     np.testing.assert_allclose(a[0].exit_covariance, b[0].exit_covariance, rtol=1e-5, atol=1e-12)
 
 
-def test_submaps_go_on_after_the_last_and_spend_no_sighting_twice() -> None:
+def test_submaps_go_on_after_the_last_and_spend_no_observation_twice() -> None:
     log = flight(1)
     every = submaps_of(log)
     assert len(every) > 2

@@ -51,7 +51,7 @@ def velocities(cut: bool = True) -> SensorLog:
     sizes = rng.integers(0, 4, n)
     q = int(sizes.sum())
     bearing = rng.uniform(0.5, 3.0, q)
-    sightings = LandmarkObservations(
+    detections = LandmarkObservations(
         times=times,
         offsets=np.concatenate([[0], np.cumsum(sizes)]),
         ranges=np.where(rng.random(q) < 0.05, 0.0, rng.uniform(1.0, 60.0, q)),
@@ -59,7 +59,7 @@ def velocities(cut: bool = True) -> SensorLog:
         sigmas=np.column_stack([rng.uniform(0.05, 0.2, q), rng.uniform(0.01, 0.05, q)]),
         ids=rng.integers(-1, 6, q),
     )
-    return SensorLog(name="drawn", streams={"wheels": motion, "seen": sightings})
+    return SensorLog(name="drawn", streams={"wheels": motion, "seen": detections})
 
 
 def recorded() -> SensorLog:

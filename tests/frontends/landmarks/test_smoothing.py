@@ -88,12 +88,12 @@ def test_a_landmark_under_the_sensor_is_not_placed_by_its_bearing(off):
     a, b = (np.sqrt(np.diag(x.gaussian.covariance)[9:11]) for x in (with_it, without))
     assert np.all(np.linalg.eigvalsh(with_it.gaussian.covariance) > 0.0)
     assert np.all(a <= 1.05 * b)  # each where its own optimum is
-    # one sighting has its range, and where it is nearer than that no more than as much across
+    # one observation has its range, and where it is nearer than that no more than as much across
     assert np.all(a > 0.4 * np.minimum(b, R[0]))
 
 
 def test_bends_are_what_samples_of_the_relative_place_show():
-    """Twin: the relative place of each sighting is drawn from its dense covariance, and seen."""
+    """Twin: the relative place of each observation is drawn from its dense covariance, and seen."""
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(4), T=8, L=4)
     s = SmoothingProblem(u, np.tile(Q, (len(truth), 1, 1)), k, j, z, SENSOR).smooth(truth, landmarks)
     p, l, T = s.poses, s.landmarks, len(truth)
@@ -160,7 +160,7 @@ def test_trimming_removes_planted_outliers_and_counts_them():
     assert 0.7 < s.chi2 / s.dof < 1.3
 
 
-def test_landmark_left_without_sightings_goes():
+def test_landmark_left_without_observations_goes():
     truth, landmarks, u, k, j, z = drive(np.random.default_rng(2))
     last = j == j.max()
     z[last, 0] += np.linspace(5, 25, last.sum())  # nonsense ranges, none agreeing with another

@@ -42,7 +42,7 @@ def test_features_correspond_by_their_observations_not_by_their_slots():
     np.testing.assert_array_equal(slots, [[0, 1], [7, 3]])
 
 
-def test_landmarks_come_in_order_of_sighting_and_rare_ones_are_left_out():
+def test_landmarks_come_in_order_of_observation_and_rare_ones_are_left_out():
     p = particle_set(observations=7)
     p.assoc[0, :7] = [5, 5, 2, -1, 5, 2, 9]
     p.weights = np.array([1.0, 0, 0, 0])
@@ -204,16 +204,16 @@ def test_front_end_resumes_at_any_submap_with_the_same_numbers(world):
         assert [s.key for s in rest] == [s.key for s in whole[k + 1 :]]
         for a, b in zip(rest, whole[k + 1 :]):
             np.testing.assert_array_equal(a.landmarks.covariance, b.landmarks.covariance)
-            np.testing.assert_array_equal(a.landmarks.sightings, b.landmarks.sightings)
+            np.testing.assert_array_equal(a.landmarks.detections, b.landmarks.detections)
 
 
 def test_every_usable_observation_is_in_exactly_one_submap(world):
     drops = DropCounter()
-    seen = np.concatenate([s.landmarks.sightings[:, 0] for s in front().submaps(world, seed=SeedTree(0), drops=drops)])
+    seen = np.concatenate([s.landmarks.detections[:, 0] for s in front().submaps(world, seed=SeedTree(0), drops=drops)])
     assert len(np.unique(seen)) == len(seen)
     assert len(seen) + sum(drops.counts.values()) == len(world["landmarks"].ranges)
     ids = world["landmarks"].ids
     for s in front().submaps(world, seed=SeedTree(0)):
-        rows = s.landmarks.sightings
+        rows = s.landmarks.detections
         np.testing.assert_array_equal(ids[rows[:, 0]], s.landmarks.ids[rows[:, 1]])
         break

@@ -144,7 +144,7 @@ def test_it_follows_its_landmarks():
     assert graph.records[one].variables() == [f"l{b}", f"l{c}"]
     assert both not in graph.records
     last = graph.submaps[-1]
-    new = [i for i in graph.landmark_ids_of(last.key).tolist() if len(graph.sightings(i)) == 1]
+    new = [i for i in graph.landmark_ids_of(last.key).tolist() if len(graph.detections(i)) == 1]
     fid = graph.add_factor([f"l{new[0]}"], lambda p: p[0], 1.0, evidence="prior")
     graph.remove(last.factor_id)
     assert fid not in graph.records

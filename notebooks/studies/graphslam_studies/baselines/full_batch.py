@@ -19,7 +19,7 @@ from graphslam.core.records import LandmarkObservations
 from graphslam.graph.covariance import JointCovariance
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.between import BetweenBatch
-from graphslam.graph.factors.sighting import SightingBatch
+from graphslam.graph.factors.observation import ObservationBatch
 from graphslam.graph.noise import whiteners
 from graphslam.graph.variables import Values
 from graphslam.solve.descent import descend_to_minimum, limits_of
@@ -122,7 +122,7 @@ def full_batch(
     W = whiteners(np.asarray(np.linalg.inv(back @ Q @ back.T), dtype=np.float64))
     batches = [
         BetweenBatch.of_arrays(np.column_stack([steps, steps + 1]), measured, W, layout),
-        SightingBatch.of_arrays(seen, z, True, (1.0 / sigma)[:, :, None] * np.eye(2), layout),
+        ObservationBatch.of_arrays(seen, z, True, (1.0 / sigma)[:, :, None] * np.eye(2), layout),
     ]
     flat = FactorArrays((), layout, batches)
     problem = SparseProblem(flat)

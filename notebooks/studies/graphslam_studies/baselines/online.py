@@ -185,7 +185,7 @@ def _relinearise(
     """The same map at the least-squares optimum of its submaps, reached from its present mean."""
     labels = landmark_labels(joined, joined.ids, identified=identified)
     problem = SubmapProblem(submaps, ids=[labels[e] for e in joined.entries], information=matrices)
-    # Poses, then landmarks by first sighting: both sides number their landmarks that way.
+    # Poses, then landmarks by first observation: both sides number their landmarks that way.
     scalars = np.concatenate(
         [(joined.pose_at[:, None] + np.arange(3)).ravel(), (joined.landmark_at[:, None] + np.arange(2)).ravel()]
     )

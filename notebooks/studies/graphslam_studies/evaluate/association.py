@@ -41,7 +41,7 @@ class AssociationErrors:
 
     Parameters
     ----------
-    sightings : int
+    detections : int
         Observations that were assigned to a landmark.
     wrong : int
         Of these, observations of something else than their landmark is by majority: another feature, clutter in a
@@ -56,7 +56,7 @@ class AssociationErrors:
         Features observed at least ``min_hits`` times that no landmark of the map is by majority.
     """
 
-    sightings: int
+    detections: int
     wrong: int
     landmarks: int
     spurious: int
@@ -65,8 +65,8 @@ class AssociationErrors:
 
     @property
     def wrong_share(self) -> float:
-        """``wrong / sightings``."""
-        return self.wrong / self.sightings if self.sightings else float("nan")
+        """``wrong / detections``."""
+        return self.wrong / self.detections if self.detections else float("nan")
 
     def __add__(self, other: AssociationErrors) -> AssociationErrors:
         """Counts of two maps together."""
@@ -85,7 +85,7 @@ def association_errors(labels: npt.ArrayLike, truth: npt.ArrayLike, *, min_hits:
     real = identities[identities >= 0]
     seen, times = np.unique(b[b >= 0], return_counts=True)
     return AssociationErrors(
-        sightings=len(used),
+        detections=len(used),
         wrong=int(np.sum(np.maximum(b[used], -1) != of)),
         landmarks=len(landmarks),
         spurious=int(np.sum(identities < 0)),

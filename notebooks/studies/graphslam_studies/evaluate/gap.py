@@ -66,7 +66,7 @@ def objectives_along(submaps: Sequence[Submap], method: str, *, progress: bool =
 
     def note(k: int, view: JoinedMapView) -> None:
         x = view.x[np.concatenate([pose_scalars(view.pose_at).ravel(), landmark_scalars(view.landmark_at).ravel()])]
-        # both number their landmarks by first sighting; headings need no wrapping, residuals are wrapped
+        # both number their landmarks by first observation; headings need no wrapping, residuals are wrapped
         found[k] = SubmapProblem(submaps[: k + 1], ids=[view.ids[e] for e in view.entries]).objective(x)
 
     _JOINERS[method](submaps, on_join=note, progress=progress)

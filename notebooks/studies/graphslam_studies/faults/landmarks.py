@@ -1,4 +1,4 @@
-"""Faults put into a log of wheels, sightings of landmarks and GPS: each a function from a log to a log.
+"""Faults put into a log of wheels, detections of landmarks and GPS: each a function from a log to a log.
 
 The logs have no ground truth: the run has only its own tests.
 """
@@ -173,11 +173,11 @@ def measured_increments(log: SensorLog) -> SensorLog:
     return replace(log, streams=streams)
 
 
-# ---- sightings -------------------------------------------------------------------------------------------------------
+# ---- detections ----------------------------------------------------------------------------------------------------
 
 
-def sightings(change: Callable[[LandmarkObservations, np.random.Generator], LandmarkObservations]) -> Inject:
-    """A change of the stream of sightings."""
+def detections(change: Callable[[LandmarkObservations, np.random.Generator], LandmarkObservations]) -> Inject:
+    """A change of the stream of detections."""
 
     def inject(log: SensorLog) -> SensorLog:
         return with_stream(log, "landmarks", change(log["landmarks"], np.random.default_rng(7)))
@@ -187,19 +187,19 @@ def sightings(change: Callable[[LandmarkObservations, np.random.Generator], Land
 
 def ranges(factor: float = 1.0, offset: float = 0.0) -> Inject:
     """Ranges in another unit, or longer by a constant; the sensor's stated reach is in the same wrong unit."""
-    return sightings(
+    return detections(
         lambda z, _: replace(z, ranges=factor * z.ranges + offset, max_range=factor * z.max_range + offset)
     )
 
 
 def constant_ranges(value: float) -> Inject:
     """A rangefinder that always says the same."""
-    return sightings(lambda z, _: replace(z, ranges=np.full_like(z.ranges, value)))
+    return detections(lambda z, _: replace(z, ranges=np.full_like(z.ranges, value)))
 
 
 def mirrored() -> Inject:
     """Bearings positive to the right."""
-    return sightings(lambda z, _: replace(z, bearings=-z.bearings))
+    return detections(lambda z, _: replace(z, bearings=-z.bearings))
 
 
 def bearing_offset(angle: float) -> Inject:
@@ -209,12 +209,12 @@ def bearing_offset(angle: float) -> Inject:
         low, high = z.field_of_view
         return replace(z, bearings=wrap_angle(z.bearings + angle), field_of_view=(low + angle, high + angle))
 
-    return sightings(change)
+    return detections(change)
 
 
 def bearings_in_degrees() -> Inject:
     """Numbers of degrees, read as radians; σ and field of view stay as the data sheet says."""
-    return sightings(lambda z, _: replace(z, bearings=np.rad2deg(z.bearings)))
+    return detections(lambda z, _: replace(z, bearings=np.rad2deg(z.bearings)))
 
 
 def mounted(x: float, y: float, angle: float) -> Inject:
@@ -226,7 +226,7 @@ def mounted(x: float, y: float, angle: float) -> Inject:
         r, b = np.hypot(d[:, 0], d[:, 1]), np.arctan2(d[:, 1], d[:, 0])
         return replace(z, ranges=r, bearings=b, field_of_view=(-np.pi, np.pi))
 
-    return sightings(change)
+    return detections(change)
 
 
 def wrong_identities(share: float) -> Inject:
@@ -237,7 +237,7 @@ def wrong_identities(share: float) -> Inject:
         wrong = rng.random(len(z.ids)) < share
         return replace(z, ids=np.where(wrong, rng.choice(np.unique(z.ids[z.ids >= 0]), len(z.ids)), z.ids))
 
-    return sightings(change)
+    return detections(change)
 
 
 def repeated(times: int) -> Inject:
@@ -256,12 +256,12 @@ def repeated(times: int) -> Inject:
             ids=z.ids[rows],
         )
 
-    return sightings(change)
+    return detections(change)
 
 
 def thinned(keep: Callable[[LandmarkObservations], Array]) -> Inject:
     """Only some scans."""
-    return sightings(lambda z, _: z.take(keep(z)))
+    return detections(lambda z, _: z.take(keep(z)))
 
 
 # ---- GPS -------------------------------------------------------------------------------------------------------------

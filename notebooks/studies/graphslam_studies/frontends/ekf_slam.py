@@ -51,7 +51,7 @@ class EkfSlam(FrontEnd):
     config: EkfSlamConfig = field(default_factory=EkfSlamConfig)
     on_scan: OnScan | None = None
     name: ClassVar[str] = "ekf-slam"
-    calibrates: ClassVar[str] = "sightings"
+    calibrates: ClassVar[str] = "observations"
 
     def submaps(
         self,

@@ -133,7 +133,7 @@ class RbpfSlam(FrontEnd):
 
     config: RbpfSlamConfig = field(default_factory=RbpfSlamConfig)
     name: ClassVar[str] = "rbpf-slam"
-    calibrates: ClassVar[str] = "sightings"
+    calibrates: ClassVar[str] = "observations"
 
     def submaps(
         self,
@@ -181,13 +181,13 @@ class RbpfSlam(FrontEnd):
         path = _trajectory(filter)
         poses = path.poses[len(path) - len(times) :]
         report["systematic"] = bias_score_test(data, 0, len(times), used, landmark, poses, end.landmarks)
-        sightings = np.column_stack([data.original[used], landmark])
+        detections = np.column_stack([data.original[used], landmark])
         landmarks = LandmarkMap(
             ids=end.landmark_ids,
             exit_pose=end.pose,
             positions=end.landmarks,
             covariance=end.gaussian.covariance,
-            sightings=None if self.config.association == "known" else sightings,
+            detections=None if self.config.association == "known" else detections,
         )
         return Submap.from_landmarks(
             0,

@@ -10,7 +10,7 @@ One log a robot. The clock of odometry, measurements and Vicon is common to all 
 
 What is refused and what is dropped: a file that is missing, truncated, or holds a line of another length is a
 :class:`FormatError` or :class:`MissingDataError` that names file and line. Isolated bad records (not finite, repeated
-or out of order, ranges that are not positive) are dropped and counted; sightings of barcodes that the table does not
+or out of order, ranges that are not positive) are dropped and counted; detections of barcodes that the table does not
 know, and of other robots, are dropped and counted unless asked for.
 """
 
@@ -72,7 +72,7 @@ def read_mrclam(
     robot : int, optional
         1 to 5; needed where the folder holds several.
     robots : bool
-        Keep sightings of other robots, as a stream ``robots`` of its own with ids 1 to 5.
+        Keep detections of other robots, as a stream ``robots`` of its own with ids 1 to 5.
     control_delay : float
         Added to the stamps of the controls [s].
     range_sigma, bearing_sigma : float
@@ -80,7 +80,7 @@ def read_mrclam(
     range_bias : float
         Subtracted from every range [m].
     idle : float
-        Spacing of empty scans where nothing was read for longer [s]; ``inf`` for none. Sightings of other robots are
+        Spacing of empty scans where nothing was read for longer [s]; ``inf`` for none. Detections of other robots are
         scans, too, with nothing in them for the stream ``landmarks``.
     name : str, optional
         The log is called ``<name>/robot<k>``; by default ``name`` is that of the folder.

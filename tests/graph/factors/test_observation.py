@@ -1,4 +1,4 @@
-"""Sightings of landmarks from poses: Jacobians against differences, GTSAM's own factor, and the graph of a file."""
+"""Detections of landmarks from poses: Jacobians against differences, GTSAM's own factor, and the graph of a file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.graph.factor_arrays import FactorArrays
 from graphslam.graph.factors.batch import gtsam_factor
-from graphslam.graph.factors.sighting import SightingRecord
+from graphslam.graph.factors.observation import ObservationRecord
 from graphslam.graph.network import network_values, problem_of_network
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.variables import Values
@@ -15,14 +15,14 @@ from tests.reference.gtsam_twin import to_gtsam
 from tests.solve.network.test_model import random_network
 
 
-def records(rng, polar: bool) -> tuple[list[SightingRecord], Values]:
+def records(rng, polar: bool) -> tuple[list[ObservationRecord], Values]:
     values = Values(2, {"x": rng.standard_normal((4, 3)), "l": 3.0 + rng.standard_normal((3, 2))}, np.array([7, 8, 20]))
     values.poses[0] = 0.0
     pairs = [(0, 7), (1, 7), (1, 20), (3, 8)]
     W = rng.standard_normal((4, 2, 2)) + 2.0 * np.eye(2)
     robust = [RobustKernel(), RobustKernel("huber", 1.0), RobustKernel("cauchy", 1.0), RobustKernel()]
     z = np.array([2.0, 4.0]) + rng.standard_normal((4, 2))
-    return [SightingRecord(k, i, l, z[k], polar, W[k], robust[k]) for k, (i, l) in enumerate(pairs)], values
+    return [ObservationRecord(k, i, l, z[k], polar, W[k], robust[k]) for k, (i, l) in enumerate(pairs)], values
 
 
 @pytest.mark.parametrize("polar", [True, False])
@@ -63,4 +63,4 @@ def test_records_and_arrays_are_one_kind(rng, kind):
     a, b = flat.evaluate(values, dense=True), again.evaluate(values, dense=False)
     np.testing.assert_allclose(b.A.toarray(), a.A, rtol=1e-12, atol=1e-12 * np.abs(a.A).max())
     np.testing.assert_allclose(b.chi2, a.chi2, rtol=1e-12)
-    assert flat.records[len(net.edges)].label() == "sighting of l100 from x0 (factor 0)"
+    assert flat.records[len(net.edges)].label() == "observation of l100 from x0 (factor 0)"

@@ -16,7 +16,7 @@ from graphslam.graph.variables import VariableLayout, gtsam_key
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SightingRecord:
+class ObservationRecord:
     """Landmark ``landmark_id`` observed from a node.
 
     Parameters
@@ -36,7 +36,7 @@ class SightingRecord:
     polar: bool
     whitener: Array
     robust: RobustKernel = NO_KERNEL
-    group: str = "sighting"
+    group: str = "observation"
 
     @property
     def rows(self) -> int:
@@ -52,19 +52,21 @@ class SightingRecord:
         return f"{self.group} of l{self.landmark_id} from x{self.node} (factor {self.factor_id})"
 
 
-class SightingBatch(UniformBatch):
+class ObservationBatch(UniformBatch):
     """Observations: predicted minus measured, bearings wrapped."""
 
-    record = SightingRecord
+    record = ObservationRecord
     slots = ("x", "l")
 
-    def __init__(self, records: Sequence[SightingRecord], layout: VariableLayout) -> None:
+    def __init__(self, records: Sequence[ObservationRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
         self._z = np.array([r.z for r in records]).reshape(-1, 2)
         self._polar = np.array([r.polar for r in records], dtype=bool)
 
     @classmethod
-    def of_arrays(cls, seen: Index, z: Array, polar: bool, whiteners: Array, layout: VariableLayout) -> SightingBatch:
+    def of_arrays(
+        cls, seen: Index, z: Array, polar: bool, whiteners: Array, layout: VariableLayout
+    ) -> ObservationBatch:
         """A batch from arrays, without an object per factor.
 
         Parameters
@@ -74,16 +76,16 @@ class SightingBatch(UniformBatch):
         z, whiteners : (k, 2), (k, 2, 2)
         """
 
-        def record(k: int) -> SightingRecord:
+        def record(k: int) -> ObservationRecord:
             node, row = seen[k].tolist()
-            return SightingRecord(k, node, int(layout.landmark_ids[row]), z[k], polar, whiteners[k])
+            return ObservationRecord(k, node, int(layout.landmark_ids[row]), z[k], polar, whiteners[k])
 
-        out = cls._bare(seen, whiteners, layout, "sighting", record)
+        out = cls._bare(seen, whiteners, layout, "observation", record)
         out._z, out._polar = z, np.full(len(seen), polar)
         return out
 
     @staticmethod
-    def keys(record: SightingRecord) -> Sequence[int | None]:
+    def keys(record: ObservationRecord) -> Sequence[int | None]:
         """Node, landmark."""
         return record.node, record.landmark_id
 

@@ -29,7 +29,7 @@ FEW = 0.25
 """Share of implausible pairs that wrong identities or wheel slip may explain."""
 
 
-def check_sightings(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
+def check_observations(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
     """Findings on a stream of landmark observations.
 
     Parameters

@@ -18,11 +18,11 @@ from graphslam.app.run.options import RunOptions
 from graphslam.calibrate.clock import profile_clock
 from graphslam.calibrate.corrections import Corrections, apply_corrections, moved_end
 from graphslam.calibrate.estimate import Estimate
-from graphslam.calibrate.landmark_calibration import LONG, QUICK, RAN_AWAY, SHORT, calibrate_sightings
-from graphslam.calibrate.landmarks import fit_noise, smooth_sightings
-from graphslam.calibrate.prediction_check import predict_withheld_sightings
+from graphslam.calibrate.landmark_calibration import LONG, QUICK, RAN_AWAY, SHORT, calibrate_observations
+from graphslam.calibrate.landmarks import fit_noise, smooth_observations
+from graphslam.calibrate.prediction_check import predict_withheld_observations
 from graphslam.calibrate.smoothing import CONSTANTS
-from graphslam.calibrate.windows import SightingLog, window_scans
+from graphslam.calibrate.windows import ObservationLog, window_scans
 from graphslam.core.config import read_toml
 from graphslam.core.errors import ConfigError, DataError
 from graphslam.core.geometry import se2_between, se2_compose, se2_exp
@@ -46,7 +46,7 @@ def log():
 
 @pytest.fixture(scope="module")
 def found(log):
-    return calibrate_sightings(SightingLog.of(log, "landmarks", log["landmarks"]), QUICK)
+    return calibrate_observations(ObservationLog.of(log, "landmarks", log["landmarks"]), QUICK)
 
 
 def test_drawn_robot_is_found_again(found) -> None:
@@ -68,17 +68,17 @@ def test_clocks_that_agree_are_left_alone(number: int, rate: float, scans: float
     """Records that are averaged over half a period look less noisy, whatever the clocks are."""
     robot = dataclasses.replace(draw_robot(number), clock=0.0)
     drawn = drive(robot, number, 90.0, rate=rate, scans=scans)
-    seen = SightingLog.of(drawn, "landmarks", drawn["landmarks"]).holding()
+    seen = ObservationLog.of(drawn, "landmarks", drawn["landmarks"]).holding()
     free = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
-    clock = profile_clock(fit_noise(smooth_sightings(seen, SHORT, 20, free))[0], seen)
+    clock = profile_clock(fit_noise(smooth_observations(seen, SHORT, 20, free))[0], seen)
     assert not clock.applied
     assert abs(clock.value) < 0.02
 
 
-def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, found) -> None:
+def test_withheld_observations_take_what_is_right_and_refuse_what_is_wrong(log, found) -> None:
     assert found.prediction.supported == "all"
     assert found.prediction.gains["all"] > 100.0
-    seen = SightingLog.of(log, "landmarks", log["landmarks"]).holding()
+    seen = ObservationLog.of(log, "landmarks", log["landmarks"]).holding()
     share = float(seen.withheld.mean())
     assert 0.0 < share < 0.2
     scans = window_scans(seen, LONG)
@@ -86,7 +86,7 @@ def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, fou
     blunt = dataclasses.replace(bent, range_sigma=1e5, bearing_sigma=1e4)
     for c, taken in ((bent, "noise"), (blunt, "nothing")):
         wrong = found.validated(
-            predict_withheld_sightings(seen, dataclasses.replace(found, corrections=c), scans, MotionNoise())
+            predict_withheld_observations(seen, dataclasses.replace(found, corrections=c), scans, MotionNoise())
         )
         assert wrong.prediction.supported == taken
         assert not any(e.applied for e in wrong.estimates)
@@ -95,15 +95,15 @@ def test_withheld_sightings_take_what_is_right_and_refuse_what_is_wrong(log, fou
 
 
 def test_corrections_that_change_nothing_foretell_nothing_better(log, found) -> None:
-    seen = SightingLog.of(log, "landmarks", log["landmarks"]).holding()
+    seen = ObservationLog.of(log, "landmarks", log["landmarks"]).holding()
     none = dataclasses.replace(found, corrections=Corrections())
-    gains = predict_withheld_sightings(seen, none, window_scans(seen, LONG), MotionNoise()).gains
+    gains = predict_withheld_observations(seen, none, window_scans(seen, LONG), MotionNoise()).gains
     assert gains["all"] == pytest.approx(0.0, abs=0.01)
 
 
 def test_corrected_log_says_nothing_more_of_its_constants(log, found) -> None:
     mended = apply_corrections(log, found.corrections)
-    again = calibrate_sightings(SightingLog.of(mended, "landmarks", mended["landmarks"]), QUICK)
+    again = calibrate_observations(ObservationLog.of(mended, "landmarks", mended["landmarks"]), QUICK)
     before = {e.name: e for e in found.estimates if e.applied}
     for e in again.estimates:
         assert not e.applied or abs(e.value) < 0.3 * abs(before[e.name].value), e
@@ -111,7 +111,7 @@ def test_corrected_log_says_nothing_more_of_its_constants(log, found) -> None:
 
 def test_tracks_without_identities_tell_the_same(log, found) -> None:
     blind = dataclasses.replace(log["landmarks"], ids=None)
-    there = calibrate_sightings(SightingLog.of(log, "landmarks", blind), QUICK).corrections
+    there = calibrate_observations(ObservationLog.of(log, "landmarks", blind), QUICK).corrections
     assert there.distance_scale == pytest.approx(found.corrections.distance_scale, abs=0.01)
     assert there.clock == pytest.approx(found.corrections.clock, abs=0.1)
     assert there.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.3)
@@ -123,15 +123,15 @@ def test_wrong_identities_are_trimmed(log, found) -> None:
     wrong = rng.random(len(ids)) < 0.05
     ids[wrong] = rng.permutation(ids[wrong])
     spoilt = dataclasses.replace(log["landmarks"], ids=ids)
-    c = calibrate_sightings(SightingLog.of(log, "landmarks", spoilt), QUICK).corrections
+    c = calibrate_observations(ObservationLog.of(log, "landmarks", spoilt), QUICK).corrections
     assert c.range_sigma == pytest.approx(ROBOT.range_sigma, rel=0.2)
     assert c.bearing_sigma == pytest.approx(ROBOT.bearing_sigma, rel=0.2)
 
 
-def test_too_few_sightings_are_refused_with_a_count(log) -> None:
+def test_too_few_observations_are_refused_with_a_count(log) -> None:
     short = log.slice(0.0, 1.5)
     with pytest.raises(DataError, match="observations of landmarks"):
-        calibrate_sightings(SightingLog.of(short, "landmarks", short["landmarks"].take(slice(0, 2))), QUICK)
+        calibrate_observations(ObservationLog.of(short, "landmarks", short["landmarks"].take(slice(0, 2))), QUICK)
 
 
 def test_run_of_an_unknown_log_is_calibrated_and_says_so(log, tmp_path) -> None:
@@ -189,9 +189,8 @@ def test_noise_of_the_wheels_does_not_make_their_distances_look_too_long() -> No
     robot = dataclasses.replace(ROBOT, speed=0.6, along_metre=0.12, clock=0.0, distance_scale=1.0, range_sigma=0.03)
     noisy = drive(robot, 5, 60.0)
     effort = dataclasses.replace(QUICK, clock=False)
-    e = {
-        e.name: e for e in calibrate_sightings(SightingLog.of(noisy, "landmarks", noisy["landmarks"]), effort).estimates
-    }
+    seen = ObservationLog.of(noisy, "landmarks", noisy["landmarks"])
+    e = {e.name: e for e in calibrate_observations(seen, effort).estimates}
     assert abs(e["distance_scale"].value) < 2.5 * e["distance_scale"].sigma
 
 
@@ -208,18 +207,18 @@ def test_a_scale_that_is_hardly_told_is_left() -> None:
 
 @pytest.mark.data
 def test_a_scale_that_runs_away_is_held_and_the_noise_is_found(data_dir):
-    """Sightings of MRCLAM are so sparse that wheels without any say are likelier than the right ones."""
+    """Detections of MRCLAM are so sparse that wheels without any say are likelier than the right ones."""
     log = gs.load("mrclam-dataset7/robot1")
-    seen = SightingLog.of(log, "landmarks", log["landmarks"])
+    seen = ObservationLog.of(log, "landmarks", log["landmarks"])
     free = ("yaw_bias", "distance_scale", "range_offset", "sensor_yaw")
-    wild, _ = fit_noise(smooth_sightings(seen, SHORT, 20, free))
+    wild, _ = fit_noise(smooth_observations(seen, SHORT, 20, free))
     assert abs(wild.constants[CONSTANTS.index("distance_scale")]) > RAN_AWAY * 0.2
-    found = calibrate_sightings(seen, dataclasses.replace(QUICK, clock=False))
+    found = calibrate_observations(seen, dataclasses.replace(QUICK, clock=False))
     assert "distance_scale" not in {e.name for e in found.estimates}
     assert any("distance_scale: not observable" in f.text for f in found.findings())
     assert found.corrections.distance_scale == 1.0
     assert 0.01 < found.noise["range_sigma"] < 0.1
-    assert int(found.data.split()[3]) > 900  # sightings: nearly none is trimmed
+    assert int(found.data.split()[3]) > 900  # detections: nearly none is trimmed
 
 
 def test_no_constant_is_corrected_twice() -> None:
