@@ -149,7 +149,7 @@ def _range_and_bearing(seen: ObservationLog, effort: CalibrationBudget, held: tu
         two, estimates = fit_two_level_noise(seen, long, effort, estimates)
         noise |= two
         if two or lasts or alike > ALIKE:
-            notes.append(_lasting_note(short, long, alike))
+            notes.append(_correlation_note(short, long, alike))
     if seen.slips:
         notes.append(slip_finding(seen.slips, short, seen.span))
     made = calibration_of("observations", estimates, noise, notes, _data(short))
@@ -201,7 +201,7 @@ def _ranges_alone(seen: ObservationLog, effort: CalibrationBudget, seed: int) ->
         )
         notes.append(Finding("look", "metre", text))
     if lasts or alike > ALIKE:
-        notes.append(_lasting_note(half, whole, alike))
+        notes.append(_correlation_note(half, whole, alike))
     data = f"{until:.0f} s of ranges ({len(whole.windows[0].rows)})"
     return calibration_of("ranges", estimates, noise, notes, data), whole
 
@@ -365,7 +365,7 @@ def _data(s: Smoothing) -> str:
     return f"{len(s.windows)} windows with {n} observations"
 
 
-def _lasting_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
+def _correlation_note(short: Smoothing, long: Smoothing, alike: float) -> Finding:
     r = [s.sigmas["range"] for s in (short, long)]
     text = f"range errors: σ {r[0]:.3g} m in short windows, {r[1]:.3g} m in long ones, autocorrelation per landmark "
     text += f"{alike:.2f} — time-correlated. Treat landmarks seen from one side only as less certain than reported."

@@ -66,7 +66,7 @@ class LandmarkMap:
         External maps and those of the papers are Cartesian; the front ends of this package use the group chart.
     path : PathPoints or None
         Points of the path at fixes, jointly Gaussian with the map (2-D only).
-    lasting : SensorBiases or None
+    biases : SensorBiases or None
         Dependence of the map on constant errors of wheels and sensor; the Gaussian assumes that they are zero.
     """
 
@@ -78,7 +78,7 @@ class LandmarkMap:
     detections: npt.NDArray[np.int64] | None = None
     chart: str = "cartesian"
     path: PathPoints | None = None
-    lasting: SensorBiases | None = None
+    biases: SensorBiases | None = None
 
     def __post_init__(self) -> None:
         check_chart(self.chart)
@@ -109,9 +109,9 @@ class LandmarkMap:
             object.__setattr__(self, "information", info)
         if self.path is not None and (self.path.cross.shape[1] != n or len(self.path.lever) != dim):
             raise GeometryError("points of the path do not fit the map", got=self.path.cross.shape, wanted=f"(…, {n})")
-        if self.lasting is not None and len(self.lasting.response) != n:
+        if self.biases is not None and len(self.biases.response) != n:
             raise GeometryError(
-                "systematic errors do not fit the map", got=self.lasting.response.shape, wanted=f"({n}, 6)"
+                "systematic errors do not fit the map", got=self.biases.response.shape, wanted=f"({n}, 6)"
             )
         if self.detections is not None:
             rows = np.ascontiguousarray(self.detections, dtype=np.int64).reshape(-1, 2)
@@ -167,7 +167,7 @@ class LandmarkMap:
             covariance=self.dense_covariance()[np.ix_(ix, ix)],
             chart=self.chart,
             path=None if self.path is None else self.path.of_landmarks(ix),
-            lasting=None if self.lasting is None else self.lasting.of_landmarks(ix),
+            biases=None if self.biases is None else self.biases.of_landmarks(ix),
         )
 
     def with_biases(self, mean: Array, covariance: Array) -> LandmarkMap:
@@ -178,9 +178,9 @@ class LandmarkMap:
         mean, covariance : (6,), (6, 6)
             Of the errors, including the information of this map.
         """
-        if self.lasting is None:
+        if self.biases is None:
             return self
-        S = self.lasting.response
+        S = self.biases.response
         off = S @ mean
         exit_pose = self.exit_pose + off[:3]
         exit_pose[2] = wrap_angle(exit_pose[2])

@@ -178,7 +178,7 @@ def sum_bias_windows(reports: Sequence[Mapping[str, Any]]) -> BiasTest | None:
     if not found:
         return None
     total = {k: np.sum([np.asarray(f[k], dtype=np.float64) for f in found], axis=0) for k in found[0]}
-    free = {ESTIMATED[n] for r in reports for n in r.get("lasting", ())}
+    free = {ESTIMATED[n] for r in reports for n in r.get("biases", ())}
     s = np.maximum(np.diag(total["information"]), 1e-12)
     alone = total["score"] / s
     windows = int(total["windows"])

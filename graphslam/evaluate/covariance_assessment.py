@@ -69,7 +69,7 @@ class ConsistencyTest:
     too_large, too_small : float
         Probability of at least this value if variances are at most :data:`TOLERANCE` times the reported ones, and of at
         most this value in a consistent run.
-    lasting : bool
+    correlated : bool
         The test is for time-correlated errors, not for their size.
     """
 
@@ -79,7 +79,7 @@ class ConsistencyTest:
     dof: float
     too_large: float
     too_small: float
-    lasting: bool = False
+    correlated: bool = False
 
     @property
     def upper(self) -> float:
@@ -88,7 +88,7 @@ class ConsistencyTest:
 
     def power(self, tests: int) -> float:
         """Probability that this test, one of ``tests``, detects covariances that are too small by :data:`HALF`."""
-        if self.lasting:
+        if self.correlated:
             return 0.0
         return detection_power(self.dof, TOLERANCE * chi2_quantile(1.0 - LEVEL / tests, self.dof))
 
@@ -110,7 +110,7 @@ def chi_square_ratio_test(name: str, of: Of, value: float, dof: float) -> list[C
 def largest_score_test(name: str, of: Of, score: float, *, tests: int = 1) -> ConsistencyTest:
     """Test of the largest of ``tests`` scores, each N(0, 1) if there is no systematic error."""
     p = min(1.0, tests * float(special.ndtr(-score)))
-    return ConsistencyTest(name, of, float(score), 1.0, p, 1.0, lasting=True)
+    return ConsistencyTest(name, of, float(score), 1.0, p, 1.0, correlated=True)
 
 
 def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
@@ -127,7 +127,7 @@ def short_window_tests(found: BiasTest | None) -> list[ConsistencyTest]:
     worst = min((e[0] for e in drifts if e), key=lambda e: e.too_large, default=None)
     if worst is not None:
         chance = min(1.0, p * worst.too_large)
-        out.append(ConsistencyTest(worst.name, "map", worst.value, worst.dof, chance, 1.0, lasting=True))
+        out.append(ConsistencyTest(worst.name, "map", worst.value, worst.dof, chance, 1.0, correlated=True))
     return out
 
 
@@ -170,7 +170,7 @@ def assess_covariances(
     nonlinearity : float
         See :func:`pooled_nonlinearity`; 0 if submaps are not smoothed.
     """
-    m = max(1, sum(1 if r.lasting else 2 for r in rows))
+    m = max(1, sum(1 if r.correlated else 2 for r in rows))
     large = sorted((r for r in rows if m * r.too_large < LEVEL), key=lambda r: r.too_large)
     if large:
         return CovarianceAssessment("overconfident", tuple(large), min(1.0, m * large[0].too_large))

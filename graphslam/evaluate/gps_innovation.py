@@ -170,8 +170,8 @@ def gps_innovations(
     node, arm = node[found], arm[found]
     n = len(times)
     fitted = GpsFactors.of(graph).fitted
-    lasting = fitted is not None and fitted.bias_sigma > 0
-    bias = np.full(n, -1, dtype=np.int64) if lasting else _biases(graph, times, bias_sigma, segment_gap)
+    correlated = fitted is not None and fitted.bias_sigma > 0
+    bias = np.full(n, -1, dtype=np.int64) if correlated else _biases(graph, times, bias_sigma, segment_gap)
     own = (bias >= 0) & (bias < len(values.biases))
     predicted, by = antenna_terms(values.poses[node], values.datum, values.tilt, arm)
     predicted[own] += values.biases[bias[own]]
@@ -193,7 +193,7 @@ def gps_innovations(
     needed = needed[needed >= 0]
     A = np.zeros((d * n, len(needed)))
     between = np.zeros((n, d, n, d))
-    if fitted is not None and lasting:  # bias interpolated between those of the used fixes
+    if fitted is not None and correlated:  # bias interpolated between those of the used fixes
         known, numbers = _used_biases(graph)
         gain, left = _bridged(times, known, fitted)
         U = np.linalg.cholesky(each / (0.5 * np.trace(each[:, :2, :2], axis1=1, axis2=2))[:, None, None])
@@ -267,10 +267,10 @@ def _inner(graph: FactorGraph, s: SubmapNode, fixes: Ints, points: Ints) -> Inne
     cross = np.hstack([path.cross[ix], path.covariance[np.ix_(ix, own)]])
     gain = np.linalg.solve(joint, cross.T).T
     z = np.concatenate([inner.mean, path.positions[used].ravel()])
-    if inner.lasting is not None:  # shifted by the sensor biases that the graph estimated
+    if inner.biases is not None:  # shifted by the sensor biases that the graph estimated
         g = sensor_biases_at(values, s.robot)
-        z = z + np.concatenate([inner.lasting.response, inner.lasting.points[own]]) @ g
-        path = replace(path, positions=path.positions + (inner.lasting.points @ g).reshape(-1, 2))
+        z = z + np.concatenate([inner.biases.response, inner.biases.points[own]]) @ g
+        path = replace(path, positions=path.positions + (inner.biases.points @ g).reshape(-1, 2))
     marks = np.array([lay.row_of[i] for i in ids.tolist()], dtype=np.int64)
     places = np.concatenate([values.landmarks[marks].reshape(-1, 2), values["point"][rows].reshape(-1, 2)])
     record = graph.records[s.factor_id]

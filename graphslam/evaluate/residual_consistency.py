@@ -26,7 +26,7 @@ from graphslam.graph.factors.between import BetweenRecord
 from graphslam.graph.factors.gps import GpsBatch
 from graphslam.graph.noise import robust_terms
 
-LASTING = "correlated: overconfident"
+CORRELATED = "correlated: overconfident"
 """Verdict on residuals that are time-correlated, whatever their size."""
 JUDGED_WITH = {"path": ("gps", "control", "distance")}
 """Factors that measure nothing alone: points of a path exist for fixes or control points, and share their residuals.
@@ -119,7 +119,7 @@ class ClassConsistency:
         w, verdict = self.whiteness, "not tested" if self.name in NOT_TESTED else "no redundancy"
         if self.name not in NOT_TESTED and np.isfinite(self.ratio):
             low, high, verdict = two_sided_bounds(self.ratio, self.independent, self.confidence)
-            verdict = LASTING if w is not None and w.lasting() else verdict
+            verdict = CORRELATED if w is not None and w.correlated() else verdict
         return {
             "class": self.name,
             "factors": self.factors,

@@ -52,7 +52,7 @@ class Whiteness:
         """Probability of at least this correlation for white residuals."""
         return float(special.ndtr(-self.score))
 
-    def lasting(self, level: float = 0.005) -> bool:
+    def correlated(self, level: float = 0.005) -> bool:
         """Whether the errors are time-correlated beyond neighbouring residuals."""
         return self.p_value < level and self.tau > LAST
 

@@ -215,9 +215,9 @@ class FactorGraph(FactorGraphState):
         self._next_landmark = max(self._next_landmark, int(ids.max(initial=-1)) + 1)
         self.start_landmarks(ids, self.structure.group.transform(self.pose(node), lm.positions))
         robot, z = -1, lm.mean
-        if lm.lasting is not None:
+        if lm.biases is not None:
             robot = self._robots.get(submap.uses, self.structure.count("wheels"))
-            z, W = np.concatenate([z, np.zeros(len(lm.lasting.sigmas))]), np.hstack([W, -W @ lm.lasting.response])
+            z, W = np.concatenate([z, np.zeros(len(lm.biases.sigmas))]), np.hstack([W, -W @ lm.biases.response])
         if self.dim == 3:
             record = replace(record, factor_id=fid, start=node, landmark_ids=ids)
         else:
@@ -225,18 +225,18 @@ class FactorGraph(FactorGraphState):
         d, ends = self.structure.group.dof, np.stack([self.structure.group.identity, submap.exit_pose])
         stated = covariance_scale * submap.exit_covariance[None]
         self._append(submap, [record], np.array(submap.interval), ends, np.zeros((0, d, d)), stated)
-        if lm.lasting is not None:
+        if lm.biases is not None:
             self._robots[submap.uses] = robot
-            self._tell_lasting(lm.lasting, robot, submap.uses, covariance_scale)
+            self._add_biases(lm.biases, robot, submap.uses, covariance_scale)
         if lm.path is not None:
-            inner = InnerPoints(lm.path, lm.mean, lm.dense_covariance(), covariance_scale, lasting=lm.lasting)
+            inner = InnerPoints(lm.path, lm.mean, lm.dense_covariance(), covariance_scale, biases=lm.biases)
             self.submaps[-1] = replace(self.submaps[-1], inner_points=inner)
         self._event("submap", factor_id=fid, submap=submap.key, landmarks=n, new=len(fresh), scale=covariance_scale)
         for sensor in self.sensors.values():
             sensor.add_factors(self.submaps[-1])
         return fid
 
-    def _tell_lasting(self, lasting: SensorBiases, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
+    def _add_biases(self, biases: SensorBiases, robot: int, uses: frozenset[str], covariance_scale: float) -> None:
         """Add the information on constant errors from the last submap; it is removed together with the submap.
 
         All submaps of the same streams share these errors; the first one adds their prior.
@@ -247,27 +247,27 @@ class FactorGraph(FactorGraphState):
                 self.structure.append(word, np.zeros((1, 2)))
             fid = self.next_factor()
             self.ledger.spend(fid, "constant errors, beforehand", ["-"], s.interval, "prior")
-            self.insert(SensorBiasRecord(fid, robot, np.diag(1.0 / lasting.sigmas), np.zeros(SIZE)))
-            self._event("lasting", factor_id=fid, names=list(lasting.names), sigmas=lasting.sigmas.tolist())
-        R, d = lasting.likelihood()
+            self.insert(SensorBiasRecord(fid, robot, np.diag(1.0 / biases.sigmas), np.zeros(SIZE)))
+            self._event("biases", factor_id=fid, names=list(biases.names), sigmas=biases.sigmas.tolist())
+        R, d = biases.likelihood()
         none = SIZE - len(d)
         R, d = np.vstack([R, np.zeros((none, SIZE))]), np.concatenate([d, np.zeros(none)])
         fid = self.next_factor()
-        self.ledger.spend(fid, f"submap {s.key} of constant errors", uses, s.interval, "lasting")
+        self.ledger.spend(fid, f"submap {s.key} of constant errors", uses, s.interval, "biases")
         root = np.sqrt(covariance_scale)
         self.insert(SensorBiasRecord(fid, robot, R / root, d / root, what=f"by submap {s.key}"))
-        self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid), lasting=lasting, robot=robot)
+        self.submaps[-1] = replace(s, factor_ids=(*s.factor_ids, fid), biases=biases, robot=robot)
 
     def as_known(self, submap: Submap) -> Submap:
         """A submap corrected with the graph's estimate of its robot's constant errors, for gates and checks."""
-        if submap.landmarks is None or submap.landmarks.lasting is None:
+        if submap.landmarks is None or submap.landmarks.biases is None:
             return submap
         robot = self._robots.get(submap.uses)
-        before = np.zeros(SIZE), np.diag(submap.landmarks.lasting.sigmas**2)
-        known = before if robot is None else self.lasting_errors(robot)
+        before = np.zeros(SIZE), np.diag(submap.landmarks.biases.sigmas**2)
+        known = before if robot is None else self.sensor_biases(robot)
         return replace(submap, landmarks=submap.landmarks.with_biases(*known))
 
-    def lasting_errors(self, robot: int = 0) -> tuple[Array, Array]:
+    def sensor_biases(self, robot: int = 0) -> tuple[Array, Array]:
         """Constant errors of a robot's wheels and sensor ``(4,)`` at the graph's values, and their covariance.
 
         In the order of :data:`~graphslam.core.sensor_biases.CONSTANTS`; includes their prior.

@@ -25,7 +25,7 @@ EXCLUSIVE = "measurement"
 DECLARED = {
     "shared-scan": "a scan that made a submap also registers it to another one",
     "prior": "an assumption, not a measurement",
-    "lasting": "the factor of constant errors is the part of the likelihood that the submap Gaussian does not contain",
+    "biases": "the factor of constant errors is the part of the likelihood that the submap Gaussian does not contain",
     "levelled": "each base was levelled by the same gravity measurement as the exit of the submap",
     "aid": "used for initial guesses of matches and for deskewing only; in no covariance of the path",
     "start": "initial guess of the refinement; in no factor of the refined path",

@@ -65,7 +65,7 @@ class InnerPoints:
         Its :class:`~graphslam.graph.factors.landmark_submap.PathRecord`, once a fix is used.
     rows : mapping of int to int
         Used points → rows of the graph's points.
-    lasting : SensorBiases or None
+    biases : SensorBiases or None
         Dependence of these quantities on constant errors.
     """
 
@@ -75,7 +75,7 @@ class InnerPoints:
     scale: float = 1.0
     factor_id: int | None = None
     rows: Mapping[int, int] = field(default_factory=dict)
-    lasting: SensorBiases | None = None
+    biases: SensorBiases | None = None
 
     def record(self, submap: SubmapRecord, factor_id: int) -> PathRecord:
         """Factor of the used points, in addition to the submap's own."""
@@ -83,8 +83,8 @@ class InnerPoints:
         gain, left = self.path.given(self.joint, used)
         W = whitener(left, what=f"path of submap {submap.submap_key} at its fixes", scale=self.scale)
         z, parts = [self.mean, self.path.positions[used].ravel()], [-W @ gain, W]
-        if self.lasting is not None:
-            moved = self.lasting.points[self.path.scalars(used)] - gain @ self.lasting.response
+        if self.biases is not None:
+            moved = self.biases.points[self.path.scalars(used)] - gain @ self.biases.response
             z, parts = [*z, np.zeros(moved.shape[1])], [*parts, -W @ moved]
         return PathRecord(
             factor_id, submap.submap_key, submap.start, submap.landmark_ids,
@@ -119,7 +119,7 @@ class SubmapNode:
         relative poses alone, for instance in cycles of loops and chain. For a landmark submap, its end pose.
     inner_points : InnerPoints or None
         Of a landmark submap with points of its path.
-    lasting : SensorBiases or None
+    biases : SensorBiases or None
         Dependence of a landmark submap on constant errors of the robot's wheels and sensor.
     robot : int
         Row of these errors in the graph; -1: none.
@@ -139,7 +139,7 @@ class SubmapNode:
     covariances: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     stated: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     inner_points: InnerPoints | None = None
-    lasting: SensorBiases | None = None
+    biases: SensorBiases | None = None
     robot: int = -1
 
     @property

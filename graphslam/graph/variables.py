@@ -99,15 +99,15 @@ for _kind in (
     # Constant errors of a robot (graphslam.core.sensor_biases): turn and log distance of its wheels; ranges and
     # bearings of its sensor, and the sensor's position.
     VariableKind(
-        "wheels", "w", {2: "rr"}, classes=("lasting",),
+        "wheels", "w", {2: "rr"}, classes=("biases",),
         remedy="constant errors of the wheels need a prior.",
     ),
     VariableKind(
-        "sensor", "e", {2: "mr"}, classes=("lasting",),
+        "sensor", "e", {2: "mr"}, classes=("biases",),
         remedy="constant errors of the sensor need a prior.",
     ),
     VariableKind(
-        "mount", "m", {2: "mm"}, classes=("lasting",),
+        "mount", "m", {2: "mm"}, classes=("biases",),
         remedy="the sensor position needs a prior.",
     ),
     # In 3-D the datum's heading is last, and it is updated by addition.

@@ -59,10 +59,10 @@ def submap_arrays(submap: Submap) -> dict[str, Any]:
         if landmarks.path is not None:
             for part in ("times", "lever", "positions", "covariance", "cross"):
                 arrays[f"path_{part}"] = getattr(landmarks.path, part)
-        if landmarks.lasting is not None:
-            arrays["lasting_names"] = np.array(landmarks.lasting.names, dtype=np.str_)
-            for part in _LASTING:
-                arrays[f"lasting_{part}"] = getattr(landmarks.lasting, part)
+        if landmarks.biases is not None:
+            arrays["biases_names"] = np.array(landmarks.biases.names, dtype=np.str_)
+            for part in _BIASES:
+                arrays[f"biases_{part}"] = getattr(landmarks.biases, part)
     if submap.trajectory is not None:
         arrays["trajectory_times"] = submap.trajectory.times
         arrays["trajectory_poses"] = submap.trajectory.poses
@@ -144,13 +144,13 @@ _FIELDS = {
     "path_positions": floats("f", "c", optional=True),
     "path_covariance": floats("g", "g", optional=True),
     "path_cross": floats("g", "v", optional=True),
-    "lasting_names": texts(6, optional=True),
-    "lasting_sigmas": floats(6, optional=True),
-    "lasting_response": floats("v", 6, optional=True),
-    "lasting_score": floats(6, optional=True),
-    "lasting_information": floats(6, 6, optional=True),
-    "lasting_path": floats("n", 3, 6, optional=True),
-    "lasting_points": floats("g", 6, optional=True),
+    "biases_names": texts(6, optional=True),
+    "biases_sigmas": floats(6, optional=True),
+    "biases_response": floats("v", 6, optional=True),
+    "biases_score": floats(6, optional=True),
+    "biases_information": floats(6, 6, optional=True),
+    "biases_path": floats("n", 3, 6, optional=True),
+    "biases_points": floats("g", 6, optional=True),
     "trajectory_times": floats("n", optional=True),
     "trajectory_poses": floats("n", "p", optional=True),
     "trajectory_covariances": floats("n", "d", "d", optional=True),
@@ -199,7 +199,7 @@ def _landmark_map(a: Arrays, dim: int, where: str) -> LandmarkMap:
         detections=a.get("detections"),
         chart=_chart(a, where),
         path=_path(a, where),
-        lasting=_lasting(a, where),
+        biases=_biases(a, where),
     )
 
 
@@ -210,14 +210,14 @@ def _path(a: Arrays, where: str) -> PathPoints | None:
     return PathPoints(**{part: _need(a, f"path_{part}", where) for part in parts})
 
 
-_LASTING = ("sigmas", "response", "score", "information", "path", "points")
+_BIASES = ("sigmas", "response", "score", "information", "path", "points")
 
 
-def _lasting(a: Arrays, where: str) -> SensorBiases | None:
-    if "lasting_names" not in a:
+def _biases(a: Arrays, where: str) -> SensorBiases | None:
+    if "biases_names" not in a:
         return None
-    arrays = {part: _need(a, f"lasting_{part}", where) for part in _LASTING}
-    return SensorBiases(names=tuple(a["lasting_names"].tolist()), **arrays)
+    arrays = {part: _need(a, f"biases_{part}", where) for part in _BIASES}
+    return SensorBiases(names=tuple(a["biases_names"].tolist()), **arrays)
 
 
 def _chart(a: Arrays, where: str) -> str:

@@ -75,7 +75,7 @@ class MotionModel:
     def __init__(self, steps: Scans, *, knot: float = 30.0, bridge: Array | None = None) -> None:
         self.steps = steps
         self.group: Group = group_of(steps.odometry.increments)
-        self.sigmas = steps.lasting
+        self.sigmas = steps.biases
         n = len(steps)
         t = steps.times
         d = self.group.dim

@@ -32,7 +32,7 @@ FIELDS: dict[str, Field] = {
     "ages": floats("q", optional=True),
     "tilt": floats("n", "t", optional=True),
 }
-LASTING = ("yaw_bias", "yaw_walk", "scale", "direction", "clock", "tilt", "bend", "turn")
+BIASES = ("yaw_bias", "yaw_walk", "scale", "direction", "clock", "tilt", "bend", "turn")
 """``scalars``: max_range, tilt_sigma, tilt_time, these σ of systematic errors, ``matched`` (0 if missing)."""
 REACH = 10.0, 30.0
 """Bounds of the reach (distance of chunks that may observe the same surfaces), if the log determines it [m]."""
@@ -72,7 +72,7 @@ class Scans:
     origins: npt.NDArray[np.float32]
     returns: npt.NDArray[np.bool_]
     max_range: float
-    lasting: BiasSigmas
+    biases: BiasSigmas
     ages: npt.NDArray[np.float32] | None = None
     tilt: Array | None = None
     tilt_sigma: float = 0.0
@@ -93,7 +93,7 @@ class Scans:
             points=steps.points.astype(np.float32, copy=False),
             origins=steps.origins.astype(np.float32, copy=False),
             ages=None if steps.ages is None else steps.ages.astype(np.float32),
-            lasting=steps.bias_sigmas,
+            biases=steps.bias_sigmas,
             **{k: getattr(steps, k) for k in same},
         )
 
@@ -125,7 +125,7 @@ class Scans:
 
     def save(self, file: Path) -> None:
         """Write ``scans.npz``."""
-        lasting = [getattr(self.lasting, k) for k in LASTING]
+        biases = [getattr(self.biases, k) for k in BIASES]
         arrays: dict[str, Any] = {
             "format": SCANS_FORMAT,
             "times": self.times,
@@ -135,7 +135,7 @@ class Scans:
             "points": self.points,
             "origins": self.origins,
             "returns": self.returns,
-            "scalars": np.array([self.max_range, self.tilt_sigma, self.tilt_time, *lasting, self.matched]),
+            "scalars": np.array([self.max_range, self.tilt_sigma, self.tilt_time, *biases, self.matched]),
         }
         if self.ages is not None:
             arrays["ages"] = self.ages
@@ -169,7 +169,7 @@ class Scans:
                 tilt=a.get("tilt"),
                 tilt_sigma=float(s[1]),
                 tilt_time=float(s[2]),
-                lasting=BiasSigmas(**dict(zip(LASTING, s[3:11].tolist()))),
+                biases=BiasSigmas(**dict(zip(BIASES, s[3:11].tolist()))),
                 name=name,
                 matched=bool(np.any(s[11:])),
             )

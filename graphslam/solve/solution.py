@@ -216,7 +216,7 @@ class Solution:
             Only these submaps, e.g. those of one robot of several.
         """
         P_nodes = self.node_covariances() if covariances else None
-        P_lasting = self._lasting_covariances() if covariances else {}
+        P_biases = self._bias_covariances() if covariances else {}
         times, poses, covs = [], [], []
         chosen = [s for s in self._submaps if keys is None or s.key in keys]
         with_path = [s for s in chosen if s.trajectory is not None and len(s.trajectory)]
@@ -239,11 +239,11 @@ class Solution:
             at = s.before(path.times[keep])
             node = np.array(s.nodes)[at]
             T, P_local = s.local_rows(keep, at)
-            if s.lasting is not None:
-                S = s.lasting.path[keep]
+            if s.biases is not None:
+                S = s.biases.path[keep]
                 T = group.compose(T, group.exp(S @ sensor_biases_at(self.values, s.robot)))
                 if P_local is not None and P_nodes is not None:
-                    P_local = P_local + S @ P_lasting[s.robot] @ np.swapaxes(S, 1, 2)
+                    P_local = P_local + S @ P_biases[s.robot] @ np.swapaxes(S, 1, 2)
             poses.append(group.compose(self.values.poses[node], T))
             if P_nodes is not None:
                 ad = group.adjoint(group.inverse(T))
@@ -255,7 +255,7 @@ class Solution:
             np.concatenate(covs[::-1]) if covariances else None,
         )
 
-    def _lasting_covariances(self) -> dict[int, Array]:
+    def _bias_covariances(self) -> dict[int, Array]:
         """Covariance of the constant errors of each robot ``(6, 6)``."""
         robots = range(self.values.count("wheels"))
         return {k: self._joint.joint(bias_variable_names(k)) for k in robots}

@@ -69,7 +69,7 @@ def test_on_a_plain_table_of_landmarks_that_was_calibrated(tmp_path: Path) -> No
         np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=header, comments="", fmt="%.9g")
     run = gs.run(tmp_path, out=tmp_path / "run", progress=False)
     assert run.graph is not None
-    assert "lasting" in {r.group for r in run.graph.records.values()}
+    assert "biases" in {r.group for r in run.graph.records.values()}
     same(run, tmp_path / "run")
 
 

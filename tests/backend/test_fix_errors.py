@@ -16,7 +16,7 @@ from graphslam.graph.factors.gps import BiasPriorRecord, GpsRecord
 from graphslam.graph.noise import RobustKernel
 from graphslam.graph.sensors.gps import GpsConfig
 from graphslam.solve.batch import BatchSolver
-from graphslam_studies.trust_worlds import lasting
+from graphslam_studies.trust_worlds import correlated
 
 STEP = np.array([0.06, 0.04, np.deg2rad(0.15)])
 """σ of the odometry in a second."""
@@ -26,7 +26,7 @@ CAUCHY = RobustKernel("cauchy", 2.385)
 def drive(rng: np.random.Generator, errors: np.ndarray, *, every: int = 5) -> tuple[FactorGraph, np.ndarray, Gps]:
     """Dead reckoning with a fix each second whose σ is stated as 1 m: graph, true nodes, fixes."""
     n = len(errors)
-    rate = 0.05 * lasting(rng, n, 1.0, 20.0, 1)[:, 0]
+    rate = 0.05 * correlated(rng, n, 1.0, 20.0, 1)[:, 0]
     true = np.zeros((n + 1, 3))
     for k in range(n):
         true[k + 1] = se2_compose(true[k], np.array([2.0, 0.0, rate[k]]))
@@ -85,8 +85,8 @@ def multipath(rng: np.random.Generator, n: int) -> np.ndarray:
 
 KINDS = {
     "white": lambda rng, n: rng.standard_normal((n, 2)),
-    "lasting": lambda rng, n: lasting(rng, n, 1.0, 60.0, 2),
-    "lasting-white": lambda rng, n: lasting(rng, n, 1.0, 60.0, 2) + 0.3 * rng.standard_normal((n, 2)),
+    "correlated": lambda rng, n: correlated(rng, n, 1.0, 60.0, 2),
+    "correlated-white": lambda rng, n: correlated(rng, n, 1.0, 60.0, 2) + 0.3 * rng.standard_normal((n, 2)),
     "multipath": multipath,
 }
 
@@ -95,8 +95,8 @@ KINDS = {
     ("kind", "low", "high", "before"),
     [
         ("white", 0.4, 1.4, None),
-        ("lasting", 0.1, 1.3, 3.0),
-        ("lasting-white", 0.1, 1.3, 3.0),
+        ("correlated", 0.1, 1.3, 3.0),
+        ("correlated-white", 0.1, 1.3, 3.0),
         ("multipath", 0.3, 1.5, None),
     ],
 )
@@ -160,10 +160,10 @@ def test_innovations_are_those_of_a_map_without_fixes(rng):
 
 
 def test_few_fixes_or_biases_that_are_stated_are_left_alone(rng):
-    graph, _, fixes = drive(rng, lasting(rng, 60, 1.0, 30.0, 2))
+    graph, _, fixes = drive(rng, correlated(rng, 60, 1.0, 30.0, 2))
     few = solved(graph, fixes.take(slice(0, LEAST - 1)))
     assert fit_fix_errors(few) is None
-    graph, _, fixes = drive(rng, lasting(rng, 60, 1.0, 30.0, 2))
+    graph, _, fixes = drive(rng, correlated(rng, 60, 1.0, 30.0, 2))
     graph.add_sensor(fixes, config=GpsConfig(bias_sigma=1.0, bias_time=20.0))
     graph.finish_sensors()
     BatchSolver(graph).solve_to_optimum()
@@ -174,7 +174,7 @@ def test_withheld_fixes_are_foretold_with_the_bias_between_the_used_ones(rng):
     """Every second fix is used; NIS of the others is honest in size and together."""
     each, joint = [], []
     for _ in range(4):
-        graph, _, fixes = drive(rng, lasting(rng, 200, 1.0, 40.0, 2) + 0.2 * rng.standard_normal((200, 2)))
+        graph, _, fixes = drive(rng, correlated(rng, 200, 1.0, 40.0, 2) + 0.2 * rng.standard_normal((200, 2)))
         solved(graph, fixes.take(slice(0, None, 2)))
         found = fit_fix_errors(graph)
         assert found is not None

@@ -117,11 +117,11 @@ def judged(p: ScanPairs) -> Calibration:
 
 
 def test_halves_that_contradict_each_other_refuse_what_the_whole_says() -> None:
-    """A robot that bends to one side in half of the blocks and to the other in the rest has no lasting bend."""
+    """A robot that bends to one side in half of the blocks and to the other in the rest has no constant bend."""
     side = np.where(np.arange(240) // BLOCK % 2 == 0, 0.1, -0.1)
-    lasting = judged(drawn_pairs(0.1, stated=0.25))
-    assert lasting.prediction.supported == "all"
-    assert lasting.corrections.turn_per_metre == 0.1
+    correlated = judged(drawn_pairs(0.1, stated=0.25))
+    assert correlated.prediction.supported == "all"
+    assert correlated.corrections.turn_per_metre == 0.1
     refused = judged(drawn_pairs(side, stated=0.25))
     assert refused.prediction.supported == "noise"
     assert refused.corrections == Corrections(along_metre=0.03)

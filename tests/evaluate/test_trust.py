@@ -24,7 +24,7 @@ from graphslam.evaluate.covariance_assessment import (
     pooled_nonlinearity,
     short_window_tests,
 )
-from graphslam.evaluate.residual_consistency import LASTING, class_consistency
+from graphslam.evaluate.residual_consistency import CORRELATED, class_consistency
 from graphslam.evaluate.whiteness import residual_whiteness
 from graphslam.graph.factor_graph import FactorGraph
 from graphslam.graph.sensors.gps import GpsConfig
@@ -40,17 +40,17 @@ def walk(rng: np.random.Generator, n: int, keep: float, d: int = 2) -> np.ndarra
     return out
 
 
-def test_scores_of_white_residuals_are_standard_normal_and_lasting_ones_are_found(rng):
+def test_scores_of_white_residuals_are_standard_normal_and_correlated_ones_are_found(rng):
     times = np.arange(120.0)
     scores = [w.score for _ in range(300) if (w := residual_whiteness(times, rng.standard_normal((120, 2))))]
     assert stats.kstest(scores, "norm").pvalue > 0.01
     found = [residual_whiteness(times, 0.3 * walk(rng, 120, 0.6)) for _ in range(50)]
-    assert all(w is not None and w.lasting() for w in found)  # small as they are
+    assert all(w is not None and w.correlated() for w in found)  # small as they are
     # integrated over all lags (1 + 0.6) / (1 - 0.6) = 4
     assert np.mean([w.tau for w in found if w]) == pytest.approx(4.0, rel=0.25)
 
 
-def test_what_the_fit_makes_of_white_noise_is_not_called_lasting(rng):
+def test_what_the_fit_makes_of_white_noise_is_not_called_correlated(rng):
     """Residuals of white noise with its rough part fitted away are alike; the score knows by how much."""
     n = 80
     t = np.arange(float(n))
@@ -100,12 +100,12 @@ def solved(rng, errors) -> FactorGraph:
 
 def test_fixes_whose_errors_last_are_over_confident_however_small_their_residuals(rng):
     white = [class_consistency(solved(rng, lambda n: rng.standard_normal((n, 2))))["gps"] for _ in range(12)]
-    lasting = [class_consistency(solved(rng, lambda n: walk(rng, n, 0.97)))["gps"] for _ in range(6)]
-    assert sum(c.as_row()["verdict"] == LASTING for c in white) <= 1
-    assert all(c.as_row()["verdict"] == LASTING for c in lasting)
+    correlated = [class_consistency(solved(rng, lambda n: walk(rng, n, 0.97)))["gps"] for _ in range(6)]
+    assert sum(c.as_row()["verdict"] == CORRELATED for c in white) <= 1
+    assert all(c.as_row()["verdict"] == CORRELATED for c in correlated)
     # by size alone most of them would be honest or conservative
-    assert np.median([c.ratio for c in lasting]) < 1.0
-    assert all(c.independent < 0.4 * c.dof for c in lasting)
+    assert np.median([c.ratio for c in correlated]) < 1.0
+    assert all(c.independent < 0.4 * c.dof for c in correlated)
 
 
 HONEST = chi_square_ratio_test("map", "map", 1.0, 2000.0) + chi_square_ratio_test("fixes", "fixes", 1.0, 400.0)

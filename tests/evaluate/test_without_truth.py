@@ -227,15 +227,15 @@ def test_correlation_between_fixes_is_seen_where_their_size_is_right():
     """Errors that last (a bias a segment) pass the size test of single fixes and fail the joint one and whiteness."""
     generator, n = np.random.default_rng(5), 200
     S = np.eye(2 * n)
-    lasting = np.repeat(generator.standard_normal((n // 20, 2)), 20, axis=0)
-    g = GpsInnovations(times=np.arange(n, dtype=float), innovations=lasting, covariance=S, unpredicted=0)
+    correlated = np.repeat(generator.standard_normal((n // 20, 2)), 20, axis=0)
+    g = GpsInnovations(times=np.arange(n, dtype=float), innovations=correlated, covariance=S, unpredicted=0)
     rows = g.tests().set_index("test")
     assert rows.loc["each", "autocorrelation"] > 10 * rows.loc["each", "white"] / 1.96
     # told of the correlation, the joint test is satisfied with the very same errors plus white ones
     model = np.kron(np.kron(np.eye(n // 20), np.ones((20, 20))), np.eye(2)) + 0.01 * np.eye(2 * n)
     told = GpsInnovations(
         times=g.times,
-        innovations=lasting + 0.1 * generator.standard_normal((n, 2)),
+        innovations=correlated + 0.1 * generator.standard_normal((n, 2)),
         covariance=model,
         unpredicted=0,
     )

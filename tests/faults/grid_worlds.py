@@ -82,6 +82,6 @@ def world(dim: int, seed: int = 3) -> Drive:
     steps = {"max_range": RANGE, "most_points": 240, "level_floors": dim == 3}
     options = {"steps": steps, "filter": {"particles": 8, "weight_beams": 120, "walk_scale": 0.5}}
     if dim == 2:
-        steps |= {"controls": {"speed": 0.02, "yaw_rate": 0.01, "heading": 0.003}, "lasting_yaw_bias": 0.003}
-        steps |= {"lasting_scale": 0.01}
+        steps |= {"controls": {"speed": 0.02, "yaw_rate": 0.01, "heading": 0.003}, "constant_yaw_bias": 0.003}
+        steps |= {"constant_scale": 0.01}
     return Drive(ring_log(seed) if dim == 2 else court_log(seed), options)

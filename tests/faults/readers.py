@@ -325,7 +325,7 @@ def some_scans(root: Path) -> None:
         returns=np.ones(12, np.bool_),
         ages=np.zeros(12, np.float32),
         max_range=8.0,
-        lasting=LEAST,
+        biases=LEAST,
         tilt=np.zeros((n, 2)),
         tilt_sigma=1e-3,
         tilt_time=5.0,

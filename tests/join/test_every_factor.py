@@ -38,7 +38,7 @@ def with_constants(rng: np.random.Generator) -> FactorGraph:
     log = gs.simulate("mixed", preset="quick", seed=3)
     log = log.slice(log.interval[0], log.interval[0] + 90.0)
     sigmas = {"distance_scale": 0.02, "range_offset": 0.05}
-    options = {"frontend": {"lasting": sigmas, "particles": 2}, "gps": {"use": "all", "baseline": 5.0}}
+    options = {"frontend": {"biases": sigmas, "particles": 2}, "gps": {"use": "all", "baseline": 5.0}}
     run = gs.run(log, frontend="rbpf-ekf", config=options, progress=False)
     assert run.graph is not None
     return run.graph

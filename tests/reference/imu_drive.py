@@ -96,18 +96,18 @@ def drive(
     gives_attitude: bool = True,
     stated: ImuNoise = STATED,
     noise: DeadReckoningNoise = NOISE,
-    lasting: bool = True,
+    biased: bool = True,
 ) -> Drive:
     """Drive for ``seconds``; without a generator nothing is noisy.
 
-    Every error is drawn as ``stated`` and ``noise`` say; with ``lasting`` off, biases and scales are zero.
+    Every error is drawn as ``stated`` and ``noise`` say; with ``biased`` off, biases and scales are zero.
     """
     h = 1.0 / rate
 
     def draw(*shape: int) -> np.ndarray:
         return np.zeros(shape) if rng is None else rng.standard_normal(shape)
 
-    on = float(lasting)
+    on = float(biased)
     t, straight, Rs, body, force, speed = noise_free(seconds, rate, waves)
     n = len(t)
     slip = np.sqrt(speed[:-1] * h)[:, None] * draw(n - 1, 2) * [noise.lateral, noise.vertical]

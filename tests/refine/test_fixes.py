@@ -40,8 +40,8 @@ def plain():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("lasting", [{}, {"bias_sigma": 0.5}, {"bias_sigma": 0.5, "bias_time": 6.0}])
-def test_jacobians(rng, dim, lasting):
+@pytest.mark.parametrize("correlated", [{}, {"bias_sigma": 0.5}, {"bias_sigma": 0.5, "bias_time": 6.0}])
+def test_jacobians(rng, dim, correlated):
     problem, _, _, poses, states = some_problem(rng, dim)
     t = problem.motion.steps.times
     A = rng.standard_normal((9, dim, dim))
@@ -52,14 +52,14 @@ def test_jacobians(rng, dim, lasting):
         lever=rng.standard_normal(dim),
         covariances=A @ np.swapaxes(A, 1, 2) + np.eye(dim),
     )
-    config = GpsConfig(segment_gap=0.2, robust=RobustKernel("none"), **lasting)
+    config = GpsConfig(segment_gap=0.2, robust=RobustKernel("none"), **correlated)
     model = FixModel(gps, config, problem.motion, poses)
     problem = RefinementProblem(problem.motion, problem.cloud, poses[0].copy(), model)
     g = problem.motion.group
     datum = g.exp(0.3 * rng.standard_normal(g.dof))
     states = (*states, datum, rng.standard_normal((len(model.keep), dim)))
-    assert len(model.keep) == (9 if lasting else 0)
-    assert len(model.terms(poses, states)) == 1 + 2 * bool(lasting) + (dim == 3)
+    assert len(model.keep) == (9 if correlated else 0)
+    assert len(model.terms(poses, states)) == 1 + 2 * bool(correlated) + (dim == 3)
     for k, terms in enumerate(model.terms(poses, states)):
         _, J = dense_terms(terms, problem.widths)
         plain = np.zeros_like(J)
@@ -119,17 +119,17 @@ def test_errors_that_last_are_no_news_fix_after_fix(rng):
         bias[k] = keep * bias[k - 1] + np.sqrt(1 - keep**2) * 0.5 * rng.standard_normal(3)
     gps = replace(gps, positions=gps.positions + bias)
     white = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0)))
-    lasting = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0, bias_sigma=0.5, bias_time=60.0)))
+    correlated = refine_by_scans(scans, reckoned, gps=(gps, GpsConfig(baseline=5.0, bias_sigma=0.5, bias_time=60.0)))
     assert white.fixes is not None
-    assert lasting.fixes is not None
+    assert correlated.fixes is not None
     assert white.fixes.contradicted
-    assert not lasting.fixes.contradicted
+    assert not correlated.fixes.contradicted
     g = group_of(truth)
-    errors = [np.sqrt(np.mean(g.log(g.between(truth, r.poses))[:, 3:] ** 2)) for r in (white, lasting)]
+    errors = [np.sqrt(np.mean(g.log(g.between(truth, r.poses))[:, 3:] ** 2)) for r in (white, correlated)]
     assert errors[1] < errors[0]
     told = {f.code: f for f in refinement_findings(white)}
     assert told["refine-fixes"].level == "look"
-    assert {f.code: f for f in refinement_findings(lasting)}["refine-fixes"].level == "good"
+    assert {f.code: f for f in refinement_findings(correlated)}["refine-fixes"].level == "good"
 
 
 def test_fixes_that_do_not_say_where_north_is_hold_nothing(rng, plain):

@@ -1,4 +1,4 @@
-"""Refinement in the plane: lasting errors of wheels, a wheel that slips, turns on the spot, σ of recorded odometry."""
+"""Refinement in the plane: constant errors of wheels, a wheel that slips, turns on the spot, σ of recorded odometry."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def normalised(found, true):
     return np.einsum("ki,kij,kj->k", e, np.linalg.inv(found.covariances[1:]), e) / 3.0
 
 
-def test_lasting_errors_of_wheels_are_found() -> None:
+def test_biases_of_wheels_are_found() -> None:
     """Distances 3 % too long, and a turn of 0.02 rad a metre too far to the left."""
     found, off, start, true = refined(scale=1.03, bend=0.02)
     assert np.hypot(*(start - true)[:, :2].T).max() > 1.0

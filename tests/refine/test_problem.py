@@ -46,7 +46,7 @@ def some_scans(rng, dim, n=7, beams=9):
         returns=np.ones(n * beams, bool),
         ages=rng.uniform(0, 0.3, n * beams).astype(np.float32),
         max_range=30.0,
-        lasting=LEAST,
+        biases=LEAST,
         tilt=0.05 * rng.standard_normal((n, 2)) if dim == 3 else None,
         tilt_sigma=4e-3,
         tilt_time=5.0,

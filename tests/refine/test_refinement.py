@@ -98,7 +98,7 @@ def test_motion_as_stated_is_not_widened(drives):
     assert all(np.max(found.scales) < 1.3 for *_, found in drives)
 
 
-def test_lasting_errors_are_found_within_their_sigma(drives):
+def test_biases_are_found_within_their_sigma(drives):
     z = []
     for *_, found in drives:
         clock, sigma = found.constants["clock"]
@@ -204,7 +204,7 @@ def test_scans_are_read_as_written(drives, tmp_path):
     back = Scans.load(tmp_path / "scans.npz")
     for name in ("times", "offsets", "points", "origins", "returns", "ages", "tilt"):
         np.testing.assert_array_equal(getattr(back, name), getattr(scans, name))
-    assert back.lasting == scans.lasting
+    assert back.biases == scans.biases
 
 
 def test_matched_scans_refine_a_graph_only_if_they_contradict_it(bent):

@@ -23,7 +23,7 @@ def test_so_many_beams_are_left_each_in_its_step(most: int) -> None:
     scans = Scans(
         times=times, odometry=motion,
         offsets=offsets, points=points, origins=points, returns=np.ones(99, bool), max_range=9.0,
-        lasting=BiasSigmas(**sigmas),
+        biases=BiasSigmas(**sigmas),
     )  # fmt: skip
     some = thin_beams(scans, most)
     assert len(some.points) == most == some.offsets[-1]

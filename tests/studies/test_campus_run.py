@@ -96,7 +96,7 @@ def with_streams(log: SensorLog, **streams: Any) -> SensorLog:
     return replace(log, streams={**log.streams, **streams})
 
 
-def lasting(n: int, time: float, sigma: float) -> np.ndarray:
+def correlated(n: int, time: float, sigma: float) -> np.ndarray:
     rng, keep = np.random.default_rng(0), np.exp(-1.0 / time)
     x = sigma * rng.standard_normal((n, 3))
     for k in range(1, n):
@@ -108,9 +108,9 @@ def only_at_the_start(log: SensorLog) -> SensorLog:
     return with_streams(log, gps=log["gps"].take(log["gps"].times < 8.0))
 
 
-def lasting_fixes(log: SensorLog) -> SensorLog:
+def correlated_fixes(log: SensorLog) -> SensorLog:
     g = log["gps"]
-    return with_streams(log, gps=replace(g, positions=g.positions + lasting(len(g.times), 20.0, 3.0)))
+    return with_streams(log, gps=replace(g, positions=g.positions + correlated(len(g.times), 20.0, 3.0)))
 
 
 def saturated(log: SensorLog) -> SensorLog:
@@ -136,7 +136,7 @@ def with_empty_scans(log: SensorLog) -> SensorLog:
     ("spoil", "code", "level"),
     [
         (only_at_the_start, {"gps-not-used"}, "bad"),
-        (lasting_fixes, {"consistency-test", "gps-correlated"}, ""),
+        (correlated_fixes, {"consistency-test", "gps-correlated"}, ""),
         (saturated, {"imu-saturated"}, "bad"),
         (in_degrees, {"turns-disagree"}, "bad"),
         (with_a_gap, {"motion-gap"}, ""),

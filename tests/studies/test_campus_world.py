@@ -392,8 +392,8 @@ def test_errors_of_fixes_are_as_stated_under_an_open_sky_and_larger_upwards() ->
     np.testing.assert_array_less(np.abs(e.mean(axis=0)), 4.0 / np.sqrt(n))
     np.testing.assert_array_less(np.abs(np.mean(e**2, axis=0) - 1.0), 4.0 * np.sqrt(2.0 / n))
     assert min(r.min() for r in ratio) > 1.0
-    lasting = fixes(dataclasses.replace(QUICK, gps_rate=10.0), GROUND, 0, orbit_sigma=1.0, code_sigma=0.2)
-    e = (lasting.positions - lasting.truth)[:, 0]
+    correlated = fixes(dataclasses.replace(QUICK, gps_rate=10.0), GROUND, 0, orbit_sigma=1.0, code_sigma=0.2)
+    e = (correlated.positions - correlated.truth)[:, 0]
     assert np.corrcoef(e[10:], e[:-10])[0, 1] > 0.5  # as far apart as a second
     f = fixes(config, GROUND, 0, orbit_sigma=0.6, code_sigma=0.4)
     e = (f.positions - f.truth)[:, 0]

@@ -22,7 +22,7 @@ from graphslam_studies.trust import (
     world_table,
 )
 from graphslam_studies.trust_faults import FAULTS, fault_worlds
-from graphslam_studies.trust_worlds import TrustWorld, draw_world, lasting, world_log
+from graphslam_studies.trust_worlds import TrustWorld, correlated, draw_world, world_log
 
 
 def test_worlds_are_drawn_alike_again_and_half_of_them_are_clean():
@@ -30,7 +30,7 @@ def test_worlds_are_drawn_alike_again_and_half_of_them_are_clean():
     drawn = [w for w in FULL.values() if isinstance(w, TrustWorld)]
     assert sum(w.clean for w in drawn) == len(drawn) // 2 >= 25
     assert {w.kind for w in FULL.values() if isinstance(w, ScanWorld)} == {"park", "laser", "garage", "lidar"}
-    assert {w.gps for w in drawn} == {"none", "white", "rtk", "lasting", "lasting-white", "multipath"}
+    assert {w.gps for w in drawn} == {"none", "white", "rtk", "correlated", "correlated-white", "multipath"}
     assert {w.front_end for w in drawn} == {"rbpf-ekf", "ekf"}
     assert all(w.wrong != "nothing" for k, w in enumerate(drawn) if k % 2)
 
@@ -48,7 +48,7 @@ def test_a_log_states_what_its_data_sheets_say_and_not_what_is_true():
     assert np.array_equal(stated, [0.02, 0.01, np.deg2rad(0.3)])
     gps = log["gps"]
     assert np.all(gps.sigma == 0.7)
-    lasts = lasting(np.random.default_rng(0), 20000, 1.0, 10.0, 2)
+    lasts = correlated(np.random.default_rng(0), 20000, 1.0, 10.0, 2)
     assert np.std(lasts) == pytest.approx(1.0, abs=0.05)
     assert np.mean(lasts[1:] * lasts[:-1]) == pytest.approx(np.exp(-0.1), abs=0.05)
 

@@ -190,11 +190,11 @@ class SensorBiasConfig:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ConfigError(f"lasting.{name} = {getattr(self, name)}; wanted a finite σ ≥ 0")
+                raise ConfigError(f"biases.{name} = {getattr(self, name)}; wanted a finite σ ≥ 0")
         for one, other in (("yaw_bias", "turn_per_metre"), ("sensor_yaw", "range_scale")):
             if getattr(self, one) and getattr(self, other):
                 raise ConfigError(
-                    f"lasting.{one} and lasting.{other} cannot be estimated together; wanted 0 for one of them"
+                    f"biases.{one} and biases.{other} cannot be estimated together; wanted 0 for one of them"
                 )
 
     def chosen(self) -> tuple[tuple[str, ...], Array]:
@@ -226,7 +226,7 @@ class RbpfEkfConfig(FilterConfig):
     their pooled moments is reported as a check. The filter takes K times as long; 0 = off."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
     """Criteria for the end of a submap."""
-    lasting: SensorBiasConfig | None = None
+    biases: SensorBiasConfig | None = None
     """Constant errors of wheels and sensor that the graph estimates with the map; None: none."""
 
     def __post_init__(self) -> None:

@@ -58,9 +58,9 @@ class RbpfEkf(FrontEnd):
 
         The graph estimates systematic errors that a calibration did not remove, or removed wrongly.
         """
-        if not corrected or self.config.lasting is not None or "lasting" in asked:
+        if not corrected or self.config.biases is not None or "biases" in asked:
             return self
-        return type(self)(config=replace(self.config, lasting=possible_biases(log, self.config.detector)))
+        return type(self)(config=replace(self.config, biases=possible_biases(log, self.config.detector)))
 
     def follow(
         self,
@@ -182,11 +182,11 @@ class RbpfEkf(FrontEnd):
         report["systematic"] = bias_score_test(data, first, last, used, lm_index, smoothed.poses, places)
         whole = c.handover == "smoothed"
         way = place_fixes(growing.feed, smoothed, t_start, obs.times[span]) if whole else None
-        lasting = None
-        if whole and c.lasting is not None:
+        biases = None
+        if whole and c.biases is not None:
             seconds = np.diff(obs.times[span], prepend=t_start)
-            lasting = estimate_sensor_biases(c.lasting, smoothed, seconds, way, base=t_start < obs.times[first])
-            report["lasting"] = [n for n in lasting.names if n]
+            biases = estimate_sensor_biases(c.biases, smoothed, seconds, way, base=t_start < obs.times[first])
+            report["biases"] = [n for n in biases.names if n]
         landmarks = LandmarkMap(
             ids=ids,
             exit_pose=handed.mean[:3],
@@ -195,7 +195,7 @@ class RbpfEkf(FrontEnd):
             detections=np.column_stack([data.original[used], lm_index]),
             chart="group" if whole else "cartesian",  # particles: as in the paper
             path=None if way is None else fix_points(smoothed, way),
-            lasting=lasting,
+            biases=biases,
         )
         trajectory = _trajectory(t_start, obs.times[span], smoothed)
         if not whole:  # the end of the path is that of the Gaussian

@@ -425,7 +425,7 @@ def gravity_along_path(inertial: InertialPredictor, times: Array, poses: Array) 
         variances.append(C[2, 2] + noise.accelerometer**2 / span)
     if len(at) < MOSTLY * len(times):
         return None
-    lasting = noise.accelerometer_bias
-    sigma = float(np.sqrt(np.median(variances) + lasting**2)) / GRAVITY
+    constant = noise.accelerometer_bias
+    sigma = float(np.sqrt(np.median(variances) + constant**2)) / GRAVITY
     out = PathGravity(np.array(at), np.array(ups), sigma, 0.5 * WINDOW)
     return None if np.abs(out.at(times, poses)[:, 1]).max() > ON_ITS_SIDE else out

@@ -89,7 +89,7 @@ PRETENDED = 1.5
 normals causes."""
 MAPPED = ("first", "matched", "found again", "new space")
 """States of scans that enter the map."""
-LASTING = 4.0
+CORRELATION = 4.0
 """Factor on the variance of the gradient, because consecutive scans see the same surfaces and their errors are
 correlated. Found on simulated lidars (`tests/frontends/lidar_odometry`)."""
 ACCELERATION = (3.0, 2.0)
@@ -442,7 +442,7 @@ class LidarOdometry:
             # ratio of the gradient variance by parts of space to that by single cells
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
             self.agreeing.append(float(np.trace(np.linalg.solve(E, G.T @ G))) / 6.0)
-            M *= LASTING * float(np.mean(self.agreeing))
+            M *= CORRELATION * float(np.mean(self.agreeing))
             F = observable_gradient(fit.H, fit.every, seen.unheld)
             H, M = F @ H, F @ M @ F.T
         self.errors.step(self.pose, motion, Q, H, M, self._bent(raw), self.off)

@@ -24,9 +24,9 @@ from graphslam.core.trajectory import Trajectory
 from graphslam_frontends.odometry.dead_reckoning_kernels import complementary_kernel
 from graphslam_frontends.odometry.gaps import Gaps, find_gaps
 from graphslam_frontends.odometry.inertial_biases import (
+    CONSTANT,
     FADING,
     GYRO,
-    LASTING,
     POS,
     PSI,
     SCALE,
@@ -124,7 +124,7 @@ def integrate_imu_and_wheels(
     active = np.searchsorted(wheels.times, middle, side="right") - 1
     speed = wheels.speed[active]
     to_base = se3.quat_rotate(imu.T_base_imu[3:], imu.angular_rate)
-    up, lasting = _up(imu, wheels, to_base, noise)
+    up, error_model = _up(imu, wheels, to_base, noise)
     tilt = _tilt(_interpolate(knots, imu.times, up))
     if np.abs(tilt[:, 1]).max() > _STEEPEST:
         raise GeometryError(
@@ -159,22 +159,22 @@ def integrate_imu_and_wheels(
         ]
     )
     at = np.searchsorted(knots, t)
-    F, Q = _transitions(fine, at, lasting)
+    F, Q = _transitions(fine, at, error_model)
     path = Trajectory(knots, fine.poses)
     poses = fine.poses[at]
     floor = np.repeat([FLOOR_ANGLE, noise.floor_position], 3)
     increments = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(t), 1))
     increments[1:] = se3.se3_between(poses[:-1], poses[1:])
     covariances = np.tile(np.diag(floor**2), (len(t), 1, 1))
-    covariances[1:] += _white(poses, F, Q, lasting)
+    covariances[1:] += _white(poses, F, Q, error_model)
     return MotionPrior(
         odometry=Odometry(times=t, increments=increments, covariances=covariances),
         poses=poses,
         path=path,
-        biases=InertialBiases(times=t, poses=poses, lasting=lasting, transitions=F, noises=Q, floor=floor),
+        biases=InertialBiases(times=t, poses=poses, model=error_model, transitions=F, noises=Q, floor=floor),
         tilt=tilt[at],
-        tilt_sigma=float(np.hypot(lasting.attitude, lasting.attitude_bias)),
-        tilt_time=lasting.attitude_time,
+        tilt_sigma=float(np.hypot(error_model.attitude, error_model.attitude_bias)),
+        tilt_time=error_model.attitude_time,
         gaps=Gaps(np.concatenate([imu_gaps.begin, wheel_gaps.begin]), np.concatenate([imu_gaps.end, wheel_gaps.end])),
     )
 
@@ -255,14 +255,14 @@ def _up(
         r, p = imu.attitude.T
         up = np.column_stack([-np.sin(p), np.sin(r) * np.cos(p), np.cos(r) * np.cos(p)])
         lasts = min(noise.attitude_bias, n.attitude)
-        lasting = DeadReckoningErrorModel(
+        error_model = DeadReckoningErrorModel(
             **common,
             attitude=float(np.sqrt(n.attitude**2 - lasts**2)),
             attitude_time=max(n.attitude_time, 1e-3),
             attitude_bias=lasts,
             attitude_walk=0.0,
         )
-        return se3.quat_rotate(imu.T_base_imu[3:], up), lasting
+        return se3.quat_rotate(imu.T_base_imu[3:], up), error_model
     # gravity = specific force minus the acceleration of the base (forward and centripetal) and that of the lever arm
     lever = imu.T_base_imu[:3]
     force = se3.quat_rotate(imu.T_base_imu[3:], imu.specific_force)
@@ -333,7 +333,7 @@ def _fine_steps(knots: Array, tilt: Array, rate: Array, speed: Array) -> _Fine:
     return _Fine(h, g, g_tilt, moved, pitched, axes, w[:, 2], poses, np.zeros((len(h), 4)))
 
 
-def _transitions(fine: _Fine, at: npt.NDArray[np.intp], lasting: DeadReckoningErrorModel) -> tuple[Array, Array]:
+def _transitions(fine: _Fine, at: npt.NDArray[np.intp], error_model: DeadReckoningErrorModel) -> tuple[Array, Array]:
     """Transition and noise ``(n, 12, 12)`` of the error state between the knots ``at`` ``(n,)``.
 
     All intervals advance together, one fine step of each at a time.
@@ -343,47 +343,47 @@ def _transitions(fine: _Fine, at: npt.NDArray[np.intp], lasting: DeadReckoningEr
     counts = np.diff(at)
     for m in range(int(counts.max(initial=0))):
         live = np.flatnonzero(counts > m)
-        A, N = _fine_transition(fine, at[live] + m, lasting)
+        A, N = _fine_transition(fine, at[live] + m, error_model)
         F[live + 1] = A @ F[live + 1]
         Q[live + 1] = A @ Q[live + 1] @ np.swapaxes(A, -1, -2) + N
     return F, Q
 
 
-def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], lasting: DeadReckoningErrorModel) -> tuple[Array, Array]:
+def _fine_transition(fine: _Fine, i: npt.NDArray[np.intp], error_model: DeadReckoningErrorModel) -> tuple[Array, Array]:
     """Transition and noise ``(k, 12, 12)`` of the fine steps ``i`` ``(k,)``, first order about the middle."""
     h = fine.h[i]
     A, N = np.tile(np.eye(STATES), (len(i), 1, 1)), np.zeros((len(i), STATES, STATES))
     A[:, PSI, GYRO] = h[:, None] * fine.g[i]
-    A[:, PSI, FADING] = A[:, PSI, LASTING] = h[:, None] * fine.g_tilt[i]
+    A[:, PSI, FADING] = A[:, PSI, CONSTANT] = h[:, None] * fine.g_tilt[i]
     turned = np.column_stack([-fine.moved[i, 1], fine.moved[i, 0], np.zeros(len(i))])  # e_z × moved
     # on average over the step, an error of the rate has half its final effect
     A[:, POS, 4:] = 0.5 * turned[:, :, None] * A[:, PSI, None, 4:]
     A[:, POS, PSI] = turned
     A[:, POS, SCALE] = fine.moved[i]
     A[:, POS, FADING.stop - 1] += fine.pitched[i]
-    A[:, POS, LASTING.stop - 1] += fine.pitched[i]
-    fade = np.exp(-h / lasting.attitude_time)
+    A[:, POS, CONSTANT.stop - 1] += fine.pitched[i]
+    fade = np.exp(-h / error_model.attitude_time)
     A[:, 8, 8] = A[:, 9, 9] = fade
-    if lasting.filtered:  # de/dt = β - e/T in the body frame, which rotates
+    if error_model.filtered:  # de/dt = β - e/T in the body frame, which rotates
         roll, pitch = FADING.start, FADING.start + 1
         A[:, roll, GYRO.start] = A[:, pitch, GYRO.start + 1] = h
-        A[:, roll, pitch] = A[:, roll, LASTING.start + 1] = h * fine.turn[i]
-        A[:, pitch, roll] = A[:, pitch, LASTING.start] = -h * fine.turn[i]
+        A[:, roll, pitch] = A[:, roll, CONSTANT.start + 1] = h * fine.turn[i]
+        A[:, pitch, roll] = A[:, pitch, CONSTANT.start] = -h * fine.turn[i]
     N[:, PSI, PSI] = h * fine.rates[i, 0]
     R = fine.axes[i]
     N[:, POS, POS] = (R * (h[:, None] * fine.rates[i, 1:])[:, None, :]) @ np.swapaxes(R, -1, -2)
     j = np.arange(4, STATES)
-    walk = np.array([lasting.gyro_walk**2] * 3 + [0.0] * 3 + [lasting.attitude_walk**2] * 2)
+    walk = np.array([error_model.gyro_walk**2] * 3 + [0.0] * 3 + [error_model.attitude_walk**2] * 2)
     N[:, j, j] = h[:, None] * walk
-    N[:, 8, 8] = N[:, 9, 9] = lasting.attitude**2 * (1.0 - fade**2)
+    N[:, 8, 8] = N[:, 9, 9] = error_model.attitude**2 * (1.0 - fade**2)
     return A, N
 
 
-def _white(poses: Array, F: Array, Q: Array, lasting: DeadReckoningErrorModel) -> Array:
+def _white(poses: Array, F: Array, Q: Array, error_model: DeadReckoningErrorModel) -> Array:
     """Covariances ``(n - 1, 6, 6)`` of increments from body to body, without systematic errors."""
     P = np.zeros((len(F) - 1, STATES + 2, STATES + 2))
     pick = np.vstack([np.eye(STATES), np.eye(STATES)[FADING]])[:, FADING]
-    P[:] = lasting.attitude**2 * pick @ pick.T
+    P[:] = error_model.attitude**2 * pick @ pick.T
     A = np.tile(np.eye(STATES + 2), (len(P), 1, 1))
     A[:, :STATES, :STATES] = F[1:]
     P = A @ P @ np.swapaxes(A, -1, -2)

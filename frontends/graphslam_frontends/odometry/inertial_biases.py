@@ -15,7 +15,7 @@ from graphslam.core import se3
 from graphslam.core.geometry import Array
 from graphslam.core.poses import remove_roll_pitch
 
-PSI, POS, GYRO, SCALE, FADING, LASTING = 0, slice(1, 4), slice(4, 7), 7, slice(8, 10), slice(10, 12)
+PSI, POS, GYRO, SCALE, FADING, CONSTANT = 0, slice(1, 4), slice(4, 7), 7, slice(8, 10), slice(10, 12)
 STATES = 12
 
 
@@ -49,7 +49,7 @@ class DeadReckoningErrorModel:
         P[GYRO] = self.gyro_bias**2 + self.gyro_walk**2 * since
         P[SCALE] = self.wheel_scale**2
         P[FADING] = self.attitude**2
-        P[LASTING] = self.attitude_bias**2 + self.attitude_walk**2 * since
+        P[CONSTANT] = self.attitude_bias**2 + self.attitude_walk**2 * since
         M = np.eye(STATES)
         if self.filtered:
             # error of the filter: T · gyro bias in steady state, and the opposite at its start, from the backward run
@@ -78,7 +78,7 @@ class InertialBiases:
 
     times: Array
     poses: Array
-    lasting: DeadReckoningErrorModel
+    model: DeadReckoningErrorModel
     transitions: Array
     noises: Array
     floor: Array
@@ -86,13 +86,13 @@ class InertialBiases:
     @property
     def sigmas(self) -> Mapping[str, float]:
         """See :class:`~graphslam_frontends.odometry.motion_prior.BiasStates`."""
-        e = self.lasting
+        e = self.model
         return {"yaw_bias": e.gyro_bias, "yaw_walk": e.gyro_walk, "scale": e.wheel_scale, "tilt": e.attitude_bias}
 
     def initial(self, start: int) -> Array:
         """See :class:`~graphslam_frontends.odometry.motion_prior.BiasStates`."""
-        pick = np.vstack([np.eye(STATES), np.eye(STATES)[FADING] + np.eye(STATES)[LASTING]])
-        return np.asarray(pick @ self.lasting.covariance(float(self.times[start])) @ pick.T)
+        pick = np.vstack([np.eye(STATES), np.eye(STATES)[FADING] + np.eye(STATES)[CONSTANT]])
+        return np.asarray(pick @ self.model.covariance(float(self.times[start])) @ pick.T)
 
     def step(self, k: int) -> tuple[Array, Array]:
         """See :class:`~graphslam_frontends.odometry.motion_prior.BiasStates`."""
@@ -132,7 +132,7 @@ def tangent_of_state(start: Array, end: Array, *, level_start: bool, level_end: 
     G[:, :3, PSI] = to_end[:, :, 2]
     if not level_end:
         G[:, :3, FADING] = to_end[:, :, :2]
-        G[:, :3, LASTING] = to_end[:, :, :2]
+        G[:, :3, CONSTANT] = to_end[:, :, :2]
     G[:, 3:, POS] = np.swapaxes(se3.quat_to_matrix(end[:, 3:]), -1, -2)
     if not level_start:
         ad = se3.se3_adjoint(se3.se3_between(end, start))

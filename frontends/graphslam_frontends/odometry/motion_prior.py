@@ -182,8 +182,8 @@ class OdometryBiases:
 
     def initial(self, start: int) -> Array:
         """See :class:`BiasStates`."""
-        lasting = np.diag([self.yaw_bias**2, self.scale**2])
-        return _blocks(self.odometry.covariances[0], lasting)
+        constant = np.diag([self.yaw_bias**2, self.scale**2])
+        return _blocks(self.odometry.covariances[0], constant)
 
     def step(self, k: int) -> tuple[Array, Array]:
         """See :class:`BiasStates`."""

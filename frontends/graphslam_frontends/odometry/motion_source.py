@@ -122,8 +122,8 @@ def _spacing(stamps: Array) -> float:
 
 
 def _biases(odometry: Odometry, config: StepConfig) -> OdometryBiases:
-    bias = float(np.hypot(config.lasting_yaw_bias, config.yaw_bias))
-    return OdometryBiases(odometry=odometry, yaw_bias=bias, scale=config.lasting_scale)
+    bias = float(np.hypot(config.constant_yaw_bias, config.yaw_bias))
+    return OdometryBiases(odometry=odometry, yaw_bias=bias, scale=config.constant_scale)
 
 
 def _recorded(log: SensorLog, name: str, odometry: Odometry, config: StepConfig) -> MotionSource:

@@ -39,9 +39,9 @@ class StepConfig:
     """Noise of planar controls; recorded odometry uses its floors."""
     yaw_bias: float = 0.0
     """Deliberate error added to the yaw rate of all motion [rad/s], for tests; it is in the name of the steps."""
-    lasting_yaw_bias: float = 0.0
+    constant_yaw_bias: float = 0.0
     """σ of a constant yaw-rate error of recorded odometry or controls [rad/s]; ``yaw_bias`` is added in quadrature."""
-    lasting_scale: float = 0.0
+    constant_scale: float = 0.0
     """σ of a constant relative error of their distances."""
     yaw_per_metre: float = 0.0
     """Heading error of planar recorded odometry per metre driven, to subtract [rad/m], for example by unequal wheel
@@ -67,7 +67,7 @@ class StepConfig:
         for name, value in positive.items():
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"steps: {name} = {value}; wanted > 0")
-        for name in ("min_range", "lasting_yaw_bias", "lasting_scale", "odometry_tilt_sigma"):
+        for name in ("min_range", "constant_yaw_bias", "constant_scale", "odometry_tilt_sigma"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"steps: {name} = {getattr(self, name)}; wanted ≥ 0")
         for name in ("yaw_bias", "yaw_per_metre"):

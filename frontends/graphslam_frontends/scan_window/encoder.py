@@ -100,7 +100,7 @@ def encoder_offset(
                 got=f"{np.mean(seen):.0%}",
                 wanted="30 % or more",
             )
-        askew, sigma = float(tracker.lasting[2]), float(np.sqrt(tracker.P[tracker.w + 2, tracker.w + 2]))
+        askew, sigma = float(tracker.biases[2]), float(np.sqrt(tracker.P[tracker.w + 2, tracker.w + 2]))
         found -= heads[stream] * askew
         if abs(askew) < max(0.2 * sigma, 2e-4):
             break

@@ -168,7 +168,7 @@ def _submap(
             dropped += grid.insert_scan(points, origins, pose=T, max_range=steps.max_range, returns=returns).dropped
     report = {"ended": ended, "steps": end - start, "length": round(float(np.ptp(steps.path_length[[start, end]])), 3)}
     report |= {"beams_dropped": int(dropped), **_summary([s[2] for s in states[int(start > 0) :]])}
-    report["yaw_bias"], report["askew"] = float(tracker.lasting[0]), float(tracker.lasting[2])
+    report["yaw_bias"], report["askew"] = float(tracker.biases[0]), float(tracker.biases[2])
     report["askew_sigma"] = float(np.sqrt(tracker.P[tracker.w + 2, tracker.w + 2]))
     findings = [*steps.findings, *scan_findings(steps)] if key == 0 else []
     findings += _lost(key, end - start, report)

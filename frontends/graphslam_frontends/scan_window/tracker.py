@@ -97,7 +97,7 @@ class ScanToWindowOdometry:
         if self.gravity:
             prior += [s.tilt, s.tilt, steps.tilt_sigma, steps.tilt_sigma]
         self.x = w + len(prior)  # size of pose and systematic errors together
-        self.lasting = np.zeros(len(prior))
+        self.biases = np.zeros(len(prior))
         self.slots = MOST_STEPS + 1
         self.ANCHOR, self.NOW = self.slots, self.slots + 1
         n = self.x + (self.slots + 1) * w
@@ -161,7 +161,7 @@ class ScanToWindowOdometry:
         u, dt = self.steps.odometry.increments[k], float(self.steps.times[k] - self.steps.times[k - 1])
         m = self.motion_states
         B = bias_effects(u, dt)
-        step = g.compose(u, g.exp(B @ self.lasting[:m]))
+        step = g.compose(u, g.exp(B @ self.biases[:m]))
         Q = np.zeros((x, x))
         C = self.steps.odometry.covariances[k].copy()
         if self.gravity:
@@ -176,7 +176,7 @@ class ScanToWindowOdometry:
             phi = np.exp(-dt / max(self.steps.tilt_time, 1e-6))
             fading = np.arange(x - 2, x)
             F[fading, fading] = phi
-            self.lasting[-2:] *= phi
+            self.biases[-2:] *= phi
             Q[fading, fading] = self.steps.tilt_sigma**2 * (1.0 - phi**2)
         P = self.P
         P[:x, x:] = F @ P[:x, x:]
@@ -191,7 +191,7 @@ class ScanToWindowOdometry:
         H = np.zeros((2, self.x))
         H[:, :6] = D[0]
         H[:, -4:-2] = H[:, -2:] = np.eye(2)
-        r = self.steps.tilt[self.k] - seen[0] - self.lasting[-4:-2] - self.lasting[-2:]
+        r = self.steps.tilt[self.k] - seen[0] - self.biases[-4:-2] - self.biases[-2:]
         gain = self._gain(H, np.zeros((2, 0)), np.zeros(0, np.int64), TOLD**2)
         self._correct(gain, r)
 
@@ -233,7 +233,7 @@ class ScanToWindowOdometry:
         P[: self.w] = turned @ P[: self.w]
         P[:, : self.w] = P[:, : self.w] @ turned.T
         self.pose = self.group.compose(self.pose, self.group.exp(d[: self.w]))
-        self.lasting = self.lasting + d[self.w :]
+        self.biases = self.biases + d[self.w :]
 
     # --- the scan ----------------------------------------------------------------------------------------------------
 
@@ -418,13 +418,13 @@ class TrackedPath:
     joints : (n, 2 d, 2 d)
         Joint covariance of the first pose of the submap and the pose of the step, right tangents. A step between two
         submaps belongs to the first of them.
-    lasting : (n, m)
+    biases : (n, m)
         Yaw bias [rad/s], scale, direction … after each step.
     """
 
     poses: Array
     joints: Array
-    lasting: Array
+    biases: Array
     found: tuple[ScanMatch, ...]
 
 
@@ -433,12 +433,12 @@ def track_steps(steps: Steps, config: ScanWindowConfig, starts: Iterable[int] = 
     t = ScanToWindowOdometry(steps, config)
     n, begins = len(steps), {0, *starts}
     poses, joints = np.empty((n, t.group.size)), np.empty((n, 2 * t.w, 2 * t.w))
-    lasting, found = np.empty((n, len(t.lasting))), []
+    biases, found = np.empty((n, len(t.biases))), []
     for k in range(n):
         found.append(t.step())
         if k == 0:
             t.begin()
-        poses[k], joints[k], lasting[k] = t.pose, t.joint, t.lasting
+        poses[k], joints[k], biases[k] = t.pose, t.joint, t.biases
         if k in begins:
             t.begin()
-    return TrackedPath(poses, joints, lasting, tuple(found))
+    return TrackedPath(poses, joints, biases, tuple(found))

@@ -201,8 +201,8 @@ def explain_disagreement(
 def bias_table(graph: FactorGraph) -> list[dict[str, Any]]:
     """One row per constant error that was estimated with the map: name, value, σ, and prior σ."""
     out = []
-    for robot, event in enumerate(e for e in graph.events if e["event"] == "lasting"):
-        g, P = graph.lasting_errors(robot)
+    for robot, event in enumerate(e for e in graph.events if e["event"] == "biases"):
+        g, P = graph.sensor_biases(robot)
         rows = zip(event["names"], g.tolist(), np.sqrt(np.diag(P)).tolist(), event["sigmas"])
         out += [{"name": n, "value": v, "sigma": s, "beforehand": b, "robot": robot} for n, v, s, b in rows if n]
     return out
@@ -219,11 +219,11 @@ def bias_findings(facts: Sequence[Mapping[str, Any]]) -> list[Finding]:
     text = f"systematic errors estimated with the map: {'; '.join(said) or 'none significant'}"
     text += f" — not significant: {', '.join(rest)}." if rest else "."
     text += " The covariances include their uncertainty."
-    out = [Finding("", "lasting", text)]
+    out = [Finding("", "biases", text)]
     if wild:
         text = f"{'; '.join(estimate_text(r['name'], r['value'], r['sigma']) for r in wild)} — implausibly large. "
         text += "To do: check unit, sign and mounting of the sensor; `graphslam data check`."
-        out.append(Finding("bad", "lasting", text))
+        out.append(Finding("bad", "biases", text))
     return out
 
 

@@ -32,7 +32,7 @@ from graphslam.evaluate.metrics import Metrics
 from graphslam.evaluate.residual_consistency import NOT_TESTED, ClassConsistency, class_consistency
 from graphslam.graph.factor_graph import FactorGraph
 
-OF_THE_MAP = ("submap", "lasting", "dense-submap", "match", "loop")
+OF_THE_MAP = ("submap", "biases", "dense-submap", "match", "loop")
 """Factor classes whose χ² covers motion and observations."""
 MOST_FORETOLD = {2: 1000, 3: 300}
 """Largest number of withheld fixes that are predicted, spread evenly over the run, by dimension of the graph."""
@@ -97,7 +97,7 @@ class ResidualConsistency:
             if name != "gps-bias" and dof > 0:
                 out += chi_square_ratio_test(f"χ² of {name}", of, chi2 / dof, dof * c.independent / max(c.dof, 1e-9))
             if c.whiteness is not None and np.isfinite(c.ratio):
-                score = c.whiteness.score if c.whiteness.lasting() else min(c.whiteness.score, 0.0)
+                score = c.whiteness.score if c.whiteness.correlated() else min(c.whiteness.score, 0.0)
                 out.append(largest_score_test(f"autocorrelation of {name} residuals", of, score))
         if self.gps is not None:
             for r in self.gps.tests().to_dict("records"):

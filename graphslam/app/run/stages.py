@@ -368,9 +368,9 @@ def _report(made: SolvedMap, checks: ResidualConsistency, identities: str) -> di
         report["nees_chart"] = "group" if refined is not None or back.graph.dim == 3 else made.solution.chart
     if checks.gps is not None:
         report["gps_innovations"] = checks.gps.facts()
-    lasting = bias_table(back.graph)
-    if lasting:
-        report["lasting"] = lasting
+    biases = bias_table(back.graph)
+    if biases:
+        report["biases"] = biases
     if made.slam.control is not None:
         report["control_points"] = control_facts(back.graph, made.slam.control)
     if made.checked is not None:
@@ -402,7 +402,7 @@ def _verdict(made: SolvedMap, report: dict[str, Any]) -> None:
     lines = [
         *findings_from_run(streams, made.inputs.noticed, submaps, graph.events),
         *explain_disagreement(log, settings.calibrate, *join, ranges_corrected=corrected),
-        *bias_findings(report.get("lasting", [])),
+        *bias_findings(report.get("biases", [])),
         *observation_findings(log, reports, dropped),
         *bias_test_findings(reports),
         *made.findings,

@@ -77,7 +77,7 @@ ADVICE: dict[str, str] = {
     "scan-encoder": "subtract the offset from the encoder angles",
     "calibration-contradiction": "run `graphslam data check` to find the stream that is wrong",
     "calibration": "correct the calibration error that is named below",
-    "lasting": "check unit, sign and mounting of the sensor whose error is named below",
+    "biases": "check unit, sign and mounting of the sensor whose error is named below",
     # then what the run did with the log
     "observations-not-used": "check units, signs and ids of the observations",
     "*-not-used": "correct the cause for which a stream was not used",

@@ -24,7 +24,7 @@ from graphslam.evaluate.covariance_assessment import (
     assess_covariances,
     consistency_tests_of_json,
 )
-from graphslam.evaluate.residual_consistency import LASTING, two_sided_bounds
+from graphslam.evaluate.residual_consistency import CORRELATED, two_sided_bounds
 
 
 def covariance_assessment(figures: RunMetrics) -> CovarianceAssessment | None:
@@ -90,7 +90,7 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
 
 def _said(row: ConsistencyTest) -> str:
     """One test with its value."""
-    if row.lasting and row.dof == 1.0:
+    if row.correlated and row.dof == 1.0:
         return f"{row.name} ({row.value:.1f} σ)"
     return f"{row.name} ({row.value:.3g} at {row.dof:.3g} degrees of freedom)"
 
@@ -124,8 +124,8 @@ def check_classes(figures: RunMetrics) -> list[Finding]:
         )
         check(f"χ²/dof of factors “{row.get('class')}”", row.get("chi2_per_dof"), dof, cause)
         # a refined path contains GPS factors; the other factors of the graph only gave its initial value
-        if row.get("verdict") == LASTING and (row.get("class") == "gps" or not figures.part("refine")):
-            out.append(_lasting(row))
+        if row.get("verdict") == CORRELATED and (row.get("class") == "gps" or not figures.part("refine")):
+            out.append(_correlated(row))
     m = figures.metrics
     cause = "GPS errors are larger or more correlated than assumed, or the map is wrong."
     check("NIS/dof of withheld GPS fixes", m.get("gps_nis_joint_value"), m.get("gps_nis_joint_dof"), cause)
@@ -151,7 +151,7 @@ _LASTS = (
 )
 
 
-def _lasting(row: Mapping[str, Any]) -> Finding:
+def _correlated(row: Mapping[str, Any]) -> Finding:
     """Autocorrelated residuals: the map follows time-correlated errors."""
     text = (
         f"autocorrelation of “{row.get('class')}” residuals: {float(row['lag1']):.2f}, that is "

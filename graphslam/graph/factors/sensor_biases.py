@@ -51,7 +51,7 @@ class SensorBiasRecord:
     root: Array
     told: Array
     what: str = "beforehand"
-    group: str = "lasting"
+    group: str = "biases"
 
     @property
     def rows(self) -> int:

@@ -1,6 +1,6 @@
 """The study ``calibration``: noise and systematic errors estimated from a log, and the maps made with them.
 
-Worlds: ``drawn``: random robots whose logs state a quarter of their true σ (``drawn-lasting``: with errors correlated
+Worlds: ``drawn``: random robots whose logs state a quarter of their true σ (``drawn-correlated``: errors correlated
 over seconds; ``planted``: one constant error at a time, and none); ``plaza1`` with a yaw-rate bias of 0.31 deg/s added;
 the robots of MRCLAM 7, each without its preset; and recorded sets with scans, with a random yaw bias, scale and
 odometry noise added in each run. The recorded sets must be available (``GRAPHSLAM_DATA``).
@@ -31,7 +31,7 @@ from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs, wh
 BIAS = float(np.deg2rad(0.31))
 WORLDS = {
     "drawn": CalibrationTrialConfig(),
-    "drawn-lasting": CalibrationTrialConfig(lasting=True, seconds=300.0),
+    "drawn-correlated": CalibrationTrialConfig(correlated=True, seconds=300.0),
     "planted": CalibrationTrialConfig(planted=tuple(PLANTED)),
     "plaza1": CalibrationTrialConfig(source="plaza1", added=Added(bias=BIAS), presets="plaza1.rbpf-ekf"),
 }

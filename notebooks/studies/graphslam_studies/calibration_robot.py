@@ -20,7 +20,7 @@ FINE = 0.02
 class DrawnRobot:
     """True parameters of a robot.
 
-    Sigmas as in :class:`graphslam.calibrate.corrections.Corrections`; ``lasting_…``: σ of Gauss–Markov errors of yaw
+    Sigmas as in :class:`graphslam.calibrate.corrections.Corrections`; ``correlated_…``: σ of Gauss–Markov errors of yaw
     rate [rad/s] and speed [m/s] with time constant ``memory`` [s].
     """
 
@@ -38,12 +38,12 @@ class DrawnRobot:
     sensor_yaw: float
     clock: float
     range_scale: float = 1.0
-    lasting_rate: float = 0.0
-    lasting_speed: float = 0.0
+    correlated_rate: float = 0.0
+    correlated_speed: float = 0.0
     memory: float = 5.0
 
 
-def draw_robot(seed: int, *, lasting: bool = False) -> DrawnRobot:
+def draw_robot(seed: int, *, correlated: bool = False) -> DrawnRobot:
     """A random robot: log-uniform sigmas; normally distributed constants, except for a uniform clock offset."""
     rng = SeedTree(seed).child("calibration", "robot").generator()
 
@@ -64,8 +64,8 @@ def draw_robot(seed: int, *, lasting: bool = False) -> DrawnRobot:
         range_offset=float(0.2 * rng.standard_normal()),
         sensor_yaw=float(np.deg2rad(2.0) * rng.standard_normal()),
         clock=float(rng.uniform(-0.25, 0.25)),
-        lasting_rate=between(0.01, 0.06) if lasting else 0.0,
-        lasting_speed=between(0.01, 0.1) if lasting else 0.0,
+        correlated_rate=between(0.01, 0.06) if correlated else 0.0,
+        correlated_speed=between(0.01, 0.1) if correlated else 0.0,
     )
 
 
@@ -131,8 +131,8 @@ def _odometry(robot: DrawnRobot, truth: Trajectory, stamps: Array, rng: np.rando
         ]
     )
     noise = sigma * rng.standard_normal(sigma.shape)
-    noise[:, 0] += _gauss_markov(r.lasting_speed, r.memory, dt, rng) * dt
-    noise[:, 2] += _gauss_markov(r.lasting_rate, r.memory, dt, rng) * dt
+    noise[:, 0] += _gauss_markov(r.correlated_speed, r.memory, dt, rng) * dt
+    noise[:, 2] += _gauss_markov(r.correlated_rate, r.memory, dt, rng) * dt
     moved = xi + noise
     moved[:, :2] *= r.distance_scale
     moved[1:, 2] += r.yaw_bias * dt[1:]

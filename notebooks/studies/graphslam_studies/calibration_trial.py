@@ -43,7 +43,7 @@ class CalibrationTrialConfig:
     """Recorded set; empty: a random robot."""
     seconds: float = 120.0
     """Duration of the drive of a random robot [s]."""
-    lasting: bool = False
+    correlated: bool = False
     """Whether its odometry has time-correlated errors."""
     planted: tuple[str, ...] = ()
     """Keys of ``PLANTED``: errors added one at a time to a random robot without constant errors; no maps are made."""
@@ -73,7 +73,7 @@ def run_calibration_trial(config: CalibrationTrialConfig, seed: int) -> list[Mea
 
 
 def _drawn(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
-    robot = draw_robot(seed, lasting=config.lasting)
+    robot = draw_robot(seed, correlated=config.correlated)
     log = drive(robot, seed, config.seconds)
     begin = process_time()
     found = calibrate_log(log, frontend="rbpf-ekf", quick=True, seed=seed)
@@ -103,7 +103,7 @@ PLANTED: dict[str, tuple[dict[str, float], str, float]] = {
 
 def _planted(config: CalibrationTrialConfig, seed: int) -> Iterator[Measurement]:
     """For each planted error: whether it is within 3σ of its estimate, and which other constants were corrected."""
-    exact = replace(draw_robot(seed, lasting=config.lasting), **EXACT)
+    exact = replace(draw_robot(seed, correlated=config.correlated), **EXACT)
     for name in config.planted:
         changes, constant, true = PLANTED[name]
         log = drive(replace(exact, **changes), seed, config.seconds)
@@ -135,11 +135,11 @@ def true_figures(r: DrawnRobot) -> Corrections:
         range_offset=r.range_offset,
         sensor_yaw=r.sensor_yaw,
         along_metre=r.along_metre,
-        along_second=r.lasting_speed * long,
+        along_second=r.correlated_speed * long,
         lateral_metre=r.lateral_metre,
         heading_metre=r.heading_metre,
         heading_radian=r.heading_radian,
-        heading_second=float(np.hypot(r.heading_second, r.lasting_rate * long)),
+        heading_second=float(np.hypot(r.heading_second, r.correlated_rate * long)),
         range_sigma=r.range_sigma,
         bearing_sigma=r.bearing_sigma,
     )

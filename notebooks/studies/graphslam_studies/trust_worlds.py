@@ -16,7 +16,7 @@ from graphslam.core.random import SeedTree
 from graphslam.core.records import Gps, LandmarkObservations, Odometry, Stream
 from graphslam_studies.charts import RATE, ChartConfig, draw_log
 
-GPS_KINDS = ("none", "white", "rtk", "lasting", "lasting-white", "multipath")
+GPS_KINDS = ("none", "white", "rtk", "correlated", "correlated-white", "multipath")
 FRONT_ENDS = ("rbpf-ekf", "ekf")
 
 
@@ -34,7 +34,7 @@ class TrustWorld:
         Ratio of measured to true wheel distances.
     tails : float
         Share of outlier observations; they have additional noise of eight times the stated σ.
-    lasting_odometry : tuple of float
+    correlated_odometry : tuple of float
         σ of the time-correlated odometry error per 0.1 s over the stated white σ, and its time constant [s].
     gps : str
         One of :data:`GPS_KINDS`.
@@ -51,7 +51,7 @@ class TrustWorld:
     understated: float = 1.0
     scale: float = 1.0
     tails: float = 0.0
-    lasting_odometry: tuple[float, float] = (0.0, 1.0)
+    correlated_odometry: tuple[float, float] = (0.0, 1.0)
     gps: str = "none"
     gps_sigma: float = 1.0
     gps_time: float = 60.0
@@ -60,7 +60,9 @@ class TrustWorld:
     @property
     def clean(self) -> bool:
         """Whether all errors agree with the noise model in the log."""
-        right = self.understated == 1.0 and self.scale == 1.0 and self.tails == 0.0 and self.lasting_odometry[0] == 0.0
+        right = (
+            self.understated == 1.0 and self.scale == 1.0 and self.tails == 0.0 and self.correlated_odometry[0] == 0.0
+        )
         return right and self.gps in ("none", "white", "rtk")
 
     @property
@@ -73,9 +75,11 @@ class TrustWorld:
             out.append(f"wheels {100 * (self.scale - 1):+.1f} %")
         if self.tails:
             out.append(f"{100 * self.tails:.0f} % outlier observations")
-        if self.lasting_odometry[0]:
-            out.append(f"time-correlated odometry ×{self.lasting_odometry[0]:.1f}, {self.lasting_odometry[1]:.0f} s")
-        if self.gps in ("lasting", "lasting-white", "multipath"):
+        if self.correlated_odometry[0]:
+            out.append(
+                f"time-correlated odometry ×{self.correlated_odometry[0]:.1f}, {self.correlated_odometry[1]:.0f} s"
+            )
+        if self.gps in ("correlated", "correlated-white", "multipath"):
             out.append(f"GPS {self.gps}" + (f", {self.gps_time:.0f} s" if self.gps != "multipath" else ""))
         return "; ".join(out) or "nothing"
 
@@ -122,13 +126,13 @@ def draw_world(number: int, *, seconds: float = 250.0) -> TrustWorld:
         elif k == 2:
             world = replace(world, tails=drawn[2])
         elif k == 3:
-            world = replace(world, lasting_odometry=drawn[3])
+            world = replace(world, correlated_odometry=drawn[3])
         elif world.understated == 1.0:
             world = replace(world, understated=drawn[4])  # the noise model is conservative
     return world
 
 
-def lasting(rng: np.random.Generator, n: int, dt: float, time: float, width: int) -> Array:
+def correlated(rng: np.random.Generator, n: int, dt: float, time: float, width: int) -> Array:
     """Stationary Gauss–Markov process ``(n, width)`` with unit variance."""
     keep = np.exp(-dt / time)
     out = rng.standard_normal((n, width))
@@ -150,9 +154,9 @@ def world_log(w: TrustWorld, seed: SeedTree) -> SensorLog:
     stated = np.array([c.odometry[0], c.odometry[1], np.deg2rad(c.odometry[2])])
     odometry: Odometry = log["odometry"]
     u = odometry.increments.copy()
-    size, time = w.lasting_odometry
+    size, time = w.correlated_odometry
     if size:
-        add = size * stated * lasting(rng, len(u) - 1, 1.0 / RATE, time, 3)
+        add = size * stated * correlated(rng, len(u) - 1, 1.0 / RATE, time, 3)
         u[1:] = se2_compose(u[1:], se2_exp(add))
     u[:, :2] *= w.scale
     streams: dict[str, Stream] = {
@@ -185,10 +189,10 @@ def fixes_of(w: TrustWorld, times: Array, poses: Array, rng: np.random.Generator
     exact = se2_transform(GPS_FRAME, poses[at, :2])
     s = w.gps_sigma
     noise = s * rng.standard_normal((n, 2))
-    if w.gps == "lasting":
-        noise = s * lasting(rng, n, 1.0, w.gps_time, 2)
-    elif w.gps == "lasting-white":
-        noise = s * lasting(rng, n, 1.0, w.gps_time, 2) + 0.3 * noise
+    if w.gps == "correlated":
+        noise = s * correlated(rng, n, 1.0, w.gps_time, 2)
+    elif w.gps == "correlated-white":
+        noise = s * correlated(rng, n, 1.0, w.gps_time, 2) + 0.3 * noise
     elif w.gps == "multipath":
         k = 0
         while k < n:

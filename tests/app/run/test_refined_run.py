@@ -343,7 +343,7 @@ def test_scans_are_read_again_as_they_were(finished: Run) -> None:
     read = type(scans).load(finished.folder / "scans.npz")
     for name in ("times", "offsets", "points", "origins", "returns", "tilt"):
         np.testing.assert_array_equal(getattr(read, name), getattr(scans, name))
-    assert read.lasting == scans.lasting
+    assert read.biases == scans.biases
 
 
 @pytest.mark.parametrize(("second", "settled"), [(50, True), (0, False)])

@@ -93,7 +93,7 @@ def test_what_is_new_in_each_step_is_as_stated() -> None:
     """With errors that last switched off, increments of 0.4 s are as far off as their covariances say, each axis."""
     squares = []
     for seed in range(40):
-        d = drive(np.random.default_rng(1000 + seed), lasting=False)
+        d = drive(np.random.default_rng(1000 + seed), biased=False)
         o = integrate_imu_and_wheels(d.imu, d.wheels, TIMES, NOISE).odometry
         truth = d.truth.interpolate(TIMES)
         e = se3.se3_log(se3.se3_between(o.increments[1:], se3.se3_between(truth[:-1], truth[1:])))

@@ -39,10 +39,10 @@ def garage(layout: str) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("layout", ["A", "B", "C", "D"])
-def test_particles_walk_ten_to_twenty_times_what_lasting_errors_move_in_a_step(layout: str) -> None:
-    """n steps of a lasting error b come to n b, n steps of white noise of σ = r b to √n r b: particles reach what must
+def test_particles_walk_ten_to_twenty_times_what_biases_move_in_a_step(layout: str) -> None:
+    """n steps of a constant error b come to n b, n steps of white noise of σ = r b to √n r b: particles reach what must
     be undone over r² steps. Ten to twenty are 100 to 400 steps, 30 to 120 m, as long as segments are; more only spreads
-    particles. Heading: the gyro's bias; height: gravity's lasting error; along the way: the wheels' scale."""
+    particles. Heading: the gyro's bias; height: gravity's constant error; along the way: the wheels' scale."""
     step, turned = garage(layout)
     crawler = CrawlerConfig()
     quiet = GridFilterConfig(heading_turn=0.0)

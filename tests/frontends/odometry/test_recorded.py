@@ -96,7 +96,7 @@ def test_errors_over_an_interval_are_as_stated(dim: int) -> None:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_lasting_effect_equals_finite_differences(dim: int) -> None:
+def test_bias_effect_equals_finite_differences(dim: int) -> None:
     step, seconds, eps = winding(dim).increments[13], 0.2, 1e-6
     xi = log(step)
     J = bias_effect(step, seconds)

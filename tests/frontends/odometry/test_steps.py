@@ -161,7 +161,7 @@ def test_degraded_by_a_stated_bias(room: SensorLog) -> None:
     xi = se3.se3_log(se3.se3_between(U, T))  # true in estimated: the bias itself, hardly anything else
     assert xi[2] == pytest.approx(-0.005 * seconds, rel=0.1)
     assert np.sqrt(C[2, 2] - P[2, 2]) == pytest.approx(0.005 * seconds, rel=0.1)
-    added = C - P  # one σ of one lasting error
+    added = C - P  # one σ of one constant error
     np.testing.assert_allclose(added, np.outer(xi, xi), atol=0.05 * np.abs(added).max())
     with pytest.raises(DataError, match="where level is"):
         off.errors.between(0, 9, level_start=True)
@@ -189,9 +189,9 @@ def test_motion_of_an_imu_and_wheels() -> None:
 
 
 def test_level_floors_tell_what_gravity_is_off_by(rng: np.random.Generator) -> None:
-    """Out on the flat, up a ramp, on, down another, and back: the median is the lasting error, whatever the ramps."""
-    lasting = np.array([0.004, -0.0055])
-    tilt = lasting + 0.004 * rng.standard_normal((600, 2))
+    """Out on the flat, up a ramp, on, down another, and back: the median is the constant error, whatever the ramps."""
+    constant = np.array([0.004, -0.0055])
+    tilt = constant + 0.004 * rng.standard_normal((600, 2))
     tilt[100:160, 1] -= 0.12
     tilt[380:440, 1] += 0.12
     increments = np.zeros((600, 7))
@@ -203,7 +203,7 @@ def test_level_floors_tell_what_gravity_is_off_by(rng: np.random.Generator) -> N
     assert level is not None
     taken = tilt - level
     np.testing.assert_allclose(taken, np.broadcast_to(taken[0], taken.shape), atol=1e-15)  # one number each
-    np.testing.assert_allclose(taken[0], lasting, atol=8e-4)
+    np.testing.assert_allclose(taken[0], constant, atol=8e-4)
     assert level_on_the_whole(None, increments) is None
     still = level_on_the_whole(tilt, np.tile([0.0, 0, 0, 0, 0, 0, 1], (600, 1)))
     assert still is not None

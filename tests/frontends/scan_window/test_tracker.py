@@ -63,7 +63,7 @@ def errors(steps: Steps, made: TrackedPath, start: int, end: int) -> tuple[Array
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_what_lasting_errors_take_off_a_motion(dim: int) -> None:
+def test_what_biases_take_off_a_motion(dim: int) -> None:
     rng = np.random.default_rng(dim)
     g = SE2 if dim == 2 else SE3
     u, dt, h = g.exp(0.4 * rng.normal(size=g.dof)), 0.4, 1e-6
@@ -87,7 +87,7 @@ def test_how_errors_move_with_the_body(dim: int) -> None:
     def tracker() -> ScanToWindowOdometry:
         t = ScanToWindowOdometry(steps, CONFIG)
         t.k, t.pose = 3, g.exp(np.random.default_rng(1).normal(size=g.dof))
-        t.lasting = 1e-3 * np.random.default_rng(2).normal(size=len(t.lasting))
+        t.biases = 1e-3 * np.random.default_rng(2).normal(size=len(t.biases))
         return t
 
     t = tracker()
@@ -100,9 +100,9 @@ def test_how_errors_move_with_the_body(dim: int) -> None:
         if i < t.w:
             other.pose = g.compose(other.pose, g.exp(h * np.eye(t.w)[i]))
         else:
-            other.lasting[i - t.w] += h
+            other.biases[i - t.w] += h
         other._move()
-        F[:, i] = np.concatenate([g.log(g.between(t.pose, other.pose)), other.lasting - t.lasting]) / h
+        F[:, i] = np.concatenate([g.log(g.between(t.pose, other.pose)), other.biases - t.biases]) / h
     assert t.P[: t.x, t.x : t.x + t.w] == pytest.approx(F @ before, abs=2e-3)
     assert np.abs(F @ before).max() > 1.0
 
@@ -171,7 +171,7 @@ def test_covariance_of_a_motion_between_frames_beside_the_body(dim: int) -> None
 def test_what_was_said_of_a_step_stays_said(dim: int) -> None:
     steps = drawn_ring(4, dim, 14.0)
     whole, part = track_steps(steps, CONFIG, [12]), track_steps(head(steps, 31), CONFIG, [12])
-    for a, b in zip((whole.poses, whole.joints, whole.lasting), (part.poses, part.joints, part.lasting)):
+    for a, b in zip((whole.poses, whole.joints, whole.biases), (part.poses, part.joints, part.biases)):
         assert a[:31].tobytes() == b.tobytes()
     assert sum(f.lost == "" for f in part.found) > 10
 

@@ -18,7 +18,7 @@ from tests.graph.factors.test_gps_uneven import TILTED, uneven
 from tests.reference.gtsam_twin import to_gtsam
 from tests.reference.space_chain import dense_chain
 
-LASTING = GpsConfig(bias_sigma=0.5, bias_time=20.0, baseline=2.0)
+CORRELATED = GpsConfig(bias_sigma=0.5, bias_time=20.0, baseline=2.0)
 
 
 def priors(graph: FactorGraph) -> list[BiasPriorRecord]:
@@ -29,7 +29,7 @@ def test_biases_follow_from_each_other(rng):
     """One in two seconds; what one leaves of the one before, and what is new, keep σ as it is at any time."""
     chain = dense_chain(rng, 3, m=6)
     gps = fixes_along(chain, rng, level_datum_pose(DATUM))
-    g = built(chain, gps, LASTING)
+    g = built(chain, gps, CORRELATED)
     found = priors(g)
     assert len(found) == g.structure.count("bias") >= 3
     assert [r.before for r in found] == [None, *range(len(found) - 1)]
@@ -45,7 +45,7 @@ def test_biases_follow_from_each_other(rng):
 
 def test_jacobians_and_gtsam_agree(rng):
     chain = dense_chain(rng, 3, m=4)
-    g = built(chain, uneven(fixes_along(chain, rng, level_datum_pose(DATUM)), TILTED), LASTING)
+    g = built(chain, uneven(fixes_along(chain, rng, level_datum_pose(DATUM)), TILTED), CORRELATED)
     (batch,) = [b for b in g.flat().batches if isinstance(b, BiasPriorBatch)]
     shape = batch.records[0].shape
     np.testing.assert_allclose(shape, TILTED / 0.17, rtol=1e-12)  # as large as sigma over east and north
@@ -64,7 +64,7 @@ def test_jacobians_and_gtsam_agree(rng):
 def test_all_solvers_end_at_one_optimum(rng):
     chain = dense_chain(rng, 3, m=4)
     gps = uneven(fixes_along(chain, rng, level_datum_pose(DATUM)), TILTED)
-    graphs = [built(chain, gps, LASTING) for _ in range(2)]
+    graphs = [built(chain, gps, CORRELATED) for _ in range(2)]
     BatchSolver(graphs[0]).solve_to_optimum()
     incremental = Isam2Solver(graphs[1])
     incremental.update()
@@ -74,8 +74,8 @@ def test_all_solvers_end_at_one_optimum(rng):
 
 
 def test_what_is_claimed_of_the_datum_holds(rng):
-    """Fixes off by one lasting error: as if new every time they claim centimetres; told that they last, they do not."""
-    chi2 = {"white": [], "lasting": []}
+    """Fixes off by one constant error: as if new every time they claim centimetres; told that they last, they do not."""
+    chi2 = {"white": [], "correlated": []}
     for _ in range(12):
         chain = dense_chain(rng, 3, m=4)
         gps = fixes_along(chain, rng, level_datum_pose(DATUM), sigma=0.05)
@@ -84,14 +84,14 @@ def test_what_is_claimed_of_the_datum_holds(rng):
         )
         for name, config in (
             ("white", GpsConfig(baseline=2.0)),
-            ("lasting", GpsConfig(bias_sigma=0.5, bias_time=500.0, baseline=2.0)),
+            ("correlated", GpsConfig(bias_sigma=0.5, bias_time=500.0, baseline=2.0)),
         ):
             g = built(chain, gps, config)
             BatchSolver(g).solve_to_optimum()
             e = g.values.datum[:3] + g.gps_origin - DATUM[:3]
             chi2[name].append(float(e @ np.linalg.solve(g.covariance().marginal("datum")[:3, :3], e)) / 3.0)
     assert np.mean(chi2["white"]) > 10.0
-    assert 0.4 < np.mean(chi2["lasting"]) < 1.9
+    assert 0.4 < np.mean(chi2["correlated"]) < 1.9
 
 
 def test_what_lasts_needs_a_size():

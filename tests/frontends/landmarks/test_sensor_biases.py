@@ -128,9 +128,9 @@ def erring(log, g):
     return replace(log, streams=streams)
 
 
-def figures(log, lasting, seed):
+def figures(log, biases, seed):
     options = {
-        "frontend": {"association": "known", "particles": 5, "stopping": {"max_distance": 15.0}, "lasting": lasting},
+        "frontend": {"association": "known", "particles": 5, "stopping": {"max_distance": 15.0}, "biases": biases},
         "backend": {"associate": False, "merge_every": 0},
         "calibrate": {"use": "none"},
     }
@@ -156,7 +156,7 @@ def test_constant_errors_are_found_with_the_map_and_its_covariances_know_of_them
         )
         g = np.array([0.005, 0.02, 0.05, 0.02, 0.05, 0.05]) * rng.standard_normal(6)
         run = figures(erring(log, g), {"mount": 0.2}, seed)
-        found, P = run.graph.lasting_errors()
+        found, P = run.graph.sensor_biases()
         scores.append((found - g) @ np.linalg.solve(P, found - g) / 6.0)
         value = run.metrics.set_index("key")["value"]
         nees.append((value["nees_aligned_poses_per_dof"] + value["nees_aligned_landmarks_per_dof"]) / 2)
@@ -167,7 +167,7 @@ def test_constant_errors_are_found_with_the_map_and_its_covariances_know_of_them
     assert np.median(without) > 1.6
 
 
-def test_lasting_errors_refuse_what_does_not_fit():
+def test_biases_refuse_what_does_not_fit():
     good = {
         "names": SensorBiasConfig().chosen()[0], "sigmas": np.ones(6),
         "response": np.zeros((5, 6)), "score": np.zeros(6), "information": np.eye(6), "path": np.zeros((3, 3, 6)),

@@ -39,12 +39,12 @@ def with_errors(rng, s: Submap, *, points: int = 0) -> Submap:
         own = gain @ P @ gain.T + 0.01 * np.eye(2 * points)
         poses = s.trajectory.interpolate(times)
         path = PathPoints(times=times, lever=np.zeros(2), positions=poses[:, :2], covariance=own, cross=gain @ P)
-    lasting = SensorBiases(
+    biases = SensorBiases(
         names=NAMES, sigmas=np.array([0.02, 0.05, 0.3, 0.1, 0.2, 0.2]), response=0.05 * rng.standard_normal((n, 6)),
         score=B.T @ rng.standard_normal(8), information=B.T @ B,
         path=0.1 * rng.standard_normal((len(s.trajectory), 3, 6)), points=0.05 * rng.standard_normal((2 * points, 6)),
     )  # fmt: skip
-    return replace(s, landmarks=replace(lm, lasting=lasting, path=path, chart="group"))
+    return replace(s, landmarks=replace(lm, biases=biases, path=path, chart="group"))
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_kernel_equals_the_slow_twin_and_finite_differences(graph, rng):
     values = graph.values.retract(0.02 * rng.standard_normal(flat.layout.size))
     graph.set_values(values)
     flat = graph.flat()
-    records = [r for r in graph.records.values() if r.group in ("submap", "lasting")]
+    records = [r for r in graph.records.values() if r.group in ("submap", "biases")]
     everything = flat.evaluate(values, hessian=False).chi2
     for r, chi2 in zip(graph.records.values(), everything):
         if r in records:
@@ -81,11 +81,11 @@ def test_kernel_equals_the_slow_twin_and_finite_differences(graph, rng):
     made = flat.evaluate(values)
     np.testing.assert_allclose(made.g, slope, rtol=1e-5, atol=1e-5 * np.abs(slope).max())
     J = np.vstack([numeric_jacobian(lambda v, r=r: whitened_residual(r, v), values) for r in records])
-    lasting = flat.layout.columns_of(["wheels0", "sensor0", "mount0"])
-    assert np.linalg.matrix_rank(J[:, lasting]) == 6
+    biases = flat.layout.columns_of(["wheels0", "sensor0", "mount0"])
+    assert np.linalg.matrix_rank(J[:, biases]) == 6
 
 
-@pytest.mark.parametrize("group", ["submap", "path", "lasting"])
+@pytest.mark.parametrize("group", ["submap", "path", "biases"])
 def test_factor_of_gtsam_has_the_same_residual_and_jacobians(graph, rng, group):
     values = graph.values.retract(0.02 * rng.standard_normal(graph.flat().layout.size))
     records = [r for r in graph.records.values() if r.group == group]
@@ -131,7 +131,7 @@ def test_solvers_come_to_one_optimum(rng, solver):
         s.update()
     s.solve_to_optimum()
     solution = s.solution()
-    found, P = g.lasting_errors()
+    found, P = g.sensor_biases()
     twin = FactorGraph()
     made = np.random.default_rng(4)
     for submap in chain.submaps:
@@ -141,8 +141,8 @@ def test_solvers_come_to_one_optimum(rng, solver):
     plain.solve_to_optimum()
     best = plain.solution()
     assert solution.objective == pytest.approx(best.objective, rel=1e-8)
-    np.testing.assert_allclose(found, twin.lasting_errors()[0], atol=1e-5)
-    np.testing.assert_allclose(P, twin.lasting_errors()[1], rtol=1e-3, atol=1e-8)
+    np.testing.assert_allclose(found, twin.sensor_biases()[0], atol=1e-5)
+    np.testing.assert_allclose(P, twin.sensor_biases()[1], rtol=1e-3, atol=1e-8)
     path = solution.trajectory()
     assert np.all(np.isfinite(path.covariances))
 
@@ -151,13 +151,13 @@ def test_a_submap_that_is_removed_takes_its_word_along(rng):
     chain = make_chain(rng, m=4, landmarks=8)
     g = FactorGraph()
     ids = [g.add_submap(with_errors(rng, s)) for s in chain.submaps]
-    words = lambda: sum(r.group == "lasting" for r in g.records.values())  # noqa: E731
+    words = lambda: sum(r.group == "biases" for r in g.records.values())  # noqa: E731
     assert words() == 1 + len(ids)
-    assert set(g.ledger.table()["kind"]) >= {"measurement", "lasting", "prior"}
+    assert set(g.ledger.table()["kind"]) >= {"measurement", "biases", "prior"}
     g.remove(ids[-1])
     assert words() == len(ids)
     with pytest.raises(DataError, match="no constant errors"):
-        g.lasting_errors(1)
+        g.sensor_biases(1)
 
 
 def test_what_is_known_of_the_errors_moves_and_widens_a_map(rng):
@@ -165,7 +165,7 @@ def test_what_is_known_of_the_errors_moves_and_widens_a_map(rng):
     s = with_errors(rng, chain.submaps[0])
     g = np.array([0.01, 0.02, -0.1, 0.03, 0.1, -0.1])
     moved = s.landmarks.with_biases(g, np.eye(6))
-    S = s.landmarks.lasting.response
+    S = s.landmarks.biases.response
     np.testing.assert_allclose(moved.mean, s.landmarks.mean + S @ g)
     np.testing.assert_allclose(moved.covariance, s.landmarks.dense_covariance() + S @ S.T)
     plain = chain.submaps[1]
@@ -177,9 +177,9 @@ def test_a_store_keeps_them(rng, tmp_path):
     write_submaps(tmp_path, [s])
     back = read_submaps(tmp_path)[0]
     for name in ("names", "sigmas", "response", "score", "information", "path", "points"):
-        np.testing.assert_array_equal(getattr(back.landmarks.lasting, name), getattr(s.landmarks.lasting, name))
+        np.testing.assert_array_equal(getattr(back.landmarks.biases, name), getattr(s.landmarks.biases, name))
     part = s.landmarks.subset([1])
-    np.testing.assert_array_equal(part.lasting.response, s.landmarks.lasting.response[[0, 1, 2, 5, 6]])
+    np.testing.assert_array_equal(part.biases.response, s.landmarks.biases.response[[0, 1, 2, 5, 6]])
 
 
 def test_records_of_submaps_keep_their_own_part(rng):
