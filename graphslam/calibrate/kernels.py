@@ -150,7 +150,7 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
                 if j >= 0:
                     last[j] = k
     at[:], when[:], order[:] = -1, -1, -1
-    used, gone_by = np.zeros((m - HEAD) // 2, np.bool_), np.zeros(M, np.bool_)
+    used, passed = np.zeros((m - HEAD) // 2, np.bool_), np.zeros(M, np.bool_)
     known = went = 0
     for k in range(n):
         X[k] = 0.0
@@ -197,11 +197,11 @@ def eliminate_window(poses, nuisance, g, data, sensor, p, damping, work):
         active = HEAD + 2 * known
         for q in range(first[k], first[k + 1]):
             for j in slots[q]:
-                if j < 0 or last[j] != k or gone_by[j]:
+                if j < 0 or last[j] != k or passed[j]:
                     continue
                 order[went], when[went] = j, k
                 went += 1
-                gone_by[j], used[at[j]] = True, False
+                passed[j], used[at[j]] = True, False
                 col = HEAD + 2 * at[j]
                 if damping > 0.0:
                     S[col, col] *= 1.0 + damping

@@ -71,13 +71,13 @@ def calibrate_observations(
     if blind:
         found, whole = _ranges_alone(held, effort, seed)
         scans = [window_scans(seen, 1e9)[0][: len(whole.windows[0].poses)]]
-        foretell = partial(
+        predict = partial(
             predict_withheld_observations, held, found, scans, noise, partial(_along, whole, seen.detections.ids)
         )
     else:
         found = _range_and_bearing(held, effort)
-        foretell = partial(predict_withheld_observations, held, found, _tested(held, effort), noise)
-    prediction = None if found.contradictions() else foretell()
+        predict = partial(predict_withheld_observations, held, found, _tested(held, effort), noise)
+    prediction = None if found.contradictions() else predict()
     if blind or effort.again:  # after the test, the withheld data are used, too
         found = _ranges_alone(seen, effort, seed)[0] if blind else _range_and_bearing(seen, effort)
     return found if prediction is None or found.contradictions() else found.validated(prediction)

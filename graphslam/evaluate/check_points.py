@@ -33,7 +33,7 @@ from graphslam.graph.sensors.control import ControlFactors
 from graphslam.graph.sensors.gps import arm_jacobian
 from graphslam.refine.result import Refinement
 
-Word = Literal["consistent", "conservative", "overconfident", "wrong", "not tested"]
+Verdict = Literal["consistent", "conservative", "overconfident", "wrong", "not tested"]
 CONFIDENCE = 0.95
 WRONG = 9.0
 """NIS per degree of freedom above which errors are not explained by a covariance that is too small: 3 σ on average."""
@@ -69,7 +69,7 @@ class CheckPoints:
         return two_sided_bounds(1.0, self.dof, CONFIDENCE)[:2] if self.dof > 0 else (0.0, float("inf"))
 
     @property
-    def word(self) -> Word:
+    def verdict(self) -> Verdict:
         """Verdict."""
         ratio, (low, high) = self.nis / max(self.dof, 1.0), self.bounds
         if ratio > high:
@@ -87,7 +87,7 @@ class CheckPoints:
         """Entries of ``run.json``."""
         low, high = self.bounds
         refused = [{"line": line, "why": why} for line, why in self.refused]
-        out: dict[str, Any] = {"source": self.source, "rows": self.rows, "refused": refused, "word": self.word}
+        out: dict[str, Any] = {"source": self.source, "rows": self.rows, "refused": refused, "verdict": self.verdict}
         if self.rows:
             ratio = self.nis / self.dof if self.dof > 0 else None
             out |= {"rmse": self.rmse, "nis_per_dof": ratio, "dof": self.dof, "power": self.power}

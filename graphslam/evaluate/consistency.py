@@ -216,7 +216,7 @@ class Consistency:
             "verdict": self.verdict,
             "ci_mean": float(np.mean(index)),
             "ci_median": float(np.median(index)),
-            "ci_honest": float(self.dimension / chi2_quantile(self.confidence, self.dimension)),
+            "ci_consistent": float(self.dimension / chi2_quantile(self.confidence, self.dimension)),
             "coverage": self.coverage,
             "dimension": self.dimension,
             "runs": self.runs,

@@ -29,7 +29,7 @@ from scipy import special
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.evaluate.bias_test import BiasTest
 
-Word = Literal["consistent", "conservative", "not tested", "overconfident"]
+Verdict = Literal["consistent", "conservative", "not tested", "overconfident"]
 Of = Literal["map", "fixes", "other"]
 LEVEL = 0.05
 """Largest share of consistent runs that are called overconfident."""
@@ -137,7 +137,7 @@ class CovarianceAssessment:
 
     Parameters
     ----------
-    word : str
+    verdict : str
     speaking : tuple of ConsistencyTest
         Tests that decided it: those that are too large or too small; for the other verdicts those with enough power.
     chance : float
@@ -150,7 +150,7 @@ class CovarianceAssessment:
         Least power of the required tests against covariances that are too small by :data:`HALF`.
     """
 
-    word: Word
+    verdict: Verdict
     speaking: tuple[ConsistencyTest, ...]
     chance: float
     missing: tuple[str, ...] = ()

@@ -166,12 +166,12 @@ class GaussianMap:
             if group is not None:
                 new[word][rows] = group.compose(old[word][rows], group.exp(part))
                 continue
-            hang = self.anchors[places]
-            free, tied = hang < 0, hang >= 0
+            anchor = self.anchors[places]
+            free, anchored = anchor < 0, anchor >= 0
             new[word][rows[free]] = old[word][rows[free]] + part[free]
-            if np.any(tied):
-                m = g.transform(g.inverse(old["x"][hang[tied]]), old[word][rows[tied]]) + part[tied]
-                new[word][rows[tied]] = g.transform(new["x"][hang[tied]], m)
+            if np.any(anchored):
+                m = g.transform(g.inverse(old["x"][anchor[anchored]]), old[word][rows[anchored]]) + part[anchored]
+                new[word][rows[anchored]] = g.transform(new["x"][anchor[anchored]], m)
         return new
 
     def step_to(self, values: Values) -> Array:
@@ -182,11 +182,11 @@ class GaussianMap:
             if group is not None:
                 step[columns] = group.log(group.between(x, y))
                 continue
-            part, hang = y - x, self.anchors[places]
-            tied = hang >= 0
-            if np.any(tied):
-                before = g.transform(g.inverse(self.values["x"][hang[tied]]), x[tied])
-                part[tied] = g.transform(g.inverse(values["x"][hang[tied]]), y[tied]) - before
+            part, anchor = y - x, self.anchors[places]
+            anchored = anchor >= 0
+            if np.any(anchored):
+                before = g.transform(g.inverse(self.values["x"][anchor[anchored]]), x[anchored])
+                part[anchored] = g.transform(g.inverse(values["x"][anchor[anchored]]), y[anchored]) - before
             step[columns] = wrap_angle(part) if word == "compass" else part
         return step
 
@@ -248,8 +248,8 @@ class GaussianMap:
 
         The Jacobian is in the frame of the anchor, with lever arm ``m``.
         """
-        g, hang = self.problem.group, self.anchors[places]
-        X = self.values["x"][hang]
+        g, anchor = self.problem.group, self.anchors[places]
+        X = self.values["x"][anchor]
         m = g.transform(g.inverse(X), self.values[word][rows])
         R = np.array([rotation_of(g, x) for x in X])
         return R, lever_matrix(g, m)
@@ -259,13 +259,13 @@ class GaussianMap:
         at, d = self._at, self.problem.group.dof
         blocks, entries = [], []
         for word, _, places, rows, columns in self.kinds():
-            tied = self.anchors[places] >= 0
-            if not np.any(tied):
+            anchored = self.anchors[places] >= 0
+            if not np.any(anchored):
                 continue
-            R, D = self._arms(places[tied], rows[tied], word)
-            pose = at[np.searchsorted(self.variables, self.anchors[places[tied]])][:, None] + np.arange(d)
-            blocks.append((columns[tied], np.swapaxes(R, 1, 2) if inverse else R))
-            entries.append(self._entries(columns[tied], pose, -D if inverse else R @ D))
+            R, D = self._arms(places[anchored], rows[anchored], word)
+            pose = at[np.searchsorted(self.variables, self.anchors[places[anchored]])][:, None] + np.arange(d)
+            blocks.append((columns[anchored], np.swapaxes(R, 1, 2) if inverse else R))
+            entries.append(self._entries(columns[anchored], pose, -D if inverse else R @ D))
         return self._identity_but(blocks, sp.csc_matrix(sum(entries))) if blocks else None
 
     def _entries(self, rows: Index, columns: Index, blocks: Array) -> sp.csc_matrix:
@@ -274,7 +274,7 @@ class GaussianMap:
         at = np.repeat(rows, columns.shape[1], axis=1).ravel(), np.tile(columns, (1, rows.shape[1])).ravel()
         return sp.csc_matrix((blocks.ravel(), at), shape=(n, n))
 
-    def hung_as(self, other: GaussianMap) -> GaussianMap:
+    def anchored_as(self, other: GaussianMap) -> GaussianMap:
         """The Gaussian with the anchors of another map over the same variables, at the values of both."""
         at, d = self._at, self.problem.group.dof
         T = None
@@ -381,10 +381,10 @@ class GaussianMap:
     def widened(self, variables: Index, values: Values, anchors: Index | None = None) -> GaussianMap:
         """The map with additional variables without information, at given values."""
         where = np.searchsorted(variables, self.variables)
-        hang = np.full(len(variables), -1, dtype=np.int64) if anchors is None else anchors.copy()
-        hang[where] = self.anchors  # existing anchors are unchanged
+        anchor = np.full(len(variables), -1, dtype=np.int64) if anchors is None else anchors.copy()
+        anchor[where] = self.anchors  # existing anchors are unchanged
         if len(variables) == len(self.variables):
-            return replace(self, values=values, anchors=hang)
+            return replace(self, values=values, anchors=anchor)
         width, own = self.problem.width[variables], self.problem.width[self.variables]
         starts = np.cumsum(width) - width
         at = np.repeat(starts[where] - (np.cumsum(own) - own), own) + np.arange(own.sum())
@@ -393,7 +393,7 @@ class GaussianMap:
         gradient[at] = self.gradient
         A = self.information.tocoo()
         A = sp.csc_matrix((A.data, (at[A.row], at[A.col])), shape=(n, n))
-        return replace(self, values=values, variables=variables, anchors=hang, information=A, gradient=gradient)
+        return replace(self, values=values, variables=variables, anchors=anchor, information=A, gradient=gradient)
 
 
 def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tuple[GaussianMap, bool]:
@@ -420,7 +420,7 @@ def add_maps(a: GaussianMap, b: GaussianMap, values: Values | None = None) -> tu
     anchors[np.searchsorted(variables, b.variables)] = b.anchors
     anchors[np.searchsorted(variables, a.variables)] = a.anchors
     wide_a = a.widened(variables, values, anchors)
-    wide_b = seen.widened(variables, values, anchors).hung_as(wide_a)
+    wide_b = seen.widened(variables, values, anchors).anchored_as(wide_a)
     joined = replace(
         wide_a, stop=b.stop, information=sp.csc_matrix(wide_a.information + wide_b.information),
         gradient=wide_a.gradient + wide_b.gradient, waiting=np.concatenate([a.waiting, b.waiting]),

@@ -321,12 +321,12 @@ def _nodes_on_poses(anchor: Index) -> tuple[Index, Index]:
     for i in range(N):
         begin[i + 1] += begin[i]
     fill = begin[:-1].copy()
-    hanging = np.empty(begin[N], np.int64)
+    attached = np.empty(begin[N], np.int64)
     for i in range(N):
         if anchor[i] != i:
-            hanging[fill[anchor[i]]] = i
+            attached[fill[anchor[i]]] = i
             fill[anchor[i]] += 1
-    return begin, hanging
+    return begin, attached
 
 
 @njit
@@ -352,7 +352,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
     _, width, ptr, idx, block, value = m
     N = len(width)
     arc, gradient = _arcs(m, anchor, x)
-    begin, hanging = _nodes_on_poses(anchor)
+    begin, attached = _nodes_on_poses(anchor)
     new_ptr = np.zeros(N + 1, np.int64)
     seen = np.full(N, -1, np.int64)
     room = 0
@@ -371,7 +371,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
             base = e if sweep else 0  # while counting, only one row is stored
             count = 0
             for part in range(-1, begin[r + 1] - begin[r]):
-                i = r if part < 0 else hanging[begin[r] + part]
+                i = r if part < 0 else attached[begin[r] + part]
                 for f in range(ptr[i], ptr[i + 1]):
                     j = idx[f]
                     if seen[j] < first:
@@ -404,7 +404,7 @@ def relinearise_in_chart(m: BlockMap, anchor: Index, x: Array) -> tuple[BlockMap
                     if wr == 3:
                         out[t + 2 * wj + q] = value[v + 2 * wj + q] + hx * y0 + hy * y1
             for h in range(begin[r], begin[r + 1]):
-                i = hanging[h]
+                i = attached[h]
                 hx, hy = arc[i, 2], arc[i, 3]
                 for f in range(ptr[i], ptr[i + 1]):
                     wj, v, t = width[idx[f]], block[f], new_block[seen[idx[f]]]

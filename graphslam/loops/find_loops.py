@@ -135,7 +135,7 @@ class LoopSearch:
             self._measurer = m = LoopMeasurer(submaps, p, c.pairs)
             chain = chain_of_graph(graph)
             self.closer = LoopCloser(
-                ours, *chain, c.decisions, judge=truncated_least_squares_inliers, witness=m.contradictions
+                ours, *chain, c.decisions, judge=truncated_least_squares_inliers, map_check=m.contradictions
             )
         closer, measurer = self.closer, self._measurer
         closer.extend_chain(ours, *chain_of_graph(graph))

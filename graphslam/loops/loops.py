@@ -43,7 +43,7 @@ from graphslam.loops.conflicting_groups import (
     find_conflicting_groups,
 )
 from graphslam.loops.ledger import LoopDecision, LoopLedger, Verdict
-from graphslam.loops.map_overlap_test import Witness, disagreement_shares, overlap_log_likelihood_ratio
+from graphslam.loops.map_overlap_test import MapCheck, disagreement_shares, overlap_log_likelihood_ratio
 from graphslam.loops.measure import Loop
 from graphslam.loops.places import Ints
 from graphslam.loops.rules import Judge, LoopConfig, LoopGraph, chi2_without
@@ -62,7 +62,7 @@ class LoopCloser:
     judge : callable, optional
         Joint inlier test of all loops, from increments, covariances, and loops (ends, poses, covariances) to a mask
         (:func:`graphslam.loops.global_inlier_check.truncated_least_squares_inliers`).
-    witness : callable, optional
+    map_check : callable, optional
         Contradiction between the maps of loops at relative poses of their ends
         (:mod:`graphslam.loops.map_overlap_test`).
     """
@@ -75,13 +75,13 @@ class LoopCloser:
         config: LoopConfig | None = None,
         ledger: LoopLedger | None = None,
         judge: Judge | None = None,
-        witness: Witness | None = None,
+        map_check: MapCheck | None = None,
     ) -> None:
         self.graph = graph
         self.increments, self.covariances = increments, covariances
         self.config = LoopConfig() if config is None else config
         self.ledger = LoopLedger() if ledger is None else ledger
-        self.judge, self.witness = judge, witness
+        self.judge, self.map_check = judge, map_check
         self.loops: dict[int, Loop] = {}
         self._torn: list[tuple[list[int], list[int]]] = []
         self._dof = group_of(increments).dof
@@ -172,7 +172,7 @@ class LoopCloser:
             seen.append(self.accepted)
             if self._disputes():
                 self._reconsider()
-                if self.witness is not None:
+                if self.map_check is not None:
                     settled = {d.loop for d in self.ledger.current() if d.why.startswith(SETTLED)}
                     self._round([], settled)
                     self._reconsider()
@@ -301,7 +301,7 @@ class LoopCloser:
         """Decide between contradictory groups: accept the one that agrees with the rest of the graph, or neither."""
         inside = self.accepted
         outside = [n for n in self._refused_by_company() if self._bears(n)]
-        least = 2 if self.witness is None else 1  # maps can decide on a single loop
+        least = 2 if self.map_check is None else 1  # maps can decide on a single loop
         if not inside or len(outside) < least:
             return False
         both = [*inside, *outside]
@@ -344,7 +344,7 @@ class LoopCloser:
             Relative poses of the ends of all of them in the solution with a.
         """
         others = [n for n in self.accepted if n not in a]
-        if self.witness is None or not others:
+        if self.map_check is None or not others:
             return 0.0
         factors = [self.graph.add_loop(self.loops[n], self._kernel()) for n in b]
         self.graph.solve()
@@ -358,7 +358,7 @@ class LoopCloser:
         # move undisputed loops by the differences between the two solutions, in turn, in both directions
         D = np.concatenate([D, g.inverse(D)])
         moved = g.compose(at, D[np.arange(len(at)) % len(D)])
-        shares = [self.witness(x, T) for x, T in ((calm, at), (calm, moved), (asked, with_b), (asked, with_a))]
+        shares = [self.map_check(x, T) for x, T in ((calm, at), (calm, moved), (asked, with_b), (asked, with_a))]
         return overlap_log_likelihood_ratio(
             *(disagreement_shares(x, s) for x, s in zip((calm, calm, asked, asked), shares))
         )

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from graphslam.core.geometry import Array
 from graphslam.loops.measure import Loop
 
-Witness = Callable[[Sequence[Loop], Array], Array]
+MapCheck = Callable[[Sequence[Loop], Array], Array]
 """Share of contradiction between the maps of loops ``(k,)``, at the relative poses ``(k, 7|3)`` of their ends."""
 
 ERROR = 1e-3

@@ -45,29 +45,29 @@ class Contradictions:
     ----------
     pairs : (n, 2) int
         Keys of submaps that reached a place along different paths; both orders.
-    seen, denied : (n,) int
+    seen, contradicted : (n,) int
         Occupied points of the first that are occupied in the second, and that are in its free space.
     """
 
     pairs: npt.NDArray[np.int64]
     seen: npt.NDArray[np.int64]
-    denied: npt.NDArray[np.int64]
+    contradicted: npt.NDArray[np.int64]
 
     @property
     def points(self) -> int:
         """Number of points that were confirmed or contradicted."""
-        return int(self.seen.sum() + self.denied.sum())
+        return int(self.seen.sum() + self.contradicted.sum())
 
     @property
     def share(self) -> float | None:
         """Share of contradicted points; None below :data:`FEW` points."""
-        return float(self.denied.sum()) / self.points if self.points >= FEW else None
+        return float(self.contradicted.sum()) / self.points if self.points >= FEW else None
 
     @property
     def contradicted_submaps(self) -> npt.NDArray[np.int64]:
         """Rows of ``pairs`` that are contradictory, the worst first."""
-        n = self.seen + self.denied
-        share = self.denied / np.maximum(n, 1)
+        n = self.seen + self.contradicted
+        share = self.contradicted / np.maximum(n, 1)
         rows = np.flatnonzero((n >= FEW) & (share > DOUBTED))
         return rows[np.argsort(-share[rows], kind="stable")]
 

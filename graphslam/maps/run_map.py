@@ -133,13 +133,13 @@ class RunMap:
         f = self.fused
         unit = "m³" if f.dim == 3 else "m²"
         seconds = (("divide", self.divide_s), ("fuse", self.fuse_s), ("move", self.move_s))
-        denied = self.passes.share
+        contradicted = self.passes.share
         return [
             ("map_entropy", f.entropy(), f"nat {unit}", "lower"),
             ("map_known_volume", f.known_volume(), unit, "none"),
             ("map_entropy_open_chain", self.open_entropy, f"nat {unit}", "none"),
             ("map_known_volume_open_chain", self.open_volume, unit, "none"),
-            *((("map_denied", denied, "", "lower"),) if denied is not None else ()),
+            *((("map_contradicted", contradicted, "", "lower"),) if contradicted is not None else ()),
             ("map_pieces", len(f), "", "none"),
             ("map_megabytes", f.nbytes / 1e6, "MB", "lower"),
             *((f"map_{name}_seconds", value, "s", "lower") for name, value in seconds),

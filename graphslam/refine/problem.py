@@ -214,7 +214,7 @@ def surface_residuals(pairs: PlanePairs, cloud: ScanReturns, surfaces: Surfaces,
     return out
 
 
-FEIGNED = 1.5
+NOISE_INDUCED = 1.5
 """Factor on the average spurious information of noisy normals that is subtracted, because groups scatter."""
 
 
@@ -247,7 +247,7 @@ def chunk_information(
     size = np.einsum("mii->mi", H + F) + 1e-12
     L = np.linalg.cholesky(F + 1e-9 * np.eye(w) * size[:, None, :])
     values, U = np.linalg.eigh(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, H), 1, 2)))
-    share = np.maximum(1.0 - FEIGNED / np.maximum(values, 1e-12), 0.0)
+    share = np.maximum(1.0 - NOISE_INDUCED / np.maximum(values, 1e-12), 0.0)
     back = np.swapaxes(np.linalg.solve(np.swapaxes(L, 1, 2), U), 1, 2)  # Uᵀ L⁻¹
     return GroupInformation(group, centre, np.ascontiguousarray((L @ (U * share[:, None, :])) @ back), surfaces.tilts)
 

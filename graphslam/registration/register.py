@@ -299,8 +299,10 @@ def _measure(
             upright = float(np.mean(near[steep]))
     own, partner = source.normals(paired), target.normals(which[paired])
     rotation = se2.rotation2(found.T[2]) if planar else se3.quat_to_matrix(found.T[3:])
-    feigned = noise_induced_information(source.points[paired], rotation, (own[0], partner[0]), (own[1], partner[1]))
-    information = found.hessian - feigned
+    noise_induced = noise_induced_information(
+        source.points[paired], rotation, (own[0], partner[0]), (own[1], partner[1])
+    )
+    information = found.hessian - noise_induced
     held = translational_degeneracy(information, dim)
     # noise estimated from the pairs: 1 if the variances of the shapes are right
     freedom = max(found.pairs - len(found.hessian), 1)

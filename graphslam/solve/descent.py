@@ -25,7 +25,7 @@ SAME = 1e-6
 CLIMB, PATIENCE = 1e4, 8
 # The decrement is extrapolated if the last step changed the objective as predicted, up to this relative error, and if
 # each decrement is at most this share of the previous one (with a third of the limit).
-TRUE_TO_WORD, FAST = 0.1, 0.02
+AS_PREDICTED, FAST = 0.1, 0.02
 # A start is rejected if after this number of steps it is above the best of the others.
 CHALLENGE = 10
 
@@ -91,7 +91,7 @@ def descend_to_minimum(
     *,
     best_known: float = np.inf,
     max_iterations: int = 200,
-    foretell: bool = False,
+    predict: bool = False,
     limits: DescentLimits | None = None,
 ) -> Optimum:
     """Descend from ``values`` to the local minimum, or stop early if another start is better.
@@ -103,7 +103,7 @@ def descend_to_minimum(
         times its recent decrease would not reach it.
     max_iterations : int
         Gauss-Newton and damped steps together.
-    foretell : bool
+    predict : bool
         Skip the last step if the rate of convergence predicts a negligible change.
     limits : DescentLimits, optional
         Default: :func:`limits_of` the number of measurements.
@@ -122,7 +122,7 @@ def descend_to_minimum(
 
     while used < budget:
         patience = limits.patience if attempts == 0 else min(2, limits.patience)
-        found = _newton(problem, values, objective, min(budget - used, 40), patience, foretell, limits)
+        found = _newton(problem, values, objective, min(budget - used, 40), patience, predict, limits)
         used, attempts = used + found.iterations, attempts + 1
         if found.objective < objective:
             values, objective = found.values, found.objective
@@ -152,7 +152,7 @@ def _newton(
     objective: float,
     budget: int,
     patience: int,
-    foretell: bool,
+    predict: bool,
     limits: DescentLimits,
 ) -> Optimum:
     """Full Gauss-Newton steps; the objective may increase for some steps.
@@ -174,12 +174,12 @@ def _newton(
             return Optimum(best, objective, lowest, max(fall, 0.0), steps, "converged")
         if not np.isfinite(now) or fall < 0.0 or now > CLIMB * lowest:
             break
-        held = values is best and abs(lowest - now - fall) <= TRUE_TO_WORD * fall
+        held = values is best and abs(lowest - now - fall) <= AS_PREDICTED * fall
         left, before = fall * fall / before if np.isfinite(before) else float("inf"), fall
         values, since = moved, since + 1
         if now < lowest:
             best, lowest, since = moved, now, 0
-            if foretell and held and left <= FAST * fall and limits.reached(lowest, 3.0 * left):
+            if predict and held and left <= FAST * fall and limits.reached(lowest, 3.0 * left):
                 return Optimum(best, objective, lowest, left, steps, "converged")
     return Optimum(best, objective, lowest, float("inf"), steps, "stalled")
 

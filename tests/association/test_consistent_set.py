@@ -78,7 +78,7 @@ def test_cycles_equal_the_brute_force_twin_in_every_order_of_ends(rng: np.random
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_chi2_of_right_loops_is_honest_both_ways(rng: np.random.Generator, dim: int) -> None:
+def test_chi2_of_right_loops_is_consistent_both_ways(rng: np.random.Generator, dim: int) -> None:
     """Over many drives D² of pairs and of single loops is χ²: mean and tail inside two-sided bounds.
 
     Halving or doubling the stated covariances must fall outside.

@@ -46,7 +46,7 @@ def test_the_statistic_is_what_the_objective_falls_by(rng, submap):
     assert new in g.landmark_ids_of(submap)
 
 
-def test_honest_observations_are_chi_square(rng):
+def test_consistent_observations_are_chi_square(rng):
     values = []
     for _ in range(12):
         g = solved(make_chain(rng, m=8, landmarks=20).submaps)

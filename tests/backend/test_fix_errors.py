@@ -100,7 +100,7 @@ KINDS = {
         ("multipath", 0.3, 1.5, None),
     ],
 )
-def test_nodes_are_honest_whatever_the_receiver(rng, kind, low, high, before):
+def test_nodes_are_consistent_whatever_the_receiver(rng, kind, low, high, before):
     plain, fitted, found = [], [], []
     for _ in range(4):
         graph, true, fixes = drive(rng, KINDS[kind](rng, 240))

@@ -31,7 +31,7 @@ from graphslam.loops.appearance import AppearanceConfig, appearance_candidates
 from graphslam.loops.candidates import CandidateConfig, proximity_candidates
 from graphslam.loops.global_inlier_check import truncated_least_squares_inliers
 from graphslam.loops.loops import LoopCloser
-from graphslam.loops.map_overlap_test import Witness
+from graphslam.loops.map_overlap_test import MapCheck
 from graphslam.loops.measure import Loop, LoopMeasurer
 from graphslam.loops.places import Places
 from graphslam.registration.place_descriptor import concatenate_descriptors, describe_places, descriptor_similarity
@@ -110,26 +110,26 @@ def nees(net: LoopNetwork, truth: Array) -> float:
 
 
 def closed(
-    chain: ChainRelativePoses, loops: list[Loop], witness: Witness | None = None
+    chain: ChainRelativePoses, loops: list[Loop], map_check: MapCheck | None = None
 ) -> tuple[LoopNetwork, LoopCloser]:
     net = LoopNetwork(chain.increments, chain.covariances)
     closer = LoopCloser(
-        net, chain.increments, chain.covariances, judge=truncated_least_squares_inliers, witness=witness
+        net, chain.increments, chain.covariances, judge=truncated_least_squares_inliers, map_check=map_check
     )
     closer.propose(loops)
     return net, closer
 
 
-def wrong_table(chain: ChainRelativePoses, loops: list[Loop], truth: Array, seeds: range, witness: Witness) -> None:
+def wrong_table(chain: ChainRelativePoses, loops: list[Loop], truth: Array, seeds: range, map_check: MapCheck) -> None:
     """Precision and recall of decisions, and the ATE against that of the clean run."""
-    clean = ate(closed(chain, loops, witness)[0].poses[: len(truth)], truth)
+    clean = ate(closed(chain, loops, map_check)[0].poses[: len(truth)], truth)
     for kind in KINDS:
         for share in (0.1, 0.3, 0.5):
             counts, ratios = np.zeros((2, 2), int), []
             for seed in seeds:
                 rng = SeedTree(seed).child("wrong", kind).generator()
                 mixed, wrong = inject_wrong_loops(loops, truth, share, rng, kind=kind)
-                net, closer = closed(chain, mixed, witness)
+                net, closer = closed(chain, mixed, map_check)
                 taken = np.isin(np.arange(len(mixed)), closer.accepted)
                 np.add.at(counts, (wrong.astype(int), taken.astype(int)), 1)
                 ratios.append(ate(net.poses[: len(truth)], truth) / clean)

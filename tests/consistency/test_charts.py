@@ -1,4 +1,4 @@
-"""Headings that drift by degrees inside a submap: maps are honest in the group chart, and joins of them without a
+"""Headings that drift by degrees inside a submap: maps are consistent in the group chart, and joins of them without a
 polish; the same maps read as plain vectors are not."""
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ RUNS = 10
 
 
 @pytest.fixture(scope="module")
-def honesty() -> dict[str, tuple[float, int]]:
+def consistency() -> dict[str, tuple[float, int]]:
     """Joint NEES and its dimension over all runs, by method, in the group chart; 16 maps, 2.3° each."""
     found: dict[str, tuple[float, int]] = {}
     for seed in range(RUNS):
@@ -32,18 +32,18 @@ def honesty() -> dict[str, tuple[float, int]]:
 
 
 @pytest.mark.parametrize("method", ["eif-tree", "batch", "isam2"])
-def test_joined_maps_are_honest_in_the_group_chart(honesty: dict[str, tuple[float, int]], method: str) -> None:
-    d2, dof = honesty[method]
+def test_joined_maps_are_consistent_in_the_group_chart(consistency: dict[str, tuple[float, int]], method: str) -> None:
+    d2, dof = consistency[method]
     low, high = chi2_mean_bounds(dof, 1, confidence=0.999)
     assert low < d2 < 1.03 * high  # an unpolished filter may cost three parts in a hundred
     assert not low < 2.0 * d2 < 1.03 * high  # and a covariance of half the size is found
 
 
-def test_the_classical_filter_is_not(honesty: dict[str, tuple[float, int]]) -> None:
-    assert honesty["eif-tree-classical"][0] > 1.3 * honesty["eif-tree"][0]
+def test_the_classical_filter_is_not(consistency: dict[str, tuple[float, int]]) -> None:
+    assert consistency["eif-tree-classical"][0] > 1.3 * consistency["eif-tree"][0]
 
 
-def test_local_maps_of_a_drifting_robot_are_honest_in_their_chart_only() -> None:
+def test_local_maps_of_a_drifting_robot_are_consistent_in_their_chart_only() -> None:
     """The front end smooths; exit headings are uncertain by some 7°."""
     config = ChartConfig(odometry=(0.1, 0.1, 3.0), seconds=120.0)
     rows = [

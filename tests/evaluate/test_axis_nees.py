@@ -55,7 +55,7 @@ def test_the_verdict_names_an_overconfident_axis_and_nothing_else() -> None:
     m |= {f"nees_{k}_per_dof": v for k, v in zip(AXES[3], (0.5, 0.5, 0.6, 0.5, 0.4, 2.9))}
     m |= {f"nees_{k}_dof": 20.0 for k in AXES[3]}
     judged = nees_tests(RunMetrics({}, m))
-    assert [(j.about, j.word) for j in judged] == [
+    assert [(j.about, j.verdict) for j in judged] == [
         ("first base fixed", "conservative"),
         ("z of all nodes", "overconfident"),
     ]

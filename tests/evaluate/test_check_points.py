@@ -78,7 +78,7 @@ def test_nis_of_a_row_is_its_own():
     assert two.nis != pytest.approx(sum(r["nis"] for r in two.rows), rel=1e-3)  # they share the datum
     free, _, _ = world(1, False)
     one = check_points(free, table(surveyed([("l5", chain.landmarks[5])], rng, SIGMA)))
-    assert (one.dof, one.word, one.facts()["nis_per_dof"]) == (0.0, "not tested", None)
+    assert (one.dof, one.verdict, one.facts()["nis_per_dof"]) == (0.0, "not tested", None)
 
 
 def test_in_space():
@@ -129,7 +129,7 @@ def test_power_is_that_of_the_map_and_not_of_the_rows():
     ],
 )
 def test_words(ratio, power, word):
-    assert CheckPoints("", nis=40.0 * ratio, dof=40.0, power=power).word == word
+    assert CheckPoints("", nis=40.0 * ratio, dof=40.0, power=power).verdict == word
 
 
 def test_rows_without_a_place_are_refused():
@@ -141,4 +141,4 @@ def test_rows_without_a_place_are_refused():
         (3, "no landmark has this id"),
         (4, "the time is outside the map"),
     ]
-    assert check_points(g, table(rows[1:])).word == "not tested"
+    assert check_points(g, table(rows[1:])).verdict == "not tested"

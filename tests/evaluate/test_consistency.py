@@ -126,8 +126,8 @@ def test_pose_error_is_the_right_tangent(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("unit", ["run", "value"])
-def test_honest_estimator_is_consistent_as_often_as_stated(unit: str, rng: np.random.Generator) -> None:
-    """95 % of studies of an honest estimator pass; the bounds are neither too tight nor too wide."""
+def test_consistent_estimator_is_consistent_as_often_as_stated(unit: str, rng: np.random.Generator) -> None:
+    """95 % of studies of an consistent estimator pass; the bounds are neither too tight nor too wide."""
     shared = unit == "run"
     verdicts = [judged(simulated(rng, 20, 5, 3, 1.0, shared=shared), 3, unit=unit).verdict for _ in range(400)]
     passed = sum(v == "consistent" for v in verdicts)
@@ -142,7 +142,7 @@ def test_honest_estimator_is_consistent_as_often_as_stated(unit: str, rng: np.ra
     ("claim", "verdict"),
     [(1 / 1.8, "overconfident"), (1.8, "conservative"), (0.1, "overconfident"), (10, "conservative")],
 )
-def test_dishonest_estimators_fail(unit: str, claim: float, verdict: str, rng: np.random.Generator) -> None:
+def test_inconsistent_estimators_fail(unit: str, claim: float, verdict: str, rng: np.random.Generator) -> None:
     """A covariance that is wrong by 1.8 (σ by 1.34) must be caught with 50 runs, in either direction."""
     for _ in range(20):
         assert judged(simulated(rng, 50, 4, 3, claim, shared=unit == "run"), 3, unit=unit).verdict == verdict
@@ -170,7 +170,7 @@ def test_correlated_values_count_once_per_run(rng: np.random.Generator) -> None:
     assert by_value < 60
 
 
-def test_curve_finds_the_submap_where_honesty_ends(rng: np.random.Generator) -> None:
+def test_curve_finds_the_submap_where_consistency_ends(rng: np.random.Generator) -> None:
     d2 = np.concatenate([simulated(rng, 50, 10, 3, 1.0), simulated(rng, 50, 10, 3, 0.4)], axis=1)
     mean, low, high = judged(d2, 3).curve()
     assert np.mean(mean[:10] < high[:10]) >= 0.8
@@ -248,7 +248,7 @@ def test_row_states_gauge_dimension_runs_and_confidence() -> None:
     assert row["nees_over_n"] == 1.0
     assert row["low"] == pytest.approx(stats.chi2.ppf(0.05, 12) / 12)
     assert row["high"] == pytest.approx(stats.chi2.ppf(0.95, 12) / 12)
-    assert row["ci_honest"] == row["ci_mean"] == pytest.approx(3 / stats.chi2.ppf(0.9, 3))
+    assert row["ci_consistent"] == row["ci_mean"] == pytest.approx(3 / stats.chi2.ppf(0.9, 3))
     assert GAUGE in judged(np.ones((2, 1)), 3)._repr_html_()
 
 
@@ -317,7 +317,7 @@ def test_submap_without_landmarks_is_judged_by_its_exit() -> None:
         submap_nees(Submap(key=1, interval=(1.0, 2.0), exit_pose=[1, 0, 0], exit_covariance=np.eye(3)), truth)
 
 
-def test_smoothed_submaps_are_honest_and_scaled_ones_are_not() -> None:
+def test_smoothed_submaps_are_consistent_and_scaled_ones_are_not() -> None:
     """The whole chain simulator → smoother → submap → NEES, with power in both directions."""
     log = simulate_landmark_field(PRESETS["demo"], 1)
     cuts = list(range(0, len(log["landmarks"].times), 20))

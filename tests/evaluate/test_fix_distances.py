@@ -45,7 +45,7 @@ def chances(**how: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wild", [0.0, 0.3])
-def test_an_honest_path_is_hardly_ever_contradicted(wild: float) -> None:
+def test_an_consistent_path_is_hardly_ever_contradicted(wild: float) -> None:
     """However alike its errors are from pose to pose; also where a part of the fixes is wild."""
     p = chances(wild=wild)
     assert np.mean(p < 0.05) <= 0.05

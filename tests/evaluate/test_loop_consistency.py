@@ -1,4 +1,4 @@
-"""Loops against each other: equal to a slow twin that composes poses, honest by sampling, and a false loop is found."""
+"""Loops against each other: equal to a slow twin that composes poses, consistent by sampling, and a false loop is found."""
 
 from __future__ import annotations
 
@@ -146,8 +146,8 @@ def test_a_false_loop_disagrees_with_the_others_and_is_named(rng):
     ids = [s.landmarks.ids.copy() for s in chain]
     assert not set(ids[2]) & set(ids[8])
     ids[8][:2] = ids[2][:2]
-    honest = loop_consistency(find_landmark_loops(chain, X))
-    assert honest.blame().max() < 0.5
+    consistent = loop_consistency(find_landmark_loops(chain, X))
+    assert consistent.blame().max() < 0.5
     got = loop_consistency(find_landmark_loops(chain, X, ids=ids))
     # the pair also turns up between these submaps' neighbours; the loop 2–8 is the false one of all
     k = int(np.flatnonzero((got.loops.a == 2) & (got.loops.b == 8))[0])

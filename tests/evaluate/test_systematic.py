@@ -54,7 +54,7 @@ def test_an_error_is_measured(log: SensorLog, frontend: str, fault: inject.Injec
 
 
 @pytest.mark.parametrize("seed", range(40, 46))
-def test_honest_robots_have_no_error(seed: int) -> None:
+def test_consistent_robots_have_no_error(seed: int) -> None:
     rng = np.random.default_rng(seed)
     log = simulate(
         "landmark-field",

@@ -108,7 +108,7 @@ def test_fixes_whose_errors_last_are_over_confident_however_small_their_residual
     assert all(c.independent < 0.4 * c.dof for c in correlated)
 
 
-HONEST = chi_square_ratio_test("map", "map", 1.0, 2000.0) + chi_square_ratio_test("fixes", "fixes", 1.0, 400.0)
+CONSISTENT = chi_square_ratio_test("map", "map", 1.0, 2000.0) + chi_square_ratio_test("fixes", "fixes", 1.0, 400.0)
 
 SMALL = chi_square_ratio_test("fixes", "fixes", 0.13, 400.0)
 
@@ -116,17 +116,17 @@ SMALL = chi_square_ratio_test("fixes", "fixes", 0.13, 400.0)
 @pytest.mark.parametrize(
     ("rows", "fixes", "word"),
     [
-        (HONEST, True, "consistent"),
-        (HONEST[:1], False, "consistent"),
-        (HONEST[:1], True, "not tested"),  # nothing says how good the fixes are
+        (CONSISTENT, True, "consistent"),
+        (CONSISTENT[:1], False, "consistent"),
+        (CONSISTENT[:1], True, "not tested"),  # nothing says how good the fixes are
         (chi_square_ratio_test("map", "map", 1.0, 8.0), False, "not tested"),  # half as large again is possible
         ([], False, "not tested"),
         (chi_square_ratio_test("map", "map", 1.3, 2000.0), False, "overconfident"),
         (chi_square_ratio_test("map", "map", 0.6, 2000.0), False, "conservative"),
         (chi_square_ratio_test("map", "map", 0.97, 20000.0), False, "consistent"),  # significant, and of no matter
         # small residuals, and alike from one to the next: never conservative
-        ([*HONEST[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "overconfident"),
-        ([*HONEST[:1], *SMALL], True, "conservative"),
+        ([*CONSISTENT[:1], *SMALL, largest_score_test("next", "fixes", 9.0)], True, "overconfident"),
+        ([*CONSISTENT[:1], *SMALL], True, "conservative"),
         (
             [
                 *chi_square_ratio_test("map", "map", 0.5, 2000.0),
@@ -138,52 +138,53 @@ SMALL = chi_square_ratio_test("fixes", "fixes", 0.13, 400.0)
     ],
 )  # fmt: skip
 def test_the_word(rows: list[ConsistencyTest], fixes: bool, word: str) -> None:
-    assert assess_covariances(rows, fixes=fixes).word == word
+    assert assess_covariances(rows, fixes=fixes).verdict == word
 
 
 def test_power_is_the_share_of_maps_half_as_certain_that_are_detected(rng) -> None:
     dof = 80.0
     (row,) = chi_square_ratio_test("map", "map", 1.0, dof)
     found = assess_covariances([row], fixes=False)
-    assert found.word == "consistent"
+    assert found.verdict == "consistent"
     drawn = HALF * rng.chisquare(dof, 4000) / dof
-    words = [assess_covariances(chi_square_ratio_test("map", "map", v, dof), fixes=False).word for v in drawn]
+    words = [assess_covariances(chi_square_ratio_test("map", "map", v, dof), fixes=False).verdict for v in drawn]
     share = words.count("overconfident") / len(drawn)
     assert abs(share - found.power) < 4.0 * np.sqrt(share * (1.0 - share) / len(drawn))
     assert row.power(50) < row.power(2)
     # a test without power cannot carry "consistent", however well it fits
-    assert assess_covariances(chi_square_ratio_test("map", "map", 0.6, 20.0), fixes=False).word == "not tested"
+    assert assess_covariances(chi_square_ratio_test("map", "map", 0.6, 20.0), fixes=False).verdict == "not tested"
     # linearised covariances are no better than the tolerance
-    assert assess_covariances(chi_square_ratio_test("map", "map", 1.09, 1e5), fixes=False).word == "consistent"
-    assert assess_covariances(chi_square_ratio_test("map", "map", 1.13, 1e5), fixes=False).word == "overconfident"
+    assert assess_covariances(chi_square_ratio_test("map", "map", 1.09, 1e5), fixes=False).verdict == "consistent"
+    assert assess_covariances(chi_square_ratio_test("map", "map", 1.13, 1e5), fixes=False).verdict == "overconfident"
 
 
 def test_maps_that_bend_are_promised_nothing() -> None:
-    assert assess_covariances(HONEST, fixes=True, nonlinearity=0.9 * MAX_NONLINEARITY).word == "consistent"
-    found = assess_covariances(HONEST, fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY)
-    assert found.word == "not tested"
+    assert assess_covariances(CONSISTENT, fixes=True, nonlinearity=0.9 * MAX_NONLINEARITY).verdict == "consistent"
+    found = assess_covariances(CONSISTENT, fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY)
+    assert found.verdict == "not tested"
     assert found.bent
     assert not found.missing
     assert (
-        assess_covariances([*HONEST[:1], *SMALL], fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY).word == "not tested"
+        assess_covariances([*CONSISTENT[:1], *SMALL], fixes=True, nonlinearity=1.1 * MAX_NONLINEARITY).verdict
+        == "not tested"
     )
     # what the log itself contradicts comes first
     wrong = chi_square_ratio_test("map", "map", 1.3, 2000.0)
-    assert assess_covariances(wrong, fixes=False, nonlinearity=1.1 * MAX_NONLINEARITY).word == "overconfident"
+    assert assess_covariances(wrong, fixes=False, nonlinearity=1.1 * MAX_NONLINEARITY).verdict == "overconfident"
     # a mean over unknowns, of the submaps that say it
     reports = [{"nonlinearity": 0.01, "unknowns": 30}, {"nonlinearity": 0.04, "unknowns": 10}, {}]
     assert pooled_nonlinearity(reports) == pytest.approx(0.0175)
     assert pooled_nonlinearity([{}]) == 0.0
 
 
-def test_honest_runs_are_seldom_called_wrong(rng):
+def test_consistent_runs_are_seldom_called_wrong(rng):
     wrong = 0
     for _ in range(400):
         rows = [
             chi_square_ratio_test(f"{k}", "map", rng.chisquare(200 * k) / (200 * k), 200.0 * k)[0] for k in range(1, 8)
         ]
         rows += [largest_score_test(f"s{k}", "map", rng.standard_normal()) for k in range(5)]
-        wrong += assess_covariances(rows, fixes=False).word in ("overconfident", "conservative")
+        wrong += assess_covariances(rows, fixes=False).verdict in ("overconfident", "conservative")
     assert wrong <= stats.binom.ppf(0.999, 400, 0.05)
 
 
@@ -212,8 +213,8 @@ def test_errors_that_last_for_a_window_are_found(rng):
 
 
 def test_the_line_says_what_it_rests_on_and_survives_the_file():
-    rows = json.loads(json.dumps(consistency_tests_as_json(HONEST)))
-    assert consistency_tests_of_json(rows) == HONEST
+    rows = json.loads(json.dumps(consistency_tests_as_json(CONSISTENT)))
+    assert consistency_tests_of_json(rows) == CONSISTENT
     assert consistency_tests_of_json([{"name": "x"}, 3, None]) == consistency_tests_of_json(None) == []
     lines = {f.code: f for f in findings_from_metrics(RunMetrics({"converged": True, "evidence": rows}, {}))}
     assert lines["trust"].level == "good"

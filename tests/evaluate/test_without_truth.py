@@ -1,4 +1,4 @@
-"""χ² per class and withheld GPS: equal to slow twins, silent for honest data, alarmed by a factor of two either way."""
+"""χ² per class and withheld GPS: equal to slow twins, silent for consistent data, alarmed by a factor of two either way."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def small_run(seed: int, scale: float, robust: RobustKernel) -> tuple[FactorGrap
 
 @pytest.mark.parametrize("robust", [NO_KERNEL, RobustKernel("cauchy", 1.0)])
 @pytest.mark.parametrize("scale", [1.0, 2.0, 0.5])
-def test_alarm_is_silent_for_honest_noise_and_fires_for_half_and_double(scale, robust):
+def test_alarm_is_silent_for_consistent_noise_and_fires_for_half_and_double(scale, robust):
     verdicts, ratios = [], []
     for seed in range(10):
         graph, withheld = small_run(seed, scale, robust)

@@ -199,7 +199,7 @@ def closed_ring(rng, dim, steps):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_path_covariance_is_honest(rng, dim):
+def test_path_covariance_is_consistent(rng, dim):
     """At full rate, nodes and the way between them, with a loop: two-sided."""
     group = GROUP[dim]
     ratios, runs = [], 25

@@ -175,7 +175,7 @@ def test_batch_and_isam2_agree_and_no_dof_is_made(drive, chart):
     assert one.values.count("point") == sum(r.point is not None for r in one.records.values() if hasattr(r, "point"))
 
 
-def test_joint_rows_are_honest_and_nearer_where_arms_are_not():
+def test_joint_rows_are_consistent_and_nearer_where_arms_are_not():
     """5 cm: arms with a variance of their own claim half of the error they make."""
     scores = {True: [], False: []}
     errors = {True: [], False: []}

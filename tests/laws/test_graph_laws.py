@@ -1,4 +1,4 @@
-"""What must hold for any graph: honest covariances, indifference to order and to the place of the frame."""
+"""What must hold for any graph: consistent covariances, indifference to order and to the place of the frame."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def solve(chain, **scale) -> FactorGraph:
     return g
 
 
-@pytest.mark.parametrize(("scale", "honest"), [(1.0, True), (0.6, False), (1.7, False)])
-def test_nees_and_chi2_of_the_graph_are_honest(rng, scale, honest):
+@pytest.mark.parametrize(("scale", "consistent"), [(1.0, True), (0.6, False), (1.7, False)])
+def test_nees_and_chi2_of_the_graph_are_consistent(rng, scale, consistent):
     """Monte Carlo, two-sided: the joint NEES and the χ² of the join see a covariance wrong by 1.7 either way."""
     runs, nees, chi2, dof, n = 25, [], [], 0, 0
     for _ in range(runs):
@@ -42,9 +42,9 @@ def test_nees_and_chi2_of_the_graph_are_honest(rng, scale, honest):
     low, high = (b * runs for b in chi2_mean_bounds(n / runs, runs, 0.999))
     mean = np.average(nees) * n
     inside = low < mean < high
-    assert inside == honest, (low, mean, high)
+    assert inside == consistent, (low, mean, high)
     p = stats.chi2.cdf(np.sum(chi2), dof)
-    assert (0.0005 < p < 0.9995) == honest
+    assert (0.0005 < p < 0.9995) == consistent
 
 
 def test_order_of_factors_does_not_matter(rng):

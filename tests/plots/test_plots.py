@@ -193,10 +193,10 @@ def judged(d2: np.ndarray) -> Consistency:
 
 def test_consistency_curves_show_mean_and_bounds(rng: np.random.Generator, tmp_path: Path) -> None:
     d2 = rng.chisquare(3, size=(10, 20))
-    curves = {"honest": judged(d2), "bold": judged(9 * d2)}
+    curves = {"consistent": judged(d2), "bold": judged(9 * d2)}
     ax = rendered(plot_consistency(None, curves), tmp_path)
     assert ax.get_yscale() == "log"
-    assert np.allclose(line(ax, "honest")[:, 1], d2.mean(0) / 3)
+    assert np.allclose(line(ax, "consistent")[:, 1], d2.mean(0) / 3)
     assert np.allclose(line(ax, "expected if consistent")[:, 1], 1.0)
     assert np.allclose(line(ax, "bold")[:, 1], 3 * d2.mean(0))
     assert "95% bounds, 10 runs" in legend_of(ax)

@@ -12,7 +12,7 @@ from graphslam.core.poses import SE2, SE3, group_of
 from graphslam.core.records import Odometry
 from graphslam.refine.motion import MotionModel
 from graphslam.refine.problem import (
-    FEIGNED,
+    NOISE_INDUCED,
     RefinementProblem,
     chunk_information,
     correlation_factor,
@@ -190,12 +190,12 @@ def test_what_noise_of_normals_feigns_is_not_held(rng, dim):
         u, B = of_group(g, poses[pairs.j[some]], centre, Jj[some])
         np.testing.assert_allclose(u, -v, atol=1e-6)
         said = (v.T * w[some]) @ v
-        feigned = sum(
+        noise_induced = sum(
             (x.T * w[some]) @ x for x in (of_group(g, poses[pairs.i[some]], centre, t[some])[0] for t in tilted)
         )
-        values, V = eigh(said, feigned)
-        share = feigned @ V @ np.diag(np.maximum(1.0 - FEIGNED / values, 0.0)) @ V.T
-        assert 0 < np.sum(values > FEIGNED) < d or dim == 2
+        values, V = eigh(said, noise_induced)
+        share = noise_induced @ V @ np.diag(np.maximum(1.0 - NOISE_INDUCED / values, 0.0)) @ V.T
+        assert 0 < np.sum(values > NOISE_INDUCED) < d or dim == 2
         np.testing.assert_allclose(
             share @ said @ share.T, holds.share[m] @ said @ holds.share[m].T, rtol=1e-4, atol=1e-3
         )

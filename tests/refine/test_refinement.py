@@ -80,7 +80,7 @@ def test_joint_covariance_holds_that_of_each_step(drives):
     assert np.linalg.eigvalsh(found.joint(some))[0] > 0
 
 
-def test_motion_noisier_than_stated_is_widened_and_honest():
+def test_motion_noisier_than_stated_is_widened_and_consistent():
     values, scales, said = [], [], []
     for seed in (41, 42):
         scans, start, truth = court(seed, wheel_sigma=0.06)  # the front end takes 0.02 for it

@@ -69,7 +69,7 @@ def test_free_space_contradicts_only_where_it_is_known(pair: tuple[PreparedMap, 
     assert (wrong > 0.03) == target.view.knows_space
 
 
-def test_covariance_is_honest_for_clouds_that_are_bent_inside() -> None:
+def test_covariance_is_consistent_for_clouds_that_are_bent_inside() -> None:
     """Monte Carlo: pairs of clouds of one place, each with drift of its own inside; NEES a degree of freedom.
 
     Of what drift bends: along, across and heading, without a direction that the match itself calls loose. The floors of

@@ -85,7 +85,7 @@ def test_ratio_and_direction_of_planes(dim: int) -> None:
     np.testing.assert_allclose(found.eigenvalues, values)
     assert abs(found.weakest @ R[:, 0]) == pytest.approx(1.0)
     assert translational_degeneracy(np.zeros((d, d)), dim).ratio == 0.0
-    H[move, move] = R @ np.diag([-1.0, 2.0, 3.0][:dim]) @ R.T  # more was feigned than there was
+    H[move, move] = R @ np.diag([-1.0, 2.0, 3.0][:dim]) @ R.T  # more was noise_induced than there was
     assert translational_degeneracy(H, dim).ratio == 0.0
 
 

@@ -132,7 +132,7 @@ def test_covariance_of_a_match_to_a_perfect_map_is_calibrated() -> None:
     assert np.mean(n < 2.1) > 0.85  # 95 % of a χ² of six, over six, lie below
 
 
-def test_default_covariance_is_honest_where_the_map_is_2_cm_and_2_mrad_wrong() -> None:
+def test_default_covariance_is_consistent_where_the_map_is_2_cm_and_2_mrad_wrong() -> None:
     world, rng, errors, covariances = hall(cars=24), np.random.default_rng(2), [], []
     for k in range(30):
         if k % 5 == 0:
@@ -152,7 +152,7 @@ def test_default_covariance_is_honest_where_the_map_is_2_cm_and_2_mrad_wrong() -
 
 
 @pytest.mark.parametrize(("jitter", "low", "high"), [(0.0, 0.15, 0.6), (0.02, 0.4, 1.5)])
-def test_planar_covariance_is_honest(jitter: float, low: float, high: float) -> None:
+def test_planar_covariance_is_consistent(jitter: float, low: float, high: float) -> None:
     world, rng, errors, covariances = hall(cars=24), np.random.default_rng(3), [], []
     for k in range(60):
         if k % (6 if jitter else 20) == 0:

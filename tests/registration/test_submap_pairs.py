@@ -131,7 +131,7 @@ def test_a_corridor_holds_all_but_one_direction() -> None:
     assert "degenerate" in refused.why
 
 
-def test_covariance_is_honest_for_maps_that_are_bent_inside() -> None:
+def test_covariance_is_consistent_for_maps_that_are_bent_inside() -> None:
     """Pairs of maps of one place, each with drift of its own inside: mean NEES of all, two-sided."""
     world = hall(cars=24)
     nees, accepted = [], 0

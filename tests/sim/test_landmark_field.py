@@ -169,7 +169,7 @@ def test_systematic_errors_are_the_stated_ones_and_no_part_of_the_noise() -> Non
     assert np.allclose(b.steering - a.steering, math.radians(-0.5), atol=1e-12)
 
 
-def test_the_worlds_that_confuse_state_an_honest_noise() -> None:
+def test_the_worlds_that_confuse_state_an_consistent_noise() -> None:
     """Their presets draw nothing that the stated σ do not cover, and truth names the clutter."""
     for name in ("clutter", "pairs", "rows", "hard"):
         c = PRESETS[name]
@@ -312,7 +312,7 @@ def test_residuals_at_the_truth_are_chi_square() -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.3, 0.75])
-def test_batch_optimum_is_honest_only_if_the_simulator_is(scale: float) -> None:
+def test_batch_optimum_is_consistent_only_if_the_simulator_is(scale: float) -> None:
     """χ²/dof and joint NEES of a full batch: inside the two-sided bounds at scale 1, outside for a lying simulator.
 
     Small noise, so that the Gaussian of the optimum is exact; four runs.

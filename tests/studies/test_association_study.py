@@ -151,7 +151,7 @@ def test_report_and_figures(table, tmp_path):
     assert all(p.stat().st_size > 10_000 for p in made)
 
 
-def test_honesty_of_local_maps_is_judged_from_both_sides(table):
+def test_consistency_of_local_maps_is_judged_from_both_sides(table):
     rows = local_nees(table).set_index(["world", "algorithm"])
     for world in QUICK:
         # a curved way that is poorly known makes a Cartesian Gaussian a little overconfident, whoever is who

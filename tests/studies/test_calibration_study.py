@@ -24,9 +24,9 @@ def test_quick_study_maps_a_drawn_robot_three_ways(tmp_path) -> None:
     result = CliRunner().invoke(app, args)
     assert result.exit_code == 0, result.output
     reports = json.loads(result.stdout)["reports"]
-    honest = {r["algorithm"]: r["nees_poses"] for r in reports["maps"]}
-    assert set(honest) == {"stated", "calibrated", "oracle"}
-    assert honest["calibrated"] < 0.2 * honest["stated"]
+    consistent = {r["algorithm"]: r["nees_poses"] for r in reports["maps"]}
+    assert set(consistent) == {"stated", "calibrated", "oracle"}
+    assert consistent["calibrated"] < 0.2 * consistent["stated"]
     found = {r["quantity"]: r["median"] for r in reports["found"]}
     assert 0.8 < found["range_sigma_ratio"] < 1.2
     assert abs(found["clock_error"]) < 0.05

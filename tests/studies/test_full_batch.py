@@ -52,7 +52,7 @@ def test_same_optimum_and_covariance_as_the_slow_twin(log: SensorLog) -> None:
     )
 
 
-def test_honest_on_average() -> None:
+def test_consistent_on_average() -> None:
     """χ²/dof of objective and NEES of the last pose and landmarks over runs, two-sided (4σ of their chi-squares)."""
     chi2, dof, nees, n = 0.0, 0, 0.0, 0
     for seed in range(12):

@@ -1,4 +1,4 @@
-"""Pseudoranges, clocks, biases, odometers: Jacobians, GTSAM's own factor, every solver, honesty, refusals."""
+"""Pseudoranges, clocks, biases, odometers: Jacobians, GTSAM's own factor, every solver, consistency, refusals."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_every_solver_ends_at_the_same_place():
     assert total == pytest.approx(ours, rel=1e-6)
 
 
-def test_positions_are_honest_where_the_noise_is_as_stated():
+def test_positions_are_consistent_where_the_noise_is_as_stated():
     """Squared errors of the last epoch over their covariance, 16 drives."""
     config, found = SatelliteConfig(seconds=40.0, step=2.0), []
     for seed in range(16):
@@ -123,9 +123,9 @@ def test_positions_are_honest_where_the_noise_is_as_stated():
 def test_what_is_stated_matters():
     """The stated σ alone, for signals that come round corners: far off, and sure of it."""
     log = simulate_satellites(3, SatelliteConfig(seconds=60.0, step=2.0))
-    naive, honest = (score_of([errors(log, solve_street(log, c), 1)]) for c in (PseudorangeConfig(), TRUE))
-    assert naive.nees > 50.0 > 5.0 > honest.nees
-    assert honest.rmse < naive.rmse
+    naive, consistent = (score_of([errors(log, solve_street(log, c), 1)]) for c in (PseudorangeConfig(), TRUE))
+    assert naive.nees > 50.0 > 5.0 > consistent.nees
+    assert consistent.rmse < naive.rmse
 
 
 def test_the_turn_of_the_earth_is_not_left_out():

@@ -35,14 +35,14 @@ from tests.reference.trials import dies_once, fails_once, gives_a_lambda, notes_
 
 
 def noisy_trial(seed: int) -> Iterator[Measurement]:
-    """NEES of an honest and of an overconfident estimator at three submaps, and a final RMSE."""
+    """NEES of an consistent and of an overconfident estimator at three submaps, and a final RMSE."""
     rng = np.random.default_rng(seed)
     for submap in range(3):
         d2 = rng.chisquare(3)
-        yield Measurement("honest", "nees", d2, submap)
+        yield Measurement("consistent", "nees", d2, submap)
         yield Measurement("bold", "nees", 4 * d2, submap)
     e = rng.uniform(1, 2)
-    yield Measurement("honest", "rmse", e)
+    yield Measurement("consistent", "rmse", e)
     yield Measurement("bold", "rmse", 2 * e)
 
 
@@ -105,7 +105,7 @@ def test_summary_by_hand() -> None:
 
 def test_consistency_from_the_table_has_the_right_verdicts() -> None:
     t = run_trials(noisy_trial, 60, progress=False)
-    for name, verdict in (("honest", "consistent"), ("bold", "overconfident")):
+    for name, verdict in (("consistent", "consistent"), ("bold", "overconfident")):
         submaps, c = consistency_of(t, name, "nees", dof=3, gauge="first base fixed")
         assert submaps.tolist() == [0, 1, 2]
         assert c.nees.shape == (60, 3)
@@ -140,7 +140,7 @@ def test_paired_ratio_by_hand() -> None:
 
 
 def test_pairing_sees_what_unpaired_means_cannot() -> None:
-    r = paired_ratio(run_trials(noisy_trial, 10, progress=False), "rmse", "bold", "honest")
+    r = paired_ratio(run_trials(noisy_trial, 10, progress=False), "rmse", "bold", "consistent")
     assert r.mean == pytest.approx(2.0)
     assert r.half_width == pytest.approx(0.0, abs=1e-12)
     assert r.wins == 0
@@ -220,7 +220,7 @@ def test_nonsense_and_double_figures_are_failures() -> None:
 
 
 def study_table(rng: np.random.Generator, *, worlds: int = 2, runs: int = 40, scale: float = 1.0) -> pd.DataFrame:
-    """``scale`` times honest NEES of poses (3), and of joint maps whose dimension differs from run to run."""
+    """``scale`` times consistent NEES of poses (3), and of joint maps whose dimension differs from run to run."""
     rows = []
     for w in range(worlds):
         for run in range(runs):
@@ -237,7 +237,7 @@ def study_table(rng: np.random.Generator, *, worlds: int = 2, runs: int = 40, sc
 
 
 @pytest.mark.parametrize(("scale", "verdict"), [(1.0, True), (2.5, False), (0.3, False)])
-def test_consistency_table_tells_honest_from_bold_and_from_timid(
+def test_consistency_table_tells_consistent_from_bold_and_from_timid(
     rng: np.random.Generator, scale: float, verdict: bool
 ) -> None:
     t = study_table(rng, scale=scale)
@@ -246,7 +246,7 @@ def test_consistency_table_tells_honest_from_bold_and_from_timid(
         assert found["world"].tolist() == ["w0", "w1"]
         assert found["inside"].tolist() == [verdict] * 2
         assert np.allclose(found["nees_over_n"], scale, rtol=0.4)
-        assert ((found["ci_low"] < found["ci_honest"]) & (found["ci_honest"] < found["ci_high"])).all()
+        assert ((found["ci_low"] < found["ci_consistent"]) & (found["ci_consistent"] < found["ci_high"])).all()
 
 
 def test_bounds_of_the_consistency_table_hold_as_often_as_they_say(rng: np.random.Generator) -> None:
@@ -306,13 +306,13 @@ def test_interval_of_a_geometric_mean_holds_as_often_as_it_says(rng: np.random.G
     assert 0.90 < inside / 300 < 0.985
 
 
-@pytest.mark.parametrize(("scale", "honest"), [(1.0, True), (1.3, False), (0.7, False)])
-def test_coverage_of_local_maps(rng: np.random.Generator, scale: float, honest: bool) -> None:
+@pytest.mark.parametrize(("scale", "consistent"), [(1.0, True), (1.3, False), (0.7, False)])
+def test_coverage_of_local_maps(rng: np.random.Generator, scale: float, consistent: bool) -> None:
     t = study_table(rng, worlds=1, runs=400, scale=scale)
     (row,) = coverage_table(t, confidence=0.95).to_dict("records")
     assert row["maps"] == 400
     assert row["joint"] == pytest.approx(scale, rel=0.05)
     assert row["pose"] == pytest.approx(scale, rel=0.2)
-    assert (row["inside_low"] - 0.01 <= row["inside"] <= row["inside_high"] + 0.01) == honest
+    assert (row["inside_low"] - 0.01 <= row["inside"] <= row["inside_high"] + 0.01) == consistent
     with pytest.raises(DataError, match="no local maps"):
         coverage_table(t[t["algorithm"] == "a"])

@@ -1,4 +1,4 @@
-"""A robot of MRCLAM 7 with its preset: near the truth, and honest about how near."""
+"""A robot of MRCLAM 7 with its preset: near the truth, and consistent about how near."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def test_a_landmark_that_stands_twice_in_a_submap(chain: list[Submap]) -> None:
     assert joined.objective == pytest.approx(best.objective, rel=1e-6)
 
 
-def test_the_default_policy_keeps_the_map_honest_over_a_closure() -> None:
+def test_the_default_policy_keeps_the_map_consistent_over_a_closure() -> None:
     """Two laps with the stated noise: once linearised the map believes in its errors, relinearised it does not."""
     ratios = {"once": [], "online": []}
     for seed in range(4):

@@ -47,7 +47,7 @@ def test_map_from_ranges_is_near_the_truth(run, log):
     assert sum(s.report["beacons_without_landmark"] + s.report["ambiguous_landmarks"] for s in run.submaps) == 0
 
 
-def test_map_is_honest_but_for_the_scale_of_the_odometer(run, log):
+def test_map_is_consistent_but_for_the_scale_of_the_odometer(run, log):
     """Up to a similarity the covariance explains the errors of 12 submap ends and 4 beacons; rigidly it cannot, since
     nothing in the log says how long the odometer's metre is (0.4 % off)."""
     s, beacons = run.solution, dict(zip(log.truth.landmark_ids.tolist(), log.truth.landmarks))

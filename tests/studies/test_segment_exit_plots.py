@@ -41,14 +41,14 @@ def test_exit_shows_every_particle_and_each_covariance() -> None:
 
 
 def test_scores_of_all_segments_are_there_and_those_inside_counted() -> None:
-    honest, sure = np.array([2.0, 4.0, 20.0]), np.array([400.0, 4000.0, 3.0])
-    scores = {n: ExitNees(v, 4, np.zeros((3, 4))) for n, v in (("honest", honest), ("sure", sure))}
+    consistent, sure = np.array([2.0, 4.0, 20.0]), np.array([400.0, 4000.0, 3.0])
+    scores = {n: ExitNees(v, 4, np.zeros((3, 4))) for n, v in (("consistent", consistent), ("sure", sure))}
     ax = plot_exit_nees(None, scores)
     points = [line for line in ax.lines if line.get_marker() not in ("None", "")]
-    np.testing.assert_allclose(points[0].get_ydata(), honest / 4)
+    np.testing.assert_allclose(points[0].get_ydata(), consistent / 4)
     np.testing.assert_allclose(points[1].get_ydata(), sure / 4)
     labels = [t.get_text() for t in ax.get_legend().get_texts()]
-    assert "honest: mean 2.2, 2 of 3 inside" in labels
+    assert "consistent: mean 2.2, 2 of 3 inside" in labels
     assert "sure: mean 366.9, 1 of 3 inside" in labels
     band = ax.patches[0]
     low, high = band.get_y(), band.get_y() + band.get_height()

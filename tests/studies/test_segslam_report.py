@@ -74,12 +74,12 @@ def test_table_of_nees_pools_segments_and_bounds_over_runs() -> None:
             rows.append(("w", run, "segslam-5", k, "exit_nees", d2))
             rows.append(("w", run, "segslam-5", k, "exit_nees_matched", 100.0 * d2))
     t = report.nees_table(frame(rows)).set_index("covariance")
-    honest, paper = t.loc["particles + drift"], t.loc["moment matching (paper)"]
-    assert honest["segments"] == 320
-    assert honest["low"] < 1.0 < honest["high"]
-    assert honest["honest_low"] < honest["nees_over_n"] < honest["honest_high"]
-    assert 0.91 < honest["inside"] < 0.985
-    assert paper["nees_over_n"] == pytest.approx(100 * honest["nees_over_n"])
+    consistent, paper = t.loc["particles + drift"], t.loc["moment matching (paper)"]
+    assert consistent["segments"] == 320
+    assert consistent["low"] < 1.0 < consistent["high"]
+    assert consistent["honest_low"] < consistent["nees_over_n"] < consistent["honest_high"]
+    assert 0.91 < consistent["inside"] < 0.985
+    assert paper["nees_over_n"] == pytest.approx(100 * consistent["nees_over_n"])
     assert paper["inside"] < 0.05
     assert paper["low"] > 1.0
     assert "particles + stated motion" not in t.index

@@ -34,9 +34,11 @@ def test_the_quick_one_runs_by_its_command(tmp_path: Path):
     said = json.loads(out.stdout)
     assert "gauss-markov" in str(said)
     table = open_study(tmp_path / "s").table
-    naive, honest = (table[table["algorithm"] == a].set_index("quantity")["value"] for a in ("naive", "gauss-markov"))
-    assert honest["nees"] < 0.2 * naive["nees"]
-    assert honest["bias_sigma"] in (2.5, 5.0)
+    naive, consistent = (
+        table[table["algorithm"] == a].set_index("quantity")["value"] for a in ("naive", "gauss-markov")
+    )
+    assert consistent["nees"] < 0.2 * naive["nees"]
+    assert consistent["bias_sigma"] in (2.5, 5.0)
     assert {"rmse", "nees", "sigma", "rmse_chosen", "nees_chosen"} <= set(naive.index)
 
 
@@ -48,8 +50,8 @@ def test_parts_share_no_record():
         assert [len(p[name].times) for p in parts] == [10, 10, 10, 10]
 
 
-def test_least_error_among_the_honest_is_chosen(monkeypatch):
-    """And where none is honest, the one nearest to it."""
+def test_least_error_among_the_consistent_is_chosen(monkeypatch):
+    """And where none is consistent, the one nearest to it."""
     scores = {1.0: Score(2.0, 30.0, 0.3, (0, 0)), 2.0: Score(6.0, 1.3, 5.0, (0, 0)), 3.0: Score(5.0, 0.8, 6.0, (0, 0))}
     monkeypatch.setattr(smartloc, "scored", lambda logs, settings, every: scores[settings["sigma_scale"]])
     assert chosen([], {"sigma_scale": (1.0, 2.0, 3.0)}, 1) == ({"sigma_scale": 3.0}, scores[3.0])
@@ -71,7 +73,7 @@ def test_some_of_the_recorded_street(data_dir):
     log = load_recording("smartloc-gnss").slice(150.0, 190.0)
     naive = scored([log], {}, 10)
     settings = {CAUCHY: 1.0, "density_scale": 10.0, "bias_sigma": 5.0, "bias_time": 15.0, "bias_every": 1.0}
-    honest = scored([log], settings, 10)
+    consistent = scored([log], settings, 10)
     assert naive.nees > 100.0
-    assert honest.nees < 4.0
-    assert honest.rmse < min(naive.rmse, 12.0)
+    assert consistent.nees < 4.0
+    assert consistent.rmse < min(naive.rmse, 12.0)

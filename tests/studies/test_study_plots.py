@@ -1,4 +1,4 @@
-"""Figures of a study: the curves are the table's figures, the bounds are those of an honest estimator."""
+"""Figures of a study: the curves are the table's figures, the bounds are those of an consistent estimator."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def legend_of(ax: Axes) -> list[str]:
 
 
 def band(ax: Axes) -> tuple[float, float]:
-    """Vertical extent of the bounds of an honest estimator."""
+    """Vertical extent of the bounds of an consistent estimator."""
     patch = next(p for p in ax.patches if "bounds" in str(p.get_label()))
     box = patch.get_path().vertices if not hasattr(patch, "get_bbox") else patch.get_bbox().get_points()
     return float(box[:, 1].min()), float(box[:, 1].max())
@@ -75,8 +75,8 @@ def test_ci_curves_are_the_statistic_over_the_runs(study, statistic: str) -> Non
     assert ax.get_yscale() == "log"  # the single particle filter explodes
     assert any("12 runs" in text for text in legend_of(ax))
     low, high = band(ax)
-    honest = line(ax, "default, online")[:, 1]
-    assert np.mean((honest > low) & (honest < high)) > 0.8
+    consistent = line(ax, "default, online")[:, 1]
+    assert np.mean((consistent > low) & (consistent < high)) > 0.8
     assert np.all(line(ax, "RBPF, one map")[-5:, 1] > 1e3 * high)
 
 

@@ -16,7 +16,7 @@ from graphslam_studies.trust import (
     WORDS,
     ScanWorld,
     confusion_table,
-    honesty,
+    consistency,
     run_trial,
     summary_table,
     world_table,
@@ -77,13 +77,13 @@ def test_the_confusion_table_sets_truth_against_words():
     known = {"a": FULL["world-800"], "b": FULL["fault-00"], "c": FULL["fault-01"]}
     figures = {"a": (1.0, 0), "b": (2.5, 0), "c": (50.0, 4)}
     rows = []
-    for world, (nees, word) in figures.items():
-        values = {"node": nees, "node_dof": 40.0, "joint": nees, "joint_dof": 60.0, "word": float(word)}
+    for world, (nees, verdict) in figures.items():
+        values = {"node": nees, "node_dof": 40.0, "joint": nees, "joint_dof": 60.0, "verdict": float(verdict)}
         rows += [
             {"world": world, "run": 0, "algorithm": "run", "submap": -1, "quantity": q, "value": v}
             for q, v in values.items()
         ]
-    rows.append({"world": "d", "run": 0, "algorithm": "run", "submap": -1, "quantity": "word", "value": 5.0})
+    rows.append({"world": "d", "run": 0, "algorithm": "run", "submap": -1, "quantity": "verdict", "value": 5.0})
     known["d"] = FULL["fault-02"]
     worlds = world_table(pd.DataFrame(rows), known)
     assert worlds["true"].tolist() == ["consistent", "overconfident", "wrong", "refused"]
@@ -93,16 +93,16 @@ def test_the_confusion_table_sets_truth_against_words():
     assert table.loc[("fault", "wrong"), "wrong"] == table.loc[("fault", "refused"), "refused"] == 1
 
 
-def test_honesty_of_errors_that_are_as_stated(rng):
+def test_consistency_of_errors_that_are_as_stated(rng):
     A = rng.standard_normal((30, 30))
     P = A @ A.T + 0.1 * np.eye(30)
     L = np.linalg.cholesky(P)
-    found = [honesty((L @ rng.standard_normal(30)).reshape(10, 3), P) for _ in range(400)]
+    found = [consistency((L @ rng.standard_normal(30)).reshape(10, 3), P) for _ in range(400)]
     assert np.mean([f["joint"] for f in found]) == pytest.approx(1.0, abs=0.05)
     assert np.mean([f["node"] for f in found]) == pytest.approx(1.0, abs=0.05)
     # the mean over correlated nodes varies as χ² of the dof that are told
     assert np.var([f["node"] for f in found]) == pytest.approx(2.0 / found[0]["node_dof"], rel=0.3)
-    wide = honesty(2.0 * (L @ rng.standard_normal(30)).reshape(10, 3), P)
+    wide = consistency(2.0 * (L @ rng.standard_normal(30)).reshape(10, 3), P)
     assert wide["joint"] > 2.0
 
 
@@ -110,23 +110,28 @@ def test_honesty_of_errors_that_are_as_stated(rng):
 def test_quick_worlds_are_mapped_with_default_options(world):
     rows = {m.quantity: m.value for m in run_trial(QUICK[world], 5)}
     assert rows["clean"] == float(QUICK[world].clean)
-    assert rows["word"] in (0.0, 3.0)  # noise that is stated wrongly is estimated from the log
+    assert rows["verdict"] in (0.0, 3.0)  # noise that is stated wrongly is estimated from the log
     assert 0.2 < rows["joint"] < 2.5  # 15 degrees of freedom or so
 
 
 @pytest.mark.parametrize("kind", ["park", "laser"])
 def test_worlds_with_scans_are_mapped_as_a_newcomer_would(kind):
     rows = {m.quantity: m.value for m in run_trial(ScanWorld(kind=kind, number=3), 5)}
-    assert WORDS[int(rows["word"])] in ("consistent", "not tested")
+    assert WORDS[int(rows["verdict"])] in ("consistent", "not tested")
     assert rows["rms"] < 0.5
     assert 0.1 < rows["joint"] < 2.0
 
 
 def test_the_table_counts_what_must_not_happen():
     rows = []
-    for world, node, word in (("quick-04", 1.0, 0), ("quick-22", 0.9, 1), ("quick-31", 4.0, 2), ("quick-09", 1.1, 3)):
+    for world, node, verdict in (
+        ("quick-04", 1.0, 0),
+        ("quick-22", 0.9, 1),
+        ("quick-31", 4.0, 2),
+        ("quick-09", 1.1, 3),
+    ):
         for trial in range(3):
-            figures = {"node": node, "node_dof": 40.0, "joint": node, "joint_dof": 60.0, "word": float(word)}
+            figures = {"node": node, "node_dof": 40.0, "joint": node, "joint_dof": 60.0, "verdict": float(verdict)}
             rows += [
                 {"world": world, "run": trial, "algorithm": "run", "submap": -1, "quantity": q, "value": v}
                 for q, v in figures.items()

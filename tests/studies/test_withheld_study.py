@@ -43,7 +43,7 @@ def test_the_density_is_that_of_the_motion(rng):
     assert steady_motion(walked(rng, 2.0), 0.5).noise.accelerometer == pytest.approx(1.0, rel=0.2)
 
 
-def test_steady_motion_is_honest_where_it_is_true(rng):
+def test_steady_motion_is_consistent_where_it_is_true(rng):
     """Every second fix withheld, acceleration as white as it is said to be."""
     found = scores_steady(walked(rng, 1.0, 160), 2.0, 1.0)
     assert 0.75 < found["nees"] < 1.3

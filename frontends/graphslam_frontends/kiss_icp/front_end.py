@@ -160,7 +160,7 @@ class KissIcpOdometry(LidarOdometry):
         return pose, fit, ScanResult(len(points), fit.overlap, 6 - round(float(np.trace(P))), state, False)
 
     def _instead(self, seen: ScanResult, motion: Array, Q: Array | None) -> Array | None:
-        if not seen.unheld or self.scan == 0:
+        if not seen.unobservable or self.scan == 0:
             return None
         moved = np.asarray(se3.se3_log(motion))
         turn2, shift2 = np.maximum(np.mean(self.missed, axis=0) if self.missed else 0.0, [1e-6, 1e-4])

@@ -502,7 +502,7 @@ def _submap(
     states = Counter(f.seen.state for f in kept[int(key > 0) :])
     overlaps = [f.seen.overlap for f in kept if np.isfinite(f.seen.overlap)]
     # all six directions are unobservable: lost scans, and matches with too few cells
-    lost = sum(f.seen.unheld == 6 for f in kept[int(key > 0) :])
+    lost = sum(f.seen.unobservable == 6 for f in kept[int(key > 0) :])
     report: dict[str, Any] = {
         "ended": ended,
         "scans": len(kept) - 1,
@@ -510,7 +510,7 @@ def _submap(
         "scan_states": dict(sorted(states.items())),
         "scans_searched": sum(f.seen.searched for f in kept[int(key > 0) :]),
         "scans_lost": lost,
-        "scans_unheld": sum(f.seen.unheld > 0 for f in kept[int(key > 0) :] if f.seen.state in MAPPED),
+        "scans_unobservable": sum(f.seen.unobservable > 0 for f in kept[int(key > 0) :] if f.seen.state in MAPPED),
         "overlap_median": float(np.median(overlaps)) if overlaps else None,
         "beams_dropped": int(dropped),
         "exit_covariance": "window",
@@ -558,7 +558,7 @@ def _findings(
         )
         out.append(Finding("look", "imu-left-aside", text))
     own = kept[int(key > 0) :]
-    alone = sum(f.seen.unheld == 6 and not f.seen.bridged for f in own)
+    alone = sum(f.seen.unobservable == 6 and not f.seen.bridged for f in own)
     if report["scans_lost"] > MANY * n + (BEGUN if key == 0 else 0):
         text = f"unmatched scans in submap {key}: {report['scans_lost']} of {n} — not in the map. "
         if alone < report["scans_lost"]:
@@ -567,14 +567,14 @@ def _findings(
         else:
             text += "Constant velocity is assumed there, with a matching covariance."
         out.append(Finding("bad" if alone > 0.5 * n else "look", "scans-lost", text))
-    if report["scans_unheld"] > 0.5 * n:
+    if report["scans_unobservable"] > 0.5 * n:
         by = "constant velocity" if report.get("scans_aided", 0) < 0.5 * n else imu
         by = wheels if any(f.seen.bridged for f in own) else by
         text = (
-            f"unobservable directions in submap {key}: {report['scans_unheld']} of {n} scans, as in a corridor or on a "
-            f"plain — the path along them is that of {by}."
+            f"unobservable directions in submap {key}: {report['scans_unobservable']} of {n} scans, as in a corridor or "
+            f"on a plain — the path along them is that of {by}."
         )
-        out.append(Finding("look", "scans-unheld", text))
+        out.append(Finding("look", "scans-unobservable", text))
     return out
 
 

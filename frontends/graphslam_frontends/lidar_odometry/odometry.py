@@ -84,7 +84,7 @@ REMEMBERED = 10
 """Number of scans in the running medians."""
 NORMAL_SIGMA = 0.05
 """σ of the normals of cells [rad]."""
-PRETENDED = 1.5
+NOISE_INDUCED = 1.5
 """A direction is unobservable if its information is at most this multiple of the spurious information that noise of the
 normals causes."""
 MAPPED = ("first", "matched", "found again", "new space")
@@ -127,7 +127,7 @@ class ScanResult:
         Number of points matched.
     overlap : float
         Sum of the weights on the finest level, divided by the number of points; nan for the first scan of a map.
-    unheld : int
+    unobservable : int
         Number of unobservable directions, of six; the prediction is used along them.
     state : str
         "first", "matched", "new space", "found again" (wide search), "lost" (predicted, not in the map), "empty".
@@ -141,7 +141,7 @@ class ScanResult:
 
     points: int
     overlap: float
-    unheld: int
+    unobservable: int
     state: str
     searched: bool
     aided: bool = False
@@ -302,7 +302,7 @@ class LidarOdometry:
                 self.pose, seen = bridge, replace(seen, bridged=True)
         else:
             self.pose, fit, seen = self._match(raw, chosen, predicted, bridge, Q, time, ahead is not None)
-            seen = replace(seen, watched=bridge is not None, bridged=bridge is not None and seen.unheld > 0)
+            seen = replace(seen, watched=bridge is not None, bridged=bridge is not None and seen.unobservable > 0)
         if ahead is not None or raw.straight is not None:
             seen = replace(seen, aided=True)
         self.points = self._unbent(raw, self.pose, time)
@@ -311,7 +311,7 @@ class LidarOdometry:
             predicted = bridge
         motion = np.asarray(se3.se3_between(before, predicted))
         self._doubt(raw, points, motion, even, dt, fit, seen, self._instead(seen, motion, Q))
-        sure = fit is not None and not seen.unheld and not self.lost and seen.state in MAPPED
+        sure = fit is not None and not seen.unobservable and not self.lost and seen.state in MAPPED
         if sure and told is not None and self.reckoned is not None:
             made, guess = (np.asarray(se3.se3_between(before, x)) for x in (self.pose, even))
             self.reckoned.learn(told[0], made, guess)
@@ -418,7 +418,7 @@ class LidarOdometry:
             self.missed.append((float(np.mean(off[:3] ** 2)), float(np.mean(off[3:] ** 2))))
         if self.scan == 0:
             return
-        self.loose = self.loose + 1 if fit is None or seen.unheld else 1
+        self.loose = self.loose + 1 if fit is None or seen.unobservable else 1
         dt = min(dt, LONGEST)
         turn2, shift2 = np.mean(self.missed, axis=0) if self.missed else (0.0, 0.0)
         turn2 = max(turn2, (0.5 * ACCELERATION[0] * dt**2) ** 2, 1e-6)
@@ -430,7 +430,7 @@ class LidarOdometry:
             # a constant velocity error: this step adds k² − (k − 1)² of its variance, also in `spread`
             unknown = np.diag([0.0] * 3 + [(2 * self.loose - 1) * (FASTEST * dt) ** 2] * 3)
             Q, self.spread = Q + unknown, self.spread + unknown
-        self.held += fit is not None and not seen.unheld
+        self.held += fit is not None and not seen.unobservable
         if reckoned is not None:
             # a constant odometry error: σ grows linearly, so this step adds k² − (k − 1)² of the variance
             Q = self.spread = (2 * self.loose - 1) * reckoned
@@ -443,7 +443,7 @@ class LidarOdometry:
             E = M + 1e-6 * np.trace(M) / 6.0 * np.eye(6)
             self.agreeing.append(float(np.trace(np.linalg.solve(E, G.T @ G))) / 6.0)
             M *= CORRELATION * float(np.mean(self.agreeing))
-            F = observable_gradient(fit.H, fit.every, seen.unheld)
+            F = observable_gradient(fit.H, fit.every, seen.unobservable)
             H, M = F @ H, F @ M @ F.T
         self.errors.step(self.pose, motion, Q, H, M, self._bent(raw), self.off)
 
@@ -527,19 +527,19 @@ class LidarOdometry:
                 fits = fit.quality > FITS * np.median(self.qualities) and fit.known * len(points) > FEW
                 spread = self.spread if told is None else told
                 state = "new space" if fits and not self.lost and not _far(stands, pose, spread) else "lost"
-        free, (pose, unheld) = pose, self._hold(pose, stands, fit)
+        free, (pose, unobservable) = pose, self._hold(pose, stands, fit)
         if inertial is not None and state != "lost":
             inertial.shifts.append(float(np.linalg.norm(se3.se3_between(predicted, pose)[:3])))
-            while not alike(pose) and alike(pose, np.inf) and unheld < MOST_WEAK:
+            while not alike(pose) and alike(pose, np.inf) and unobservable < MOST_WEAK:
                 # weak directions let a scan slide, for example along a wall: use the IMU along them
-                pose, unheld = self._hold(free, stands, fit, unheld + 1)
+                pose, unobservable = self._hold(free, stands, fit, unobservable + 1)
                 at_it = self.levels[-1].fit(self._unbent(raw, pose, time)[chosen], *split_pose(pose), SCALE)
                 state = "matched" if at_it.overlap > SUSPICIOUS * fit.overlap else "lost"
         if state == "lost" or not alike(pose):
             return stands, None, ScanResult(len(points), fit.overlap, 6, "lost", searched)
         if fit.known < LITTLE:
             return start if bridge is None else bridge, None, ScanResult(len(points), fit.overlap, 6, state, searched)
-        if unheld and bridge is None and len(self.missed) < 3:
+        if unobservable and bridge is None and len(self.missed) < 3:
             # the motion model is still unknown: zero velocity is used only if the scan fits there as well
             points = self._unbent(raw, pose, time)[chosen]
             if self.levels[-1].fit(points, *split_pose(pose), SCALE).overlap < LIKELY * fit.overlap:
@@ -550,7 +550,7 @@ class LidarOdometry:
             self.coarse.append(
                 top[-1].fit(points[evenly_spaced_rows(len(points), COARSE_POINTS)], *split_pose(pose), SCALE).overlap
             )
-        return pose, fit, ScanResult(len(points), fit.overlap, unheld, state, searched)
+        return pose, fit, ScanResult(len(points), fit.overlap, unobservable, state, searched)
 
     def _finish(self, raw: RawScan, chosen: Index, pose: Array, time: float) -> tuple[Array, Array, NormalEquations]:
         """Match on the finest level: pose, points deskewed with it, fit."""
@@ -620,11 +620,11 @@ class LidarOdometry:
     def _hold(self, pose: Array, predicted: Array, fit: NormalEquations, least: int = 0) -> tuple[Array, int]:
         """Use the prediction along unobservable directions, at least ``least`` of them; and their number."""
         P = observable_projection(fit.H, fit.every, least)
-        unheld = 6 - round(float(np.trace(P)))
-        if unheld:
+        unobservable = 6 - round(float(np.trace(P)))
+        if unobservable:
             xi = P @ np.asarray(se3.se3_log(se3.se3_between(predicted, pose)))
             pose = np.asarray(se3.se3_compose(predicted, se3.se3_exp(xi)))
-        return pose, unheld
+        return pose, unobservable
 
 
 def _far(predicted: Array, pose: Array, spread: Array) -> bool:
@@ -647,7 +647,7 @@ def observable_projection(H: Array, every: Array, least: int = 0) -> Array:
         Number of the weakest directions that are removed in any case.
     """
     values, V, B = _directions(H, every)
-    U = V[:, max(int(np.sum(values <= PRETENDED)), least) :]
+    U = V[:, max(int(np.sum(values <= NOISE_INDUCED)), least) :]
     return np.asarray(U @ U.T @ B)
 
 
@@ -657,7 +657,7 @@ def observable_gradient(H: Array, every: Array, least: int = 0) -> Array:
     The ``least`` weakest directions are removed completely.
     """
     values, V, B = _directions(H, every)
-    share = np.maximum(1.0 - PRETENDED / np.maximum(values, 1e-9), 0.0)
+    share = np.maximum(1.0 - NOISE_INDUCED / np.maximum(values, 1e-9), 0.0)
     share[:least] = 0.0
     return np.asarray(B @ (V * share) @ V.T)
 

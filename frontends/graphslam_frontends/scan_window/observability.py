@@ -55,22 +55,22 @@ def direction_strengths(information: Array, every: Array, sigma: float) -> tuple
     return values, V
 
 
-def observable_directions(information: Array, every: Array, sigma: float, unheld: Array) -> Array:
+def observable_directions(information: Array, every: Array, sigma: float, unobservable: Array) -> Array:
     """Matrix ``(m, w)`` from ``Jᵀ Λ r`` to m ≤ w values of unit noise, for the directions that surfaces constrain.
 
     Parameters
     ----------
     information, every, sigma
         Of one scan, as in :func:`direction_strengths`.
-    unheld : (w, k)
+    unobservable : (w, k)
         Directions to marginalise first: one scan estimates them slightly rotated, and would leak their error into
         others.
     """
-    w, u = len(information), unheld.shape[1]
+    w, u = len(information), unobservable.shape[1]
     given_up = np.eye(w)
     if u:
-        B = information @ unheld
-        given_up -= B @ np.linalg.solve(unheld.T @ B, unheld.T)
+        B = information @ unobservable
+        given_up -= B @ np.linalg.solve(unobservable.T @ B, unobservable.T)
     left = given_up @ information
     values, V = direction_strengths(0.5 * (left + left.T), every, sigma)
     held = values > CLEARLY

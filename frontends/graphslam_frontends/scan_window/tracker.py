@@ -277,7 +277,7 @@ class ScanToWindowOdometry:
             # the measurement: Jᵀ Λ r in the observable directions, each with unit noise
             every = full_rank_information(points[p][near], information)
             seen = np.stack([L, every])
-            M = observable_directions(L, every, NORMAL_SIGMA, self._unheld(lately + seen))
+            M = observable_directions(L, every, NORMAL_SIGMA, self._unobservable(lately + seen))
             H = np.zeros((len(M), self.x))
             H[:, :w] = M @ L @ g.adjoint(g.exp(-d[:w]))  # from the axes of the pose before corrections
             y = M @ (L @ d[:w] - b)
@@ -290,7 +290,7 @@ class ScanToWindowOdometry:
             self._correct(gain, y)
         return ScanMatch(n, overlap, scatter, surprise, lost)
 
-    def _unheld(self, seen: Array) -> Array:
+    def _unobservable(self, seen: Array) -> Array:
         """Directions ``(w, m)`` that no recent scan constrains, this one included, for example along a corridor."""
         values, V = direction_strengths(seen[0], seen[1], NORMAL_SIGMA)
         return V[:, values <= CLEARLY]

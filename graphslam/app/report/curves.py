@@ -44,7 +44,7 @@ def report_curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     -------
     list of dict
         ``name``, ``said``, ``unit`` and ``kind``. For the kinds ``line`` and ``dots``: ``t`` [s] from the start of the
-        path, ``s`` [m] path length, ``xyz`` [m], ``value``, as base64 of float32; ``log``; ``honest``: consistent value
+        path, ``s`` [m] path length, ``xyz`` [m], ``value``, as base64 of float32; ``log``; ``expected``: consistent value
         or None; ``bounds``: two numbers, or ``half``: half width of the band at each point; ``cut``: points before
         which the line breaks. For the kind ``rows``: ``rows``, each ``name``, ``value``, ``low``, ``high``.
     """
@@ -86,7 +86,7 @@ class _Axis:
         values: Array,
         *,
         unit: str = "",
-        honest: float | None = None,
+        expected: float | None = None,
         bounds: tuple[float, float] | None = None,
         sigmas: Array | None = None,
     ) -> dict[str, Any]:
@@ -94,7 +94,7 @@ class _Axis:
         cut = np.flatnonzero(np.diff(self.piece[keep]) > 0) + 1
         out: dict[str, Any] = {
             **{"name": name, "said": said, "unit": unit, "kind": self.kind, "colour": style.ESTIMATE},
-            **{"log": bounds is not None, "honest": honest, "cut": cut.tolist()},
+            **{"log": bounds is not None, "expected": expected, "cut": cut.tolist()},
             **{"t": base64_floats(self.t[keep]), "s": base64_floats(self.s[keep])},
             **{"xyz": packed_points(self.xyz[keep]), "value": base64_floats(values[keep])},
         }
@@ -142,7 +142,7 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     )
     if made.certain:
         said += f" Not shown: {made.certain} poses with a singular covariance, such as the first base."
-    panels = [axis.panel("NEES/dof of the path", said, ratio, honest=1.0, bounds=(low, high))]
+    panels = [axis.panel("NEES/dof of the path", said, ratio, expected=1.0, bounds=(low, high))]
     for k, name in enumerate(made.names):
         turn = name == "heading"
         scale = np.rad2deg(1.0) if turn else 1.0
@@ -150,7 +150,7 @@ def _against_truth(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
         out = float(np.mean(np.abs(errors) > SIGMAS * sigmas))
         said = f"Ground truth minus estimate, ± {SIGMAS:g} σ; {_percent(out)} outside (consistent: 5 %)."
         panels.append(
-            axis.panel(f"Error of {name}", said, errors, unit="°" if turn else "m", honest=0.0, sigmas=sigmas)
+            axis.panel(f"Error of {name}", said, errors, unit="°" if turn else "m", expected=0.0, sigmas=sigmas)
         )
     return panels
 
@@ -175,11 +175,11 @@ def _fixes(folder: ReportFolder, path: Trajectory) -> list[dict[str, Any]]:
         if folder.part("refine"):
             said += " The prediction is that of the graph before refinement."
         name = "NIS/dof of withheld GPS"
-        out = [axis.panel(name, said, nis / d, honest=1.0, bounds=(low, high))]
+        out = [axis.panel(name, said, nis / d, expected=1.0, bounds=(low, high))]
         for k, of in enumerate("xyz"[:d]):
             said = f"Fix minus prediction, {of} of the GPS frame, ± {SIGMAS:g} σ of both."
             name, half = f"Withheld GPS, {of}", sigma[:, k]
-            out.append(axis.panel(name, said, v[:, k], unit="m", honest=0.0, sigmas=half))
+            out.append(axis.panel(name, said, v[:, k], unit="m", expected=0.0, sigmas=half))
         return out
     for name, said in (("withheld", "withheld from the graph"), ("all", "as in the metrics")):
         try:

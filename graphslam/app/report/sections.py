@@ -156,7 +156,7 @@ def control_section(folder: ReportFolder) -> Markup:
         return Markup("")
     parts: list[Any] = []
     if checked:
-        names = ("word", "rmse", "nis_per_dof", "low", "high", "dof", "power", "aligned")
+        names = ("verdict", "rmse", "nis_per_dof", "low", "high", "dof", "power", "aligned")
         parts += [html_element("h3", "Check points"), pair_list({k: checked.get(k) for k in names})]
         columns = {
             **{"line": "line", "name": "name", "place": "place", "frame": "frame", "error": "error [m]"},

@@ -34,7 +34,7 @@ def best_map(inputs: RunInputs, slam: SubmapSlam, clock: RunClock, undo: Sequenc
     while True:
         for candidate in _solved(inputs, slam, clock, undo):
             found.add(candidate)
-        if not (again and found.kept.denied and slam.draw + 1 < most):
+        if not (again and found.kept.contradicted and slam.draw + 1 < most):
             break
         logger.warning("overlapping submaps still contradict each other: making submaps again with another seed")
         slam = slam.next_draw()
@@ -54,7 +54,7 @@ def _solved(
     run = run_of_solution(inputs, slam, slam.finish(undo), clock)
     first = _MapCandidate(run, slam.draw, slam.back.config.looks)
     yield first
-    if slam.options.settings.backend.loops == "auto" and first.denied:
+    if slam.options.settings.backend.loops == "auto" and first.contradicted:
         logger.warning("overlapping submaps contradict each other: searching loop closures between submaps")
         other = slam.searching_loops()
         yield _MapCandidate(run_of_solution(inputs, other, other.finish(undo), clock), slam.draw, True)
@@ -82,7 +82,7 @@ class _MapCandidate:
         return None if self.run.fused is None else self.run.fused.passes
 
     @property
-    def denied(self) -> bool:
+    def contradicted(self) -> bool:
         """Do traversals in its map contradict each other?"""
         return self.passes is not None and self.passes.is_contradictory
 

@@ -93,23 +93,23 @@ def control_findings(report: Mapping[str, Any]) -> list[Finding]:
 
 def _tested(facts: Mapping[str, Any]) -> Finding:
     """``check points: NIS …``."""
-    word, n, dof, ratio = facts["word"], len(facts["rows"]), facts["dof"], facts["nis_per_dof"]
+    verdict, n, dof, ratio = facts["verdict"], len(facts["rows"]), facts["dof"], facts["nis_per_dof"]
     head = f"check points ({facts['source']}): RMSE {facts['rmse']:.3g} m at {n} rows"
     if ratio is None:
         text = f"{head}; not tested — the rows determine no more than where their frame is. Measure more check points."
         return Finding("", "check-points", text)
     text = (
         f"{head}; NIS {ratio:.3g} per degree of freedom [{facts['low']:.3g}, {facts['high']:.3g}; {dof:g} dof] — "
-        f"{word}: {MEANINGS[word]}. Power {facts['power']:.2f} [≥ {LEAST_POWER:g}] against covariances that are too "
-        "small by two"
+        f"{verdict}: {MEANINGS[verdict]}. Power {facts['power']:.2f} [≥ {LEAST_POWER:g}] against covariances "
+        "that are too small by two"
     )
     text += f"; {facts['aligned']} dof moved the frame of the rows onto the map." if facts["aligned"] else "."
-    if word in ("conservative", "overconfident") and facts["power"] < LEAST_POWER:
+    if verdict in ("conservative", "overconfident") and facts["power"] < LEAST_POWER:
         text += " Most of the expected error is that of the rows: check their sigma first."
-    level: Level = {"consistent": "good", "not tested": "", "wrong": "bad"}.get(word, "look")  # type: ignore[assignment]
-    if word == "overconfident" and ratio > two_sided_bounds(1.0, dof, CERTAIN)[1]:
+    level: Level = {"consistent": "good", "not tested": "", "wrong": "bad"}.get(verdict, "look")  # type: ignore[assignment]
+    if verdict == "overconfident" and ratio > two_sided_bounds(1.0, dof, CERTAIN)[1]:
         level = "bad"
-    if level in ("look", "bad") and word != "conservative":
+    if level in ("look", "bad") and verdict != "conservative":
         worst = max(facts["rows"], key=lambda r: r["nis"] / max(r["dof"], 1))
         text += f" Check line {worst['line']} first: error {worst['error']:.3g} m, expected {worst['sigma']:.2g} m."
-    return Finding(level, "check-points-wrong" if word == "wrong" else "check-points", text)
+    return Finding(level, "check-points-wrong" if verdict == "wrong" else "check-points", text)

@@ -34,7 +34,7 @@ from graphslam.graph.factor_graph import FactorGraph
 
 OF_THE_MAP = ("submap", "biases", "dense-submap", "match", "loop")
 """Factor classes whose χ² covers motion and observations."""
-MOST_FORETOLD = {2: 1000, 3: 300}
+MOST_PREDICTED = {2: 1000, 3: 300}
 """Largest number of withheld fixes that are predicted, spread evenly over the run, by dimension of the graph."""
 
 
@@ -185,7 +185,7 @@ def _innovations(graph: FactorGraph, gps: Gps | None, settings: RunConfig) -> Gp
         return None
     c = settings.gps
     withheld = split_fixes(gps, c)[1]
-    most, n = MOST_FORETOLD[graph.dim], len(withheld.times)
+    most, n = MOST_PREDICTED[graph.dim], len(withheld.times)
     if n > most:  # their joint covariance grows with the square of their number
         withheld = withheld.take(np.unique(np.linspace(0, n - 1, most).astype(int)))
     try:

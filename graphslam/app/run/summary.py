@@ -1,6 +1,6 @@
 """The first line of a verdict: one of five results, main values, and the most important next step.
 
-The results are *consistent*, *conservative*, *not tested*, *overconfident* and *wrong* (:func:`verdict_word`).
+The results are *consistent*, *conservative*, *not tested*, *overconfident* and *wrong* (:func:`run_verdict`).
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ ADVICE: dict[str, str] = {
     "metre": "measure one distance in the field to fix the scale",
     "place-unknown": "add a GPS fix or a known landmark",
     "imu-left-aside": "check axes, units and stamps of the IMU",
-    "scans-unheld": "check the stretches where the scans are unconstrained",
+    "scans-unobservable": "check the stretches where the scans are unconstrained",
     "stream-part-used": "check why records of a stream were not used",
     "flagged": "check the submaps that the front end flags",
     "refine-scale": "check the scale of the odometry, and the field of view of the scanner",
@@ -175,13 +175,13 @@ def summarise_run(figures: RunMetrics, findings: Sequence[Finding]) -> Finding:
 def _with_check_points(figures: RunMetrics) -> CovarianceAssessment | None:
     """The assessment; check points replace it if it is "not tested", or if they show larger errors."""
     found, checked = covariance_assessment(figures), figures.part("check_points")
-    word = checked.get("word", "wrong")  # a wrong map has its own finding
-    if found is None or word == "wrong" or (found.word != "not tested" and word != "overconfident"):
+    verdict = checked.get("verdict", "wrong")  # a wrong map has its own finding
+    if found is None or verdict == "wrong" or (found.verdict != "not tested" and verdict != "overconfident"):
         return found
-    return replace(found, word=word, power=float(checked.get("power", 0.0)))
+    return replace(found, verdict=verdict, power=float(checked.get("power", 0.0)))
 
 
-def verdict_word(
+def run_verdict(
     findings: Iterable[Finding], tests: Sequence[ChiSquareTest], assessment: CovarianceAssessment | None
 ) -> tuple[str, float]:
     """One of the five results, and the power of the tests behind it (see :data:`START`).
@@ -198,15 +198,15 @@ def verdict_word(
         return "wrong", 0.0
     nees = [j for j in tests if j.code == "nees"]
     used = nees or (list(tests) if assessment is None else [])
-    words = {j.word for j in used} | ({assessment.word} if assessment else set())
+    words = {j.verdict for j in used} | ({assessment.verdict} if assessment else set())
     if bad or "overconfident" in words:
         return "overconfident", 0.0
     power = max((j.power for j in used), default=0.0)
-    if "conservative" in {j.word for j in nees}:  # not from χ² alone: correlated errors give small residuals, too
+    if "conservative" in {j.verdict for j in nees}:  # not from χ² alone: correlated errors give small residuals, too
         return "conservative", power
-    if power >= LEAST_POWER and {j.word for j in used} == {"consistent"}:
+    if power >= LEAST_POWER and {j.verdict for j in used} == {"consistent"}:
         return "consistent", power
-    return (assessment.word, assessment.power) if assessment else ("not tested", power)
+    return (assessment.verdict, assessment.power) if assessment else ("not tested", power)
 
 
 def headline(
@@ -233,16 +233,18 @@ def headline(
     found = list(findings)
     worst: Level = worst_level(found) or "good"
     points = sum(f.level == worst for f in found) if worst in MARKED else 0
-    word, power = verdict_word(found, tests, assessment)
-    start = START[word]
-    if word == "consistent":
+    verdict, power = run_verdict(found, tests, assessment)
+    start = START[verdict]
+    if verdict == "consistent":
         start += f" (power {min(power, 0.99):.0%} against covariances half as large as they should be)"
     if points:
         start += f"; {points} {'point' if points == 1 else 'points'} marked “{worst}”"
     said = "; ".join([x for x in facts if x] + [consistency_line(j, found) for j in tests])
-    over = {j.code for j in tests if j.word == "overconfident"} | ({"trust"} if word == "overconfident" else set())
-    do = _advice(found, over, known, word)
-    level: Level = "" if worst == "good" and word == "not tested" else worst
+    over = {j.code for j in tests if j.verdict == "overconfident"} | (
+        {"trust"} if verdict == "overconfident" else set()
+    )
+    do = _advice(found, over, known, verdict)
+    level: Level = "" if worst == "good" and verdict == "not tested" else worst
     return Finding(level, "headline", f"{start}{' — ' + said if said else ''}. To do: {do}.")
 
 
@@ -251,17 +253,17 @@ def consistency_line(j: ChiSquareTest, findings: Sequence[Finding]) -> str:
     ratio = f"{j.name} {j.ratio:.3g}"
     if j.code == "chi2" and any(f.code == "consistency-test" for f in findings):
         return f"some measurements contradict the others (all: {ratio})"
-    return f"{WORDS[j.code, j.word]} ({ratio})"
+    return f"{WORDS[j.code, j.verdict]} ({ratio})"
 
 
-def _advice(findings: Sequence[Finding], over: set[str], known: bool, word: str) -> str:
+def _advice(findings: Sequence[Finding], over: set[str], known: bool, verdict: str) -> str:
     """The most important next step."""
     level = worst_level(findings)
     if level not in MARKED:
-        return NOTHING if known and word != "not tested" else NOTHING_KNOWN
+        return NOTHING if known and verdict != "not tested" else NOTHING_KNOWN
     _, first = min(((_rank(f.code, over), f) for f in findings if f.level == level), key=lambda r: r[0])
     if first.code in JUDGED - over:
-        return SMALL_RESIDUALS if first.code == "chi2" and word != "conservative" else CONSERVATIVE
+        return SMALL_RESIDUALS if first.code == "chi2" and verdict != "conservative" else CONSERVATIVE
     own = first.text.partition("To do: ")[2].rstrip(".")
     if own and len(own) <= SHORT:
         return own

@@ -52,7 +52,7 @@ class ChiSquareTest:
         return low, high * (TOLERANCE if self.code == "chi2" else 1.0)
 
     @property
-    def word(self) -> str:
+    def verdict(self) -> str:
         """``consistent``, ``overconfident`` or ``conservative``."""
         low, high = self.bounds()
         return "overconfident" if self.ratio > high else "conservative" if self.ratio < low else "consistent"
@@ -65,7 +65,7 @@ class ChiSquareTest:
     @property
     def level(self) -> Level:
         """``good`` within the bounds; ``bad`` above those at confidence :data:`CERTAIN`; otherwise ``look``."""
-        if self.word == "consistent":
+        if self.verdict == "consistent":
             return "good"
         return "bad" if self.ratio > self.bounds(CERTAIN)[1] else "look"
 
@@ -73,7 +73,7 @@ class ChiSquareTest:
     def text(self) -> str:
         """``1.02 per degree of freedom [0.94, 1.06; 4321 dof] — residuals match the noise model``."""
         low, high = self.bounds()
-        meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[self.word]
+        meaning = (IN_WORDS if self.code == "nees" else RESIDUALS_IN_WORDS)[self.verdict]
         return f"{self.ratio:.3g} per degree of freedom [{low:.3g}, {high:.3g}; {self.dof:.4g} dof] — {meaning}"
 
 
@@ -87,7 +87,7 @@ def chi_square_test(figures: RunMetrics) -> ChiSquareTest | None:
 
 def of_the_start(figures: RunMetrics, chi2: ChiSquareTest) -> bool:
     """Is the run refined, and is the χ² of its initial graph conservative? Then it is not a fault of the result."""
-    return bool(figures.part("refine")) and chi2.word == "conservative"
+    return bool(figures.part("refine")) and chi2.verdict == "conservative"
 
 
 def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
@@ -104,4 +104,4 @@ def nees_tests(figures: RunMetrics) -> list[ChiSquareTest]:
         for key, about, n in [(*g, 1) for g in gauges] + [(f"nees_{k}", f"{k} of all nodes", len(axes)) for k in axes]
         if is_finite_number(m.get(f"{key}_per_dof")) and m.get(f"{key}_dof", 0.0) > 0
     ]
-    return [j for j in known if j.tests == 1 or j.word == "overconfident"]
+    return [j for j in known if j.tests == 1 or j.verdict == "overconfident"]

@@ -60,10 +60,10 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
     rest = "Tested with residuals and withheld data, without ground truth"
     if figures.report.get("identities") == "run" and figures.metrics.get("landmarks", 0.0) > 0:
         rest += "; correct data association is assumed"
-    if found.word == "overconfident":
+    if found.verdict == "overconfident":
         text = f"covariances: overconfident — above the bounds: {said}. {rest}."
         return [Finding("bad" if found.chance < 1.0 - CERTAIN else "look", "trust", text)]
-    if found.word == "not tested":
+    if found.verdict == "not tested":
         held = f" Available tests: {said}." if said else ""
         causes = []
         if found.missing:
@@ -80,7 +80,7 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
         if found.missing:
             text += " Add loop closures, GPS or control points."
         return [Finding("", "trust", text)]
-    if found.word == "conservative":
+    if found.verdict == "conservative":
         text = f"covariances: conservative — below the bounds: {said}; residuals are not time-correlated. {rest}."
         return [Finding("look", "trust", text)]
     power = f"power {min(found.power, 0.99):.0%} against covariances half as large as they should be"

@@ -11,7 +11,7 @@ from graphslam.maps.contradictions import LOOK
 
 TWO_MAPS_DO = "check which of the two is right there, or add GPS there and run again"
 """Advice if two maps explain a log."""
-DENIED = 0.1
+CONTRADICTED = 0.1
 """A map is bad if overlapping submaps contradict more than this fraction of its occupied voxels."""
 
 
@@ -39,7 +39,7 @@ def _passes(found: Mapping[str, Any]) -> list[Finding]:
         f" — {share:.1%} are free space in other submaps{most}: a loop closure is wrong or missing, or objects moved. "
         "Look for double walls in the map; try another seed (--seed 1) or --set calibrate.use=none."
     )
-    return [Finding("bad" if share > DENIED else "look", "passes", text)]
+    return [Finding("bad" if share > CONTRADICTED else "look", "passes", text)]
 
 
 def _attempts(rows: Any) -> list[Finding]:

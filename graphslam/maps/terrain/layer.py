@@ -220,7 +220,7 @@ def _add(made: Pyramid, piece: TerrainPiece, T: Array, sign: int) -> None:
         made.ratios[:, cell] += sign * piece.ratios[:, source]
         made.counts[:, cell] += sign * piece.counts[:, source]
         made.heights[:, cell] += sign * piece.heights[:, source]
-        hung = piece.counts[OVERHANG, source] > 0
-        made.votes[0, cell] += sign * hung
-        made.votes[1, cell] += sign * (~hung & (piece.counts[SUPPORT, source] > 0))
+        overhanging = piece.counts[OVERHANG, source] > 0
+        made.votes[0, cell] += sign * overhanging
+        made.votes[1, cell] += sign * (~overhanging & (piece.counts[SUPPORT, source] > 0))
         made.heights[1, cell] += sign * height * piece.heights[0, source]

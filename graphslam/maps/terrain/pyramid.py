@@ -247,13 +247,13 @@ class Pyramid:
                 free[channel][fresh] = factors[channel][fresh]
                 known[channel] |= fresh
                 (band if channel == STEP else support_band)[fresh] = b
-            hanging = (counts[OVERHANG] > 0) & stays
+            overhanging = (counts[OVERHANG] > 0) & stays
             if b:  # a finer band with an overhang within the cell locates it better
                 k = round(float(self.cells[b] / self.cells[0]))
                 within = known[2].reshape(ny // k, k, nx // k, k).any(axis=(1, 3))
-                hanging &= ~within.repeat(k, axis=0).repeat(k, axis=1)
-            free[2] = np.where(hanging, factors[2], free[2])
-            known[2] |= hanging
+                overhanging &= ~within.repeat(k, axis=0).repeat(k, axis=1)
+            free[2] = np.where(overhanging, factors[2], free[2])
+            known[2] |= overhanging
             above |= counts[ABOVE] > 0
             number, height, bend = self._fine(self.heights, b)
             fresh = (number > 0) & ~np.isfinite(ground)

@@ -218,10 +218,10 @@ def best_of_starts(
             reports.append(StartReport(name, initial, twin.objective, 0, f"same as {twin.name}"))
             continue
         known = np.inf if best is None else best.objective
-        end = descend_to_minimum(problem, start, best_known=known, foretell=True)
+        end = descend_to_minimum(problem, start, best_known=known, predict=True)
         if end.status in ("stalled", "out of iterations") and not problem.thorough:
             problem.thorough = True
-            end = descend_to_minimum(problem, end.values, best_known=known, foretell=True)
+            end = descend_to_minimum(problem, end.values, best_known=known, predict=True)
         reports.append(StartReport(name, initial, end.objective, end.iterations, end.status))
         log.info("%s: %s %.8g -> %.8g (%s)", network.source, name, initial, end.objective, end.status)
         if best is None or _better(end, best):

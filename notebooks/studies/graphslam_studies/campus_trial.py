@@ -184,10 +184,10 @@ class Judge:
         if angles:
             yield Measurement(kind, "angle_error", float(np.rad2deg(np.mean(np.abs(angles)))))
             yield Measurement(kind, "angle_error_max", float(np.rad2deg(np.max(np.abs(angles)))))
-        yield from self.honesty(kind, path, true, inside)
+        yield from self.consistency(kind, path, true, inside)
         yield Measurement(kind, "failed", 0.0)
 
-    def honesty(self, kind: str, path: Trajectory, true: Array, inside: np.ndarray) -> Iterator[Measurement]:
+    def consistency(self, kind: str, path: Trajectory, true: Array, inside: np.ndarray) -> Iterator[Measurement]:
         """NEES per degree of freedom, first base fixed: mid-path, indoors, at the end, and mean over the path."""
         assert path.covariances is not None
         e = SE3.log(SE3.between(path.poses, true))

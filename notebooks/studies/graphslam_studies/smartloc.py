@@ -46,7 +46,7 @@ from graphslam_studies.montecarlo.trials import Measurement
 from graphslam_studies.montecarlo.worlds_study import WorldsStudy, draw_runs
 from graphslam_studies.sim.satellites import SatelliteConfig, simulate_satellites
 
-HONEST = (0.7, 1.4)
+CONSISTENT = (0.7, 1.4)
 """NEES/n that counts as consistent."""
 LEVEL = 0.02
 """σ of roll and pitch of a car on a road [rad]."""
@@ -99,9 +99,9 @@ class Score:
     mean: tuple[float, float]
 
     @property
-    def honest(self) -> bool:
-        """NEES/n inside :data:`HONEST`."""
-        return HONEST[0] <= self.nees <= HONEST[1]
+    def consistent(self) -> bool:
+        """NEES/n inside :data:`CONSISTENT`."""
+        return CONSISTENT[0] <= self.nees <= CONSISTENT[1]
 
 
 def settings_of(grid: Mapping[str, tuple[float, ...]]) -> list[dict[str, float]]:
@@ -175,9 +175,9 @@ def chosen(
             continue
     if not found:
         raise GraphSlamError(f"no settings of {dict(grid)} have a solution")
-    honest = [f for f in found if f[1].honest]
-    if honest:
-        return min(honest, key=lambda f: f[1].rmse)
+    consistent = [f for f in found if f[1].consistent]
+    if consistent:
+        return min(consistent, key=lambda f: f[1].rmse)
     return min(found, key=lambda f: abs(np.log(f[1].nees)))
 
 

@@ -13,7 +13,7 @@ Quantities
 ----------
 ``node``: mean NEES/n of the single nodes; ``node_dof``: effective degrees of freedom of this mean (node errors are
 correlated: ``n² / ‖C‖²``); ``joint``, ``joint_dof``: NEES/n of all nodes jointly; ``rms``: position error [m];
-``word``: index into :data:`WORDS`, the only metric if the log is refused; ``clean``. Runs with a 3-D graph or
+``verdict``: index into :data:`WORDS`, the only metric if the log is refused; ``clean``. Runs with a 3-D graph or
 without a graph are scored by the NEES of the run (``nees_per_dof``), as both ``joint`` and ``node``.
 """
 
@@ -29,7 +29,7 @@ from scipy import stats
 
 from graphslam.app.run.pipeline import run
 from graphslam.app.run.run import Run
-from graphslam.app.run.summary import verdict_word
+from graphslam.app.run.summary import run_verdict
 from graphslam.app.verdict.covariances import covariance_assessment
 from graphslam.app.verdict.figures import RunMetrics
 from graphslam.app.worlds import mesh_world, simulate
@@ -136,10 +136,10 @@ def _scored_in_plane(found: Run, log: SensorLog) -> dict[str, float]:
         J, poses, true = J[1:], poses[1:], true[1:]
     error = se2_log(se2_between(poses, true))
     A = J.reshape(-1, len(at))
-    return honesty(error, A @ P @ A.T)
+    return consistency(error, A @ P @ A.T)
 
 
-def honesty(error: Array, covariance: Array) -> dict[str, float]:
+def consistency(error: Array, covariance: Array) -> dict[str, float]:
     """NEES and RMS of errors ``(k, 3)`` with their joint covariance ``(3k, 3k)``."""
     k = len(error)
     white, L = [], np.zeros_like(covariance)
@@ -158,11 +158,11 @@ def honesty(error: Array, covariance: Array) -> dict[str, float]:
     }
 
 
-def word_without_truth(found: Run) -> int:
+def verdict_without_truth(found: Run) -> int:
     """Verdict without ground truth, as an index into :data:`WORDS`."""
     figures = RunMetrics.of_table(found.report, found.metrics, found.events)
     lines = [f for f in found.verdict if f.code not in ("headline", "nees")]
-    return WORDS.index(verdict_word(lines, [], covariance_assessment(figures))[0])
+    return WORDS.index(run_verdict(lines, [], covariance_assessment(figures))[0])
 
 
 def run_trial(w: World, seed: int) -> Iterator[Measurement]:
@@ -172,11 +172,11 @@ def run_trial(w: World, seed: int) -> Iterator[Measurement]:
     try:
         found = run(log, seed=seed, progress=False)
     except GraphSlamError:
-        yield Measurement("run", "word", float(WORDS.index("refused")))
+        yield Measurement("run", "verdict", float(WORDS.index("refused")))
         return
     for quantity, value in scored(found, log).items():
         yield Measurement("run", quantity, value)
-    yield Measurement("run", "word", float(word_without_truth(found)))
+    yield Measurement("run", "verdict", float(verdict_without_truth(found)))
 
 
 class TrustStudy(WorldsStudy[World]):
@@ -206,8 +206,8 @@ def world_table(table: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
     out = []
     for world in table["world"].unique():
         own = table[table["world"] == world]
-        figures = {q: whole(own, q)["value"].to_numpy() for q in ("node", "node_dof", "joint", "joint_dof", "word")}
-        if not len(figures["word"]):
+        figures = {q: whole(own, q)["value"].to_numpy() for q in ("node", "node_dof", "joint", "joint_dof", "verdict")}
+        if not len(figures["verdict"]):
             continue
         row: dict[str, object] = {"world": world, "what is wrong": known[world].wrong, "gps": known[world].gps}
         bad, large, small = False, False, True
@@ -223,7 +223,7 @@ def world_table(table: pd.DataFrame, known: dict[str, World]) -> pd.DataFrame:
         if np.isnan(mean):
             row["true"] = "refused"
         row["bad map"], row["clean"] = bad, known[world].clean
-        out.append(row | {word: int(np.sum(figures["word"] == k)) for k, word in enumerate(WORDS)})
+        out.append(row | {verdict: int(np.sum(figures["verdict"] == k)) for k, verdict in enumerate(WORDS)})
     return pd.DataFrame(out)
 
 
@@ -234,7 +234,7 @@ def confusion_table(worlds: pd.DataFrame, known: dict[str, World]) -> pd.DataFra
         "clean" if known[w].clean else "fault" if isinstance(known[w], FaultWorld) else "error" for w in worlds["world"]
     ]
     for (name, true), own in worlds.groupby([pd.Series(kind, worlds.index), "true"]):
-        rows.append({"worlds": name, "true": true, **{word: int(own[word].sum()) for word in WORDS}})
+        rows.append({"worlds": name, "true": true, **{verdict: int(own[verdict].sum()) for verdict in WORDS}})
     return pd.DataFrame(rows)
 
 
@@ -246,7 +246,7 @@ def summary_table(worlds: pd.DataFrame) -> pd.DataFrame:
         ("clean", worlds[worlds["clean"]]),
         ("other", worlds[~worlds["clean"] & ~worlds["bad map"]]),
     ):
-        counts = {word: int(rows[word].sum()) for word in WORDS}
+        counts = {verdict: int(rows[verdict].sum()) for verdict in WORDS}
         runs = sum(counts.values())
         bad = counts["consistent"] + counts["conservative"]
         if name != "NEES/n > 1.5":

@@ -234,11 +234,11 @@ class WithheldStudy(WorldsStudy[WithheldConfig]):
         return 1
 
     def report(self, table: pd.DataFrame, timings: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        """``errors`` and ``honesty`` (consistency), one row per world."""
+        """``errors`` and ``consistency`` (consistency), one row per world."""
         wide = table.pivot_table(index=["world", "algorithm"], columns="quantity", values="value", sort=False)
         errors = ["used", "withheld", "rmse", "median", "worst", "rmse_plane", "straight"]
-        honesty = ["nees", "nees_plane", "inside", "sigma", "chi2_gps", "chi2_imu"]
-        return {"errors": wide[errors].reset_index(), "honesty": wide[honesty].reset_index()}
+        consistency = ["nees", "nees_plane", "inside", "sigma", "chi2_gps", "chi2_imu"]
+        return {"errors": wide[errors].reset_index(), "consistency": wide[consistency].reset_index()}
 
     def figures(self, table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
         """Error and NEES of all runs."""

@@ -68,7 +68,7 @@ def test_the_report_the_metrics_and_the_verdict(run):
     said = {f.code: f.text for f in run.verdict}
     assert "line 8: no landmark has this id; got l9999" in said["control-points-refused"]
     assert "14 of 15 rows used — refused: line 16: sigma is not above 0; got -1" in said["check-points-refused"]
-    assert f"— {check['word']}:" in said["check-points"]
+    assert f"— {check['verdict']}:" in said["check-points"]
     assert "RMSE at the check points" in run.headline.text or "ground truth" in run.headline.text
     assert set(run.ledger["stream"]) >= {f"control rows/{k}" for k in range(2, 8)}
     T = np.array(control["T_control_map"])

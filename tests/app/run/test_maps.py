@@ -127,8 +127,8 @@ def test_the_folder_gives_the_same_map_again(finished: Run, tmp_path: Path) -> N
     assert all(Path(p).is_file() for p in (*value["files"], *value["figures"]))
     rows = value["candidates"]
     assert [r["verdict"] for r in rows] == ["chosen"] + ["runner-up"] * (len(rows) - 1)
-    honest = [r["entropy"] for r in rows if not r["contradicted"]]
-    assert honest == sorted(honest)
+    consistent = [r["entropy"] for r in rows if not r["contradicted"]]
+    assert consistent == sorted(consistent)
     assert [r["contradicted"] for r in rows] == sorted(r["contradicted"] for r in rows)
     kept = json.loads((folder / "clearest.json").read_text())
     assert kept["why"] == value["chosen_because"] == rows[0]["why"]

@@ -92,7 +92,7 @@ def test_landmarks_that_return_are_the_same(run, log):
 def test_layers_of_both_kinds(run):
     assert run.fused is not None
     assert run.fused.fused.known_volume() > 200.0
-    assert run.metric("map_denied") == 0.0
+    assert run.metric("map_contradicted") == 0.0
     assert len(run.map.landmark_covariances) == 30
     share = next(f for f in run.verdict if f.code == "front-ends")
     assert "rbpf-ekf (controls, landmarks) 0.0 to" in share.text

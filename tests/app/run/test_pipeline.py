@@ -71,7 +71,7 @@ def test_run_folder_is_complete(result, tmp_path):
     assert again.report["seconds"]["total"] == again.metric("seconds_total") > 0
 
 
-def test_map_is_accurate_and_honest_on_this_world(result):
+def test_map_is_accurate_and_consistent_on_this_world(result):
     low, high = chi2_mean_bounds(result.metric("nees_dof"), 1, 0.999)
     assert low < result.metric("nees") < high
     assert result.metric("converged") == 1

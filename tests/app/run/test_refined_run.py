@@ -232,9 +232,9 @@ def test_residuals_of_the_start_do_not_judge_the_refined_path(finished: Run) -> 
     assert not finished.report["evidence"]
 
 
-@pytest.mark.parametrize(("denied", "kept"), [(1, "loops"), (90, "matches")])
+@pytest.mark.parametrize(("contradicted", "kept"), [(1, "loops"), (90, "matches")])
 def test_passes_that_deny_each_other_are_given_loops(
-    copy: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch, denied: int, kept: str
+    copy: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch, contradicted: int, kept: str
 ) -> None:
     def told(share: int) -> Contradictions:
         return Contradictions(np.array([[0, 2]]), np.array([1000 - 10 * share]), np.array([10 * share]))
@@ -242,7 +242,7 @@ def test_passes_that_deny_each_other_are_given_loops(
     options = copy / "config.toml"
     options.write_text(options.read_text().replace("loops = true", 'loops = "auto"'))
     # each graph has a map before its refinement and one after it
-    said = iter([told(40), told(40), told(denied), told(denied)])
+    said = iter([told(40), told(40), told(contradicted), told(contradicted)])
     monkeypatch.setattr(run_map, "find_contradictions", lambda *_: next(said))
     looked: list[bool] = []
     finish = BackEnd.finish
@@ -257,8 +257,8 @@ def test_passes_that_deny_each_other_are_given_loops(
     assert next(said, None) is None
     attempts = r.report["map_attempts"]
     assert [a["kept"] for a in attempts] == [kept == "matches", kept == "loops"]
-    assert [(a["draw"], a["loops"], a["share"]) for a in attempts] == [(0, False, 0.4), (0, True, denied / 100)]
-    assert r.metric("map_denied") == (denied / 100 if kept == "loops" else 0.4)
+    assert [(a["draw"], a["loops"], a["share"]) for a in attempts] == [(0, False, 0.4), (0, True, contradicted / 100)]
+    assert r.metric("map_contradicted") == (contradicted / 100 if kept == "loops" else 0.4)
     line = next(f for f in r.verdict if f.code == "passes-attempts")
     assert line.level == ("" if kept == "loops" else "look")
     assert read_run_folder(copy).verdict == r.verdict

@@ -178,8 +178,8 @@ def test_the_first_line_says_what_was_made_and_what_to_do() -> None:
     own = Finding("bad", "calibration", "Ranges are long. To do: check the unit of the ranges.")
     (cause,) = (summarise_run(figs, [*findings_from_metrics(figs), own]).text,)
     assert cause.endswith("To do: check the unit of the ranges.")
-    honest = figures(True, 1.0, 1.0, None)
-    assert summarise_run(honest, findings_from_metrics(honest)).text.endswith(f"To do: {NOTHING}.")
+    consistent = figures(True, 1.0, 1.0, None)
+    assert summarise_run(consistent, findings_from_metrics(consistent)).text.endswith(f"To do: {NOTHING}.")
     unknown = figures(True, 1.0, None, None)
     assert "true error unknown" in summarise_run(unknown, findings_from_metrics(unknown)).text
     assert summarise_run(unknown, findings_from_metrics(unknown)).text.endswith(f"To do: {NOTHING_KNOWN}.")
@@ -199,16 +199,16 @@ def test_loops_that_disagree_are_read_by_the_verdict() -> None:
 
 def test_what_is_said_of_many_submaps_is_said_twice_and_counted() -> None:
     def submap(key: int) -> SimpleNamespace:
-        rows = [Finding("look", "scans-unheld", f"Submap {key}: nothing holds it.").as_row()]
+        rows = [Finding("look", "scans-unobservable", f"Submap {key}: nothing holds it.").as_row()]
         rows += [Finding("", "note", text).as_row() for text in ("one", "two", "three")] if key == 0 else []
         return SimpleNamespace(key=key, report={"findings": rows})
 
     found = findings_from_run([], submaps=[submap(k) for k in range(20)])  # type: ignore[misc]
     assert [f.text for f in found if f.code == "note"] == ["one", "two", "three"]
-    unheld = [f.text for f in found if f.code == "scans-unheld"]
-    assert len(unheld) == 3
-    assert unheld[0] == "Submap 0: nothing holds it."
-    assert "18 more submaps (2, 3, 4" in unheld[2]
+    unobservable = [f.text for f in found if f.code == "scans-unobservable"]
+    assert len(unobservable) == 3
+    assert unobservable[0] == "Submap 0: nothing holds it."
+    assert "18 more submaps (2, 3, 4" in unobservable[2]
     assert not [f for f in findings_from_run([], submaps=[submap(0), submap(1)]) if "more submaps" in f.text]
 
 
@@ -227,7 +227,7 @@ def test_what_is_no_finding_of_ours_is_left_out() -> None:
     assert findings_of_json({"lines": 3}) == findings_of_json(None) == []
 
 
-def test_the_note_on_the_join_is_one_that_honest_runs_do_not_get(run: Run) -> None:
+def test_the_note_on_the_join_is_one_that_consistent_runs_do_not_get(run: Run) -> None:
     """Two-sided bounds at the join's own degrees of freedom; and a cause that a check names comes first."""
 
     def noted(chi2: float, dof: float, verdict: list[Finding]) -> list[str]:

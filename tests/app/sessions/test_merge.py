@@ -51,7 +51,7 @@ def test_one_map_of_all_landmarks(runs, merged, log):
     assert merged.metric("submaps") == sum(len(r.submaps) for r in runs)
 
 
-def test_the_second_base_is_found_with_an_honest_covariance(runs, merged, log):
+def test_the_second_base_is_found_with_an_consistent_covariance(runs, merged, log):
     bases = log.truth.trajectory.interpolate([r.submaps[0].interval[0] for r in runs])
     true = se2_between(bases[0], bases[1])
     m = merged.sessions[1].map

@@ -96,7 +96,7 @@ def test_the_map_is_of_the_place(run: tuple[Steps, RbpfResult]) -> None:
     assert len(cloud) > 1000
 
 
-def test_submap_is_the_best_particles_with_an_honest_exit(run: tuple[Steps, RbpfResult]) -> None:
+def test_submap_is_the_best_particles_with_an_consistent_exit(run: tuple[Steps, RbpfResult]) -> None:
     steps, result = run
     submap = rbpf_submap(result, drift)
     assert submap.interval == (steps.times[0], steps.times[-1])

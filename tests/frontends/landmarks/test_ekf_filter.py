@@ -158,7 +158,7 @@ def test_covariance_stays_positive_definite_over_a_loop_closure(always_compresse
         assert low > 1e-8 * high
 
 
-def test_filter_is_honest_while_its_heading_is_known(always_compressed):
+def test_filter_is_consistent_while_its_heading_is_known(always_compressed):
     """A quarter of the circle, where linearisation costs nothing yet: mean NEES inside two-sided bounds."""
     nees = []
     for seed in range(60):

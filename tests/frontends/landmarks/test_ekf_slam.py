@@ -1,4 +1,4 @@
-"""EKF front ends: honest local maps, one map over a whole log, snapshots of it, resuming, and what they refuse."""
+"""EKF front ends: consistent local maps, one map over a whole log, snapshots of it, resuming, and what they refuse."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def mean_nees(preset, handover, seeds):
     return joint / dof, pose / maps / 3, maps
 
 
-def test_local_maps_with_a_good_sensor_are_honest():
+def test_local_maps_with_a_good_sensor_are_consistent():
     """0.1 m / 1°: the EKF is as good as the smoother. Standard errors over 252 maps: joint 0.015, pose 0.051."""
     joint, pose, maps = mean_nees("C", "filter", (20, 21))
     assert maps == 252

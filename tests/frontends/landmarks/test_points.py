@@ -1,4 +1,4 @@
-"""The front end of identified points in space: honest local maps, wrong detections left out, and what is refused."""
+"""The front end of identified points in space: consistent local maps, wrong detections left out, and what is refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def submaps_of(log: SensorLog, **rest) -> list[gs.Submap]:
 
 
 @pytest.mark.parametrize(("turn", "shift"), [(0.3, 0.02), (2.5, 0.05)])
-def test_local_maps_are_honest(turn: float, shift: float) -> None:
+def test_local_maps_are_consistent(turn: float, shift: float) -> None:
     """Also where the rotation at their ends is uncertain by 6°; a covariance halved or doubled fails."""
     d2, dof, chi2, free = 0.0, 0, 0.0, 0
     for seed in range(6):

@@ -97,7 +97,7 @@ def test_straight_path_has_a_mirror_image_and_a_bend_has_none():
     assert fitted(bend(), measured(bend(), rng), np.full(12, SIGMA**2))[1][FIT_MARGIN] > 100
 
 
-def test_trilateration_is_honest():
+def test_trilateration_is_consistent():
     rng = np.random.default_rng(7)
     nees = []
     for _ in range(1000):
@@ -216,7 +216,7 @@ def judged():
     return submaps, results
 
 
-def test_range_only_maps_are_honest(judged):
+def test_range_only_maps_are_consistent(judged):
     """Joint, exit pose and landmarks: none overconfident, none too modest."""
     _, results = judged
     assert len(results) > 60

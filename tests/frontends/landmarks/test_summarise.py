@@ -169,21 +169,21 @@ def front(**changes):
     return RbpfEkf(replace(config, **changes))
 
 
-def test_smoothed_submaps_are_honest_and_moment_matched_ones_are_not_with_a_good_sensor():
+def test_smoothed_submaps_are_consistent_and_moment_matched_ones_are_not_with_a_good_sensor():
     """Two-sided on many maps; the paper's hand-over must fail the same test where the sensor is good."""
     log = simulate(
         "landmark-field", preset="A", seed=3, laps=0.5, sigma_range=0.1, sigma_bearing=float(np.deg2rad(1.0))
     )
-    honest = submaps_consistency(front().submaps(log, seed=SeedTree(1)), log.truth)
-    assert honest["joint"].count > 30
-    assert honest["joint"].verdict == "consistent", honest["joint"]
-    assert honest["exit"].verdict == "consistent", honest["exit"]
+    consistent = submaps_consistency(front().submaps(log, seed=SeedTree(1)), log.truth)
+    assert consistent["joint"].count > 30
+    assert consistent["joint"].verdict == "consistent", consistent["joint"]
+    assert consistent["exit"].verdict == "consistent", consistent["exit"]
     paper = submaps_consistency(front(handover="moments", particles=40).submaps(log, seed=SeedTree(1)), log.truth)
     assert paper["joint"].verdict == "overconfident"
-    assert paper["exit"].mean_normalised > 2 * honest["exit"].mean_normalised
+    assert paper["exit"].mean_normalised > 2 * consistent["exit"].mean_normalised
 
 
-def test_report_carries_the_honesty_figures(world):
+def test_report_carries_the_consistency_figures(world):
     for s in front().submaps(world, seed=SeedTree(0)):
         r = s.report
         assert r["moment_kl"] > 0

@@ -92,11 +92,11 @@ def test_nothing_holds_a_scan_along_an_endless_corridor():
         late = joints[-1][6:, 6:] if len(poses) % 10 != 1 else joints[-2][6:, 6:]
         along = np.sqrt(late[3, 3])
         if ends:
-            assert all(s.unheld == 0 for s in seen[3:])
+            assert all(s.unobservable == 0 for s in seen[3:])
             assert along < 0.02
             assert poses[-1, 0] == pytest.approx(0.1 * (len(poses) - 1), abs=0.1)
         else:
-            assert all(s.unheld == 1 for s in seen[5:])
+            assert all(s.unobservable == 1 for s in seen[5:])
             assert along > 0.3
             assert np.sqrt(late[4, 4]) < 0.02  # but across it
             assert np.abs(poses[:, 1]).max() < 0.05
@@ -107,7 +107,7 @@ def test_a_lidar_that_stands_when_the_log_begins_stays_where_it_is():
     log = simulate_lidar(mesh_world("garage", seed=5), 5, _lidar(5), most=1.7)
     poses, seen, _ = follow(log["clouds"])
     off = errors(poses, log.truth.trajectory.interpolate(log["clouds"].times))
-    assert any(s.unheld for s in seen[1:3])
+    assert any(s.unobservable for s in seen[1:3])
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.05
 
 
@@ -154,7 +154,7 @@ def test_a_log_may_begin_in_motion_on_open_ground(speed):
         met = (r > 0.5) & (r < 80.0)
         scans.append(d[met] * (r[met] + rng.normal(0, 0.02, met.sum()))[:, None])
     poses, seen, _ = follow(_Clouds(scans), ages=False)
-    assert all(s.unheld == 0 for s in seen[3:])
+    assert all(s.unobservable == 0 for s in seen[3:])
     assert np.abs(poses[:, :3] - np.outer(0.1 * speed * np.arange(15), [1, 0, 0])).max() < 0.03
 
 

@@ -1,4 +1,4 @@
-"""Odometry mended by neighbouring scans: better than it was, honest, and left alone where scans say nothing."""
+"""Odometry mended by neighbouring scans: better than it was, consistent, and left alone where scans say nothing."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def errors(steps: Steps) -> np.ndarray:
     return se2_log(se2_between(se2_between(true[:-1], true[1:]), steps.odometry.increments[1:]))
 
 
-def test_headings_are_mended_and_covariances_stay_honest() -> None:
+def test_headings_are_mended_and_covariances_stay_consistent() -> None:
     steps, drops = slipping(), DropCounter()
     mended = match_neighbours(steps, drops=drops)
     before, after = errors(steps), errors(mended)

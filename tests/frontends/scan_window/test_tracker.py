@@ -1,4 +1,4 @@
-"""Scan-to-window odometry: its derivatives, what it knows when, and how honest it is."""
+"""Scan-to-window odometry: its derivatives, what it knows when, and how consistent it is."""
 
 from __future__ import annotations
 

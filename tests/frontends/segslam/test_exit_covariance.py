@@ -1,4 +1,4 @@
-"""Means and scatters of poses, level frames, and honest covariances of exits: worked cases, laws, Monte Carlo."""
+"""Means and scatters of poses, level frames, and consistent covariances of exits: worked cases, laws, Monte Carlo."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_a_drift_model_that_gives_none_is_refused() -> None:
 
 
 @pytest.mark.parametrize("g", GROUPS, ids=["SE2", "SE3"])
-def test_particles_with_a_common_error_are_honest_with_drift_and_not_without(g: Group) -> None:
+def test_particles_with_a_common_error_are_consistent_with_drift_and_not_without(g: Group) -> None:
     """The truth differs from the particles' mean by what particles have (S) and by what they share (D)."""
     rng = np.random.default_rng(4)
     runs, n = 400, 40
@@ -145,14 +145,14 @@ def test_particles_with_a_common_error_are_honest_with_drift_and_not_without(g: 
         c = exit_covariance(bodies[:n], pose_mean(bodies[:n]), D, floor_position=1e-6, floor_angle=1e-6)
         rows.append((c.pose, c.total, c.matched, truth))
     T, P, M, X = (np.stack(r) for r in zip(*rows))
-    honest = exit_nees(T, P, X)
+    consistent = exit_nees(T, P, X)
     low, high = chi2_mean_bounds(g.dof, runs, 0.999)
-    assert low < honest.values.mean() < high
-    assert 0.92 < honest.inside() < 0.98
+    assert low < consistent.values.mean() < high
+    assert 0.92 < consistent.inside() < 0.98
     assert exit_nees(T, M, X).per_dof > 50  # the paper's moments alone
     some = exit_nees(T, P, X, components=(2, 0))
     assert some.dof == 2
-    np.testing.assert_allclose(some.errors, honest.errors[:, [2, 0]])
+    np.testing.assert_allclose(some.errors, consistent.errors[:, [2, 0]])
 
 
 def test_nees_of_a_worked_case() -> None:

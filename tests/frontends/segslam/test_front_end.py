@@ -1,4 +1,4 @@
-"""The front end ``segslam``: a log in, submaps with grids, matches and honest exits out."""
+"""The front end ``segslam``: a log in, submaps with grids, matches and consistent exits out."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def nees(rng: np.random.Generator, runs: int, level_sigma: float | None) -> np.n
     return np.mean(rows, axis=0)
 
 
-def test_roll_and_pitch_of_levelled_bases_are_honest_with_it_and_not_without(rng):
+def test_roll_and_pitch_of_levelled_bases_are_consistent_with_it_and_not_without(rng):
     runs = 60
     with_it, without = nees(rng, runs, SIGMA), nees(rng, runs, None)
     low, high = chi2_mean_bounds(2, runs, 0.999)

@@ -168,7 +168,7 @@ def test_every_solver_ends_at_the_same_optimum(rng, dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_heading_and_position_are_honest_with_a_compass_and_beacons(rng, dim):
+def test_heading_and_position_are_consistent_with_a_compass_and_beacons(rng, dim):
     """NEES of the last pose and of the beacons over 60 runs, two-sided; and each sensor makes the end surer."""
     G, own = group(dim), {"both": [], "none": []}
     sigma = {}

@@ -74,7 +74,7 @@ def test_all_solvers_end_at_one_optimum(rng):
 
 
 def test_what_is_claimed_of_the_datum_holds(rng):
-    """Fixes off by one constant error: as if new every time they claim centimetres; told that they last, they do not."""
+    """Fixes off by one constant error: as if new every time they claim centimetres; with correlation they do not."""
     chi2 = {"white": [], "correlated": []}
     for _ in range(12):
         chain = dense_chain(rng, 3, m=4)

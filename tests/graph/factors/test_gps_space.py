@@ -88,7 +88,7 @@ def _nodes_and_arms(g):
     return np.array([r.node for r in records]), np.array([r.arm for r in records])
 
 
-def test_position_is_honest_with_gps(rng):
+def test_position_is_consistent_with_gps(rng):
     """NEES of the bases and of the datum over runs, two-sided."""
     runs, d2 = 25, []
     for _ in range(runs):

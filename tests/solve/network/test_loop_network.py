@@ -68,7 +68,7 @@ def test_a_small_one_is_that_of_a_general_optimiser() -> None:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_relative_marginals_are_honest(dim: int) -> None:
+def test_relative_marginals_are_consistent(dim: int) -> None:
     """Monte Carlo: NEES of relative poses at the optimum, mean d, with loops in."""
     poses = square_poses(dim, nodes=60)
     g = group_of(poses)

@@ -186,7 +186,7 @@ def test_convergence_is_a_claim_about_the_objective_not_about_effort(rng: np.ran
     assert short.status != "converged" or short.decrement <= 1e-9 * short.objective
 
 
-def test_pcg_error_estimate_is_honest_on_a_long_chain(rng: np.random.Generator) -> None:
+def test_pcg_error_estimate_is_consistent_on_a_long_chain(rng: np.random.Generator) -> None:
     """On a chain a residual of 1e-6 says nothing; the energy-norm rule holds its promise."""
     n = 3000
     poses = np.zeros((n, 3))

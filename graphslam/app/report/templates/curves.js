@@ -31,7 +31,7 @@
       if (p.half) { take(-p.half[k]); take(p.half[k]); }
     }
     for (const b of p.bounds || []) take(b);
-    if (p.honest !== null) take(p.honest);
+    if (p.expected !== null) take(p.expected);
     if (p.log) {  // what is far below its bounds is as good as at the edge
       low = Math.max(low, p.bounds ? p.bounds[0] / 100 : low, high * 1e-8);
       return [Math.pow(10, Math.floor(Math.log10(low))), Math.pow(10, Math.ceil(Math.log10(high)))];
@@ -73,7 +73,7 @@
       const edge = new Path2D("M" + [...tops, ...feet].map((q) => q.join(",")).join("L") + "Z");
       ctx.fill(edge);
     }
-    if (p.honest !== null) { ctx.fillStyle = GREY; ctx.fillRect(box.left, y(p.honest) - 0.5, box.right - box.left, 1); }
+    if (p.expected !== null) { ctx.fillStyle = GREY; ctx.fillRect(box.left, y(p.expected) - 0.5, box.right - box.left, 1); }
     ctx.strokeStyle = p.colour; ctx.lineWidth = 1.4;
     if (p.kind === "line") for (const [i, j] of pieces(p)) {
       ctx.beginPath();

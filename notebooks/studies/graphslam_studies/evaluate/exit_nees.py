@@ -19,7 +19,7 @@ class ExitNees:
     Parameters
     ----------
     values : (n,)
-        ``eᵀ P⁻¹ e``; its expectation is ``dof`` if the covariances are honest.
+        ``eᵀ P⁻¹ e``; its expectation is ``dof`` if the covariances are consistent.
     errors : (n, dof)
         Right tangents at the estimates, of the components that were asked for.
     """
@@ -30,7 +30,7 @@ class ExitNees:
 
     @property
     def per_dof(self) -> float:
-        """Mean, one for honest covariances."""
+        """Mean, one for consistent covariances."""
         return float(self.values.mean() / self.dof)
 
     def inside(self, probability: float = 0.95) -> float:
@@ -45,7 +45,7 @@ def exit_nees(
     *,
     components: npt.ArrayLike | None = None,
 ) -> ExitNees:
-    """Are the covariances of exits honest?
+    """Are the covariances of exits consistent?
 
     Parameters
     ----------

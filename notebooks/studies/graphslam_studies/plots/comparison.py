@@ -41,7 +41,7 @@ def plot_comparison(
     errors : str, optional
         Column of half widths (e.g. 1.96 standard errors).
     reference : (value, label), optional
-        A line to compare with, e.g. ``(1.0, "honest")``.
+        A line to compare with, e.g. ``(1.0, "consistent")``.
     band : (low, high, label), optional
         A range to compare with, e.g. two-sided bounds.
     log : bool

@@ -55,7 +55,7 @@ def plot_ci(
 ) -> Axes:
     """Consistency index along the run, mean or median over the runs (Fig. 6 of Combined SLAM).
 
-    ``CI = D²/χ²_{n,1-α}`` (eq. 20). The band is where the mean (median) over as many runs of an honest estimator lies;
+    ``CI = D²/χ²_{n,1-α}`` (eq. 20). The band is where the mean (median) over as many runs of an consistent estimator lies;
     below it an estimator is conservative. CI = 1 is the paper's one-sided limit.
 
     Parameters
@@ -98,8 +98,8 @@ def plot_ci(
     low, high = (b / q for b in bounds_of(n, fewest, confidence))
     what = f"{confidence:.0%} bounds of the {statistic}, {fewest} run{'s' if fewest != 1 else ''}"
     ax.axhspan(low, high, color=style.BOUNDS, alpha=0.8, lw=0, label=what, zorder=0)
-    honest = (stats.chi2.ppf(0.5, n) if statistic == "median" else n) / q
-    ax.axhline(honest, color=style.GREY, lw=0.9, ls=":", label=f"{statistic} if consistent", zorder=1)
+    consistent = (stats.chi2.ppf(0.5, n) if statistic == "median" else n) / q
+    ax.axhline(consistent, color=style.GREY, lw=0.9, ls=":", label=f"{statistic} if consistent", zorder=1)
     ax.axhline(1.0, color=style.BLACK, lw=0.8, ls="--", label="CI = 1", zorder=1)
     if log or (log is None and top > 10.0 * max(high, 1.0)):
         ax.set_yscale("log")

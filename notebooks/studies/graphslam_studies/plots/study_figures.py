@@ -23,7 +23,7 @@ LOCAL = ("local-ekf", "local-paper", "local-default")
 
 
 def save_paper_figures(table: pd.DataFrame, timings: pd.DataFrame, folder: Path) -> list[Path]:
-    """Figures 5-9, and the honesty of local maps, of every world, as PNG files ``fig5-errors-rbpf-eif-A.png`` ….
+    """Figures 5-9, and the consistency of local maps, of every world, as PNG files ``fig5-errors-rbpf-eif-A.png`` ….
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 The vehicle of the landmark field drives two laps, so that every feature of the second half is an old one. Every
 submap's joint covariance is that of the smoother of its own scans and controls, linearised at the truth, and its error
-is drawn from exactly that covariance: what the joiners are given is honest by construction, and shaped like a real
+is drawn from exactly that covariance: what the joiners are given is consistent by construction, and shaped like a real
 local map (correlated through heading, the better the nearer).
 """
 

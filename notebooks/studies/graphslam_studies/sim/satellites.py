@@ -2,7 +2,7 @@
 
 What is drawn is what :mod:`graphslam_studies.graph.pseudorange` says: biases of satellites are Gauss–Markov processes
 whose size grows as the carrier-to-noise density falls, the clock drifts, the odometer has a bias and a scale error. So
-a solution that is told the same figures must be honest; a recorded street need not be like that.
+a solution that is told the same figures must be consistent; a recorded street need not be like that.
 """
 
 from __future__ import annotations

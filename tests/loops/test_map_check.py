@@ -79,15 +79,15 @@ def test_one_right_loop_stands_against_three_wrong_ones_by_what_the_maps_say() -
         wrong.append(named(replace(x, T_ij=g.between(poses[i], g.compose(W, poses[i + 240])))))
     one = named(loop_of(poses, 163, 403, rng))
 
-    def witness(loops: Sequence[Loop], T: Array) -> Array:
+    def map_check(loops: Sequence[Loop], T: Array) -> Array:
         true = g.between(poses[[x.i for x in loops]], poses[[x.j for x in loops]])
         away = np.linalg.norm(g.log(g.between(true, T))[:, 3:], axis=1)
         return np.where(away > 1.0, 0.2, 0.004) + 0.003 * rng.random(len(loops))
 
     taken = []
-    for asked in (None, witness):
+    for asked in (None, map_check):
         T, P = chain_of(poses, np.random.default_rng(7))
-        closer = LoopCloser(LoopNetwork(T, P), T, P, judge=truncated_least_squares_inliers, witness=asked)
+        closer = LoopCloser(LoopNetwork(T, P), T, P, judge=truncated_least_squares_inliers, map_check=asked)
         closer.propose([*calm, *wrong])
         (d,) = closer.propose([one])
         taken.append((len(closer.accepted), d.verdict))

@@ -1,4 +1,4 @@
-"""Pooled independent filters and the flag: pooling is honest where one small filter is not, and the alarm rings."""
+"""Pooled independent filters and the flag: pooling is consistent where one small filter is not, and the alarm rings."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_degenerate_filters_and_wrong_noise_are_flagged(options, reason):
     assert np.mean([reason in s.report["flag"] for s in submaps]) > 0.7
 
 
-def test_honest_filters_are_flagged_in_one_submap_of_twenty_at_most():
+def test_consistent_filters_are_flagged_in_one_submap_of_twenty_at_most():
     """Drawn worlds, noises and seeds, identities known and not."""
     rng, flags = np.random.default_rng(4), []
     for seed in range(60, 66):
