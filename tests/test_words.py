@@ -82,6 +82,23 @@ PATTERNS = {
     r"\blook(s|ed)? (why|where|whether)\b": "check",
     r"\b(is|are|be|was) (lost|gone|kept|put) back\b|\bkept back\b": "withheld",
 }
+# idiom in names of code (parts between underscores and capitals) → what to call it
+NAMES = {
+    "sighting": "observation, detection",
+    "sightings": "observations, detections",
+    "lasting": "biases, correlated",
+    "unheld": "unobservable",
+    "honest": "consistent",
+    "honesty": "consistency",
+    "dishonest": "inconsistent",
+    "witness": "check",
+    "feigned": "spurious, noise_induced",
+    "pretended": "spurious, noise_induced",
+    "denied": "contradicted",
+    "foretell": "predict",
+    "foretold": "predicted",
+}
+_PARTS = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _COMPILED = {re.compile(p, re.IGNORECASE): plain for p, plain in PATTERNS.items()}
 _CODE = re.compile(r"``[^`]*``|`[^`\n]*`|\]\([^)\n]*\)|^ *(>>>|\.\.\.) .*$|\b\w+\.[\w{][^\s,;)]*", re.M)
 """Code, links, names with a dot (options, files): no words."""
@@ -147,6 +164,18 @@ def occurrences() -> dict[str, list[str]]:
     return out
 
 
+def idioms_in_names(source: str) -> list[str]:
+    """Names of variables, parameters, attributes, functions, classes with a part in :data:`NAMES`, and lines."""
+    rows: set[tuple[int, str]] = set()
+    for n in ast.walk(ast.parse(source)):
+        for field in ("id", "attr", "arg", "name", "asname"):
+            name = getattr(n, field, None)
+            if isinstance(name, str):
+                rows.add((getattr(n, "lineno", 0), name))
+    parts = {name: [part.lower() for part in _PARTS.findall(name)] for _, name in rows}
+    return [f"{k}: {name} → {NAMES[p]}" for k, name in sorted(rows) for p in parts[name] if p in NAMES]
+
+
 @functools.cache
 def _found() -> dict[str, list[str]]:
     return occurrences()
@@ -167,6 +196,23 @@ def test_counts_are_those_recorded() -> None:
     found = {name: len(f) for name, f in _found().items()}
     fewer = [f"{name}: {found.get(name, 0)} < {n}" for name, n in recorded().items() if found.get(name, 0) < n]
     assert not fewer, f"plainer than recorded; record it with `{_COMMAND}`:\n" + "\n".join(fewer)
+
+
+def test_names_are_plain() -> None:
+    found: dict[str, list[str]] = {}
+    for folder in ("graphslam", "frontends", "notebooks", "tests"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            source = path.read_text(encoding="utf-8")
+            if path != Path(__file__) and any(idiom in source.lower() for idiom in NAMES):
+                rows = idioms_in_names(source)
+                found |= {str(path.relative_to(ROOT)): rows} if rows else {}
+    assert not found, "private idioms in names:\n" + "\n".join(f"{name}: {rows}" for name, rows in found.items())
+
+
+def test_an_idiom_in_a_name_is_found() -> None:
+    source = "def f(honest_x):\n    return honest_x.sightings\nclass LastingError: ...\nblasting = 'honest'\n"
+    names = [row.split()[1] for row in idioms_in_names(source)]
+    assert names == ["honest_x", "honest_x", "sightings", "LastingError"]
 
 
 def test_worst_pages_are_plain() -> None:

@@ -170,7 +170,7 @@ def test_few_fixes_or_biases_that_are_stated_are_left_alone(rng):
     assert fit_fix_errors(graph) is None
 
 
-def test_withheld_fixes_are_foretold_with_the_bias_between_the_used_ones(rng):
+def test_withheld_fixes_are_predicted_with_the_bias_between_the_used_ones(rng):
     """Every second fix is used; NIS of the others is honest in size and together."""
     each, joint = [], []
     for _ in range(4):

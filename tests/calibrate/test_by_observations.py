@@ -94,7 +94,7 @@ def test_withheld_observations_take_what_is_right_and_refuse_what_is_wrong(log, 
         assert wrong.corrections == (found.corrections.without_constants() if taken == "noise" else Corrections())
 
 
-def test_corrections_that_change_nothing_foretell_nothing_better(log, found) -> None:
+def test_corrections_that_change_nothing_predict_nothing_better(log, found) -> None:
     seen = ObservationLog.of(log, "landmarks", log["landmarks"]).holding()
     none = dataclasses.replace(found, corrections=Corrections())
     gains = predict_withheld_observations(seen, none, window_scans(seen, LONG), MotionNoise()).gains

@@ -184,9 +184,9 @@ def test_a_pipe_among_the_inputs_is_refused_and_not_waited_for(tmp_path: Path) -
 def test_a_file_that_may_not_be_read_is_not_called_corrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_npz(tmp_path / "a.npz", {"format": "x"})
 
-    def denied(*_: object) -> None:
+    def refused(*_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr("zipfile.ZipFile", denied)
-    with pytest.raises(Exception, match="cannot be read \\(Permission denied\\)"):
+    monkeypatch.setattr("zipfile.ZipFile", refused)
+    with pytest.raises(Exception, match="cannot be read \\(Permission refused\\)"):
         read_npz(tmp_path / "a.npz", fmt="x")

@@ -127,7 +127,7 @@ def test_pose_error_is_the_right_tangent(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("unit", ["run", "value"])
 def test_consistent_estimator_is_consistent_as_often_as_stated(unit: str, rng: np.random.Generator) -> None:
-    """95 % of studies of an consistent estimator pass; the bounds are neither too tight nor too wide."""
+    """95 % of studies of a consistent estimator pass; the bounds are neither too tight nor too wide."""
     shared = unit == "run"
     verdicts = [judged(simulated(rng, 20, 5, 3, 1.0, shared=shared), 3, unit=unit).verdict for _ in range(400)]
     passed = sum(v == "consistent" for v in verdicts)

@@ -1,4 +1,4 @@
-"""Loops against each other: equal to a slow twin that composes poses, consistent by sampling, and a false loop is found."""
+"""Loops against each other: equal to a slow twin that composes poses, consistent by sampling; a false loop is found."""
 
 from __future__ import annotations
 

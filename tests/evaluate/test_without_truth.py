@@ -1,4 +1,4 @@
-"""χ² per class and withheld GPS: equal to slow twins, silent for consistent data, alarmed by a factor of two either way."""
+"""χ² per class and withheld GPS: equal to slow twins, silent for consistent data, alarmed by a factor of two."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def passes(dim: int, off: float) -> tuple[dict[PieceId, Piece], dict[PieceId, np
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_room_that_stands_beside_itself_is_denied(dim: int) -> None:
+def test_a_room_that_stands_beside_itself_is_contradicted(dim: int) -> None:
     once = BeamModel(clamp=(0.41, 0.971))  # one beam says all that is to be said of free space
     same = find_contradictions(*passes(dim, 0.1), once)
     assert sorted(map(tuple, same.pairs.tolist())) == [(0, 3), (3, 0)]

@@ -90,7 +90,7 @@ def test_ratio_and_direction_of_planes(dim: int) -> None:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_what_is_feigned_is_the_sum_over_the_pairs(dim: int, rng: np.random.Generator) -> None:
+def test_what_is_spurious_is_the_sum_over_the_pairs(dim: int, rng: np.random.Generator) -> None:
     n, d = 20, 3 if dim == 2 else 6
     p = rng.uniform(-5, 5, (n, dim))
     if dim == 2:

@@ -35,7 +35,7 @@ from tests.reference.trials import dies_once, fails_once, gives_a_lambda, notes_
 
 
 def noisy_trial(seed: int) -> Iterator[Measurement]:
-    """NEES of an consistent and of an overconfident estimator at three submaps, and a final RMSE."""
+    """NEES of a consistent and of an overconfident estimator at three submaps, and a final RMSE."""
     rng = np.random.default_rng(seed)
     for submap in range(3):
         d2 = rng.chisquare(3)

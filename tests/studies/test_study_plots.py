@@ -1,4 +1,4 @@
-"""Figures of a study: the curves are the table's figures, the bounds are those of an consistent estimator."""
+"""Figures of a study: the curves are the table's figures, the bounds are those of a consistent estimator."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def legend_of(ax: Axes) -> list[str]:
 
 
 def band(ax: Axes) -> tuple[float, float]:
-    """Vertical extent of the bounds of an consistent estimator."""
+    """Vertical extent of the bounds of a consistent estimator."""
     patch = next(p for p in ax.patches if "bounds" in str(p.get_label()))
     box = patch.get_path().vertices if not hasattr(patch, "get_bbox") else patch.get_bbox().get_points()
     return float(box[:, 1].min()), float(box[:, 1].max())

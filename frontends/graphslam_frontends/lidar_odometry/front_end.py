@@ -571,8 +571,8 @@ def _findings(
         by = "constant velocity" if report.get("scans_aided", 0) < 0.5 * n else imu
         by = wheels if any(f.seen.bridged for f in own) else by
         text = (
-            f"unobservable directions in submap {key}: {report['scans_unobservable']} of {n} scans, as in a corridor or "
-            f"on a plain — the path along them is that of {by}."
+            f"unobservable directions in submap {key}: {report['scans_unobservable']} of {n} scans, as in a corridor "
+            f"or on a plain — the path along them is that of {by}."
         )
         out.append(Finding("look", "scans-unobservable", text))
     return out

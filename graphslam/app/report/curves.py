@@ -44,7 +44,7 @@ def report_curves(folder: ReportFolder, m: GlobalMap) -> list[dict[str, Any]]:
     -------
     list of dict
         ``name``, ``said``, ``unit`` and ``kind``. For the kinds ``line`` and ``dots``: ``t`` [s] from the start of the
-        path, ``s`` [m] path length, ``xyz`` [m], ``value``, as base64 of float32; ``log``; ``expected``: consistent value
+        path, ``s`` [m] path length, ``xyz`` [m], ``value``, as base64 of float32; ``log``; ``expected`` value
         or None; ``bounds``: two numbers, or ``half``: half width of the band at each point; ``cut``: points before
         which the line breaks. For the kind ``rows``: ``rows``, each ``name``, ``value``, ``low``, ``high``.
     """

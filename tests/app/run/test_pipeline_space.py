@@ -153,7 +153,7 @@ def test_map_is_near_the_truth_and_gps_is_scored(dim, monkeypatch):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_covariances_of_maps_are_consistent_over_four_worlds(dim, monkeypatch):
-    """All bases of a map together: half or twice the covariance is outside the bounds that an consistent one misses once in
+    """All bases of a map together: half or twice the covariance is outside bounds that a consistent one misses once in
     a thousand. By blocks the values of a run are one common error, and count as one draw of χ² each."""
     runs = [solved(dim, monkeypatch, seed=seed) for seed in range(4, 8)]
     assert {r.metric("nees_dof") for r in runs} == {8.0 * GROUP[dim].dof}

@@ -70,7 +70,7 @@ def test_local_maps_with_the_stated_sensor_pay_for_linearisation_and_smoothing_r
 
 
 def test_where_ranges_are_sure_and_bearings_are_not_the_filter_believes_itself_too_much_and_the_default_does_not():
-    """6 cm / 3.5°: a observation at 20 m is an arc of 2 m, of which one linearisation makes a straight line."""
+    """6 cm / 3.5°: an observation at 20 m is an arc of 2 m, of which one linearisation makes a straight line."""
     maps = StoppingConfig(num_features=10**6, time_max=1e6, max_scans=10**6, max_distance=35.0)
     per_dof = {}
     for name, options in (("default", {}), ("filter", {"handover": "filter"})):

@@ -1,4 +1,4 @@
-"""The front end of identified points in space: consistent local maps, wrong detections left out, and what is refused."""
+"""The front end of identified points in space: consistent local maps, wrong detections left out, what is refused."""
 
 from __future__ import annotations
 

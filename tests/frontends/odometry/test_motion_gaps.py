@@ -1,4 +1,4 @@
-"""Gaps of the wheels: bridged with an consistent uncertainty, split off where nothing was seen, refused beyond a limit."""
+"""Gaps of the wheels: bridged with consistent uncertainty, split off where nothing was seen, refused above a limit."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def test_antennas_in_the_gps_frame(rng, dim):
         np.testing.assert_allclose(y, se2_transform(datum, se2_transform(poses, arm)), atol=1e-12)
 
 
-def test_withheld_fixes_are_foretold_in_space(rng):
+def test_withheld_fixes_are_predicted_in_space(rng):
     """Every second fix withheld: innovations as large as their covariance says, heights by their own σ."""
     found = []
     for _ in range(4):

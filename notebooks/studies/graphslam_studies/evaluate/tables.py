@@ -114,7 +114,7 @@ def consistency_table(
     confidence: float = 0.95,
     tolerance: float = 0.10,
 ) -> pd.DataFrame:
-    """Is the mean over the runs what an consistent estimator would give? One row an algorithm (and world, and submap).
+    """Is the mean over the runs what a consistent estimator would give? One row an algorithm (and world, and submap).
 
     A run counts once, whatever it averages over: errors of one run hang together (Combined SLAM eq. 18-20 with
     two-sided bounds of the mean).
@@ -138,7 +138,7 @@ def consistency_table(
     -------
     DataFrame
         ``nees_over_n`` with ``low`` and ``high``, its two-sided bounds; mean and median CI with ``ci_low``, ``ci_high``
-        and ``ci_consistent``, the mean of an consistent one (for differing dof, of their mean); ``inside`` the bounds, or
+        and ``ci_consistent``, that of a consistent one (for differing dof, of their mean); ``inside`` the bounds, or
         ``near``; ``runs``, and ``missing``: runs whose figure is not a number. An infinite one stays, and rules a mean.
     """
     by = _keys(table)
@@ -219,7 +219,7 @@ def coverage_table(
     -------
     DataFrame
         For each world and algorithm: number of ``maps``; ``joint`` NEES/n and ``pose`` NEES/3 with two-sided bounds;
-        the share ``inside`` the ``confidence`` region with the bounds of an consistent one.
+        the share ``inside`` the ``confidence`` region with the bounds of a consistent one.
     """
     wide = table[table["quantity"].isin(["local_joint_nees", "local_joint_dof", "local_pose_nees"])]
     by = _keys(table)

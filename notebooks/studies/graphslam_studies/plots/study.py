@@ -55,7 +55,7 @@ def plot_ci(
 ) -> Axes:
     """Consistency index along the run, mean or median over the runs (Fig. 6 of Combined SLAM).
 
-    ``CI = D²/χ²_{n,1-α}`` (eq. 20). The band is where the mean (median) over as many runs of an consistent estimator lies;
+    ``CI = D²/χ²_{n,1-α}`` (eq. 20). The band is where the mean (median) of as many runs of a consistent estimator lies;
     below it an estimator is conservative. CI = 1 is the paper's one-sided limit.
 
     Parameters
