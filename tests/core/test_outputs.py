@@ -188,5 +188,5 @@ def test_a_file_that_may_not_be_read_is_not_called_corrupt(tmp_path: Path, monke
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
     monkeypatch.setattr("zipfile.ZipFile", refused)
-    with pytest.raises(Exception, match="cannot be read \\(Permission refused\\)"):
+    with pytest.raises(Exception, match="cannot be read \\(Permission denied\\)"):
         read_npz(tmp_path / "a.npz", fmt="x")
