@@ -81,7 +81,7 @@ def check_json(value: Any, shape: Any, where: str, at: str = "") -> Any:
     place = f" of {at}" if at else ""
     if isinstance(shape, dict):
         if not isinstance(value, dict):
-            raise FormatError(f"not a mapping{place}", where=where, got=_said(value), wanted="a JSON object")
+            raise FormatError(f"not a mapping{place}", where=where, got=_text(value), wanted="a JSON object")
         if str in shape:
             for k, v in value.items():
                 check_json(v, shape[str], where, f"{at}.{k[:40]}".lstrip("."))
@@ -97,7 +97,7 @@ def check_json(value: Any, shape: Any, where: str, at: str = "") -> Any:
         return value
     if isinstance(shape, (list, tuple)):
         if not isinstance(value, list) or (isinstance(shape, tuple) and len(value) != len(shape)):
-            raise FormatError(f"not a list{place}", where=where, got=_said(value), wanted=_words(shape))
+            raise FormatError(f"not a list{place}", where=where, got=_text(value), wanted=_words(shape))
         for k, v in enumerate(value):
             check_json(v, shape[0] if isinstance(shape, list) else shape[k], where, f"{at}[{k}]")
         return value
@@ -110,11 +110,11 @@ def check_json(value: Any, shape: Any, where: str, at: str = "") -> Any:
         object: True,
     }[shape]
     if not right:
-        raise FormatError(f"value of the wrong type{place}", where=where, got=_said(value), wanted=_words(shape))
+        raise FormatError(f"value of the wrong type{place}", where=where, got=_text(value), wanted=_words(shape))
     return value
 
 
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     text = repr(value)
     return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '…'}"
 
@@ -138,7 +138,7 @@ def read_json_lines(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         where = f"{path}, line {number}"
         value = parse_json(line, where)
         if not isinstance(value, dict):
-            raise FormatError("not a JSON object", where=where, got=_said(value))
+            raise FormatError("not a JSON object", where=where, got=_text(value))
         out.append(value)
     return out
 

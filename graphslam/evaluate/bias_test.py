@@ -240,7 +240,7 @@ def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
             for k in np.argsort(-found.reduction)
             if k != best and found.reduction[k] > AS_MUCH * found.reduction[best]
         ]
-        said = [_said(names[k], found.error[k], found.sigma[k]) for k in (best, *others)]
+        said = [_error_text(names[k], found.error[k], found.sigma[k]) for k in (best, *others)]
         large = abs(found.error[best]) > KINDS[names[best]].careful
         text = f"systematic residuals: {said[0]}"
         if len(said) > 1:
@@ -251,7 +251,7 @@ def bias_test_findings(reports: Sequence[Mapping[str, Any]]) -> list[Finding]:
     return out
 
 
-def _said(name: str, error: float, sigma: float) -> str:
+def _error_text(name: str, error: float, sigma: float) -> str:
     k = KINDS[name]
     if k.unit == "%" and error < -1.0:  # a factor below zero
         what = k.less.partition(" look ")[0]

@@ -18,7 +18,7 @@ from graphslam_frontends.odometry.motion import MotionNoise, dead_reckoned_incre
 APART = 1.0
 """Least time between two compared observations of a landmark [s]."""
 LEAST_PAIRS = 20
-LEAST_WAY = 10.0
+LEAST_PATH = 10.0
 """Path length over all pairs below which the ranges are not tested [m]."""
 HARDLY = 0.01
 """Ranges that change by less than this share of the path length are in a wrong unit. When a robot passes a landmark,
@@ -59,7 +59,7 @@ def check_observations(z: LandmarkObservations, name: str, log: SensorLog) -> li
             "and each copy counts as a measurement. Keep the first of each."
         )
         out.append(Finding("bad", "scans-repeated", text))
-    return out + _ranges_and_way(z, name, log)
+    return out + _ranges_and_path(z, name, log)
 
 
 def check_steering(controls: SteeringControls, name: str, log: SensorLog) -> list[Finding]:
@@ -78,19 +78,19 @@ def _same(z: LandmarkObservations, k: int) -> bool:
     return bool(np.array_equal(z.ranges[a], z.ranges[b]) and np.array_equal(z.bearings[a], z.bearings[b]))
 
 
-def _ranges_and_way(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
+def _ranges_and_path(z: LandmarkObservations, name: str, log: SensorLog) -> list[Finding]:
     pairs = _pairs(z)
     if pairs is None:
         return []
     first, second = pairs
-    way = _way(log, z.times)
+    way = _path_length(log, z.times)
     if way is None:
         return []
     scan = np.repeat(np.arange(len(z.times)), np.diff(z.offsets))
     moved = np.abs(way[scan[second]] - way[scan[first]])
     change = np.abs(z.ranges[second] - z.ranges[first])
     noise = 4.0 * np.sqrt(z.sigmas[first, 0] ** 2 + z.sigmas[second, 0] ** 2)
-    if moved.sum() < LEAST_WAY:
+    if moved.sum() < LEAST_PATH:
         return []
     if change.sum() < HARDLY * moved.sum() and np.ptp(z.ranges) > 0.0:
         raise DataError(
@@ -130,7 +130,7 @@ def _pairs(z: LandmarkObservations) -> tuple[Array, Array] | None:
     return np.concatenate(first), np.concatenate(second)
 
 
-def _way(log: SensorLog, times: Array) -> Array | None:
+def _path_length(log: SensorLog, times: Array) -> Array | None:
     """Path length [m] up to each of ``times``, from wheel odometry."""
     try:
         steps = dead_reckoned_increments(log, times, MotionNoise(), hold=np.inf)[0].increments

@@ -17,7 +17,7 @@ ODOMETRY_FRAMES = ("odom", "odom_combined", "odometry", "world_odom")
 BASE_FRAMES = ("base_link", "base_footprint", "base")
 MAP_FRAMES = ("map", "world", "earth", "utm")
 """Frames above the odometry frame: motion relative to them is already a result of SLAM or GPS."""
-LEAST_WAY = 1.0
+LEAST_PATH = 1.0
 """A moving transform with an unknown name is odometry only if its range along x, y or z is at least this [m]; that of
 joints is smaller."""
 
@@ -118,7 +118,7 @@ class FrameTree:
             if parent is None and not known:
                 way = float(np.ptp(np.array(rows.values)[:, :3], axis=0).max())
                 based = any(leaf(f) in BASE_FRAMES for f in behind)
-                if based or way < LEAST_WAY or not (bases or scanners & carried.keys()):
+                if based or way < LEAST_PATH or not (bases or scanners & carried.keys()):
                     continue
             found.append((known, leaf(key[0]) not in MAP_FRAMES, len(rows.values), key))
         return max(found)[3] if found else None

@@ -176,7 +176,7 @@ class LoopCloser:
                     settled = {d.loop for d in self.ledger.current() if d.why.startswith(SETTLED)}
                     self._round([], settled)
                     self._reconsider()
-        self._say_weights()
+        self._report_weights()
 
     def _round(self, new: list[int], out: set[int]) -> set[int]:
         """One round over all loops except ``out``; returns consistent loops that the graph rejected."""
@@ -317,7 +317,7 @@ class LoopCloser:
                 self.graph.remove_loop(self.ledger.of(n).factor_id)
             self.graph.solve()
             other = self._against_graph(b)
-            outcome, why = choose_group(self._against_graph(a), other, self._maps_say(a, b, with_a))
+            outcome, why = choose_group(self._against_graph(a), other, self._map_evidence(a, b, with_a))
             for n in a:
                 d = self.ledger.of(n)
                 if outcome == "stays":
@@ -335,7 +335,7 @@ class LoopCloser:
             changed |= outcome != "stays"
         return changed
 
-    def _maps_say(self, a: list[int], b: list[int], with_a: Array) -> float:
+    def _map_evidence(self, a: list[int], b: list[int], with_a: Array) -> float:
         """Log-likelihood ratio of the maps with the loops b to those with a; neither is in the graph.
 
         Parameters
@@ -392,7 +392,7 @@ class LoopCloser:
             gone.add(n)
         return gone
 
-    def _say_weights(self) -> None:
+    def _report_weights(self) -> None:
         """Write the weights of the kernels, which have changed since loops were accepted."""
         chi2 = self.graph.chi2()
         for n in self.accepted:

@@ -23,7 +23,7 @@ from graphslam.maps.fuse import FusedMap
 from graphslam.maps.minimum_entropy import MapHypothesis, rank_by_entropy
 from graphslam.solve.solution import Solution
 
-TIES = ("match", "loop", "tie")
+CONSTRAINTS = ("match", "loop", "tie")
 """Classes of factors that close loops."""
 
 
@@ -61,7 +61,7 @@ class Alternative:
     def ties(self) -> int:
         """Number of submap pairs with matches or loops; several constraints of one pair count once."""
         submap = {n: k for k, s in enumerate(self.graph.submaps) for n in s.nodes[:-1]}
-        tied = [r for r in self.graph.records.values() if r.group in TIES and isinstance(r, BetweenRecord)]
+        tied = [r for r in self.graph.records.values() if r.group in CONSTRAINTS and isinstance(r, BetweenRecord)]
         last = len(self.graph.submaps) - 1  # the last exit has its own node
         return len({frozenset((submap.get(r.i, last), submap.get(r.j, last))) for r in tied})
 
@@ -197,8 +197,8 @@ def chi2_of(graph: FactorGraph) -> float:
     """χ² of a graph at its current values, with matches and loops without robust kernels."""
     score = graph.objective()
     blocks = graph.flat().factor_blocks(graph.values)
-    bare = sum(float(d2) for r, d2 in zip(blocks.records, blocks.d2) if r.group in TIES)
-    return score.total + bare - sum(score[g].chi2 for g in TIES if g in score)
+    bare = sum(float(d2) for r, d2 in zip(blocks.records, blocks.d2) if r.group in CONSTRAINTS)
+    return score.total + bare - sum(score[g].chi2 for g in CONSTRAINTS if g in score)
 
 
 def noise_scale(ties: Sequence[int], fits: Sequence[tuple[float, int]]) -> float:

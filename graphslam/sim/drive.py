@@ -132,11 +132,11 @@ class RouteMotion:
         self.length = float(np.sum(np.linalg.norm(np.diff(way.positions, axis=0), axis=1)))
         u = np.arange(len(way.yaw)) * way.step
         columns = np.column_stack([way.positions, way.yaw, way.pitch, way.roll])
-        self._way: BSpline = make_interp_spline(u, columns, k=5)
-        self._way1, self._way2 = self._way.derivative(1), self._way.derivative(2)
+        self._path: BSpline = make_interp_spline(u, columns, k=5)
+        self._path1, self._path2 = self._path.derivative(1), self._path.derivative(2)
 
         # cruise time τ(u) = ∫ du / pace, the pace less than the speed where the route turns fast
-        turning = np.abs(self._way1(u)[:, 3])
+        turning = np.abs(self._path1(u)[:, 3])
         pace = np.minimum(speed, config.most_turn_rate / np.maximum(turning, 1e-9))
         window = max(round(1.0 / way.step), 1)
         pace = minimum_filter1d(pace, window, mode="nearest")
@@ -178,18 +178,18 @@ class RouteMotion:
     def poses(self, t: ArrayLike) -> Array:
         """``T_world_base`` ``(n, 7)`` at times ``(n,)`` [s]."""
         angles = self._angles(np.asarray(t, dtype=np.float64))[0]
-        position = self._way(self._progress(t)[0])[..., :3]
+        position = self._path(self._progress(t)[0])[..., :3]
         return np.concatenate([position, euler_to_quat(angles[..., 0], angles[..., 1], angles[..., 2])], -1)
 
     def velocities(self, t: ArrayLike) -> Array:
         """World velocities of the base ``(n, 3)`` [m/s]."""
         u, du, _ = self._progress(t)
-        return self._way1(u)[..., :3] * du[..., None]
+        return self._path1(u)[..., :3] * du[..., None]
 
     def accelerations(self, t: ArrayLike) -> Array:
         """World accelerations of the base ``(n, 3)`` [m/s²]."""
         u, du, ddu = self._progress(t)
-        return self._way2(u)[..., :3] * du[..., None] ** 2 + self._way1(u)[..., :3] * ddu[..., None]
+        return self._path2(u)[..., :3] * du[..., None] ** 2 + self._path1(u)[..., :3] * ddu[..., None]
 
     def rotation(self, t: ArrayLike) -> tuple[Array, Array]:
         """Angular rates [rad/s] and angular accelerations [rad/s²] in the base frame, each ``(n, 3)``."""
@@ -212,9 +212,9 @@ class RouteMotion:
     def _angles(self, t: Array) -> tuple[Array, Array, Array]:
         """Yaw, pitch and roll ``(n, 3)`` [rad], and their first two derivatives by time."""
         u, du, ddu = self._progress(t)
-        w1 = self._way1(u)[..., 3:]
+        w1 = self._path1(u)[..., 3:]
         d1 = w1 * du[..., None]
-        return self._way(u)[..., 3:], d1, self._way2(u)[..., 3:] * du[..., None] ** 2 + w1 * ddu[..., None]
+        return self._path(u)[..., 3:], d1, self._path2(u)[..., 3:] * du[..., None] ** 2 + w1 * ddu[..., None]
 
     def trajectory(self) -> Trajectory:
         """The drive at ``config.rate``, from 0 up to the last whole period."""

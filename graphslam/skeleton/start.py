@@ -73,7 +73,7 @@ class ForwardPass:
     refused: int
 
 
-TURN_SIGMA, WAY_SIGMA = 2e-3, 0.03
+TURN_SIGMA, DISTANCE_SIGMA = 2e-3, 0.03
 """Prior σ of a pose around its prediction [rad, m]."""
 GATE = 16.27
 """99.9 % quantile of χ² with three degrees of freedom."""
@@ -95,7 +95,7 @@ def forward_pass(
     N, L = problem.poses, problem.landmarks
     out = Poses(np.empty((N, 3, 3)), np.empty((N, 3)))
     seen, D, b = np.full(L, -1, dtype=np.int32), problem.room((L, 6)), problem.room((L, 3))
-    rules = (int(ago), TURN_SIGMA**-2, WAY_SIGMA**-2, GATE)
+    rules = (int(ago), TURN_SIGMA**-2, DISTANCE_SIGMA**-2, GATE)
     tied = refused = 0
     for span in problem.chunks(0, N):
         t, r = forward_pass_kernel(problem.observations_of(*span), chain, span, rules, seen, D, b, out)

@@ -39,7 +39,9 @@ def test_what_an_old_install_left_is_found(tmp_path: Path) -> None:
     assert f"rm -r {tmp_path / 'graphslam'}" in finding.detail
 
 
-def test_what_fails_is_said_and_what_comes_after_it_is_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_fails_is_reported_and_what_comes_after_it_is_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     texts = {
         "noisy": "print('noise'); import no_such_module",
         "ends": "import os; os._exit(7)",

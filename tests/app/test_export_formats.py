@@ -98,7 +98,7 @@ def test_pandas_and_open3d(hall: Run) -> None:
         np.testing.assert_allclose(np.asarray(gs.to_open3d(hall).points), map_points(hall))
 
 
-def test_what_is_missing_is_said(hall: Run, tmp_path: Path) -> None:
+def test_what_is_missing_is_reported(hall: Run, tmp_path: Path) -> None:
     for format in ("kml", "geojson"):
         with pytest.raises(ConfigError, match="needs a datum"):
             export(hall, format=format)

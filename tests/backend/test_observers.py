@@ -48,7 +48,7 @@ class Watched(Ring):
             yield s
 
 
-def test_submaps_steps_and_the_solution_are_told_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+def test_submaps_steps_and_the_solution_are_reported_in_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     log, front = ring(2)
     monkeypatch.setattr(run_options, "make_front_end", lambda *_: Watched(front.made))
     monkeypatch.setattr(run_options, "recommended_options", lambda *_: {})

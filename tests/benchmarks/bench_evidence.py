@@ -57,13 +57,13 @@ class Targets:
 
     def most(self, name: str, value: float, limit: float) -> None:
         """A figure that must not be above its limit."""
-        self._say(name, value, limit, value <= limit, "<=")
+        self._report(name, value, limit, value <= limit, "<=")
 
     def least(self, name: str, value: float, limit: float) -> None:
         """A figure that must not be below its limit."""
-        self._say(name, value, limit, value >= limit, ">=")
+        self._report(name, value, limit, value >= limit, ">=")
 
-    def _say(self, name: str, value: float, limit: float, good: bool, sign: str) -> None:
+    def _report(self, name: str, value: float, limit: float, good: bool, sign: str) -> None:
         self.missed += not good
         print(f"{'pass' if good else 'MISS':<5} {name:<62} {value:9.3f} {sign} {limit:g}", flush=True)
 

@@ -194,7 +194,7 @@ def test_noise_of_the_wheels_does_not_make_their_distances_look_too_long() -> No
     assert abs(e["distance_scale"].value) < 2.5 * e["distance_scale"].sigma
 
 
-def test_a_scale_that_is_hardly_told_is_left() -> None:
+def test_a_scale_that_is_hardly_observable_is_left() -> None:
     """On a robot of MRCLAM wheels looked half as long as they are, ± 20 %, and the map came out 300 m wide."""
     sure = Estimate(name="distance_scale", value=0.1, sigma=0.01, gain=50.0, other=0.1, other_sigma=0.01)
     vague = dataclasses.replace(sure, value=0.68, sigma=0.2, gain=3783.0, other=0.7, other_sigma=0.2)

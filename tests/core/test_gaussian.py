@@ -193,7 +193,7 @@ def test_moment_matching_weighs_covariances_and_wraps_differences(rng: np.random
     assert g.angular == (1,)
 
 
-def test_bounds_are_of_95_percent_unless_said_otherwise() -> None:
+def test_bounds_are_of_95_percent_unless_stated_otherwise() -> None:
     assert chi2_mean_bounds(3, 10) == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 30) / 10))
 
 

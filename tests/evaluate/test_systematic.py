@@ -72,7 +72,7 @@ def test_consistent_robots_have_no_error(seed: int) -> None:
         assert 0.9 < found.ratio < 1.1
 
 
-def test_noise_that_is_larger_than_stated_is_said() -> None:
+def test_noise_that_is_larger_than_stated_is_reported() -> None:
     for scale, level in ((1.12, "look"), (2.0, "bad")):
         log = simulate("landmark-field", seed=5, preset="quick", noise_scale=scale)
         options = recommended_options(log, "rbpf-ekf")["frontend"]

@@ -59,7 +59,7 @@ def test_a_bar_says_that_kernels_are_compiled(
     assert ("front end" in written) == with_bar
 
 
-def test_nothing_is_said_where_the_kernels_are_compiled(capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_reported_where_the_kernels_are_compiled(capfd: pytest.CaptureFixture[str]) -> None:
     jit_notice.start_compiling("all", subprocess.run)  # what this process has loaded may have been deleted meanwhile
     assert jit_notice.is_compiled(mark_grids)
     jit_notice._state["checked"] = False
@@ -85,7 +85,7 @@ def test_code_that_is_not_there_is_compiled_and_announced_once(tmp_path: Path, m
 
 
 @pytest.mark.parametrize("compiling_already", [False, True])
-def test_a_machine_without_code_is_told_once_and_processes_that_compile_start_none(
+def test_a_machine_without_code_is_reported_once_and_processes_that_compile_start_none(
     compiling_already: bool, tmp_path: Path
 ) -> None:
     """With an empty cache; or there would be no end to processes."""

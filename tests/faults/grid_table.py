@@ -19,7 +19,7 @@ def in_words(seen: Seen) -> str:
     return f"{score}{' !' if seen.confident else ''}; {codes}"
 
 
-def _say(line: str) -> None:
+def _report(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -33,7 +33,7 @@ def main(seeds: list[int], dims: tuple[int, ...] = (2, 3)) -> int:
             for frontend in FRONT_ENDS:
                 begin = time.process_time()
                 clean = trial(None, drive, frontend)
-                _say(f"{dim}-D {frontend} clean: {in_words(clean)} [{time.process_time() - begin:.1f} s]")
+                _report(f"{dim}-D {frontend} clean: {in_words(clean)} [{time.process_time() - begin:.1f} s]")
                 for row in ROWS:
                     if dim not in row.dims:
                         continue
@@ -43,8 +43,8 @@ def main(seeds: list[int], dims: tuple[int, ...] = (2, 3)) -> int:
                     wrong += silent
                     mark = "SILENT " if silent else ""
                     took = f"[{time.process_time() - begin:.1f} s]"
-                    _say(f"{dim}-D {frontend} {row.name} ({row.outcome}): {mark}{in_words(seen)} {took}")
-    _say(f"silently wrong: {wrong}")
+                    _report(f"{dim}-D {frontend} {row.name} ({row.outcome}): {mark}{in_words(seen)} {took}")
+    _report(f"silently wrong: {wrong}")
     return wrong
 
 

@@ -14,7 +14,7 @@ QUICK = [(3, ["run-2d"]), (2, ["study", "merge", "report"]), (1, ["undo", "map"]
 
 
 @pytest.mark.parametrize(("kills", "verbs"), QUICK, ids=lambda of: "-".join(of) if isinstance(of, list) else "")
-def test_what_a_kill_leaves_is_whole_and_gone_on_with(kills: int, verbs: list[str]) -> None:
+def test_what_a_kill_leaves_is_whole_and_resumed(kills: int, verbs: list[str]) -> None:
     options = [x for verb in verbs for x in ("--verb", verb)]
     command = [sys.executable, "-m", "tests.faults.kills", *options, "--kills", str(kills), "--exec", "0"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)

@@ -182,7 +182,7 @@ def test_a_laser_upside_down_and_one_that_counts_backwards(tmp_path: Path) -> No
         np.testing.assert_allclose(laser.T_base_sensor, [0.3, 0, 0], atol=1e-9)
 
 
-def test_times_of_beams_that_are_not_used_are_said(tmp_path: Path) -> None:
+def test_times_of_beams_that_are_not_used_are_reported(tmp_path: Path) -> None:
     messages = laser_world(Messages())
     assert "time_increment" not in str(load_recording(written(tmp_path, "ros2", messages)).meta["notes"])
     for _, kind, _, message in messages:
@@ -222,7 +222,7 @@ def test_a_depth_camera_is_no_lidar(tmp_path: Path) -> None:
     assert "clouds" not in log
 
 
-def test_what_is_missing_is_said_and_replaced(tmp_path: Path) -> None:
+def test_what_is_missing_is_reported_and_replaced(tmp_path: Path) -> None:
     m = Messages()
     messages = [w for w in world(m) if w[0] != "/tf_static"]
     for _, _, _, message in messages:

@@ -122,7 +122,7 @@ def test_load_of_a_card(roots: tuple[Path, Path, Path], monkeypatch: pytest.Monk
         load_recording("toy/c")
 
 
-def test_folders_are_told_apart_by_what_they_hold(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_folders_are_distinguished_by_what_they_hold(tmp_path: Path, rng: np.random.Generator) -> None:
     from graphslam.core.submap import LandmarkMap
     from graphslam.io.log_store import save_log
     from graphslam.io.submap_store import write_submaps

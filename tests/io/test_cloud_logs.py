@@ -165,7 +165,7 @@ def test_columns_of_bin_and_options_that_are_wrong(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("columns", [3, 4, 5, 6])
-def test_columns_of_bin_are_told_by_content(tmp_path: Path, columns: int) -> None:
+def test_columns_of_bin_are_identified_by_content(tmp_path: Path, columns: int) -> None:
     rng = np.random.default_rng(columns)
     for k in range(6):
         n = 60 * int(rng.integers(10, 20))  # whole points for 3, 4, 5 and 6 columns
@@ -260,7 +260,7 @@ def test_scans_that_are_cut_at_the_ends_are_left_out(tmp_path: Path) -> None:
     assert sum(n for k, n in log.dropped.items() if "scan is cut" in k) == 2
 
 
-def test_kitti_poses_without_tr_are_told_by_the_direction_of_motion(tmp_path: Path) -> None:
+def test_kitti_poses_without_tr_are_identified_by_the_direction_of_motion(tmp_path: Path) -> None:
     folder = small.kitti_odometry(tmp_path / "00")
     whole = load_recording(folder)["reference"]
     (folder / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")

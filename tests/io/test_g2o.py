@@ -351,7 +351,7 @@ def test_priors_as_g2o_writes_them_and_those_of_a_position(tmp_path: Path, caplo
     assert "1 records EDGE_SE3_PRIOR_XYZ are left out: priors of a position alone are not read" in caplog.text
 
 
-def test_long_quaternions_are_normalised_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_long_quaternions_are_normalised_and_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     read_g2o(put(tmp_path, SE3))
     assert "quaternions" not in caplog.text
     net = read_g2o(put(tmp_path, SE3.replace("1.00001", "1.02")))

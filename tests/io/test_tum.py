@@ -110,7 +110,7 @@ def test_the_number_of_a_pose_behind_it_is_left_out(tmp_path: Path) -> None:
     assert read_tum(tmp_path / "a.txt").poses.tolist() == [[0, 0, 0], [1, 0, 0]]
 
 
-def test_stamps_out_of_order_are_told_with_what_to_do(tmp_path: Path) -> None:
+def test_stamps_out_of_order_are_reported_with_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "a.tum").write_text(GOOD + "\n0.5 0 0 0 0 0 0 1\n")
     with pytest.raises(FormatError, match=r"a\.tum:2: stamps do not increase; got 0\.5 after 1\.0; .*sort the file"):
         read_tum(tmp_path / "a.tum")

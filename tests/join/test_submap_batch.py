@@ -95,7 +95,7 @@ def test_a_kilometre_loop_joined_in_sequence_is_polished_in_a_few_steps() -> Non
     assert polished.objective_polished == pytest.approx(tree.objective, rel=1e-9)
 
 
-def test_the_cap_on_iterations_is_told(rng: np.random.Generator) -> None:
+def test_the_cap_on_iterations_is_reported(rng: np.random.Generator) -> None:
     submaps, _ = submap_chain(rng)
     hasty = solve_submaps(submaps, max_iterations=1)
     assert not hasty.converged

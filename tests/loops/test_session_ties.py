@@ -69,7 +69,7 @@ def test_right_ties_are_found_from_nothing(drives: tuple, two: TwoSessions) -> N
             assert not same or abs(two.new.places.way[x.j] - two.new.places.way[y.j]) >= 12.0
 
 
-def test_sessions_that_do_not_overlap_are_said_to_be_so(two: TwoSessions) -> None:
+def test_sessions_that_do_not_overlap_are_reported(two: TwoSessions) -> None:
     elsewhere = hall_drive(corridor(120.0), straight_path(-15.0, 15.0, 0.0), np.random.default_rng(5))
     ties = TwoSessions(two.known, SessionMap(elsewhere.submaps)).find(CONFIG)
     assert "looked alike" in ties.why

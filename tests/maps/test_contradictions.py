@@ -53,7 +53,7 @@ def test_verdict_says_which_passes_contradict() -> None:
     assert not [f for f in findings_from_metrics(RunMetrics({}, {})) if f.code == "passes"]
 
 
-def test_of_a_few_points_nothing_is_said() -> None:
+def test_of_a_few_points_nothing_is_reported() -> None:
     few = Contradictions(np.array([[0, 3], [3, 0]]), np.array([FEW - 2, 0]), np.array([0, 1]))
     assert few.share is None
     assert not [f for f in findings_from_metrics(RunMetrics({"map_passes": few.facts()}, {})) if f.code == "passes"]

@@ -47,7 +47,7 @@ def closest(colours: list[str], vision: str) -> float:
 
 
 @pytest.mark.parametrize("vision", VISION)
-def test_colours_that_mean_something_are_told_apart(vision: str) -> None:
+def test_colours_that_mean_something_are_distinguished(vision: str) -> None:
     assert closest(sorted(set(style.NAMES.values())), vision) > LEAST
     assert closest(list(style.CYCLE), vision) > LEAST
     assert closest(list(style.TERRAIN.values()), vision) > LEAST

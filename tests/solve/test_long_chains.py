@@ -111,7 +111,7 @@ def test_a_slow_descent_gets_to_a_minimum(starts: tuple[str, ...] | None) -> Non
     assert solution.objective < 0.5 * solution.objective_initial
 
 
-def test_no_gap_is_told_where_no_optimum_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_gap_is_reported_where_no_optimum_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multistart, "descend_to_minimum", partial(descend_to_minimum, max_iterations=3))
     solution = solve_network(noisy_streets(300, 1), "lm", starts=("file",))
     assert not solution.converged

@@ -129,7 +129,7 @@ def test_a_solution_outlives_the_graph(solved):
     assert "Solution" in solution._repr_html_()
 
 
-def test_no_trajectory_is_said():
+def test_no_trajectory_is_reported():
     g = FactorGraph()
     g.add_submap(dense_submap(0, np.array([1.0, 0, 0]), np.eye(3)))
     solver = BatchSolver(g)

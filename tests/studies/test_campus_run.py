@@ -142,7 +142,7 @@ def with_empty_scans(log: SensorLog) -> SensorLog:
         (with_a_gap, {"motion-gap"}, ""),
     ],
 )
-def test_what_is_wrong_is_said(
+def test_what_is_wrong_is_reported(
     log: SensorLog, clean: Any, spoil: Callable[[SensorLog], SensorLog], code: set[str], level: str
 ) -> None:
     made = run(spoil(log))

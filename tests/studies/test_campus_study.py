@@ -81,7 +81,7 @@ def rows_of(pairs: list[tuple[float, float]], quantity: str = "ate_indoor") -> p
     return pd.DataFrame(out, columns=["world", "run", "algorithm", "submap", "quantity", "value"])
 
 
-def test_pairs_are_told_with_a_sign_test() -> None:
+def test_pairs_are_reported_with_a_sign_test() -> None:
     row = pair_table(rows_of([(1.0, 0.4)] * 9 + [(1.0, 1.2)])).iloc[0]
     assert (row["runs"], row["better"], row["half"]) == (10, 9, 0.9)
     assert row["p"] == pytest.approx(2 * 11 / 2**10)

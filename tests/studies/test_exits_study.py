@@ -26,7 +26,7 @@ def test_robots_are_drawn_over_a_factor_of_four_around_every_default() -> None:
     assert min(FACTOR[name] ** 2 for name in noise) >= 4.0
 
 
-def test_the_estimator_is_told_what_a_data_sheet_says() -> None:
+def test_the_estimator_is_reported_what_a_data_sheet_says() -> None:
     robot, _ = drawn_robot(2)
     noise = told(robot)
     assert (noise.wheel, noise.wheel_scale, noise.attitude_bias) == (

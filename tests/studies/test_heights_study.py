@@ -84,7 +84,7 @@ def test_pairs_are_made_of_the_same_runs() -> None:
     assert row["high"] == pytest.approx(12.706 * 0.5, rel=1e-3)  # Student's t of one degree, σ / √2 = 0.5
 
 
-def test_exits_are_told_by_block() -> None:
+def test_exits_are_identified_by_block() -> None:
     rows: list[tuple[object, ...]] = [("w", 0, "a", -1, "failed", 0.0)]
     for k in range(40):
         rows += [("w", k // 4, "a", k % 4, f"exit_nees{s}", v)

@@ -155,7 +155,7 @@ def _cut(path: Path, keep: float) -> None:
     path.write_bytes(content[: int(len(content) * keep)])
 
 
-def test_truncated_points_are_told_when_they_are_needed(bare):
+def test_truncated_points_are_reported_when_they_are_needed(bare):
     _cut(bare / "xyz_i16_planar.npy.xz", 0.8)
     log = read_lidar_pack(bare, step=STEP, period=0.1)  # the stamps are still good
     with pytest.raises(

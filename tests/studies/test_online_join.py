@@ -54,7 +54,7 @@ def test_without_a_reason_it_is_the_sequence(chain: list[Submap]) -> None:
     assert "relinearisation" not in joined.times
 
 
-def test_reasons_are_told_apart(chain: list[Submap]) -> None:
+def test_reasons_are_distinguished(chain: list[Submap]) -> None:
     last: dict[int, int] = {}
     closures = 0
     gap = 4

@@ -293,7 +293,7 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
-def test_code_that_changed_between_trials_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_that_changed_between_trials_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graphslam_studies.montecarlo.study.source_digest", lambda: "another day")
     study(FRAGILE, 1, quick=True, out=tmp_path, progress=False)
     monkeypatch.undo()

@@ -98,7 +98,7 @@ def test_bounds_of_mean_and_median_hold_as_often_as_they_say(rng: np.random.Gene
         assert 0.91 < np.mean((y > low) & (y < high)) < 0.985
 
 
-def test_a_run_that_ended_early_is_said_and_an_infinite_value_does_not_hide_it(study) -> None:
+def test_a_run_that_ended_early_is_reported_and_an_infinite_value_does_not_hide_it(study) -> None:
     table, _ = study
     own = table[(table["algorithm"] == "ekf") & (table["quantity"] == "pose_nees")]
     cut = own[~((own["run"] == 3) & (own["submap"] > 20))].copy()

@@ -82,7 +82,7 @@ def _drawn(folder: ReportFolder) -> list[Markup]:
     try:
         m = read_map(folder.path)
     except GraphSlamError as error:
-        folder.problems["map.npz"] = _said(folder, error)
+        folder.problems["map.npz"] = _error_text(folder, error)
         return [
             missing_note("loop closures on the path, and NEES by submap: map.npz ", folder.problems["map.npz"], ".")
         ]
@@ -107,11 +107,11 @@ def _session_ties(folder: ReportFolder) -> list[Markup]:
         ends = [(e["i"], e["j"], "accepted") for e in ties]
         ax = plot_loops(None, path, nodes, ends, title="loop closures between sessions, from above")
     except GraphSlamError as error:
-        return [missing_note("loop closures between sessions: ", _said(folder, error), ".")]
+        return [missing_note("loop closures between sessions: ", _error_text(folder, error), ".")]
     return [inline_picture(figure_png(ax), "Paths of the sessions in the common frame, and loop closures between them")]
 
 
-def _said(folder: ReportFolder, error: Exception) -> str:
+def _error_text(folder: ReportFolder, error: Exception) -> str:
     """Text of an error without the folder's path, so that the page is the same wherever it was made."""
     return " ".join(str(error).replace(f"{folder.path}/", "").replace(f"{folder.home}/", "").split())
 
@@ -149,7 +149,7 @@ def _nees(folder: ReportFolder, nodes: np.ndarray, covariances: np.ndarray, base
         end = bases[1 + np.searchsorted(keys, truth.keys[here])]
         d2 = nees(*map_errors(nodes[end], covariances[end], truth.exit_poses[here], chart_of(folder)))
     except (GraphSlamError, KeyError, TypeError, IndexError, ValueError) as error:
-        return [missing_note("NEES by submap: ", _said(folder, error), ".")]
+        return [missing_note("NEES by submap: ", _error_text(folder, error), ".")]
     from graphslam.plots.consistency import plot_consistency
     from graphslam.plots.save import figure_png
 

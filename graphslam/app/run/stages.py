@@ -173,7 +173,7 @@ def run_of_solution(inputs: RunInputs, slam: SubmapSlam, solution: Solution, clo
         tell_stage(slam.back.observers, "fused map")
     _fuse(made, graph_map)
     tell_stage(slam.back.observers, "evaluation")
-    _time_and_way(made)
+    _time_and_path(made)
     _gps(made)
     _check(made)
     identified = [
@@ -274,7 +274,7 @@ def _fuse(made: SolvedMap, graph_map: GlobalMap) -> None:
             made.findings.append(Finding("", "moving", text))
 
 
-def _time_and_way(made: SolvedMap) -> None:
+def _time_and_path(made: SolvedMap) -> None:
     submaps, work, log = made.slam.submaps, made.slam.timing, made.inputs.log
     now = submaps[work.resumed :]
     scans = sum(int(s.report.get("scans", 0)) for s in now)

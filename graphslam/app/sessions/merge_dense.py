@@ -149,7 +149,7 @@ def merge_dense(runs: Sequence[Run], names: Sequence[str], *, by: By = "auto", s
         "format": "graphslam.merge/1",
         "by": by,
         "solver": solver,
-        "sessions": [_said(s) for s in placed],
+        "sessions": [_session_row(s) for s in placed],
         "seconds": time.perf_counter() - begin,
     }
     return MergedSubmaps(placed, solution, graph, metrics, report)
@@ -238,7 +238,7 @@ def _score(out: Metrics, placed: Sequence[PlacedSession]) -> None:
     out.add("path_max_aligned", whole.statistics.maximum, "m", "lower")
 
 
-def _said(s: PlacedSession) -> dict[str, Any]:
+def _session_row(s: PlacedSession) -> dict[str, Any]:
     a = s.attached
     return {
         "name": s.name,

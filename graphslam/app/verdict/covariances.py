@@ -56,7 +56,7 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
     found = covariance_assessment(figures)
     if found is None:
         return []
-    said = "; ".join(_said(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
+    said = "; ".join(_test_text(r) for r in found.speaking[:4]) + ("; …" if len(found.speaking) > 4 else "")
     rest = "Tested with residuals and withheld data, without ground truth"
     if figures.report.get("identities") == "run" and figures.metrics.get("landmarks", 0.0) > 0:
         rest += "; correct data association is assumed"
@@ -88,7 +88,7 @@ def check_trust(figures: RunMetrics) -> list[Finding]:
     return [Finding("good", "trust", text)]
 
 
-def _said(row: ConsistencyTest) -> str:
+def _test_text(row: ConsistencyTest) -> str:
     """One test with its value."""
     if row.correlated and row.dof == 1.0:
         return f"{row.name} ({row.value:.1f} σ)"

@@ -148,7 +148,7 @@ class ImuFactors(SensorFactors):
         if not more:
             self.check(given, stream=stream, axes=cfg.axes)
         self.used[stream] = ImuUse(imu, cfg, given)
-        ids = self._add_ways(imu, stream, cfg, places, plan.pairs)
+        ids = self._add_preintegrated(imu, stream, cfg, places, plan.pairs)
         ids += self._add_forces(imu, stream, cfg, places, plan)
         ids += self._relink(stream)
         if not more:
@@ -229,7 +229,7 @@ class ImuFactors(SensorFactors):
 
     # ---------------------------------------------------------------- inside
 
-    def _add_ways(
+    def _add_preintegrated(
         self, imu: Imu, stream: str, cfg: ImuConfig, places: dict[int, BodyPlace], pairs: Sequence[tuple[int, int]]
     ) -> list[int]:
         if not pairs:

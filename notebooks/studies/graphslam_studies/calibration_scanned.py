@@ -126,7 +126,7 @@ def scanned(
             spent.append(process_time() - clock)
         if quick:
             yield Measurement("calibrated", "cpu_seconds", max(spent), timing=True)
-        yield from _told("quick" if quick else "full", found[0], found[1], added, _speed(recorded))
+        yield from _measurements("quick" if quick else "full", found[0], found[1], added, _speed(recorded))
     unknown, known = without_noise(own), {**own, "calibrate": {"use": "none"}}
     log = replace(recorded, name=UNKNOWN)
     made = {
@@ -139,7 +139,9 @@ def scanned(
         yield from _mapped(way, *made[way], frontend, seed)
 
 
-def _told(name: str, before: Calibration, after: Calibration, added: Added, speed: float) -> Iterator[Measurement]:
+def _measurements(
+    name: str, before: Calibration, after: Calibration, added: Added, speed: float
+) -> Iterator[Measurement]:
     """Errors of the estimated additions: difference between the two calibrations minus the true addition.
 
     The yaw bias is scored only if both calibrations estimate it separately, with a combined σ below `SURELY`. The joint

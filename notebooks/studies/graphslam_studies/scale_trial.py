@@ -79,7 +79,7 @@ def rms(a: Poses, b: Poses) -> float:
     return float(np.sqrt(np.mean(np.sum((a.position - b.position) ** 2, axis=1))))
 
 
-def _said(name: str, found: RelaxationResult, best: RelaxationResult, truth: Poses, first: float) -> Rows:
+def _rows(name: str, found: RelaxationResult, best: RelaxationResult, truth: Poses, first: float) -> Rows:
     yield Measurement(name, "gap", found.objective - best.objective)
     yield Measurement(name, "chi2", found.chi2)
     yield Measurement(name, "iterations", found.iterations)
@@ -98,8 +98,8 @@ def _methods(config: ScaleTrialConfig, seed: int) -> Rows:
     first = float(np.linalg.norm(Network(WorkRanges(problem, Workers(1)), start).gradient))
     best = relax_skeleton(problem, TIGHT)
     for name, how in METHODS.items():
-        yield from _said(name, relax_skeleton(problem, how, start), best, world.truth, first)
-    yield from _said("gn, forward pass", best, best, world.truth, first)
+        yield from _rows(name, relax_skeleton(problem, how, start), best, world.truth, first)
+    yield from _rows("gn, forward pass", best, best, world.truth, first)
 
 
 def _approximations(config: ScaleTrialConfig, seed: int) -> Rows:

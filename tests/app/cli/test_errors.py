@@ -101,7 +101,7 @@ def test_a_full_file_system_behind_the_output_is_one_line() -> None:
     )
 
 
-def test_what_was_said_before_an_error_does_not_fail_once_more() -> None:
+def test_what_was_reported_before_an_error_does_not_fail_once_more() -> None:
     """Text that waits for a full disk would end the interpreter with code 120 and a second message."""
     app = "def app():\n    print('said')\n    raise MemoryError\n"
     code = f"from graphslam.app import cli\n{app}cli.app = app\ncli.main()"

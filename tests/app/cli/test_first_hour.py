@@ -116,7 +116,7 @@ def test_a_run_prints_the_figures_that_are_asked_for_first(run: Run, tmp_path: P
     assert "frontend_scans" not in short
 
 
-def test_a_wrong_name_is_said_before_anything_is_read() -> None:
+def test_a_wrong_name_is_reported_before_anything_is_read() -> None:
     with pytest.raises(UnknownNameError, match="front end 'segslamm'; did you mean segslam"):
         gs.run("no-such-log", frontend="segslamm")
     with pytest.raises(UnknownNameError, match="solver 'isam3'"):

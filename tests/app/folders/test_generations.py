@@ -107,7 +107,7 @@ def test_without_links_files_are_plain(tmp_path: Path, monkeypatch: pytest.Monke
     assert sorted(p.name for p in tmp_path.iterdir()) == [LOCK, "map.npz", "run.json"]
 
 
-def test_ids_of_two_states_are_told(tmp_path: Path) -> None:
+def test_ids_of_two_states_are_reported(tmp_path: Path) -> None:
     check_same((tmp_path / "run.json", "a"), (tmp_path / "map.npz", "a"), (tmp_path / "older.npz", None))
     with pytest.raises(FormatError, match=r"map\.npz: does not belong to the same state as run\.json.* b; wanted a"):
         check_same((tmp_path / "run.json", "a"), (tmp_path / "map.npz", "b"))

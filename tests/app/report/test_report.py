@@ -132,7 +132,7 @@ def test_an_unsolved_run_is_called_so(copy: Path) -> None:
     assert read(copy).verdict[0] == ("bad", "solution: not converged — the graph is not at its optimum.")
 
 
-def test_an_imu_of_other_axes_is_told_at_once(copy: Path) -> None:
+def test_an_imu_of_other_axes_is_reported_at_once(copy: Path) -> None:
     said = {"event": "imu-axes", "stream": "imu", "verdict": "as stated", "words": "x and y swapped <i>"}
     with (copy / "events.jsonl").open("a") as stream:
         stream.write(json.dumps(said) + "\n")

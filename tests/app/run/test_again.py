@@ -100,7 +100,7 @@ def test_a_folder_without_what_the_graph_was_made_of_says_so(
         rerun_without_loops(tmp_path / "run", [], progress=False)
 
 
-def test_files_of_two_states_are_told_apart(folder: Path, log: SensorLog, tmp_path: Path) -> None:
+def test_files_of_two_states_are_distinguished(folder: Path, log: SensorLog, tmp_path: Path) -> None:
     gs.run(log, seed=6, out=tmp_path / "other", config=OPTIONS, progress=False)
     for name in ("map.npz", "association.npz", "gps_all.npz", "fixes.npz", "events.jsonl"):
         mixed = Path(shutil.copytree(folder, tmp_path / name))  # links followed: plain files
@@ -142,7 +142,7 @@ def test_every_array_and_the_truth_count(log: SensorLog) -> None:
     assert {k for k in whole if other[k] != whole[k]} == {"(truth)"}
 
 
-def test_a_run_is_not_gone_on_with_on_another_log(copy: Path, log: SensorLog) -> None:
+def test_a_run_is_not_resumed_on_another_log(copy: Path, log: SensorLog) -> None:
     before = snapshot(copy, ("*", "figures/*", "submaps/*"))
     other = gs.simulate("landmark-field", preset="quick", seed=4, gps_rate=1.0, gps_sigma=0.3)
     assert other.name == log.name

@@ -50,7 +50,7 @@ def test_a_front_end_without_motion_is_not_given_any(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(("before", "after"), [(None, "1"), ("3", "3")])
-def test_command_line_uses_one_blas_thread_unless_told(before: str | None, after: str) -> None:
+def test_command_line_uses_one_blas_thread_unless_asked(before: str | None, after: str) -> None:
     code = (
         "import sys, typer, graphslam; assert 'numpy' not in sys.modules\n"
         "import graphslam.app.cli, os; print(os.environ['OPENBLAS_NUM_THREADS'])"

@@ -51,7 +51,7 @@ def solved(log: SensorLog, submaps: list[Submap], monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("solver", ["isam2", "lm", "gnc"])
-def test_it_is_used_and_told_of(solver, tmp_path, monkeypatch):
+def test_it_is_used_and_reported(solver, tmp_path, monkeypatch):
     log, submaps = made()
     short = replace(log, streams={"imu": log["imu"].take(log["imu"].times > 1.0)})
     r = solved(short, submaps, monkeypatch, tmp_path / "run", config={"imu": {"use": "auto"}}, solver=solver)
@@ -87,7 +87,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_an_imu_of_the_graph_that_is_wrong_is_told_of(fault, monkeypatch):
+def test_an_imu_of_the_graph_that_is_wrong_is_reported(fault, monkeypatch):
     """The front end did not use it, so that nothing but the graph can see that it is wrong."""
     log, submaps = made()
     change, codes = FAULTS[fault]
@@ -135,7 +135,7 @@ def test_wrong_axes_are_named_while_the_run_goes_on(monkeypatch):
     assert not [e for e in quiet.events if e["event"] == "imu-axes"]
 
 
-def test_a_contradiction_is_said(monkeypatch, caplog):
+def test_a_contradiction_is_reported(monkeypatch, caplog):
     """Submaps that say to be a hundred times as sure as they are."""
     log, submaps = made()
     sure = [

@@ -78,7 +78,7 @@ def finished() -> tuple[BackEnd, np.ndarray, np.ndarray]:
     )
 
 
-def test_a_back_end_finds_loops_when_it_is_told_to(finished: tuple) -> None:
+def test_a_back_end_finds_loops_when_it_is_asked_to(finished: tuple) -> None:
     back, before, after = finished
     events = [e for e in back.graph.events if e["event"] == "loop"]
     assert any(e["verdict"] == "accepted" for e in events)

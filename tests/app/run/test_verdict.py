@@ -197,7 +197,7 @@ def test_loops_that_disagree_are_read_by_the_verdict() -> None:
         assert [f.level for f in lines if "disagreement of loop closures" in f.text] == expected
 
 
-def test_what_is_said_of_many_submaps_is_said_twice_and_counted() -> None:
+def test_what_is_reported_of_many_submaps_is_reported_twice_and_counted() -> None:
     def submap(key: int) -> SimpleNamespace:
         rows = [Finding("look", "scans-unobservable", f"Submap {key}: nothing holds it.").as_row()]
         rows += [Finding("", "note", text).as_row() for text in ("one", "two", "three")] if key == 0 else []
@@ -243,7 +243,7 @@ def test_the_note_on_the_join_is_one_that_consistent_runs_do_not_get(run: Run) -
     assert "covariance_scale" not in line
 
 
-def test_two_maps_that_explain_a_log_are_said() -> None:
+def test_two_maps_that_explain_a_log_are_reported() -> None:
     """What is in either, how far they lie apart, and what is in dispute."""
     place = {"loops": [[3, 4, 5], [7]], "nodes": [[14, 19], [94, 99]], "times": [[42.0, 57.0], [282.0, 297.0]]}
     facts = {

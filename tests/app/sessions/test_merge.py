@@ -97,7 +97,7 @@ def _renamed(run, new):
     return replace(run, submaps=submaps, map=replace(run.map, landmark_ids=new(run.map.landmark_ids)))
 
 
-def test_points_of_a_run_that_a_merge_does_not_use_are_said(runs, merged, log, caplog):
+def test_points_of_a_run_that_a_merge_does_not_use_are_reported(runs, merged, log, caplog):
     a, b = runs[1].map.trajectory.times[[0, -1]]
     times = np.linspace(a + 1.0, b - 1.0, 4)
     rows = surveyed(zip(times.tolist(), log.truth.trajectory.interpolate(times)[:, :2]), np.random.default_rng(2), 0.02)

@@ -279,7 +279,7 @@ def test_a_landmark_in_the_wrong_mirror_is_put_right():
     assert again.smoothed is right
 
 
-def test_a_landmark_that_cannot_be_told_from_its_mirror_goes():
+def test_a_landmark_that_cannot_be_distinguished_from_its_mirror_goes():
     problem, poses = drive(straight(30))
     settled = resolve_mirror_ambiguity(problem, problem.smooth(poses, BEACON[None]), DelayedInitialisation())
     assert settled.ambiguous == 1

@@ -141,7 +141,7 @@ def codes(log, rows):
     return [f["code"] for s in submaps for f in s.report.get("findings", ())]
 
 
-def test_points_without_times_are_told_once_where_the_motion_bends_scans(log, submaps):
+def test_points_without_times_are_reported_once_where_the_motion_bends_scans(log, submaps):
     """The same scans without their times, and with; and of a lidar that stands there is nothing to tell."""
     clouds = log["clouds"]
     assert codes(log, [clouds.cloud(k) for k in range(len(clouds))]).count("points-without-times") == 1

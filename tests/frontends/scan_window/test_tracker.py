@@ -168,7 +168,7 @@ def test_covariance_of_a_motion_between_frames_beside_the_body(dim: int) -> None
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_what_was_said_of_a_step_stays_said(dim: int) -> None:
+def test_what_was_reported_of_a_step_stays_reported(dim: int) -> None:
     steps = drawn_ring(4, dim, 14.0)
     whole, part = track_steps(steps, CONFIG, [12]), track_steps(head(steps, 31), CONFIG, [12])
     for a, b in zip((whole.poses, whole.joints, whole.biases), (part.poses, part.joints, part.biases)):
@@ -245,7 +245,7 @@ def test_a_corridor_stays_wide() -> None:
     assert chi2_quantile(0.005, 48) < sum(values) < chi2_quantile(0.995, 48)
 
 
-def test_what_is_lost_is_told_and_widens() -> None:
+def test_what_is_lost_is_reported_and_widens() -> None:
     steps = drawn_ring(7, 2, 20.0)
     n = len(steps)
     blind, far = steps.returns.copy(), steps.points.copy()

@@ -136,7 +136,7 @@ def test_a_segment_that_saw_nothing_is_no_candidate() -> None:
     assert len(winnow(m, _sample(m, step), np.array([5.0, 0.0, 0.0]), step, c)) == 0
 
 
-def test_levels_above_each_other_are_told_apart() -> None:
+def test_levels_above_each_other_are_distinguished() -> None:
     """A ramp: the second level passes over the first, 3.2 m higher."""
     n = 60
     m = SegMap(np.arange(n + 1.0), np.arange(n + 1.0), 1, dim=3)

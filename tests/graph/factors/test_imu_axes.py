@@ -82,7 +82,7 @@ def test_the_axes_are_named() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_cannot_be_told_is_no_reproach(seed: int) -> None:
+def test_what_cannot_be_estimated_is_no_reproach(seed: int) -> None:
     """Of a body that stays level only the vertical axis shows itself."""
     imu, path = drive(tilt=0.0, seed=seed)
     right = check_imu_axes(imu, path)

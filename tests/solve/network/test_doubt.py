@@ -46,7 +46,7 @@ def in_space(net: PoseNetwork) -> PoseNetwork:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_wound_up_ring_is_told_from_a_straight_one(dim: int) -> None:
+def test_a_wound_up_ring_is_distinguished_from_a_straight_one(dim: int) -> None:
     net, wound = twisted_ring(20, 1)
     straight = net.poses
     if dim == 3:

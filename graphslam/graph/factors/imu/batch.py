@@ -159,7 +159,7 @@ class ImuBatch(UniformBatch):
 
     def __init__(self, records: Sequence[ImuRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
-        self._ways = PreintegrationArrays(records)
+        self._preintegrated = PreintegrationArrays(records)
 
     @staticmethod
     def keys(record: ImuRecord) -> Sequence[int | None]:
@@ -170,9 +170,9 @@ class ImuBatch(UniformBatch):
     def terms(self, *blocks: Array) -> tuple[Array, Array]:
         """See :meth:`~graphslam.graph.factors.batch.UniformBatch.terms`."""
         if self.dim == 2:
-            return planar_terms(self._ways, *blocks[:6])
+            return planar_terms(self._preintegrated, *blocks[:6])
         x_i, v_i, b_i, x_j, v_j, b_j, tilt = blocks
-        return preintegration_terms(self._ways, x_i, v_i, b_i, x_j, v_j, b_j, tilt[0])
+        return preintegration_terms(self._preintegrated, x_i, v_i, b_i, x_j, v_j, b_j, tilt[0])
 
 
 class GyroBatch(UniformBatch):
@@ -183,7 +183,7 @@ class GyroBatch(UniformBatch):
 
     def __init__(self, records: Sequence[GyroRecord], layout: VariableLayout) -> None:
         super().__init__(records, layout)
-        self._ways = PreintegrationArrays(records)
+        self._preintegrated = PreintegrationArrays(records)
 
     @staticmethod
     def keys(record: GyroRecord) -> Sequence[int | None]:
@@ -195,9 +195,9 @@ class GyroBatch(UniformBatch):
         x_i, b_i, x_j, b_j = blocks
         none = np.zeros((len(self), self.dim))
         if self.dim == 2:
-            r, J = planar_terms(self._ways, x_i, none, b_i, x_j, none, b_j)
+            r, J = planar_terms(self._preintegrated, x_i, none, b_i, x_j, none, b_j)
             return r[:, PLANE_GYRO_ROWS], J[:, PLANE_GYRO_ROWS][:, :, PLANE_GYRO_COLUMNS]
-        r, J = preintegration_terms(self._ways, x_i, none, b_i, x_j, none, b_j, np.zeros(2))
+        r, J = preintegration_terms(self._preintegrated, x_i, none, b_i, x_j, none, b_j, np.zeros(2))
         return r[:, GYRO_ROWS], J[:, GYRO_ROWS][:, :, GYRO_COLUMNS]
 
 

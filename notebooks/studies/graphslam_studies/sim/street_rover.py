@@ -113,7 +113,7 @@ class StreetRover:
         believed = Trajectory(times, se3.se3_compose(poses, se3.se3_exp(error)))
         rate = self.robot.line_rate
         lines = np.arange(math.ceil(first * _DT * rate - 1e-9), math.ceil((first + steps) * _DT * rate - 1e-9))
-        truth = _Way(Trajectory(times, poses))
+        truth = _Path(Trajectory(times, poses))
         seeds = self._tree.child("beams", str(first))
         scans = cast_scans(self.robot.scans(lines / rate), truth, self._caster, self.robot.noise(), seeds)
         return new, scans, believed, np.column_stack([x, y])[:steps]
@@ -153,7 +153,7 @@ class StreetRover:
 
 
 @dataclass(frozen=True, slots=True)
-class _Way:
+class _Path:
     """A trajectory as a motion."""
 
     trajectory: Trajectory
