@@ -68,7 +68,7 @@ def main(seeds: int) -> None:
                 }
                 r = pipeline.run(log, frontend="segslam", seed=2, config=config, progress=False)
                 figures = {k: float(v) for k, v in zip(r.metrics["key"], r.metrics["value"])}
-                names = ("path_rmse", "path_rmse_aligned", "honesty_imu_chi2_per_dof")
+                names = ("path_rmse", "path_rmse_aligned", "consistency_imu_chi2_per_dof")
                 words = ", ".join(f"{n} {figures[n]:.3f}" for n in names if n in figures)
                 print(f"{kind} {seed} imu {use}: {len(r.submaps)} submaps, {words}", flush=True)
 

@@ -169,7 +169,7 @@ def runs(draws: int, first: int, seconds: float) -> None:
                 value["path_rmse"],
                 1e3 * float(np.mean(np.linalg.norm(up[0] - up[1], axis=1))),
                 value["nees_per_dof"],
-                value.get("honesty_imu_chi2_per_dof", np.nan),
+                value.get("consistency_imu_chi2_per_dof", np.nan),
             )
             table.setdefault(what, []).append(tuple(float(x) for x in row))
             said = "aligned {:.4f} m, first base held {:.4f} m, up off {:.1f} mrad, NEES/n {:.2f}, ways {:.2f}"

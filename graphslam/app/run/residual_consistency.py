@@ -146,12 +146,12 @@ def check_residual_consistency(
         row = c.as_row()
         if not np.isfinite(c.ratio) or name in NOT_TESTED:
             continue
-        out.add(f"honesty_{name}_chi2_per_dof", c.ratio, "", "one")
-        out.add(f"honesty_{name}_dof", c.dof)
-        out.add(f"honesty_{name}_low", row["low"])
-        out.add(f"honesty_{name}_high", row["high"])
+        out.add(f"consistency_{name}_chi2_per_dof", c.ratio, "", "one")
+        out.add(f"consistency_{name}_dof", c.dof)
+        out.add(f"consistency_{name}_low", row["low"])
+        out.add(f"consistency_{name}_high", row["high"])
         if c.least_weight < 1.0:
-            out.add(f"honesty_{name}_mean_weight", c.mean_weight)
+            out.add(f"consistency_{name}_mean_weight", c.mean_weight)
     innovations = _innovations(graph, gps, settings)
     if innovations is not None:
         for row in innovations.tests().to_dict("records"):

@@ -74,6 +74,7 @@ ADVICE: dict[str, str] = {
     "turn-disagrees": "correct the turns of the odometry or the order of the beams",
     "mounting-disagrees": "measure the mounting of the scanner (T_base_sensor)",
     "*-disagrees": "correct the motion or the scans that disagree",
+    "scans-of-a-map": "give each scan in the frame of its scanner, not in map coordinates",
     "scan-encoder": "subtract the offset from the encoder angles",
     "calibration-contradiction": "run `graphslam data check` to find the stream that is wrong",
     "calibration": "correct the calibration error that is named below",

@@ -161,7 +161,7 @@ def test_metrics_stand_with_unit_direction_and_bounds(folder: Path, whole: Page)
     # bounds stand beside the figure they are of
     assert missing
     assert all(k.endswith(("_low", "_high")) for k in missing)
-    for name in ("honesty_gps_chi2_per_dof", "gps_nis_each_value"):
+    for name in ("consistency_gps_chi2_per_dof", "gps_nis_each_value"):
         stem = name.removesuffix("_chi2_per_dof").removesuffix("_value")
         assert shown[name]["95 % bounds"] == f"{m[f'{stem}_low']:.3g} to {m[f'{stem}_high']:.3g}"
     assert shown["pose_rmse"]["direction"] == "lower is better"

@@ -61,7 +61,7 @@ def test_it_is_used_and_reported(solver, tmp_path, monkeypatch):
     assert r.metric("path_rmse_aligned") < bare.metric("path_rmse_aligned")
     assert r.metric("imu_gyro_bias") == pytest.approx(8e-3, abs=8e-3)
     assert 0 < r.metric("imu_gyro_bias_sigma") < 5e-3
-    assert 0.6 < r.metric("honesty_imu_chi2_per_dof") < 1.6
+    assert 0.6 < r.metric("consistency_imu_chi2_per_dof") < 1.6
     assert r.report["records_dropped"]["imu: no factor: before the first reading"] == 1
     assert r.report["imu"]["use"] == "auto"
     events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
