@@ -62,6 +62,7 @@ def convert_option(hint: Any, value: Any, name: str) -> Any:
             return None
         return convert_option(next(a for a in args if a is not type(None)), value, name)
     if origin is Literal:
+        value = str(value) if value not in args and str(value) in args else value  # 1.0 is a number in TOML
         if value not in args:
             raise ConfigError(f"{name} = {value!r}; known: {', '.join(map(str, args))}")
         return value

@@ -108,6 +108,12 @@ def test_malformed_settings_are_refused(text):
         parse_setting(text)
 
 
+def test_names_that_look_like_numbers_are_names():
+    assert build_config(RbpfEkfConfig, parse_setting("proposal=1.0")).proposal == "1.0"
+    with pytest.raises(ConfigError, match=r"proposal = 3\.0; known"):
+        build_config(RbpfEkfConfig, parse_setting("proposal=3.0"))
+
+
 def test_merge_is_deep_and_the_later_wins():
     assert merge_options({"a": {"b": 1, "c": 2}}, {"a": {"b": 5}, "d": 1}) == {"a": {"b": 5, "c": 2}, "d": 1}
 
